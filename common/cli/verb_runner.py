@@ -1,16 +1,116 @@
-"""Run verbs from other verbs: found by entry point, their commands checked before anything runs."""
+"""Run verbs from other verbs: in this process, or each in a process of its own."""
 
 from __future__ import annotations
 
+import argparse
+import json
+import subprocess
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stdout
 from importlib.metadata import entry_points
+from io import StringIO
+from pathlib import Path
+from typing import Any
 
-from dreamfleet.common.cli.command_line import GROUP, Verb, load_verb
-from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.cli.command_line import GROUP, Verb, build_parser, load_verb
+from dreamfleet.common.cli.global_config import complete_arguments
+from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
+from dreamfleet.common.host.processes import VerbProcess, parent_death_command
+from dreamfleet.common.host.stop_signals import Stop
+
+POLL_INTERVAL = 0.2  # seconds between checks whether to stop
+STOP_TIMEOUT = 15.0  # seconds that a verb has to end once asked: a training finishes its update first
 
 
-def find_verb(name: str) -> Verb:
-    """The verb of an entry point's name, such as `train.vae`; `DreamfleetError` if none is installed."""
-    points = entry_points(group=GROUP, name=name)
-    if not points:
-        raise DreamfleetError(f"no verb {name!r} is installed")
-    return load_verb(next(iter(points)))
+def find_verb(words: Sequence[str]) -> tuple[str, Verb, Sequence[str]]:
+    """The verb that a command line begins with, by its entry point: its name, the verb, and the words behind it."""
+    for length in (2, 1):
+        name = ".".join(words[:length])
+        if points := entry_points(group=GROUP, name=name):
+            return name, load_verb(next(iter(points))), words[length:]
+    raise DreamfleetError(f"no verb {' '.join(words[:1])!r} is installed")
+
+
+class InProcessRunner:
+    """Runs verbs one after the other in this process. All commands are parsed before the first one runs."""
+
+    def __init__(self, commands: Mapping[str, Sequence[str]]) -> None:
+        """`commands` by the names that their answers get; a wrong one ends this process as on the command line."""
+        self._parsed = {name: _parse(words) for name, words in commands.items()}
+
+    def run_all(self) -> None:
+        """Run the verbs, each of which prints its answer."""
+        for verb, args in self._parsed.values():
+            args.json = False
+            verb.run(args)
+
+    def run_all_for_json(self) -> dict[str, Any]:
+        """Run the verbs and return their answers, which are not printed."""
+        answers = {}
+        for name, (verb, args) in self._parsed.items():
+            args.json = True
+            with redirect_stdout(StringIO()) as printed:
+                verb.run(args)
+            answers[name] = json.loads(printed.getvalue())
+        return answers
+
+
+def _parse(words: Sequence[str]) -> tuple[Verb, argparse.Namespace]:
+    name, verb, flags = find_verb(words)
+    args = build_parser(name, verb).parse_all(flags)
+    complete_arguments(args)
+    return verb, args
+
+
+class ProcessRunner:
+    """Runs each verb in a child process, which ends with this one; `stop` ends the verb early."""
+
+    def __init__(self, stop: Stop) -> None:
+        self._stop = stop
+
+    def run_for_json(self, words: Sequence[str], log: Path, on_line: Callable[[str], None] = lambda _line: None) -> Any:
+        """Run a verb as `run` does, and return its JSON answer."""
+        return json.loads(self.run(words, log, on_line).splitlines()[-1])
+
+    def run(self, words: Sequence[str], log: Path, on_line: Callable[[str], None] = lambda _line: None) -> str:
+        """Run a verb to its end and return its stdout; each line of its stderr goes to `log` and to `on_line`.
+
+        A wrong command is a `UsageError`, a stop a `StoppedError`, any other failure a `DreamfleetError`.
+        """
+        log.parent.mkdir(parents=True, exist_ok=True)
+        with log.open("w") as kept:
+
+            def forward_lines() -> None:
+                for line in child.new_lines():
+                    kept.write(line)
+                    kept.flush()
+                    on_line(line.strip())
+
+            child = VerbProcess(*words, inside=parent_death_command())
+            try:
+                wait_for_end(child, self._stop, forward_lines)
+                code, out = child.finish()
+            finally:
+                child.end(STOP_TIMEOUT)
+                forward_lines()
+        if code == 0:
+            return out
+        if code == StoppedError.exit_code:
+            raise StoppedError(f"{words[0]} was stopped")
+        if code == UsageError.exit_code:
+            raise UsageError(child.last_line())
+        raise DreamfleetError(f"{child.last_line()} ({words[0]} exited with {code}; its log is {log})")
+
+
+def wait_for_end(
+    child: VerbProcess, stop: Stop, on_poll: Callable[[], None] = lambda: None, interval: float = POLL_INTERVAL
+) -> None:
+    """Wait until a verb has ended, calling `on_poll` meanwhile; `StoppedError` as soon as `stop` is true."""
+    while child.popen.poll() is None:
+        if stop():
+            raise StoppedError("stopped")
+        on_poll()
+        try:
+            child.popen.wait(interval)
+        except subprocess.TimeoutExpired:
+            continue

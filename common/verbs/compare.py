@@ -1,4 +1,4 @@
-"""`dreamfleet compare`: whether one controller drives better than another."""
+"""`dreamfleet compare`: whether one controller scores better than another."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.evaluation_report import EvaluationReport, read_evaluation_report
 from dreamfleet.common.runs.paired_difference import PairedDifference
 
-SUMMARY = "tell the paired difference of reports that `evaluate --out` wrote, each against the first"
+SUMMARY = "print the paired difference of each report of `evaluate --out` from the first"
 EXTRAS = ()
 
 
@@ -43,7 +43,7 @@ def _line(path: Path, found: EvaluationReport) -> str:
 
 
 def _warn(first: Path, base: EvaluationReport, path: Path, other: EvaluationReport) -> None:
-    """Say what else than the controllers may make a difference."""
+    """Note what besides the controllers may cause a difference."""
     for what in ("world", "fingerprint"):
         one, another = getattr(base, what), getattr(other, what)
         if one != another:

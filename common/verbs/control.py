@@ -12,13 +12,13 @@ from dreamfleet.common.printable import printable
 
 @dataclass(frozen=True)
 class ControlVerb:
-    """A verb that asks the coordinator for one thing."""
+    """A verb that sends one request to the coordinator."""
 
     name: str
     SUMMARY: str
     outcome: str
-    request_with_workers: str = ""  # what is asked for instead with --workers; empty where that is no flag
-    coordinator_leaves: bool = False  # whether its coordinator leaves the run
+    request_with_workers: str = ""  # the request with --workers; empty if the verb has no such flag
+    coordinator_leaves: bool = False  # whether the coordinator leaves the run
     EXTRAS: tuple[str, ...] = ()
 
     def configure(self, parser: argparse.ArgumentParser) -> None:
@@ -26,20 +26,20 @@ class ControlVerb:
         parser.add_argument("run_name", nargs="?", metavar="RUN", help="name of the run (default: the only live one)")
         if self.request_with_workers:
             parser.add_argument(
-                "--workers", action="store_true", help="end its workers too, but those of any run (--any)"
+                "--workers", action="store_true", help="end its workers too, except those that serve any run (--any)"
             )
         add_global_flags(parser, "connect")
         add_json_flag(parser)
 
     def run(self, args: argparse.Namespace) -> int:
-        """Ask, and say what follows."""
+        """Send the request, and print how the run continues."""
         from dreamfleet.common.monitoring.client import Client
 
         asked = self.request_with_workers if self.request_with_workers and args.workers else self.name
         with Client(resolve_network(args, "operator", "coordinator")) as client:
             name = args.run_name or client.status().run
-            told = printable(client.control(name, asked))
-        again = {"continue": told or f"dreamfleet coordinator --resume {name}"} if self.coordinator_leaves else {}
+            command = printable(client.control(name, asked))
+        again = {"continue": command or f"dreamfleet coordinator --resume {name}"} if self.coordinator_leaves else {}
         then = "".join(f"; continue it on its host with: {each}" for each in again.values())
         print_answer(args, f"run {name} {self.outcome}{then}", run=name, asked=asked, accepted=True, **again)
         return 0

@@ -1,4 +1,4 @@
-"""`dreamfleet doctor`: what is installed, what is missing, which role it can play, and the remedy."""
+"""`dreamfleet doctor`: what is installed, what each role lacks, and how to install it."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument(
         "--role", choices=ALL_ROLES, default="coordinator",
-        help="exit 1 if this role cannot be played here (default coordinator, on which every other stands)",
+        help="exit 1 if this installation cannot play this role (default coordinator, which the others build on)",
     )  # fmt: skip
     add_global_flags(parser, "runs_dir", "join")
     add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the report; exit 1 if the role that was asked about cannot be played."""
+    """Print the report; exit 1 if `--role` cannot be played."""
     from dreamfleet.common.cli.health import missing_for_role, run_checks
     from dreamfleet.common.host.fingerprint import fingerprint
 
@@ -40,9 +40,9 @@ def run(args: argparse.Namespace) -> int:
     host = {"python": platform.python_version(), "platform": platform.platform(), "cores": usable_cores(),
             "fingerprint": fingerprint()}  # fmt: skip
     if args.json:
-        told = {role: not lacks for role, lacks in roles.items()}
+        playable = {role: not lacks for role, lacks in roles.items()}
         checks = [vars(each) for each in findings]
-        print(json.dumps({**host, "checks": checks, "roles": told, "ok": told[args.role]}, indent=2))
+        print(json.dumps({**host, "checks": checks, "roles": playable, "ok": playable[args.role]}, indent=2))
     else:
         print(f"Python {host['python']} at {sys.prefix}, {host['cores']} cores, {host['platform']}")
         print(f"fingerprint: {host['fingerprint']}\n")

@@ -1,4 +1,4 @@
-"""`dreamfleet router`: a place where coordinators and workers meet that cannot reach each other."""
+"""`dreamfleet router`: a meeting point for coordinators and workers that cannot reach each other."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dreamfleet.common.host.resource_limits import raise_open_file_limit
 from dreamfleet.common.host.stop_signals import SIGNALS
 from dreamfleet.common.transport.network import DEFAULT_ENDPOINT, SECURED_ENDPOINT, Network
 
-SUMMARY = "pass messages on between coordinators and workers that connect here; it keeps nothing and may be restarted"
+SUMMARY = "forward messages between coordinators and workers that connect here; it stores nothing and may be restarted"
 EXTRAS = ()
 
 
@@ -38,11 +38,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, RouterConfig)
     add_global_flags(parser, "join", "access_dir")
     parser.add_argument(
-        "--print-config", action="store_true", help="print what Zenoh's own zenohd reads to do the same, and leave"
+        "--print-config",
+        action="store_true",
+        help="print the configuration with which Zenoh's own zenohd does the same, and exit",
     )
     parser.add_argument(
         "--write-config", type=Path, metavar="FILE.json5",
-        help="write that to a new file of mode 600, with what the join file keeps secret, and leave",
+        help="write that to a new file of mode 600, with the join file's secrets, and exit",
     )  # fmt: skip
 
 
@@ -78,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _write_config(path: Path, network: Network) -> None:
-    """What zenohd reads, as a file; certificates and keys stand in it."""
+    """Write zenohd's configuration to a file, with certificates and keys in it."""
     from dreamfleet.common.transport.session import zenoh_config
 
     if path.suffix not in (".json", ".json5"):

@@ -1,4 +1,4 @@
-"""`dreamfleet status`: how a run is, once or live."""
+"""`dreamfleet status`: a run's status, once or live."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from dreamfleet.common.transport.network import Network
 
 T = TypeVar("T")
-SUMMARY = "show how a run is: generation, population, best, workers, throughput, waste"
+SUMMARY = "show a run's status: generation, population, best, workers, throughput, waste"
 EXTRAS = ()
 REFRESH = 0.5  # seconds
 
@@ -44,7 +44,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the status; of several live runs, of which none is named, a line each."""
+    """Print the status; if several runs are live and none is named, one line per run."""
     from dreamfleet.common.monitoring.client import Client
 
     if args.watch:
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _can_redraw() -> bool:
-    """Whether a picture can be drawn over the last one: a terminal that is dumb would show nothing until the end."""
+    """Whether the terminal can redraw; a dumb one would show nothing until the end."""
     from rich.console import Console
 
     console = Console()
@@ -69,7 +69,7 @@ def _can_redraw() -> bool:
 
 
 def print_runs(documents: Sequence[dict[str, Any]]) -> None:
-    """A line for each run; what cannot be read is a note."""
+    """One line per run; an unreadable status is a note."""
     from dreamfleet.common.monitoring.eta import estimate_eta
     from dreamfleet.common.monitoring.status import read_status
     from dreamfleet.common.printable import plural
@@ -95,7 +95,7 @@ def print_runs(documents: Sequence[dict[str, Any]]) -> None:
         for each in statuses
     ]
     print_rows(rows, right=("generation", "steps/s"), drop_order=("steps/s", "workers", "best"))
-    print(f"{plural(len(rows), 'live run')}; `dreamfleet status RUN` tells more", file=sys.stderr)
+    print(f"{plural(len(rows), 'live run')}; `dreamfleet status RUN` shows more", file=sys.stderr)
 
 
 def _print_once(client: Client, document: dict[str, Any]) -> None:
@@ -107,7 +107,7 @@ def _print_once(client: Client, document: dict[str, Any]) -> None:
 
 
 def _watch(network: Network, name: str | None, *, as_json: bool) -> int:
-    """Until the coordinator leaves; one that does not answer (yet, or any more) is waited for."""
+    """Show the status until the coordinator leaves; wait while it does not answer."""
     from dreamfleet.common.monitoring.client import Client
 
     show = _print_json_lines if as_json else _show_live if _can_redraw() else _print_changes
@@ -116,20 +116,20 @@ def _watch(network: Network, name: str | None, *, as_json: bool) -> int:
 
 
 def _retry_until_answered(ask: Callable[[], T]) -> T:
-    """What `ask` answers, once it does; that it does not is said once."""
-    told = False
+    """The answer of `ask`, repeated until it answers; the failure is printed once."""
+    reported = False
     while True:
         try:
             return ask()
         except ConnectionFailedError as error:
-            if not told:
+            if not reported:
                 print(f"{error}; waiting for it (Ctrl-C ends)", file=sys.stderr, flush=True)
-            told = True
+            reported = True
             sleep(REFRESH)
 
 
 def _follow_documents(client: Client, name: str) -> Iterator[dict[str, Any]]:
-    """The status again and again, until the coordinator leaves."""
+    """Status after status, until the coordinator leaves."""
     while True:
         try:
             yield from client.watch_documents(name, REFRESH)
@@ -158,25 +158,25 @@ def _show_live(client: Client, name: str) -> int:
 
 
 def _print_changes(client: Client, name: str) -> int:
-    """A line when a generation, an evaluation, the state or the number of workers is another; at last the picture."""
+    """Print a line whenever generation, evaluations, state or workers change; at the end the panel."""
     from rich.console import Console
 
     from dreamfleet.common.monitoring.eta import summarise_status
     from dreamfleet.common.monitoring.status import read_status
     from dreamfleet.common.printable import one_line
 
-    told = None
+    shown = None
     for status in map(read_status, _follow_documents(client, name)):
         now = status.state, status.generation.number, status.evaluations, status.workers.present
-        if now != told:
+        if now != shown:
             print(one_line(f"{status.run}: {summarise_status(status)}"), flush=True)
-        told = now
+        shown = now
     Console().print(_PanelBuilder(client).build(status))
     return 0
 
 
 class _PanelBuilder:
-    """Draws one status after another, with all workers and all closed generations, of which each is asked for once."""
+    """Draws each status with all workers and closed generations; each generation is requested once."""
 
     def __init__(self, client: Client, *, fitted: bool = False) -> None:
         self._client = client
@@ -185,7 +185,7 @@ class _PanelBuilder:
         self._history: list[StoredGeneration] = []
 
     def build(self, status: Status) -> RunPanel:
-        """The picture of this one."""
+        """The panel of this status."""
         from dreamfleet.common.monitoring.status_panel import RunPanel
 
         whole = replace(_with_all_workers(self._client, status), recent=tuple(self._full_history(status)))
@@ -206,7 +206,7 @@ class _PanelBuilder:
 
 
 def _with_all_workers(client: Client, status: Status) -> Status:
-    """The same with those that had no room in it, while the coordinator is there to tell of them."""
+    """The same with the rows that did not fit, as long as the coordinator answers."""
     if status.is_over or len(status.worker_list) >= status.workers.known:
         return status
     with suppress(ConnectionFailedError):

@@ -1,4 +1,4 @@
-"""`dreamfleet story`: what happened to a worker or a job of late."""
+"""`dreamfleet story`: recent events of a worker or a job."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dreamfleet.common.printable import join_some
 if TYPE_CHECKING:
     from dreamfleet.common.monitoring.client import Client
 
-SUMMARY = "tell what happened to a live run's workers and jobs of late: given, seen, lost, reissued, accepted, ..."
+SUMMARY = "list recent events of a live run's workers and jobs: given, seen, lost, reissued, accepted, ..."
 EXTRAS = ()
 MOST_NAMED = 8  # workers by name
 LAST = 40  # events that people are shown unless they say otherwise
@@ -30,17 +30,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
     which.add_argument("--job", metavar="G/I", help="of this candidate's jobs: generation/index, such as 3/0")
     parser.add_argument(
         "--what", nargs="+", metavar="WORD", default=(),
-        help="only what is told by these words, such as: joined back silent lost left reissued",
+        help="only events of these kinds, such as: joined back silent lost left reissued",
     )  # fmt: skip
     parser.add_argument(
-        "--last", type=int, metavar="N", help=f"so many events at most (default {LAST}; with --json all that are told)"
+        "--last", type=int, metavar="N", help=f"so many events at most (default {LAST}; with --json all)"
     )
     add_global_flags(parser, "connect")
     add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the events, the newest last; how many more there are goes to stderr."""
+    """Print the events, the newest last; the number left out goes to stderr."""
     from dreamfleet.common.monitoring.client import Client
     from dreamfleet.common.monitoring.status import EventKind
 
@@ -66,14 +66,14 @@ def run(args: argparse.Namespace) -> int:
         print("nothing of that is kept: it is too long ago, or not yet", file=sys.stderr)
     elif total > len(events):
         print(
-            f"the last {len(events)} of {total} events that are kept; --last tells more, --what chooses",
+            f"the last {len(events)} of {total} events that are kept; --last shows more, --what chooses",
             file=sys.stderr,
         )
     return 0
 
 
 def _check_known(client: Client, run: str, worker: str) -> None:
-    """`UsageError` with the names of those that are known, unless this is a worker's or a host's."""
+    """`UsageError` with the known names, unless `name` is a worker's or a host's."""
     events, _ = client.events(run)  # of those that are gone, too
     known = [*(each.worker for each in client.workers(run)), *(each.worker for each in events)]
     hosts = list(dict.fromkeys(each.partition("/")[0] for each in known))

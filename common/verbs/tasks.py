@@ -1,4 +1,4 @@
-"""`dreamfleet tasks`: what can be scored in here."""
+"""`dreamfleet tasks`: the tasks that this installation can score."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print a line a task; the exit code is 0 also where one cannot run."""
+    """Print one line per task; exit 0 even if one cannot run."""
     from dreamfleet.common.protocol.tasks import registered_tasks
 
     rows = [_row(name, point) for name, point in registered_tasks().items()]

@@ -1,13 +1,12 @@
-"""The demonstration: a coordinator and one worker a core on this machine, as anybody would start them by hand.
+"""The demonstration: a coordinator and one worker per core on this machine, as a person would start them.
 
-Two runs: one in the dream, and one in reality from the dream's best mean. Spawns console commands and watches over
-Zenoh; imports neither the run nor the worker.
+Two runs: one in the dream, and one in reality from the dream's best mean. It starts verbs as processes and watches
+over Zenoh; it imports neither the service nor the worker.
 """
 
 from __future__ import annotations
 
 import math
-import subprocess
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
@@ -21,7 +20,9 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from dreamfleet.common.cli import model_commands
 from dreamfleet.common.cli.config import option
+from dreamfleet.common.cli.model_commands import options
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
 from dreamfleet.common.host.processes import (
     VerbProcess,
@@ -31,11 +32,13 @@ from dreamfleet.common.host.processes import (
     shell_command,
 )
 from dreamfleet.common.host.resource_limits import usable_cores
+from dreamfleet.common.host.stop_signals import never_stop
 from dreamfleet.common.monitoring.client import Client
 from dreamfleet.common.monitoring.status_panel import RunPanel
 from dreamfleet.common.runs.records import best_evaluation
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import CONTROLLER
+from dreamfleet.coordinator.experiments.local_run import LocalRun
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE
 
 REFRESH = 0.5
@@ -49,10 +52,12 @@ DREAM_EVALUATIONS, REAL_EVALUATIONS = (
 SUBSPACE_SIGMA0, FULL_SIGMA0 = 0.3, 0.1  # first step sizes from zero: in a subspace, and of all parameters
 SUBSPACE_SIGMA0_AFTER_DREAM, FULL_SIGMA0_AFTER_DREAM = 0.15, 0.06  # the same after a dream
 # In reality candidates drive one track each until a mean drives well, for so many steps at most: far from a good driver
-# generations tell more than tracks, and large steps more than small ones.
+# more generations help more than more tracks, and large steps more than small ones.
 ABLE_SCORE, QUICK_STEPS = 800, 700_000
 LATE_SIGMA0 = 0.06  # step size in a subspace from there on
-OFFROAD_COST = "offroad_cost=2"  # by candidates in reality: grass foretells losses that one track is too few to show
+OFFROAD_COST = (
+    "offroad_cost=2"  # by candidates in reality: driving on grass predicts losses that one track may not show
+)
 
 
 @dataclass(frozen=True)
@@ -111,7 +116,7 @@ class Demo:
         self._console = Console()
 
     def play(self) -> None:
-        """Evolve, judge, draw, record, and say what to try next."""
+        """Evolve, judge, plot, record, and print what to try next."""
         with ExitStack() as stack:
             self._show_page(stack)
             for demo_run in self._demo_runs:
@@ -132,7 +137,7 @@ class Demo:
         self._print_next_steps(folder)
 
     def _show_page(self, stack: ExitStack) -> None:
-        """Serve a page about the runs until the stack is left; without its packages, or a port, there is none."""
+        """Serve a page about the runs until `stack` closes; none without its packages or a free port."""
         if not self._config.page or any(find_spec(package) is None for package in PAGE_PACKAGES):
             return
         where = ("--connect", self._endpoint, "--runs-dir", self._runs_dir)
@@ -150,11 +155,11 @@ class Demo:
 
     def _judge(self, controller: Path) -> dict[int, float]:
         """Score by track, on tracks that no part of the demonstration has seen."""
-        told = run_verb_for_json("evaluate", "--controller", controller, "--episodes", self._config.tracks, "--json")
-        return dict(zip(told["seeds"], told["scores"], strict=True))
+        report = run_verb_for_json(*model_commands.evaluate(controller, self._config.tracks, "--json"))
+        return dict(zip(report["seeds"], report["scores"], strict=True))
 
     def _table(self, chosen: DemoRun, drives: Mapping[int, float]) -> Table:
-        """What each stage's best look promised, what was confirmed, and what the chosen one did on unseen tracks."""
+        """Each run's best evaluation and confirmed score, and the chosen one's score on unseen tracks."""
         table = Table("run", "its best evaluation", "confirmed on fresh tracks", "on unseen tracks", box=None)
         for demo_run in self._demo_runs:
             with open_run(self._runs_dir, demo_run.run) as run:
@@ -168,32 +173,21 @@ class Demo:
         return table
 
     def _evolve(self, demo_run: DemoRun) -> None:
-        workers = self._config.workers or usable_cores()
+        workers, logs, flags = self._config.workers or usable_cores(), self._runs_dir / demo_run.run, demo_run.flags
         self._print(f"{demo_run.what}: a coordinator and {workers} workers on this machine")
-        logs = self._runs_dir / demo_run.run
-        flags = {
-            "run": demo_run.run, "runs-dir": self._runs_dir, "listen": self._endpoint, "bundle": self._config.bundle,
-            **demo_run.flags,
-        }  # fmt: skip
         if demo_run.schedule:
             logs.mkdir(parents=True, exist_ok=True)
             (logs / SCHEDULE).write_text(demo_run.schedule)
-            flags["schedule"] = logs / SCHEDULE
-        arguments = [text for name, value in flags.items() for text in (f"--{name}", value)]
-        with ExitStack() as stack:
-            log = logs / "coordinator.log"
-            coordinator = stack.enter_context(
-                VerbProcess("coordinator", *arguments, inside=parent_death_command(), log=log)
-            )
-            client = stack.enter_context(self._connect(coordinator))
+            flags = {**flags, "schedule": logs / SCHEDULE}
+        words = model_commands.begin_run(
+            demo_run.run, self._runs_dir, (self._endpoint,), *options(**flags), world_model=self._config.bundle,
+            as_json=False,
+        )  # fmt: skip
+        with LocalRun(demo_run.run, words, logs) as run, self._connect(run.coordinator) as client:
             for name in (f"core-{number}" for number in range(workers)):
-                where = ("--connect", self._endpoint, "--run", demo_run.run, "--name", name, "--slots", 1)
-                stack.enter_context(
-                    VerbProcess("worker", *where, inside=parent_death_command(), log=logs / f"{name}.log")
-                )
-            self._watch(client, coordinator.popen, demo_run.run)
-            if coordinator.finish()[0] != 0:
-                raise DreamfleetError(f"the coordinator failed; its words are in {log}")
+                run.start_worker(name, model_commands.worker(demo_run.run, self._endpoint, 1, "--name", name))
+            with Live(console=self._console, refresh_per_second=4) as live:
+                run.wait(never_stop, lambda: self._show(live, client, demo_run.run), REFRESH)
 
     def _connect(self, coordinator: VerbProcess) -> Client:
         deadline = time.monotonic() + START_SECONDS
@@ -206,15 +200,9 @@ class Demo:
                 if time.monotonic() > deadline:
                     raise
 
-    def _watch(self, client: Client, coordinator: subprocess.Popen[bytes], run: str) -> None:
-        with Live(console=self._console, refresh_per_second=4) as live:
-            while coordinator.poll() is None:
-                with suppress(ConnectionFailedError):  # it is starting, or has just ended
-                    live.update(RunPanel(client.status(run), client.worker_flags, fitted=self._console.is_terminal))
-                try:
-                    coordinator.wait(REFRESH)
-                except subprocess.TimeoutExpired:
-                    continue
+    def _show(self, live: Live, client: Client, run: str) -> None:
+        with suppress(ConnectionFailedError):  # the coordinator is starting, or has just ended
+            live.update(RunPanel(client.status(run), client.worker_flags, fitted=self._console.is_terminal))
 
     def _plot(self, demo_run: DemoRun) -> None:
         from dreamfleet.coordinator.analysis.plot import plot_fitness
@@ -226,11 +214,11 @@ class Demo:
 
     def _print_next_steps(self, folder: Path) -> None:
         controller = folder / CONTROLLER
-        told = f": the controller, {PLOT}, {VIDEO}, the journal. Three things to try:"
-        self._console.print(Text.assemble("\n", (f"In {folder}", "bold"), told))
+        files = f": the controller, {PLOT}, {VIDEO}, the journal. Three things to try:"
+        self._console.print(Text.assemble("\n", (f"In {folder}", "bold"), files))
         for command in (
             shell_command("replay", folder.name, "--candidate", "0/0", "--runs-dir", self._runs_dir),
-            shell_command("evaluate", "--controller", controller, "--episodes", 100),
+            shell_command(*model_commands.evaluate(controller, 100)),
             shell_command("coordinator", "--run", "mine", "--preset", "frugal", "--listen", self._endpoint)
             + f"   # and beside it: {shell_command('worker', '--connect', self._endpoint)}",
         ):

@@ -1,40 +1,51 @@
-"""A round's evolution: a coordinator and, where they are wanted, scoring processes of this host."""
+"""A run served on this host: its flags checked, its coordinator and workers started, its end awaited."""
 
 from __future__ import annotations
 
+import argparse
 import re
 import socket
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from dreamfleet.common.errors import DreamfleetError, StoppedError
+from dreamfleet.common.cli import model_commands
+from dreamfleet.common.cli.verb_runner import POLL_INTERVAL, wait_for_end
+from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
+from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.host.processes import VerbProcess, parent_death_command
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import Stop
-from dreamfleet.coordinator.experiments.verb_process import wait
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_paths import JOURNAL
+from dreamfleet.coordinator.settings.config import LimitsConfig, RunConfig
 
-LEFT_OPEN = 130
-ANY_ADDRESS = re.compile(r"/(0\.0\.0\.0|\[::\]):")  # where one listens, and connects to as this host
+ANY_ADDRESS = re.compile(r"/(0\.0\.0\.0|\[::\]):")  # an endpoint that listens on all of this host's addresses
+# Settings of `coordinator` that each run of an experiment has its own of, with their defaults.
+RESERVED: dict[str, str | None] = {
+    "run_name": "run",
+    **dict.fromkeys(("resume", "init", "bundle", "seed", "runs_dir", "listen", "connect", "config", "subspace")),
+}
 
 
 @dataclass(frozen=True)
 class LocalFleet:
-    """Where a run is reached, how many of its slots are here, and flags that its verbs need besides."""
+    """Where a run's coordinator listens, how many slots this host scores with, and further flags of both."""
 
     listen: tuple[str, ...]
     slots: int
-    coordinator: tuple[str, ...] = ()
+    coordinator: tuple[str, ...] = ()  # flags of a run's first coordinator
     worker: tuple[str, ...] = ()
-    security: tuple[str, ...] = ()  # of its coordinators, begun or resumed
+    security: tuple[str, ...] = ()  # flags of its first and of its resuming coordinators
 
     @classmethod
     def of(
         cls, listen: tuple[str, ...], local: int | None, coordinator: tuple[str, ...], worker: tuple[str, ...],
         join: Path | None = None, *, insecure: bool = False,
     ) -> LocalFleet:  # fmt: skip
-        """As it was asked for: without an address on a free port of this host, scored by a slot a core."""
+        """Without `listen`: a free port of this host. Without `local`: a slot per core, or none where `listen` is."""
         joined = () if join is None else ("--join", str(join))
         security = (*joined, *(("--insecure",) if insecure else ()))
         here = f"{'tcp' if join is None else 'tls'}/127.0.0.1:{_free_port()}"
@@ -43,46 +54,95 @@ class LocalFleet:
 
     @property
     def local_endpoint(self) -> str:
-        """The address for this host's own workers."""
+        """Where this host's own workers connect to."""
         return ANY_ADDRESS.sub("/127.0.0.1:", self.listen[0])
 
 
-def evolve(words: Sequence[str], run: str, local_fleet: LocalFleet, folder: Path, stop: Stop) -> None:
-    """Serve a run until it ends; logs go into `folder`.
+class LocalRun:
+    """A run's coordinator, and workers of this host, as child processes; leaving the context ends them."""
 
-    `StoppedError` if it was left open, `DreamfleetError` if it failed, or if this host's workers did.
-    """
-    with ExitStack() as stack:
-        coordinator = stack.enter_context(
-            VerbProcess(*words, inside=parent_death_command(), log=folder / "coordinator.log")
+    def __init__(self, name: str, words: Sequence[str], logs: Path) -> None:
+        """`words` are the coordinator's command line; each process logs into a file in `logs`."""
+        self._name, self._words, self._logs = name, words, logs
+        self._log = logs / "coordinator.log"
+        self._workers: list[VerbProcess] = []
+
+    def __enter__(self) -> LocalRun:
+        self._stack = ExitStack()
+        self.coordinator = self._stack.enter_context(
+            VerbProcess(*self._words, inside=parent_death_command(), log=self._log)
         )
-        workers = [stack.enter_context(_start_worker(run, local_fleet, folder))] if local_fleet.slots else []
-        wait(coordinator, stop, lambda: _check_workers(workers))
-        code, _ = coordinator.finish()
-        if code == LEFT_OPEN:
-            raise StoppedError(f"run {run} was left open")
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._stack.close()
+
+    def start_worker(self, name: str, words: Sequence[str]) -> None:
+        """Start a worker by its command line; it logs into `name`.log."""
+        log = self._logs / f"{name}.log"
+        self._workers.append(self._stack.enter_context(VerbProcess(*words, inside=parent_death_command(), log=log)))
+
+    def check_workers(self) -> None:
+        """`DreamfleetError` if a worker failed."""
+        for each in self._workers:
+            if each.popen.poll() not in (None, 0):
+                raise DreamfleetError(f"this host's worker failed: {each.last_line()}")
+
+    def wait(self, stop: Stop, on_poll: Callable[[], None], interval: float = POLL_INTERVAL) -> None:
+        """Wait until the coordinator ends, calling `on_poll` meanwhile.
+
+        `StoppedError` if `stop` is true or the run was left open, `DreamfleetError` if the coordinator failed.
+        """
+        wait_for_end(self.coordinator, stop, on_poll, interval)
+        code, _ = self.coordinator.finish()
+        if code == StoppedError.exit_code:
+            raise StoppedError(f"run {self._name} was left open")
         if code != 0:
-            raise DreamfleetError(f"{coordinator.last_line()}; its words are in {folder / 'coordinator.log'}")
+            raise DreamfleetError(f"{self.coordinator.last_line()}; the coordinator's log is {self._log}")
 
 
-def _start_worker(run: str, local_fleet: LocalFleet, folder: Path) -> VerbProcess:
-    words = (
-        "worker",
-        "--connect",
-        local_fleet.local_endpoint,
-        "--run",
-        run,
-        "--slots",
-        local_fleet.slots,
-        "--exit-when-done",
-    )
-    return VerbProcess(*words, *local_fleet.worker, inside=parent_death_command(), log=folder / "worker.log")
+def evolve(name: str, words: Sequence[str], local_fleet: LocalFleet, logs: Path, stop: Stop) -> None:
+    """Serve a run until it ends, as `LocalRun.wait` does; also `DreamfleetError` if this host's worker failed."""
+    with LocalRun(name, words, logs) as run:
+        if local_fleet.slots:
+            flags = ("--exit-when-done", *local_fleet.worker)
+            run.start_worker(
+                "worker", model_commands.worker(name, local_fleet.local_endpoint, local_fleet.slots, *flags)
+            )
+        run.wait(stop, run.check_workers)
 
 
-def _check_workers(workers: Sequence[VerbProcess]) -> None:
-    for each in workers:
-        if each.popen.poll() not in (None, 0):
-            raise DreamfleetError(f"this host's worker failed: {each.last_line()}")
+def has_begun(runs_dir: Path, name: str) -> bool:
+    """Whether the run has a journal."""
+    return path_exists(runs_dir / name / JOURNAL)
+
+
+def has_ended(runs_dir: Path, name: str) -> bool:
+    """Whether the run has begun and reached its end."""
+    if not has_begun(runs_dir, name):
+        return False
+    with open_run(runs_dir, name) as run:
+        return run.ended is not None
+
+
+def parse_run_flags(flags: Sequence[str], sources: Mapping[str, Any], verb: str) -> tuple[RunConfig, LimitsConfig]:
+    """What a run is and when it ends, by its flags, the environment and the file.
+
+    `sources` are those of `verb`, as `complete_arguments` left them. `UsageError` for flags that `verb` sets itself,
+    for wrong ones, and where none sets a limit.
+    """
+    from dreamfleet.common.cli.command_line import build_parser
+    from dreamfleet.coordinator.settings import run_setup
+
+    parsed = build_parser("coordinator", run_setup).parse_all(list(flags))
+    if taken := [name for name, default in RESERVED.items() if getattr(parsed, name, default) != default]:
+        names = ", ".join(f"--{name.replace('_name', '').replace('_', '-')}" for name in taken)
+        raise UsageError(f"{names} in --run-flags: {verb} sets them for each run; give --config to {verb}")
+    args = argparse.Namespace(sources={**sources, "flags": parsed}, given=frozenset(vars(parsed)))
+    config, limits = run_setup.load_run_config(args, base={})
+    if limits == LimitsConfig():
+        raise UsageError("a run would never end: give --run-flags a limit, such as --generations 32")
+    return config, limits
 
 
 def _free_port() -> int:

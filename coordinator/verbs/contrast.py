@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from dreamfleet.coordinator.experiments.contrast.summary import TrialResult
     from dreamfleet.coordinator.experiments.contrast.trials import Trials
 
-SUMMARY = "train kinds of MDN-RNNs on equal data, several seeds each, evolve in each one's dream, and tell them apart"
+SUMMARY = "train kinds of MDN-RNNs on equal data, several seeds each, evolve in each one's dream, and compare them"
 EXTRAS = ("train",)
 PACKAGES = ("gymnasium", "onnx", "onnxruntime", "safetensors", "torch")
 
@@ -24,8 +24,8 @@ PACKAGES = ("gymnasium", "onnx", "onnxruntime", "safetensors", "torch")
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     shown = ", ".join(f'{name} "{flags}"' for name, flags in KINDS)
-    parser.add_argument("--data", type=Path, required=True, help="a data set that is encoded: all learn from it")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the trials; one that was begun goes on")
+    parser.add_argument("--data", type=Path, required=True, help="an encoded data set: all learn from it")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the trials; one that was begun is resumed")
     parser.add_argument(
         "--kind", nargs=2, action="append", default=[], metavar=("NAME", "FLAGS"),
         help="a kind by its flags of `train mdnrnn`, with the preset tiny, as one text; the others are compared with "
@@ -39,23 +39,22 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--run-flags", default=RUN_FLAGS, metavar="FLAGS",
         help=f"of every `coordinator`, whose preset is dream unless another is named (default {RUN_FLAGS})",
     )  # fmt: skip
-    parser.add_argument("--local", type=int, help="scoring processes (default one a core)")
+    parser.add_argument("--local", type=int, help="scoring processes (default one per core)")
     add_json_flag(parser)
 
 
 @interrupted_by_signals()
 def run(args: argparse.Namespace) -> int:
-    """Do all trials that are left, and compare."""
+    """Run all trials that are left, and compare them."""
     from dreamfleet.common.files.locks import folder_lock
     from dreamfleet.coordinator.experiments.contrast.trials import LOCK, Trials
-    from dreamfleet.coordinator.experiments.local_run import LocalFleet
-    from dreamfleet.coordinator.experiments.run_flags import parse_run_flags
+    from dreamfleet.coordinator.experiments.local_run import LocalFleet, parse_run_flags
 
     contrast = Contrast(parse_kinds(args.kind), tuple(args.seeds), args.mdnrnn_flags, args.run_flags)
-    parse_run_flags(contrast.common_run_flags, args.sources, "contrast")  # what is wrong with them is said now
+    parse_run_flags(contrast.common_run_flags, args.sources, "contrast")  # wrong flags end it now
     file = ("--config", str(args.config)) if args.config else ()
     for package in PACKAGES:
-        if find_spec(package) is None:  # said now rather than after hours
+        if find_spec(package) is None:  # now rather than after hours
             raise ModuleNotFoundError(name=package)
     with folder_lock(args.out / LOCK, "contrast"), stop_on_signals() as stop:
         trials = Trials(contrast, args.data, args.out, lambda: LocalFleet.of((), args.local, file, ()), stop)

@@ -37,7 +37,7 @@ log = logging.getLogger("dreamfleet.coordinator")
 
 @dataclass(frozen=True)
 class ExitReport:
-    """What a verb has to say of a run that ended, beside what is always said, and its exit code."""
+    """What a verb adds to the report of an ended run, and its exit code."""
 
     text: str = ""
     facts: dict[str, Any] = field(default_factory=dict)
@@ -45,7 +45,7 @@ class ExitReport:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve the run until it ends; Ctrl-C leaves it to be continued."""
+    """Serve the run until it ends; after Ctrl-C it can be resumed."""
     from dreamfleet.coordinator.settings.start import find_start
 
     if args.resume and args.init:
@@ -83,7 +83,7 @@ def build_request(
     args: argparse.Namespace, name: str, config: RunConfig | None, limits: LimitsConfig, kept: Table,
     start: StartPoint | None,
 ) -> RunRequest:  # fmt: skip
-    """What is to be served where the arguments say, else where it was `kept`; without `config` it is continued."""
+    """The run to serve, at the endpoints of the arguments or else of `kept`; without `config` it is resumed."""
     from dreamfleet.coordinator.service.main import RunRequest
     from dreamfleet.coordinator.settings.resume_settings import choose_addresses
 
@@ -123,36 +123,39 @@ def _refuse_frozen(args: argparse.Namespace) -> None:
 
 
 def _warn_ignored_settings(args: argparse.Namespace, stored: RunFolder) -> None:
-    """A file serves many runs: what it says of another one is no error, but is not silently passed over either."""
+    """Log a warning about settings of the config file that differ from the run's: a file may serve many runs."""
     from dreamfleet.coordinator.settings.config import config_values
 
-    said = configured_values(RunConfig, "run", args.sources["file"], args.sources["environment"])
-    said = {**(find_preset(said.pop("preset")) if "preset" in said else {}), **said}
-    given_stages, own_stages = find_schedule(said.pop("schedule", None), args.sources["file"]), said.pop("stages", ())
+    configured = configured_values(RunConfig, "run", args.sources["file"], args.sources["environment"])
+    configured = {**(find_preset(configured.pop("preset")) if "preset" in configured else {}), **configured}
+    given_stages, own_stages = (
+        find_schedule(configured.pop("schedule", None), args.sources["file"]),
+        configured.pop("stages", ()),
+    )
     named, stages = split_first_stage(own_stages if given_stages is None else given_stages)
-    said |= named
-    _warn_ignored_subspace(said.pop("subspace", None), stored)
+    configured |= named
+    _warn_ignored_subspace(configured.pop("subspace", None), stored)
     if stages and stages != stored.settings.stages:
         log.warning("run %s keeps its own schedule; the settings say another", stored.name)
     frozen: dict[str, Any] = config_values(stored.settings, stored.bundle_path)
-    for name, value in said.items():
+    for name, value in configured.items():
         if name != "bundle" and frozen.get(name, value) != value:
             log.warning("%s is %s in run %s, which keeps it; the settings say %s", name, frozen[name], stored.name,
                         value)  # fmt: skip
 
 
 def _warn_ignored_subspace(name: str | None, stored: RunFolder) -> None:
-    """The run has its own, whole; the file of another one may be gone."""
+    """Warn if the settings name another subspace; the run stores its own, so the named file may be gone."""
     from dreamfleet.common.runs.lookup import find_subspace
 
     if name is None:
         return
     try:
-        said = "" if name == NO_SUBSPACE else find_subspace(name).sha256
+        configured = "" if name == NO_SUBSPACE else find_subspace(name).sha256
     except UsageError:
-        said = None
-    if said != stored.settings.subspace:
-        log.warning("run %s keeps to what it was begun to search; the settings name another subspace", stored.name)
+        configured = None
+    if configured != stored.settings.subspace:
+        log.warning("run %s keeps its own subspace; the settings name another", stored.name)
 
 
 def _stop_on_signals(stop: Callable[[], None]) -> None:

@@ -16,12 +16,12 @@ EXTRAS = ("dashboard",)
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     add_global_flags(parser, "connect", "runs_dir")
-    parser.add_argument("--run", help="follow this run alone (default: every live one)")
+    parser.add_argument("--run", help="follow only this run (default: every live one)")
     add_flags(parser, DashboardConfig)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve it until Ctrl-C."""
+    """Serve the page until Ctrl-C."""
     config = load(DashboardConfig, "dashboard", **args.sources)
     from dreamfleet.coordinator.dashboard.live_runs import Watcher
     from dreamfleet.coordinator.dashboard.server import serve

@@ -25,12 +25,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 @interrupted_by_signals()
 def run(args: argparse.Namespace) -> int:
-    """Play it."""
+    """Play the demonstration."""
     for package in ("av", "gymnasium", "matplotlib", "onnxruntime"):
-        if find_spec(package) is None:  # said now rather than after minutes of evolution
+        if find_spec(package) is None:  # now rather than after minutes of evolution
             raise ModuleNotFoundError(name=package)
     config = load(DemoConfig, "demo", **args.sources)
-    os.environ["DREAMFLEET_JOIN"] = ""  # of what is begun here nothing leaves this host, whatever fleet it is of
+    os.environ["DREAMFLEET_JOIN"] = ""  # the demo stays on this host, even if its user is in a fleet
     name = args.run_name or f"demo-{datetime.now():%m%d-%H%M%S}"
     Demo(config, name, args.runs_dir).play()
     return 0

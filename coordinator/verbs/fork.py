@@ -1,4 +1,4 @@
-"""`dreamfleet fork`: a new run that begins where another one is."""
+"""`dreamfleet fork`: a new run that begins where another one stands."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _adapt_to_subspace(config: RunConfig, before: dict[str, Any], sigma: float) -> RunConfig:
-    """The fork's configuration, of which the source's step `sigma` means nothing in another subspace."""
+    """The fork's configuration; the source's `sigma` has no meaning in another subspace."""
     loaded_subspace, old = config.loaded_subspace, before.get("loaded_subspace")
     if (loaded_subspace and loaded_subspace.sha256) == (old and old.sha256):
         return config

@@ -26,7 +26,9 @@ if TYPE_CHECKING:
     from dreamfleet.coordinator.experiments.iteration.runner import Iteration
     from dreamfleet.coordinator.experiments.local_run import LocalFleet
 
-SUMMARY = "make world models and evolve in their dreams in turn, each learning from what the last one's means drove"
+SUMMARY = (
+    "make world models and evolve in their dreams in turn; each world model learns from drives of the last evolution"
+)
 EXTRAS = ("train", "views")
 PACKAGES = ("gymnasium", "matplotlib", "onnx", "onnxruntime", "safetensors", "torch")
 VARYING = ("preset", "schedule", "bundle", "loaded_subspace")  # to the rounds' runs, of all settings
@@ -34,9 +36,11 @@ VARYING = ("preset", "schedule", "bundle", "loaded_subspace")  # to the rounds' 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("--data", type=Path, required=True, help="the iteration's folder; one that was begun goes on")
     parser.add_argument(
-        "--redo", metavar="ROUND/PHASE", help="first forget this phase and all behind it, such as 2/mdnrnn"
+        "--data", type=Path, required=True, help="the iteration's folder; one that was begun is resumed"
+    )
+    parser.add_argument(
+        "--redo", metavar="ROUND/PHASE", help="first undo this phase and all after it, such as 2/mdnrnn"
     )
     add_json_flag(parser)
     listen = "workers of any host find the rounds' runs here (default: none do)"
@@ -53,12 +57,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 @interrupted_by_signals()
 def run(args: argparse.Namespace) -> int:
-    """Go on until all rounds are finished, and tell what came of them."""
+    """Run the phases that are left, and print what each round reached."""
     from dreamfleet.common.files.locks import folder_lock
     from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
 
     for package in PACKAGES:
-        if find_spec(package) is None:  # said now rather than after hours
+        if find_spec(package) is None:  # now rather than after hours
             raise ModuleNotFoundError(name=package)
     layout = IterationFolder(args.data)
     with folder_lock(layout.lock, "iteration"), stop_on_signals() as stop:
@@ -73,19 +77,17 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
     from dreamfleet.coordinator.experiments.iteration.phases import find_init
     from dreamfleet.coordinator.experiments.iteration.plan import INIT, Phase
     from dreamfleet.coordinator.experiments.iteration.runner import Iteration
-    from dreamfleet.coordinator.experiments.run_flags import parse_run_flags
+    from dreamfleet.coordinator.experiments.local_run import parse_run_flags
 
     begun = IterationLedger.load(layout.ledger)
     config = load(IterateConfig, "iterate", base=begun.settings if begun else None, **args.sources)
     if is_file(Path(config.init)):
         config = replace(config, init=str(Path(config.init).resolve()))
-    # Until an iteration has what it goes on from, nothing was made, and all may change.
+    # Until --init has been copied, nothing was made, and all settings may change.
     new = begun is None or (not begun.entries and bool(config.init))
     more = _common_run_flags(args)
     first, limits = parse_run_flags([*more, *config.flags_of_run(1)], args.sources, "iterate")
-    later, _ = parse_run_flags(
-        [*more, *config.flags_of_run(2)], args.sources, "iterate"
-    )  # what is wrong with them is said now
+    later, _ = parse_run_flags([*more, *config.flags_of_run(2)], args.sources, "iterate")  # wrong flags end it now
     settings = {**asdict(first), **asdict(limits), **dict.fromkeys(VARYING)}
     if new:
         for run in (first, later):
@@ -96,14 +98,14 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
         else begun.with_settings(config, settings, layout.root)
     )
     if config.local == 0 and not args.listen:
-        raise UsageError("nobody would score: give --local slots here, or --listen for workers of other hosts")
+        raise UsageError("nothing would score: give --local slots here, or --listen for workers of other hosts")
     Network(args.listen, credentials=load_credentials(args, ("coordinator",))).check_open(insecure=_insecure(args))
     iteration = Iteration(
         layout, config, ledger, lambda: _local_fleet(args, config, more, settings["task"]), stop, _network_flags(args)
     )
     if args.redo:
         if (phase := Phase.of(args.redo)).name == INIT:
-            find_init(config.init, layout.runs)  # before all that came of it goes
+            find_init(config.init, layout.runs)  # before all that followed from it is removed
         iteration.redo(phase)
     iteration.begin()
     iteration.ledger.save(layout.ledger)
@@ -111,7 +113,7 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
 
 
 def _common_run_flags(args: argparse.Namespace) -> tuple[str, ...]:
-    """What a round's coordinator is told before `--run-flags`: the file, and the preset where nobody names one."""
+    """Flags that come before `--run-flags`: the config file, and preset dream unless the settings name one."""
     sources = args.sources
     named = "preset" in configured_values(RunConfig, "run", sources["file"], sources["environment"])
     file = ("--config", str(args.config)) if args.config else ()
@@ -119,12 +121,12 @@ def _common_run_flags(args: argparse.Namespace) -> tuple[str, ...]:
 
 
 def _check_run(config: IterateConfig, run: RunConfig, layout: IterationFolder) -> None:
-    """Whether a round's run could be begun: in the shipped world model, or in what the iteration goes on from."""
+    """Check that a round's run can begin, in the shipped world model or in that of `--init`."""
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.coordinator.experiments.iteration.phases import find_init
     from dreamfleet.coordinator.settings.start import find_start
 
-    run = replace(run, recorded=0.0)  # no bundle need hold such states yet
+    run = replace(run, recorded=0.0)  # a bundle need not hold recorded states yet
     if not config.init:
         settings = run.settings(find_bundle(DEFAULT_BUNDLE))
     else:
@@ -148,14 +150,14 @@ def _local_fleet(args: argparse.Namespace, config: IterateConfig, more: tuple[st
 
 
 def _network_flags(args: argparse.Namespace) -> tuple[str, ...]:
-    """The flags of where workers of other hosts come to."""
+    """The flags of where workers of other hosts connect, as a person repeats them."""
     listen = ("--listen", *args.listen) if args.listen else ()
     join = () if args.global_config.join is None else ("--join", str(args.global_config.join))
     return (*listen, *join, *(("--insecure",) if _insecure(args) else ()))
 
 
 def _insecure(args: argparse.Namespace) -> bool:
-    """What the flag, the environment or the file's [network] say, which the rounds' coordinators follow too."""
+    """The setting of flag, environment or file, which holds for the rounds' coordinators too."""
     return load(NetworkConfig, "network", **args.sources).insecure
 
 
@@ -176,7 +178,7 @@ def _run_phases(iteration: Iteration, layout: IterationFolder) -> None:
         def on_begin(phase: Phase) -> None:
             nonlocal doing
             doing = f"round {phase.round}: {phase.name}"
-            shown.update(escape(f"{doing}; {layout.round(phase.round) / 'logs'} tells how far"))
+            shown.update(escape(f"{doing}; {layout.round(phase.round) / 'logs'} shows how far"))
 
         def on_line(line: str) -> None:
             shown.update(escape(f"{doing}  {line}"))
@@ -190,17 +192,17 @@ def _run_phases(iteration: Iteration, layout: IterationFolder) -> None:
 def _print_results(args: argparse.Namespace, layout: IterationFolder, ledger: IterationLedger) -> None:
     from dreamfleet.coordinator.experiments.iteration import summary
 
-    told = summary.describe_rounds(layout, ledger)
-    # Behind the last finished round one may be in its midst, with a model that no gate has judged yet.
-    counts = next(each["evolved_in"] for each in reversed(told) if each["evolved_in"] is not None)
-    best, model = summary.best_round(told), str(layout.bundle(counts))
+    rounds = summary.describe_rounds(layout, ledger)
+    # The last round may be unfinished, with a model that no gate has judged yet.
+    counts = next(each["evolved_in"] for each in reversed(rounds) if each["evolved_in"] is not None)
+    best, model = summary.best_round(rounds), str(layout.bundle(counts))
     if args.json:
-        print_answer(args, "", data=layout.root, rounds=told, best=best and best["round"], model=model)
+        print_answer(args, "", data=layout.root, rounds=rounds, best=best and best["round"], model=model)
         return
-    rows = summary.table_rows(told)
+    rows = summary.table_rows(rounds)
     print_rows(rows, right=tuple(rows[0])[1:])
     print(f"world model: {model}")
     if init := ledger.settings.get("init"):
-        print(f"it began with {init}, which was not judged on these tracks: `dreamfleet compare` tells which is better")
+        print(f"it began with {init}, which was not judged on these tracks: `dreamfleet compare` shows which is better")
     if best is not None:
         print(f"best controller: round {best['round']}'s, {summary.format_score(best['score'])}: {best['controller']}")

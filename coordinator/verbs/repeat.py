@@ -1,4 +1,4 @@
-"""`dreamfleet repeat`: the run again that a controller came from."""
+"""`dreamfleet repeat`: re-run a run from its controller's provenance."""
 
 from __future__ import annotations
 
@@ -12,15 +12,19 @@ from dreamfleet.common.cli.output import add_json_flag
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.coordinator.settings.config import NetworkConfig
 
-SUMMARY = "begin the run again that a controller came from, by its receipt, and compare what it reports, to the bit"
+SUMMARY = (
+    "re-run the run that a controller came from, by its provenance, and compare its reported controller bit by bit"
+)
 EXTRAS = ()
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("controller", metavar="CONTROLLER", help="a file, a run, or one that ships; it is only read")
-    parser.add_argument("--run", dest="run_name", help="the new run, or one to go on with (default CONTROLLER-again)")
-    parser.add_argument("--optimiser", metavar="MODULE:ATTRIBUTE", help="an optimiser of one's own that the run had")
+    parser.add_argument("--run", dest="run_name", help="the new run, or one to resume (default CONTROLLER-again)")
+    parser.add_argument(
+        "--optimiser", metavar="MODULE:ATTRIBUTE", help="the run's optimiser, if it is no installed one"
+    )
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
     add_global_flags(parser, "runs_dir")
     add_json_flag(parser)
@@ -28,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve the run until it has as many generations; exit 1 if it then reports another controller."""
+    """Serve the run for as many generations; exit 1 if it then reports another controller."""
     from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
     from dreamfleet.coordinator.settings.rerun import Rerun
     from dreamfleet.coordinator.verbs.coordinator import ExitReport, build_request, serve_request

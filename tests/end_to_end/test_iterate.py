@@ -17,6 +17,7 @@ from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.subspace import Subspace
+from dreamfleet.common.cli.verb_runner import ProcessRunner
 from dreamfleet.common.host.stop_signals import never_stop
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.coordinator.experiments.iteration.commands import Commands
@@ -25,7 +26,6 @@ from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
 from dreamfleet.coordinator.experiments.iteration.ledger import FinishedPhase, IterationLedger
 from dreamfleet.coordinator.experiments.iteration.phases import PhaseRunner
 from dreamfleet.coordinator.experiments.iteration.plan import Phase
-from dreamfleet.coordinator.experiments.verb_process import run_for_json
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
@@ -174,9 +174,8 @@ def gate(layout, new, drives=write_drives, **changes):
         .add(FinishedPhase(1, "bundle", 0, 0.0, ""))
         .add(FinishedPhase(2, "bundle", 0, 0.0, ""))
     )
-    phases = PhaseRunner(
-        Commands(config, layout, ledger), None, lambda words, log: run_for_json(words, log, never_stop), never_stop
-    )
+    runner = ProcessRunner(never_stop)
+    phases = PhaseRunner(Commands(config, layout, ledger), None, runner.run_for_json, never_stop)
     return phases.do(Phase(2, "gate")).figures
 
 
@@ -333,20 +332,20 @@ def test_what_cannot_be_gone_on_from_is_refused_before_anything_is_driven(proces
     ("flags", "said"),
     [
         (("--run-flags", "--population 4"), "would never end"),
-        (("--run-flags", "--generations 1 --bundle tiny"), "--bundle in --run-flags: each run has its own"),
+        (("--run-flags", "--generations 1 --bundle tiny"), "--bundle in --run-flags: iterate sets them for each run"),
         (("--run-flags", "--generations 1 --sigma0 -1"), "--sigma0 must be a positive number"),
         (("--vae-flags", "--updates 0"), "--vae-flags: --updates must be at least 1"),
         (
             ("--vae-flags", "--error-factor 4", "--mdnrnn-flags", "--z-factor 0"),
             "--mdnrnn-flags: --z-factor must be from",
         ),
-        (("--local", 0), "nobody would score"),
+        (("--local", 0), "nothing would score"),
         (("--go-on", "--run-flags", "--generations 1 --variant feedback=last"), "--go-on fits a controller"),
         (("--subspace",), "give --go-on too"),
         (("--views", 8), "--views are beside the features of --subspace"),
         (
             ("--run-flags", "--generations 1 --subspace few.npz"),
-            "--subspace in --run-flags: each run has its own",
+            "--subspace in --run-flags: iterate sets them for each run",
         ),
     ],
 )
@@ -418,7 +417,7 @@ def test_one_iteration_works_in_a_folder_and_ctrl_c_ends_all_that_it_started(pro
     assert f"another iteration works in {layout.root}: stop it first" in err
     process.popen.send_signal(signal.SIGINT)
     assert process.finish()[0] == 130
-    assert "what is finished is kept, and goes on with: " in process.last_line()
+    assert "what is finished is kept; resume with: " in process.last_line()
     assert not left(layout.root)
 
 

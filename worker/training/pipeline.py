@@ -1,32 +1,25 @@
-"""A whole source as the verbs that make it, in their order, or a share of it."""
+"""The verbs that make a preset's world model, in order, for all of its drives and updates or a share of them."""
 
 from __future__ import annotations
 
 import math
-import shlex
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+from dreamfleet.common.cli import model_commands
+from dreamfleet.common.cli.model_commands import Words, options, split_flags
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.training.presets import TrainConfig, TrainingPreset
 
-Arguments = tuple[str, ...]
 COLLECT, VAE, ENCODE, MDNRNN, BUNDLE = STAGES = ("collect", "train.vae", "encode", "train.mdnrnn", "bundle")
-RESERVED_FLAGS = (
-    "--data",
-    "--preset",
-    "--seed",
-    "--json",
-    "--new",
-    "--summary",
-    "--from-run",
-)  # not a stage's to be given
-LEAST_DRIVES = 2  # one to learn from, one that is held out
+RESERVED_FLAGS = ("--data", "--preset", "--seed", "--json", "--new", "--summary", "--from-run")  # set for each stage
+LEAST_DRIVES = 2  # one for training, one held out
 
 
 @dataclass(frozen=True)
 class Pipeline:
-    """A preset in a data folder. Each verb goes on where it stopped, so nothing else need be remembered."""
+    """A preset's stages in a data folder. Each verb resumes by itself, so the pipeline keeps no state of its own."""
 
     preset: TrainingPreset
     data: Path
@@ -42,41 +35,31 @@ class Pipeline:
 
     @property
     def bundle(self) -> Path:
-        """Where the world model ends, if nobody says another place."""
+        """Where the world model is written by default."""
         return self.data / f"{self.preset.name}.zip"
 
-    def stages(self, jobs: int, device: str, out: Path | None = None) -> dict[str, Arguments]:
-        """The words behind each verb; of a flag that is said twice the latter counts."""
-        folder = ("--data", str(self.data))
-        begun = (*folder, "--preset", self.preset.name, "--seed", str(self.seed))
-        drives = self._scale(self.preset.collect.episodes, LEAST_DRIVES)
-        trained = (*begun, "--device", device)
+    def stages(self, jobs: int, device: str, out: Path | None = None) -> dict[str, Words]:
+        """The command line of each stage."""
+        preset, drives = self.preset.name, self._scale(self.preset.collect.episodes, LEAST_DRIVES)
+        collect_flags = self._split_flags("collect_flags")
+        train = partial(model_commands.train, seed=self.seed, preset=preset, device=device)
         return {
-            COLLECT: (*begun, "--jobs", str(jobs), "--episodes", drives,
-                      *_split_flags("--collect-flags", self.collect_flags)),
-            VAE: (*trained, *self._updates(self.preset.vae), *_split_flags("--vae-flags", self.vae_flags)),
-            ENCODE: folder,
-            MDNRNN: (*trained, *self._updates(self.preset.mdnrnn), *_split_flags("--mdnrnn-flags", self.mdnrnn_flags)),
-            BUNDLE: (*folder, "--out", str(out or self.bundle)),
-        }  # fmt: skip
+            COLLECT: model_commands.collect(
+                self.data, *collect_flags, preset=preset, seed=self.seed, episodes=drives, jobs=jobs
+            ),
+            VAE: train("vae", self.data, *self._train_flags(self.preset.vae, "vae_flags")),
+            ENCODE: model_commands.encode(self.data),
+            MDNRNN: train("mdnrnn", self.data, *self._train_flags(self.preset.mdnrnn, "mdnrnn_flags")),
+            BUNDLE: model_commands.bundle(self.data, out or self.bundle),
+        }
 
-    def _updates(self, config: TrainConfig) -> Arguments:
-        """As many looks at held-out drives, and checkpoints, at any scale; they change no weight but by patience."""
-        return ("--updates", self._scale(config.updates), "--validate-every", self._scale(config.validate_every))
+    def _train_flags(self, config: TrainConfig, name: str) -> Words:
+        """Updates, and those between checks on held-out drives, by scale: so there are as many checks at any scale."""
+        updates, between = self._scale(config.updates), self._scale(config.validate_every)
+        return (*options(updates=updates, validate_every=between), *self._split_flags(name))
 
-    def _scale(self, amount: int, least: int = 1) -> str:
-        return str(max(least, math.ceil(round(amount * self.scale, 6))))
+    def _split_flags(self, name: str) -> Words:
+        return split_flags(f"--{name.replace('_', '-')}", getattr(self, name), "pipeline", RESERVED_FLAGS)
 
-
-def _split_flags(flag: str, text: str) -> Arguments:
-    """Flags that were given as one text; `UsageError` where its quotes do not match, or one is not to be given."""
-    try:
-        words = tuple(shlex.split(text))
-    except ValueError as error:
-        raise UsageError(f"{flag} {text!r}: {error}") from error
-    said = {word.partition("=")[0] for word in words if word.startswith("--")}
-    if taken := [
-        each for each in RESERVED_FLAGS if any(each.startswith(word) for word in said)
-    ]:  # flags may be shortened
-        raise UsageError(f"{flag}: {', '.join(taken)} of a stage is the pipeline's own to give")
-    return words
+    def _scale(self, amount: int, least: int = 1) -> int:
+        return max(least, math.ceil(round(amount * self.scale, 6)))

@@ -1,4 +1,4 @@
-"""A training as a verb runs it: its progress bar, how it ended, its figures."""
+"""Run a training from a verb: progress bar, end, figures."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from dreamfleet.worker.training.training_state import resume_command
 
 @dataclass(frozen=True)
 class EarlyStop:
-    """Patience was over after update `given_up_at`: the checkpoint is that of `update`, whose held-out loss is best."""
+    """Patience ended after update `given_up_at`; the checkpoint is of `update`, which has the best held-out loss."""
 
     update: int
     held_out_loss: float
@@ -34,7 +34,7 @@ class EarlyStop:
 
 
 def find_early_stop(path: Path) -> EarlyStop | None:
-    """Whether and how the training of this checkpoint ended early."""
+    """How the training of this checkpoint ended early; None if it did not."""
     progress = load_progress(path)
     if progress.get("stopped") is None:
         return None
@@ -43,7 +43,7 @@ def find_early_stop(path: Path) -> EarlyStop | None:
 
 @contextmanager
 def explain_interrupt(path: Path, new: bool) -> Iterator[None]:
-    """A second Ctrl-C, which ends a training in the midst of an update, says what its checkpoint keeps."""
+    """On a second Ctrl-C, which ends a training within an update, report what its checkpoint keeps."""
     try:
         yield
     except KeyboardInterrupt as error:
@@ -59,7 +59,7 @@ TrainModel = Callable[[ReportProgress, Stop], dict[str, float]]
 
 
 def run_training(args: argparse.Namespace, name: str, updates: int, checkpoint: Path, train: TrainModel) -> int:
-    """Train, keep the figures beside the data, and answer; the exit code."""
+    """Train, store the figures beside the data, and print them; the exit code."""
     with (
         progress_bar(name, updates, "updates") as bar,
         explain_interrupt(checkpoint, args.new),
@@ -69,6 +69,6 @@ def run_training(args: argparse.Namespace, name: str, updates: int, checkpoint: 
     record_quality(args.data, figures)
     early = find_early_stop(checkpoint)
     text = "  ".join(f"{name} {value}" for name, value in figures.items())
-    told = text if early is None else f"{early}\n{text}"
-    print_answer(args, told, **figures, ended_early=early and asdict(early))
+    answer = text if early is None else f"{early}\n{text}"
+    print_answer(args, answer, **figures, ended_early=early and asdict(early))
     return 0

@@ -1,4 +1,4 @@
-"""`dreamfleet collect`: drives as training data, at random or from a run that kept its own."""
+"""`dreamfleet collect`: drives as training data: random ones, controllers' or a run's."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dreamfleet.common.host.resource_limits import usable_cores
 if TYPE_CHECKING:
     from dreamfleet.worker.training.data.pilot import Pilot
 
-SUMMARY = "drive at random or by controllers, or take in what a run collected, as training data for a world model"
+SUMMARY = "collect training data for a world model: random drives, drives of controllers, or rollouts that a run kept"
 EXTRAS = ("worker",)
 
 
@@ -28,18 +28,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of the data set")
     parser.add_argument("--preset", help=preset_help_text("training"))
     add_config_flags(parser, "drives", {name: each.collect for name, each in PRESETS.items()})
-    parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one a core)")
+    parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one per core)")
     parser.add_argument(
         "--controller", nargs="+", default=[], metavar="CONTROLLER",
-        help="who drives the episodes that are missing, in turn, instead of random drivers: files, runs, or what ships",
+        help="drive the missing episodes by these controllers, in turn: files, runs, or shipped ones (default random)",
     )  # fmt: skip
-    parser.add_argument("--from-run", metavar="RUN", help="drive nothing: take in what this run collected, each once")
+    parser.add_argument(
+        "--from-run", metavar="RUN", help="drive nothing; import the rollouts that this run kept, each once"
+    )
     add_global_flags(parser, "runs_dir")
     add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Collect what is missing."""
+    """Collect the missing drives."""
     if args.from_run is not None:
         return _import_run(args)
     for flag in ("noise", "spells"):
@@ -69,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
                 bar.update(before + done)
                 if stop():
                     break
-    there = len(existing_episodes(args.data))  # with those that were written as the others were told to stop
+    there = len(existing_episodes(args.data))  # with those that were written while the others stopped
     if there < total:
         raise StoppedError(
             f"stopped: {args.data} keeps {there - before} new episodes, {there} of {total} in all; the same command "

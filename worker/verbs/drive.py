@@ -17,10 +17,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dream", action="store_true", help="drive in the dream instead of in CarRacing")
     parser.add_argument("--bundle", help=f"the world model that dreams: a file, or one that ships (default {BUNDLE})")
     parser.add_argument("--temperature", type=float, help=f"of the dream (default {TEMPERATURE})")
-    parser.add_argument("--seed", type=int, help="the track, or the dream (default another each time)")
-    parser.add_argument("--steps", type=int, default=1000, help="steps until it is over (default 1000)")
+    parser.add_argument("--seed", type=int, help="the track, or the dream (default a new one each time)")
+    parser.add_argument("--steps", type=int, default=1000, help="steps until it ends (default 1000)")
     parser.add_argument(
-        "--scale", type=float, help="enlarge the picture (default: a dream to 640 pixels, the track not)"
+        "--scale", type=float, help="enlarge the picture (default: a dream to 640 pixels, the track not at all)"
     )
     add_json_flag(parser)
 

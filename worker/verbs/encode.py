@@ -18,7 +18,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Encode what is not encoded yet."""
+    """Encode the drives that are not encoded yet."""
     from dreamfleet.worker.training.torch_setup import configure_process
 
     configure_process()  # before torch is loaded

@@ -25,21 +25,23 @@ EXTRAS = ("worker",)
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("--controller", help="a file, a run, one that ships, or a trained agent's file")
-    parser.add_argument("--run", dest="run_name", metavar="RUN", help="judge what this live run reports instead")
+    parser.add_argument(
+        "--run", dest="run_name", metavar="RUN", help="judge this live run's reported controller instead"
+    )
     add_global_flags(
         parser, "connect", texts={"connect": "ask the live run here (give --run too where there are several)"}
     )
-    parser.add_argument("--episodes", type=int, default=100, help="whole episodes, one a seed (default 100)")
+    parser.add_argument("--episodes", type=int, default=100, help="whole episodes, one per seed (default 100)")
     parser.add_argument("--first-seed", type=int, default=TEST.start, help=f"the first seed (default {TEST.start})")
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
-    parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one a core)")
+    parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one per core)")
     add_global_flags(parser, "runs_dir")
     parser.add_argument("--json", action="store_true", help="print every figure and drive as JSON")
-    parser.add_argument("--out", type=Path, help="write the same JSON here too, for `compare` and `reproduce`")
+    parser.add_argument("--out", type=Path, help="also write that JSON to this file, for `compare` and `reproduce`")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Drive and print the scores."""
+    """Drive, and print the scores."""
     pin_thread_pools()  # of NumPy, which is not loaded yet: its threads take three times the time of a drive otherwise
     from dreamfleet.common.runs.evaluation_report import check_seed_range
 
@@ -62,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def judge(name: str, agent: Agent, seeds: tuple[int, ...], jobs: int) -> EvaluationReport:
-    """Drive one whole episode a seed, with a progress bar."""
+    """Drive one whole episode per seed, with a progress bar."""
     from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.worker.tools.evaluation import run_evaluation
 
@@ -74,7 +76,7 @@ def judge(name: str, agent: Agent, seeds: tuple[int, ...], jobs: int) -> Evaluat
 
 
 def _choose_agent(args: argparse.Namespace) -> tuple[str, Agent]:
-    """Whom to judge, by name: from here, or from a live run."""
+    """The name and controller to judge: from this disk, or from a live run."""
     from dreamfleet.common.monitoring.client import Client
     from dreamfleet.common.runs.lookup import find_agent, find_bundle_of
     from dreamfleet.worker.scoring.agents import make_agent

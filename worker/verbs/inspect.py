@@ -49,13 +49,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", type=int, default=300, help="steps of the page's drive (default 300)")
     parser.add_argument(
         "--action", type=float, nargs="+", metavar="N",
-        help="the page's drive does this at each step, and nobody drives: of CarRacing steering, gas and brake, "
+        help="the page's drive does this at each step, instead of a driver: of CarRacing steering, gas and brake, "
         "such as --action -0.01 1 0",
     )  # fmt: skip
     figures = parser.add_argument_group("figures, printed instead of the page")
     figures.add_argument("--probe", action="store_true", help="how much of the simulator's truth [z, h] holds")
     figures.add_argument("--losses", action="store_true", help="whether dreams lose the road where reality lost it")
-    figures.add_argument("--likeness", action="store_true", help="whether dreams hold what is rare on drives as often")
+    figures.add_argument(
+        "--likeness", action="store_true", help="whether rare events of drives are as frequent in dreams"
+    )
     parser.add_argument("--controller", help="who drives: a file, a run, or one that ships (default the run's own)")
     figures.add_argument(
         "--driver", help="who drives for --probe, from anywhere: of CarRacing those of `collect --driver`, which are "
@@ -72,7 +74,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Draw and print where the page lies, or measure and print figures."""
+    """Write the page and print its path, or measure and print figures."""
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     if args.probe or args.losses or args.likeness:
         if args.picture:
@@ -187,7 +189,7 @@ def _measure_losses(
 
 
 def _with_driver(args: argparse.Namespace, subject: InspectionSubject) -> InspectionSubject:
-    """The subject with who drives for its page, where that is said."""
+    """The subject, with the driver of its page if one is given."""
     if not args.controller:
         return subject
     bundle, driving = _choose_driver(args, subject)
@@ -231,7 +233,7 @@ def _temperature(args: argparse.Namespace, subject: InspectionSubject) -> float:
 
 
 def _choose_driver(args: argparse.Namespace, subject: InspectionSubject) -> tuple[Bundle, DriverChoice]:
-    """What is measured, and who drives."""
+    """What is measured, and its driver."""
     from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
     from dreamfleet.worker.inspection.measurements import DriverChoice
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 SUMMARY = "watch what a worker scores, the best mean, or a controller: its drive, what it decodes, what it dreams"
 EXTRAS = ("worker", "views")  # a window needs only the first
 FASTEST = 50  # pictures a second
-LONGEST = 20  # seconds of pictures in files, unless told otherwise
+LONGEST = 20  # default seconds of pictures in files
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -36,14 +36,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_run_argument(parser)
     whom = parser.add_mutually_exclusive_group()
     whom.add_argument("--worker", metavar="NAME", help="what this worker scores (default: the busiest worker's)")
-    whom.add_argument("--best", action="store_true", help="the run's best mean so far, driven here track after track")
+    whom.add_argument("--best", action="store_true", help="drive the run's best mean so far here, track after track")
     whom.add_argument(
         "--controller", help="no run: a file, a run on this disk, one that ships, or a trained agent's file"
     )
     parser.add_argument(
         "--generation", type=int, metavar="G", help="of the run that --controller names: the evaluated mean"
     )
-    parser.add_argument("--fps", type=int, default=10, help="pictures a second (default 10)")
+    parser.add_argument("--fps", type=int, default=10, help="pictures per second (default 10)")
     parser.add_argument(
         "--seconds",
         type=float,
@@ -60,7 +60,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show until it is over, closed, or told to stop."""
+    """Show until it is over, closed, or stopped."""
     _check(args)
     os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"  # a greeting on stdout, where a stream may go
     if args.out is not None:
@@ -95,7 +95,7 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _writes_files(args: argparse.Namespace) -> bool:
-    """Whether nobody looks while it runs."""
+    """Whether pictures go into files, and so need not come in real time."""
     return args.out not in (None, "-")
 
 
@@ -133,7 +133,7 @@ def _open_pictures(args: argparse.Namespace) -> Iterator[Iterator[CaptionedFrame
 
 @contextmanager
 def _worker_pictures(args: argparse.Namespace, client: Client) -> Iterator[Iterator[CaptionedFrame | None]]:
-    """What a worker of the run does."""
+    """Pictures of what a worker of the run scores."""
     from dreamfleet.common.artifacts.bundle_store import BundleStore, default_cache
     from dreamfleet.common.artifacts.car_racing_variants import Variant
     from dreamfleet.common.monitoring.live import LiveView
@@ -149,7 +149,7 @@ def _worker_pictures(args: argparse.Namespace, client: Client) -> Iterator[Itera
             bundle = fetch_bundle(
                 client.session, view.run, spec.bundle, BundleStore(default_cache()), CountingDecoder()
             )
-            assert bundle is not None  # nobody stops it
+            assert bundle is not None  # it is never stopped
             fitting = bundle.with_controllers(spec.controller, Variant.from_json(spec.options))
             glass = LiveCanvas(view.run, _action_names(spec, fitting), LiveDreamer(fitting, args.temperature))
         print(f"watching run {view.run}; its workers: {view.status.workers.present}", file=sys.stderr)
@@ -159,7 +159,7 @@ def _worker_pictures(args: argparse.Namespace, client: Client) -> Iterator[Itera
 
 
 def _action_names(spec: TaskSpec, bundle: Bundle) -> tuple[str, ...]:
-    """As the world has them; a task's name is code, so one that is not registered here is not asked."""
+    """The world's action names; empty for a task that is not registered here, as its name could load any code."""
     from dreamfleet.worker.tasks.api import Assignment
     from dreamfleet.worker.tasks.registry import find_task, known_tasks
 
@@ -168,7 +168,7 @@ def _action_names(spec: TaskSpec, bundle: Bundle) -> tuple[str, ...]:
 
 
 def _drive_pictures(args: argparse.Namespace, driver: Callable[[], Driver]) -> Iterator[CaptionedFrame]:
-    """A controller's drives; in a file as fast as they can be made, elsewhere at the world's pace."""
+    """A controller's drives: into files as fast as possible, elsewhere at `--fps`."""
     from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
     from dreamfleet.worker.tools.live_sources import driven_frames, limit_rate
 
@@ -177,7 +177,7 @@ def _drive_pictures(args: argparse.Namespace, driver: Callable[[], Driver]) -> I
 
 
 def _best_driver(client: Client, run: str) -> Driver:
-    """The run's best mean as it is now."""
+    """The run's current best mean."""
     from dreamfleet.worker.scoring.agents import make_agent
     from dreamfleet.worker.service.bundle_fetch import fetch_bundle_of
 
@@ -187,7 +187,7 @@ def _best_driver(client: Client, run: str) -> Driver:
 
 
 def _named_driver(args: argparse.Namespace) -> Callable[[], Driver]:
-    """Whom `--controller` names."""
+    """The controller of `--controller`."""
     from dreamfleet.common.runs.lookup import find_agent, find_bundle_of, find_evaluated_mean
     from dreamfleet.worker.scoring.agents import make_agent
 

@@ -26,7 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Record and print the scores."""
+    """Record, and print the scores."""
     videos = video_paths(args)
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     from dreamfleet.common.runs.lookup import find_agent, find_bundle_of

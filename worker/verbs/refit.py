@@ -12,7 +12,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, reporting_write_errors
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 
-SUMMARY = "fit a controller to another world model, so that it chooses there what it chose, on recorded drives"
+SUMMARY = "fit a controller to another world model, so that it acts there as before, by regression on recorded drives"
 EXTRAS = ("worker",)
 DRIVES = 300
 
@@ -20,10 +20,10 @@ DRIVES = 300
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("controller", metavar="CONTROLLER", help="a file, a run, or one that ships")
-    parser.add_argument("--to", required=True, metavar="BUNDLE", help="the world model it is to drive by")
-    parser.add_argument("--data", type=Path, required=True, help="folder of the drives that both models watch")
+    parser.add_argument("--to", required=True, metavar="BUNDLE", help="the world model to fit it to")
+    parser.add_argument("--data", type=Path, required=True, help="folder of the drives that both world models encode")
     parser.add_argument("--out", type=Path, required=True, help="the controller to write, NAME.npz")
-    parser.add_argument("--bundle", help="the world model that it was evolved with, where it is not found")
+    parser.add_argument("--bundle", help="the world model that it was evolved with, if it is not found")
     parser.add_argument(
         "--episodes", type=int, default=DRIVES, help=f"drives at most, the folder's last ones (default {DRIVES})"
     )
@@ -32,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit it and say how well that went."""
+    """Fit the controller, and print how well it agrees."""
     pin_thread_pools()  # of NumPy, which is not loaded yet
     if args.episodes < 2:
         raise UsageError(f"--episodes must be at least 2, not {args.episodes}")
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         fitted.controller.save(args.out)
     r_squared = [None if math.isnan(each) else round(each, 4) for each in fitted.r_squared]
     spoken = ", ".join(
-        f"{name} {'not told' if each is None else f'{each:.2f}'}"
+        f"{name} {'unknown' if each is None else f'{each:.2f}'}"
         for name, each in zip(output_names(fitted.controller, own), r_squared, strict=False)
     )
     text = f"{args.out}: fitted on {fitted.steps} steps of {fitted.drives} drives; R² on held-out ones: {spoken}"

@@ -1,4 +1,4 @@
-"""`dreamfleet replay`: a stored fitness again, to the bit."""
+"""`dreamfleet replay`: recompute a stored fitness bit by bit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dreamfleet.common.errors import JournalError, UsageError
 if TYPE_CHECKING:
     from dreamfleet.worker.tools.replay import ReplayedEpisode
 
-SUMMARY = "score a candidate of a run again and compare with the journal, to the bit on a host of the same class"
+SUMMARY = "score a run's candidate again and compare with the journal, bit by bit on a host of the same class"
 EXTRAS = ("worker",)
 
 
@@ -30,7 +30,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay each episode; exit 1 if one differs that this host can check, or if it can check none."""
+    """Replay each episode; exit 1 if one differs, or if this host can check none."""
     import numpy as np
 
     from dreamfleet.common.runs.run_folder import open_run
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--tolerance must be 0 or more, not {args.tolerance}")
     with open_run(args.runs_dir, args.run_name) as stored:
         episodes = list(replay(stored, int(found[1]), int(found[2])))
-        told = stored.fitness(int(found[1]), int(found[2]))
+        stored_fitness = stored.fitness(int(found[1]), int(found[2]))
     if not episodes:
         raise JournalError(f"candidate {args.candidate} of run {args.run_name} has no results yet")
     agree = [each.agrees(args.tolerance) for each in episodes]
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         same = all(each.same for each in episodes)
         mean = float(np.mean([each.replayed for each in episodes]))
         rows = [vars(each) for each in episodes]
-        print(json.dumps({"identical": same, "unchecked": unchecked, "fitness": mean, "stored_fitness": told,
+        print(json.dumps({"identical": same, "unchecked": unchecked, "fitness": mean, "stored_fitness": stored_fitness,
                           "episodes": rows}))  # fmt: skip
     else:
         for each in episodes:

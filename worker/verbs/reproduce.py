@@ -1,4 +1,4 @@
-"""`dreamfleet reproduce`: recorded scores again."""
+"""`dreamfleet reproduce`: check recorded scores."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ EXTRAS = ("worker",)
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("reports", metavar="REPORT", nargs="+", type=Path, help="files of `evaluate --out`")
-    parser.add_argument("--episodes", type=int, help="drive only the first so many seeds of each (default all)")
+    parser.add_argument("--episodes", type=int, help="only this many seeds of each, the first ones (default all)")
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
-    parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one a core)")
+    parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one per core)")
     add_global_flags(parser, "runs_dir")
     add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Say of each report whether it holds; exit 1 if one does not."""
+    """Check each report; exit 1 if a score differs."""
     pin_thread_pools()  # of NumPy, which is not loaded yet
     from dreamfleet.common.runs.evaluation_report import read_evaluation_report
 

@@ -10,7 +10,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, reporting_write_errors
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 
-SUMMARY = "find a few features that foretell what a driver will do and earn, for a search in them (--subspace)"
+SUMMARY = "find a few features that predict a driver's actions and rewards, for a search among them (--subspace)"
 EXTRAS = ("worker",)
 DRIVES = 300
 
@@ -18,20 +18,20 @@ DRIVES = 300
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("bundle", metavar="BUNDLE", help="the world model: a file, or one that ships")
-    parser.add_argument("--data", type=Path, required=True, help="folder of the drives that it watches")
+    parser.add_argument("--data", type=Path, required=True, help="folder of the drives that it encodes")
     parser.add_argument("--out", type=Path, required=True, help="the subspace to write, NAME.npz")
     parser.add_argument(
         "--episodes", type=int, default=DRIVES, help=f"drives at most, the folder's last ones (default {DRIVES})"
     )
     parser.add_argument(
         "--views", type=int, default=0,
-        help="beside it so many directions that foretell what the model itself will see and remember (default 0)",
+        help="add so many directions that predict what the model itself will see and remember (default 0)",
     )  # fmt: skip
     add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Find it, and tell how well each feature is foretold."""
+    """Find the features, and print how well each is predicted."""
     pin_thread_pools()  # of NumPy, which is not loaded yet
     if args.episodes < 5:
         raise UsageError(f"--episodes must be at least 5, not {args.episodes}: every fifth is held out")
@@ -51,9 +51,9 @@ def run(args: argparse.Namespace) -> int:
         subspace.save(args.out, {"drives": found.drives, "steps": found.steps, "r_squared": r_squared})
     width = max(map(len, subspace.names))
     rows = [f"{name:<{width}}  {each:.2f}" for name, each in zip(subspace.names, r_squared, strict=True)]
-    told_first = "what is foretold, in which steps from now, and its R² on held-out drives:"
+    heading = "what is foretold, in which steps from now, and its R² on held-out drives:"
     last = f"{args.out}: {len(rows)} features, by {found.steps} steps of {found.drives} drives"
-    text = "\n".join([told_first, *rows, last])
+    text = "\n".join([heading, *rows, last])
     print_answer(args, text, subspace=args.out, sha256=subspace.sha256, bundle=bundle.sha256, features=subspace.names,
            r_squared=r_squared, drives=found.drives, steps=found.steps)  # fmt: skip
     return 0

@@ -11,7 +11,7 @@ from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking
 from dreamfleet.common.host.resource_limits import raise_open_file_limit
 from dreamfleet.worker.service.config import WorkerConfig
 
-SUMMARY = "score candidates for a run; needs no files and no display, and may start before its coordinator"
+SUMMARY = "score candidates for a run; it needs no files and no display, and may start before its coordinator"
 EXTRAS = ("worker",)
 
 

@@ -1,1 +1,1 @@
-"""MDN-RNNs of different kinds on equal data, several seeds each: trained, evolved in, and told apart."""
+"""MDN-RNNs of different kinds on equal data, several seeds each: trained, evolved in, and compared."""

@@ -1,4 +1,4 @@
-"""What a contrast is: kinds of MDN-RNNs, seeds, and how each is trained and evolved in. Pure."""
+"""A contrast: kinds of MDN-RNNs, seeds, and how each is trained and evolved in. Pure."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from dreamfleet.common.cli.model_commands import Words, split_flags
 from dreamfleet.common.errors import UsageError
-from dreamfleet.coordinator.experiments.iteration.config import RESERVED_FLAGS, split_flags
+from dreamfleet.coordinator.experiments.iteration.config import RESERVED_FLAGS
 
 # Equal parameters: 422,625 and 421,277 of 32 latents and three actions.
 KINDS = (("plain", ""), ("attentive", "--window 8 --hidden 236"))
@@ -27,7 +28,7 @@ class Trial:
 
     @property
     def name(self) -> str:
-        """Of its folder and its run."""
+        """The name of its folder and its run."""
         return f"{self.kind}-{self.seed}"
 
 
@@ -57,53 +58,41 @@ class Contrast:
             *((f"--kind {name}", text) for name, text in self.kinds),
             ("--mdnrnn-flags", self.mdnrnn_flags),
         ):
-            _check_reserved(flag, text)
+            split_flags(flag, text, "contrast", RESERVED_FLAGS)
 
     @property
     def trials(self) -> tuple[Trial, ...]:
-        """All of them, seed by seed: what is there after any of them compares kinds as evenly as can be."""
+        """All trials, seed by seed, so that an unfinished contrast compares kinds evenly too."""
         return tuple(Trial(name, seed) for seed in self.seeds for name, _ in self.kinds)
 
-    def training_flags(self, trial: Trial) -> tuple[str, ...]:
-        """The flags of a trial's `train mdnrnn` but for its folder; of one that is said twice the latter counts."""
+    def training_flags(self, trial: Trial) -> Words:
+        """The flags of a trial's `train mdnrnn` beside its folder and seed; of one given twice the kind's counts."""
         own = dict(self.kinds)[trial.kind]
-        return (*split_flags("mdnrnn_flags", self.mdnrnn_flags), *split_flags("kind", own), "--seed", str(trial.seed))
+        return (*split_flags("--mdnrnn-flags", self.mdnrnn_flags), *split_flags("--kind", own))
 
     @property
-    def common_run_flags(self) -> tuple[str, ...]:
-        """What all trials' `coordinator` have in common."""
-        return ("--preset", "dream", *split_flags("run_flags", self.run_flags))
+    def common_run_flags(self) -> Words:
+        """The flags that all trials' `coordinator` have in common."""
+        return ("--preset", "dream", *split_flags("--run-flags", self.run_flags))
 
-    def evolution_flags(self, trial: Trial) -> tuple[str, ...]:
-        """The flags of a trial's `coordinator` but for its place and its world model."""
-        return (*self.common_run_flags, "--seed", str(trial.seed))
+    def merge_settings(self, kept: dict[str, Any]) -> dict[str, Any]:
+        """The settings that a folder begun with `kept` has from now on: kinds and seeds are added, none is changed.
 
-    def merge_settings(self, told: dict[str, Any]) -> dict[str, Any]:
-        """What a folder keeps that was begun by `told` and goes on by this: kinds and seeds are added, none is changed.
-
-        `UsageError` if what is there already could not be compared with this.
+        `UsageError` if its finished trials could not be compared with new ones.
         """
-        mine, kinds, known = asdict(self), dict(self.kinds), dict(told.get("kinds", ()))
+        mine, kinds, known = asdict(self), dict(self.kinds), dict(kept.get("kinds", ()))
         differing: list[str] = [
-            name for name in ("mdnrnn_flags", "run_flags") if name in told and told[name] != mine[name]
+            name for name in ("mdnrnn_flags", "run_flags") if name in kept and kept[name] != mine[name]
         ]
         differing += [f"kind {name}" for name, flags in known.items() if kinds.get(name, flags) != flags]
         if differing:
             raise UsageError(
                 f"it was begun with other {', '.join(differing)}: leave that out, or begin in another --out"
             )
-        seeds = tuple(dict.fromkeys((*told.get("seeds", ()), *self.seeds)))
+        seeds = tuple(dict.fromkeys((*kept.get("seeds", ()), *self.seeds)))
         return {**mine, "kinds": tuple((known | kinds).items()), "seeds": seeds}
 
 
-def _check_reserved(flag: str, text: str) -> None:
-    said = {word.partition("=")[0] for word in split_flags(flag.lstrip("-"), text) if word.startswith("--")}
-    if taken := [
-        each for each in RESERVED_FLAGS if any(each.startswith(word) for word in said)
-    ]:  # flags may be shortened
-        raise UsageError(f"{flag}: {', '.join(taken)} of each training is contrast's own to give")
-
-
 def parse_kinds(given: Sequence[Sequence[str]]) -> tuple[tuple[str, str], ...]:
-    """What `--kind NAME FLAGS` told, in order; without any the two that ship."""
+    """The kinds of `--kind NAME FLAGS`, in order; by default the two that ship."""
     return tuple((name, flags) for name, flags in given) or KINDS

@@ -1,4 +1,4 @@
-"""What a contrast came to: a row a trial, means over seeds, and whether kinds differ. Pure."""
+"""A contrast's results: one row per trial, means over seeds, differences between kinds. Pure."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SCORE = "score"
 
 @dataclass(frozen=True)
 class TrialResult:
-    """What came of a trial: how well its model foresees held-out drives, and how its controller drives in reality.
+    """A trial's results: how well its model predicts held-out drives, and its controller's score in reality.
 
     `score` and `error` (standard error over `tracks`) are of the confirmed mean, else of the best evaluated one.
     """
@@ -55,7 +55,7 @@ class SeedMean:
 
 
 def rows(outcomes: Sequence[TrialResult]) -> list[dict[str, object]]:
-    """A row a trial, for people."""
+    """One table row per trial."""
     return [
         {
             "kind": each.kind, "seed": each.seed, "parameters": f"{each.parameters:,}",
@@ -79,7 +79,7 @@ def means(outcomes: Sequence[TrialResult]) -> list[SeedMean]:
 
 
 def differences(outcomes: Sequence[TrialResult]) -> Iterator[tuple[str, str, PairedDifference]]:
-    """Of each kind less the first, seed by seed: kind, figure, difference; of two seeds and more."""
+    """Each kind less the first, paired by seed, if there are two seeds or more: kind, figure, difference."""
     first, *others = _kinds(outcomes)
     for kind in others:
         for figure in (*FIGURES, SCORE):

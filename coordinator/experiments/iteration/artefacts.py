@@ -1,4 +1,4 @@
-"""The files that an iteration made: their hashes, whether they still are what they were, and how they are undone."""
+"""The files that an iteration made: hashes, checks, and removal."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def drive_files(layout: IterationFolder) -> list[Path]:
 
 
 def entries_to_check(ledger: IterationLedger) -> Iterator[FinishedPhase]:
-    """The phases whose files are still asked for: all drives, the model that counts, and the last two rounds."""
+    """The phases whose files are still needed: all drives, the model that counts, and the last two rounds."""
     last = max((each.round for each in ledger.entries), default=0)
     model = ledger.model_round(last - 1) if last > 1 else last
     for each in ledger.entries:
@@ -48,7 +48,7 @@ def entries_to_check(ledger: IterationLedger) -> Iterator[FinishedPhase]:
 
 
 def check(layout: IterationFolder, ledger: IterationLedger) -> None:
-    """`DatasetError` names the first file that is still needed and is not what its phase made, with a remedy."""
+    """`DatasetError` for the first needed file that is missing or changed, with a remedy."""
     for entry in entries_to_check(ledger):
         for each in entry.made:
             if fault := _fault(layout, each):
@@ -68,7 +68,7 @@ def _remedy(layout: IterationFolder, entry: FinishedPhase) -> str:
 
 
 def undo(layout: IterationFolder, ledger: IterationLedger, phases: Iterable[Phase]) -> IterationLedger:
-    """Remove what these phases, the last ones, made or began; the ledger before them.
+    """Remove what these phases, the last ones, made or began; returns the ledger before them.
 
     Random drives that are whole stay: driven again they would be the same.
     """
@@ -94,7 +94,7 @@ def _undo_drives(
 
 
 def _outputs(layout: IterationFolder, phase: Phase) -> list[Path]:
-    """What a phase leaves in its round's folder, finished or not."""
+    """The paths in its round's folder that a phase makes, finished or not."""
     number, folder = phase.round, layout.round(phase.round)
     return {
         INIT: [folder],

@@ -1,4 +1,4 @@
-"""The verbs that each phase calls, as words: a function of the settings, of what is finished, and of nothing else."""
+"""The verbs that each phase runs, as command lines, by the settings and what is finished alone."""
 
 from __future__ import annotations
 
@@ -6,16 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from dreamfleet.common.cli import model_commands
+from dreamfleet.common.cli.model_commands import MODELS, Model, Words, command, options
 from dreamfleet.common.runs.seeds import VALIDATION
-from dreamfleet.coordinator.experiments.iteration.config import IterateConfig, split_flags
+from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
 from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
 from dreamfleet.coordinator.experiments.iteration.ledger import IterationLedger
 from dreamfleet.coordinator.experiments.iteration.plan import EVOLVE, GATE, MDNRNN, VAE, Phase
 
-Words = tuple[str, ...]
 GATE_SEED = VALIDATION.start + 30_000  # the first track of a gate: no evaluation and no confirmation has it
-GATE_NOISE = 0.3  # the measurements of docs/dreams.md
-LATER_UPDATES = {VAE: 1800, MDNRNN: 600}  # of a round that goes on with a model, if nobody says otherwise
+GATE_NOISE = 0.3  # as in docs/dreams.md
+LATER_UPDATES = {VAE: 1800, MDNRNN: 600}  # default of a round that continues a model's training
 
 
 @dataclass(frozen=True)
@@ -27,16 +28,16 @@ class Commands:
     ledger: IterationLedger
 
     def seed(self, phase: Phase) -> int:
-        """What a phase draws its chance from, each round's training and run their own; a gate's is its first track."""
+        """The seed of a phase: each round's trainings and run have their own; a gate's is its first track."""
         ours = self.config.seed + phase.round
         return {VAE: ours - 1, MDNRNN: ours - 1, EVOLVE: ours, GATE: GATE_SEED}.get(phase.name, self.config.seed)
 
     def unbundle(self) -> Words:
-        """The models of the world model that the iteration goes on from."""
-        return _words("unbundle", self.layout.bundle(0), "--data", self.layout.round(0), "--json")
+        """Write the models of the initial world model as checkpoints."""
+        return command("unbundle", self.layout.bundle(0), "--data", self.layout.round(0), "--json")
 
     def collect(self, number: int) -> Words:
-        """Random drives: those of the first round, or so many more."""
+        """Random drives: the first round's, or those that a later round adds."""
         more = self.ledger.episodes + self.config.more_drives
         return self._collect(self.config.drives if number == 1 else more)
 
@@ -44,64 +45,65 @@ class Commands:
         """The rollouts that the last round's run kept."""
         layout = self.layout
         name = layout.run_name(number - 1)
-        return _words("collect", "--data", layout.root, "--from-run", name, "--runs-dir", layout.runs, "--json")
+        return command("collect", "--data", layout.root, "--from-run", name, "--runs-dir", layout.runs, "--json")
 
     def drive(self, pilots: Sequence[Path]) -> Words:
-        """Drives of the last round's means, which lie in these files."""
+        """Drives of the last round's means, from these controller files."""
         config = self.config
         wanted = self.ledger.episodes + config.own_drives
         spells = ("--spells", config.spells) if config.spells else ()
         return self._collect(wanted, "--noise", config.noise, *spells, "--controller", *pilots)
 
-    def train(self, number: int, model: str) -> Words:
-        """The training of `vae` or `mdnrnn`: from nothing, or on from the world model that counts."""
-        config, seed = self.config, self.seed(Phase(number, model))
-        common = _words(
-            "train", model, "--data", self.layout.round(number), "--preset", config.preset, "--device", config.device,
-            "--seed", seed, "--json",
+    def train(self, number: int, model: Model) -> Words:
+        """The training of a model: from nothing, or on from the world model that counts."""
+        config, flags = self.config, self.config.flags(f"{model}_flags")
+        if not config.is_from_scratch(number):
+            updates = getattr(config, f"{model}_updates")
+            if updates is None:  # of a flag that is given twice the latter counts
+                flags = (*options(updates=LATER_UPDATES[model]), *flags)
+            else:
+                flags = (*flags, *options(updates=updates))
+            before = self.layout.checkpoint(self.ledger.model_round(number - 1), model)
+            kept = ("--decoder-only",) if model == "vae" and config.vae == "decoder" else ()
+            flags = (*flags, *options(continue_from=before), *kept)
+        return model_commands.train(
+            model, self.layout.round(number), *flags, preset=config.preset, device=config.device,
+            seed=self.seed(Phase(number, model)),
         )  # fmt: skip
-        flags = split_flags(f"{model}_flags", getattr(config, f"{model}_flags"))
-        if config.is_from_scratch(number):
-            return (*common, *flags)
-        before = self.layout.checkpoint(self.ledger.model_round(number - 1), model)
-        said = getattr(config, f"{model}_updates")  # of a flag that is said twice the latter counts
-        updates = ("--updates", LATER_UPDATES[model], *flags) if said is None else (*flags, "--updates", said)
-        kept = ("--decoder-only",) if model == "vae" and config.vae == "decoder" else ()
-        return (*common, *_words(*updates, "--continue-from", before, *kept))
 
-    def check_training(self, model: str) -> Words:
-        """The same without training anything: whether its flags are of the verb, and of the model to go on with."""
+    def check_training(self, model: Model) -> Words:
+        """The first round's training with `--summary`: it checks flags and layers, and trains nothing."""
         return (*self.train(1, model), "--summary")
 
     def check_trainings(self) -> tuple[Words, ...]:
-        """Check the training flags of both models of the world model that the iteration starts from."""
-        return tuple(self.check_training(model) for model in (VAE, MDNRNN))
+        """The checks of both models."""
+        return tuple(self.check_training(model) for model in MODELS)
 
     def encode(self, number: int) -> Words:
         """Latents of all drives."""
-        return _words("encode", "--data", self.layout.round(number), "--json")
+        return model_commands.encode(self.layout.round(number))
 
     def bundle(self, number: int) -> Words:
         """A round's models as one file."""
-        return _words("bundle", "--data", self.layout.round(number), "--out", self.layout.bundle(number), "--json")
+        return model_commands.bundle(self.layout.round(number), self.layout.bundle(number))
 
     def refit(self, number: int, path: Path) -> Words:
         """The last round's optimum fitted to this round's new world model."""
         layout = self.layout
         optimum, bundle = layout.optimum(number - 1), layout.bundle(number)
-        return _words("refit", optimum, "--to", bundle, "--data", layout.root, "--out", path, "--json")
+        return command("refit", optimum, "--to", bundle, "--data", layout.root, "--out", path, "--json")
 
     def subspace(self, number: int, path: Path) -> Words:
-        """What the model that counts foretells of the last drives."""
+        """The subspace of what the model that counts foretells of the last drives."""
         bundle = self.layout.bundle(self.ledger.model_round(number))
         views = ("--views", self.config.views) if self.config.views else ()
-        return _words("subspace", bundle, "--data", self.layout.root, *views, "--out", path, "--json")
+        return command("subspace", bundle, "--data", self.layout.root, *views, "--out", path, "--json")
 
     def gate(self, number: int) -> dict[str, dict[str, Words]]:
         """What is measured of the `old` and the `new` world model: `probe`, `losses`, or both.
 
-        Both are watched on the same drives of the last round's optimum. In dreams of losses it has to drive by the
-        model that dreams, so there the new one has it fitted to itself.
+        Both are probed on the same drives of the last round's optimum. For losses the optimum drives in the dream, so
+        the new model gets it refitted.
         """
         config, layout = self.config, self.layout
         optimum = layout.optimum(number - 1)
@@ -121,37 +123,26 @@ class Commands:
     ) -> Words:  # fmt: skip
         """A round's evolution; `more` are flags that stand before those of the run."""
         layout = self.layout
-        places = {"--init": start, "--subspace": subspace}
-        begun = [word for flag, path in places.items() if path is not None for word in (flag, path)]
-        return (
-            *_words("coordinator", *more, *self.config.flags_of_run(number)),
-            *_words("--run", layout.run_name(number), "--bundle", layout.bundle(self.ledger.model_round(number)),
-                    "--seed", self.seed(Phase(number, EVOLVE)), *begun, *self._network_flags(listen)),
+        return model_commands.begin_run(
+            layout.run_name(number), layout.runs, listen, *more, *self.config.flags_of_run(number),
+            world_model=layout.bundle(self.ledger.model_round(number)), seed=self.seed(Phase(number, EVOLVE)),
+            init=start, subspace=subspace,
         )  # fmt: skip
 
     def resume_run(self, number: int, listen: Sequence[str], security: Sequence[str] = ()) -> Words:
-        """The same evolution, continued."""
-        return _words("coordinator", "--resume", self.layout.run_name(number), *security, *self._network_flags(listen))
-
-    def _network_flags(self, listen: Sequence[str]) -> Words:
-        return _words("--runs-dir", self.layout.runs, "--json", "--listen", *listen)
+        """The same evolution, resumed."""
+        return model_commands.resume_run(self.layout.run_name(number), self.layout.runs, listen, *security)
 
     def _collect(self, episodes: int | None, *more: object) -> Words:
         config = self.config
-        chosen = {"--episodes": episodes, "--steps": config.drive_steps, "--jobs": config.jobs}
-        said = [word for flag, value in chosen.items() if value is not None for word in (flag, value)]
-        return _words(
-            "collect", "--data", self.layout.root, "--preset", config.preset, "--seed", config.seed, *said, *more,
-            "--json",
+        return model_commands.collect(
+            self.layout.root, *more, preset=config.preset, seed=config.seed, episodes=episodes,
+            steps=config.drive_steps, jobs=config.jobs,
         )  # fmt: skip
 
 
 def _inspect_words(bundle: Path, figure: str, controller: Path, episodes: int) -> Words:
-    return _words(
+    return command(
         "inspect", bundle, figure, "--controller", controller, "--episodes", episodes, "--seed", GATE_SEED,
         "--noise", GATE_NOISE, "--json",
     )  # fmt: skip
-
-
-def _words(*told: object) -> Words:
-    return tuple(map(str, told))

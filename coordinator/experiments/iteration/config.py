@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import dataclass
 from typing import Literal
 
 from dreamfleet.common.cli.config import option
+from dreamfleet.common.cli.model_commands import Words, split_flags
 from dreamfleet.common.cli.presets import NAMES, check_preset
 from dreamfleet.common.errors import UsageError
 
 # They change no round that is finished, nor what it means; what `--run-flags` lead to is compared instead of them.
 CHANGEABLE = frozenset({"rounds", "local", "jobs", "device", "run_flags"})
 MOST_SEED = 2**31 - 1  # each round's training multiplies its own
-# Flags of a training that are iterate's to give.
 RUN_FLAGS = ("run_flags", "later_run_flags")
+# Flags of each training that iterate sets itself.
 RESERVED_FLAGS = ("--data", "--preset", "--device", "--seed", "--continue-from", "--new", "--summary", "--json")
 LEAST = {
     "rounds": 1, "drives": 2, "more_drives": 0, "own_drives": 0, "means": 1, "drive_steps": 1, "vae_updates": 1,
@@ -89,28 +89,18 @@ class IterateConfig:
         if self.seed > MOST_SEED:
             raise UsageError(f"--seed must be at most {MOST_SEED}, not {self.seed}")
         for name in ("vae_flags", "mdnrnn_flags", *RUN_FLAGS):
-            _check_reserved(name, split_flags(name, getattr(self, name)))
+            self.flags(name)
 
     def is_from_scratch(self, number: int) -> bool:
         """Whether a round has nothing before it: no world model, no controller."""
         return number == 1 and not self.init
 
-    def flags_of_run(self, number: int) -> tuple[str, ...]:
-        """The flags of a round's `coordinator`; of one that is said twice the latter counts."""
+    def flags_of_run(self, number: int) -> Words:
+        """The flags of a round's `coordinator`; of one that is given twice the latter counts."""
         names = RUN_FLAGS[:1] if self.is_from_scratch(number) else RUN_FLAGS
-        return tuple(word for name in names for word in split_flags(name, getattr(self, name)))
+        return tuple(word for name in names for word in self.flags(name))
 
-
-def _check_reserved(name: str, given: tuple[str, ...]) -> None:
-    said = {word.partition("=")[0] for word in given if word.startswith("--")}
-    taken = [flag for flag in RESERVED_FLAGS if any(flag.startswith(word) for word in said)]  # flags may be shortened
-    if taken and name not in RUN_FLAGS:
-        raise UsageError(f"--{name.replace('_', '-')}: {', '.join(taken)} of each training is iterate's own to give")
-
-
-def split_flags(name: str, text: str) -> tuple[str, ...]:
-    """Flags that were given as one text; `UsageError` if its quotes do not match."""
-    try:
-        return tuple(shlex.split(text))
-    except ValueError as error:
-        raise UsageError(f"--{name.replace('_', '-')} {text!r}: {error}") from error
+    def flags(self, name: str) -> Words:
+        """The flags that a setting such as `vae_flags` holds as one text; `UsageError` for those that iterate sets."""
+        reserved = () if name in RUN_FLAGS else RESERVED_FLAGS
+        return split_flags(f"--{name.replace('_', '-')}", getattr(self, name), "iterate", reserved)

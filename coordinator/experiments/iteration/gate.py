@@ -1,4 +1,4 @@
-"""Whether a new world model takes the place of the old one, by what `inspect` measured of both.
+"""Whether a new world model replaces the old one, by the figures of `inspect` for both.
 
 Two figures, of which more is better. *Knows*: the mean, over the quantities of the simulator's truth, of the R² of a
 linear map from [z, h] on held-out drives. *Loses*: how many dreams begun shortly before real losses of the road lose it
@@ -49,14 +49,16 @@ class GateDecision:
 
 
 def judge(old: Figures, new: Figures) -> GateDecision:
-    """Hold the new model's figures to the old one's."""
+    """Compare the new model's figures with the old one's."""
     both = {name: (before, after) for name in (KNOWS, LOSES)
             if (before := old.get(name)) is not None and (after := new.get(name)) is not None}  # fmt: skip
     if not both:
         return GateDecision(True, "kept: nothing was measured of both")
     worse = [name for name, (before, after) in both.items() if after.is_clearly_below(before)]
-    told = ", ".join(f"{name} {before} -> {after}" for name, (before, after) in both.items())
-    return GateDecision(not worse, f"{told}: {'refused, clearly worse in ' + ' and '.join(worse) if worse else 'kept'}")
+    compared = ", ".join(f"{name} {before} -> {after}" for name, (before, after) in both.items())
+    return GateDecision(
+        not worse, f"{compared}: {'refused, clearly worse in ' + ' and '.join(worse) if worse else 'kept'}"
+    )
 
 
 def figures(measured: Mapping[str, Any]) -> dict[str, Figure | None]:
@@ -68,8 +70,8 @@ def knows(probe: Mapping[str, Any] | None) -> Figure | None:
     """Of `inspect --probe --json`; a quantity below 0 is not known. The error is the mean, as if all erred together."""
     if not probe or "probe" not in probe:
         return None
-    told = [each["found"]["zh_linear"] for each in probe["probe"]["known"]]
-    found = [Figure(**each) if each["value"] > 0 else NOTHING for each in told]
+    known = [each["found"]["zh_linear"] for each in probe["probe"]["known"]]
+    found = [Figure(**each) if each["value"] > 0 else NOTHING for each in known]
     return Figure(_mean(each.value for each in found), _mean(each.error for each in found))
 
 

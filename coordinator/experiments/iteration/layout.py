@@ -1,4 +1,4 @@
-"""Where everything of an iteration lies in its folder."""
+"""The paths in an iteration's folder."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ BUNDLE, CONTROLLER = "bundle.zip", "controller.npz"  # as a run's folder has the
 class IterationFolder:
     """The folder: one data set of all drives, a folder a round with its models, and the rounds' runs.
 
-    A round's folder is a data folder of its own for the verbs that train: it leads to the drives by links.
+    A round's folder is a data folder of its own for the verbs that train: it links to the drives.
     """
 
     root: Path
 
     @property
     def ledger(self) -> Path:
-        """What is finished."""
+        """The ledger of finished phases."""
         return self.root / "iteration.json"
 
     @property
     def lock(self) -> Path:
-        """Held by whoever works here."""
+        """The lock of the process that works here."""
         return self.root / "iteration.lock"
 
     @property
@@ -38,7 +38,7 @@ class IterationFolder:
         return self.root / "rounds" / f"{number:02d}"
 
     def log(self, number: int, name: str) -> Path:
-        """What a verb of a round said."""
+        """The log of a verb of a round."""
         return self.round(number) / "logs" / f"{name}.log"
 
     def bundle(self, number: int) -> Path:
@@ -50,19 +50,19 @@ class IterationFolder:
         return self.round(number) / f"{model}.safetensors"
 
     def run_name(self, number: int) -> str:
-        """Of a round's evolution."""
+        """The name of a round's run."""
         return f"round-{number:02d}"
 
     def run(self, number: int) -> Path:
-        """The folder of a round's evolution."""
+        """The folder of a round's run."""
         return self.runs / self.run_name(number)
 
     def optimum(self, number: int) -> Path:
-        """The controller that a round ended with; of round 0 the one that the iteration goes on from."""
+        """The controller that a round ended with; of round 0 that of `--init`."""
         return (self.run(number) if number else self.round(number)) / CONTROLLER
 
     def means(self, number: int) -> Path:
-        """The means of a round's run that drive for the next one, beside the world model that they see."""
+        """The means of a round's run that drive for the next one, beside their world model."""
         return self.round(number) / "means"
 
     def gate_file(self, number: int) -> Path:
@@ -78,7 +78,7 @@ class IterationFolder:
         return self.round(number) / "start.npz"
 
     def subspace(self, number: int) -> Path:
-        """What a round's evolution searches, if not everything."""
+        """The subspace of a round's evolution, if it has one."""
         return self.round(number) / "subspace.npz"
 
     def relative(self, path: Path) -> str:

@@ -1,4 +1,4 @@
-"""What of an iteration is finished, in one file: each phase with what it made, figures, commands and seed."""
+"""The finished phases of an iteration, in one file: files made, figures, commands and seed of each."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dreamfleet.coordinator.experiments.iteration.plan import ALL, BUNDLE, DATA,
 
 FORMAT = 1
 MOST_BYTES = 256 << 20
-FIGURES: dict[str, dict[str, Any]] = {  # that later phases, or people, are told of a finished one
+FIGURES: dict[str, dict[str, Any]] = {  # of a finished phase, which later phases and summaries read
     **{phase: {"new": int, "episodes": int} for phase in DATA},
     INIT: {"sha256": str, "controller": str},
     BUNDLE: {"sha256": str, "frames": int, "quality": dict},
@@ -65,7 +65,7 @@ class IterationLedger:
 
     @classmethod
     def begin(cls, config: IterateConfig, run: Mapping[str, Any]) -> IterationLedger:
-        """Of an iteration that has done nothing yet."""
+        """The ledger of an iteration that has done nothing yet."""
         return cls(asdict(config), _plain(run))
 
     @property
@@ -80,13 +80,13 @@ class IterationLedger:
     def model_round(self, number: int) -> int:
         """The round whose world model counts after so many rounds: the last one that no gate refused.
 
-        0: that which the iteration goes on from.
+        0: that of `--init`.
         """
         built = (each.round for each in self.entries if each.phase == BUNDLE and each.round <= number)
         return max((each for each in built if self.passed_gate(each)), default=0)
 
     def passed_gate(self, number: int) -> bool:
-        """Whether a round's new world model was kept; one that was held to none is."""
+        """Whether a round's new world model was kept; without a gate it is."""
         gate = self.entry(number, GATE)
         return gate is None or bool(gate.figures["kept"])
 
@@ -97,7 +97,7 @@ class IterationLedger:
 
     @property
     def files(self) -> frozenset[str]:
-        """All that was made."""
+        """The paths of all files that were made."""
         return frozenset(made.path for each in self.entries for made in each.made)
 
     def add(self, entry: FinishedPhase) -> IterationLedger:
@@ -109,7 +109,7 @@ class IterationLedger:
         return replace(self, entries=self.entries[: self.finished.index(phase)])
 
     def with_settings(self, config: IterateConfig, run: Mapping[str, Any], folder: Path) -> IterationLedger:
-        """With what may change; `UsageError` names what was begun otherwise and may not."""
+        """With changed settings; `UsageError` names those that differ and may not change."""
         wanted, begun = asdict(config), {**asdict(IterateConfig()), **self.settings}  # what is newer was its default
         known = {name: value for name, value in run.items() if name in self.run}
         differing = [*_differing(begun, wanted, CHANGEABLE), *_differing(self.run, known)]
@@ -157,13 +157,13 @@ class IterationLedger:
 
 
 def _check(entry: FinishedPhase) -> None:
-    """`ValueError` for an entry that cannot have been written of a phase."""
+    """`ValueError` for an entry that no phase can have written."""
     if entry.phase not in (INIT, *ALL):
         raise ValueError(f"there is no phase {entry.phase!r:.40}")
-    told = _bad_figure(entry.figures, FIGURES.get(entry.phase, {}))
-    told = told or _bad_figure(entry.figures.get("score") or {}, SCORE if entry.figures.get("score") else {})
-    if told:
-        raise ValueError(f"phase {entry.phase_key} does not tell its {told}")
+    missing = _bad_figure(entry.figures, FIGURES.get(entry.phase, {}))
+    missing = missing or _bad_figure(entry.figures.get("score") or {}, SCORE if entry.figures.get("score") else {})
+    if missing:
+        raise ValueError(f"phase {entry.phase_key} has no valid {missing}")
 
 
 def _bad_figure(figures: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
@@ -173,7 +173,7 @@ def _bad_figure(figures: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
 
 
 def _differing(begun: Mapping[str, Any], wanted: Mapping[str, Any], free: frozenset[str] = frozenset()) -> list[str]:
-    """What has another value, in words; compared as JSON keeps it."""
+    """The settings that differ, in words; values are compared as JSON stores them."""
     return [
         f"{name} {begun.get(name)}, not {value}"
         for name, value in _plain(wanted).items()

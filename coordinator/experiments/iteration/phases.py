@@ -1,4 +1,4 @@
-"""Doing a phase: its verbs called, what it made and measured told. Again after a kill, it goes on or ends the same."""
+"""Run a phase: its verbs, then its figures and files. A killed phase resumes to the same end."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.cli.model_commands import Model, Words
 from dreamfleet.common.errors import BundleError, DatasetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import path_exists
@@ -23,9 +24,8 @@ from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
 from dreamfleet.common.runs.records import StoredEvaluation, best_evaluation
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import BUNDLE as RUN_BUNDLE
-from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.coordinator.experiments.iteration import artefacts, gate
-from dreamfleet.coordinator.experiments.iteration.commands import Commands, Words
+from dreamfleet.coordinator.experiments.iteration.commands import Commands
 from dreamfleet.coordinator.experiments.iteration.layout import ENCODED, EPISODES
 from dreamfleet.coordinator.experiments.iteration.plan import (
     BUNDLE,
@@ -40,14 +40,14 @@ from dreamfleet.coordinator.experiments.iteration.plan import (
     VAE,
     Phase,
 )
-from dreamfleet.coordinator.experiments.local_run import LocalFleet, evolve
+from dreamfleet.coordinator.experiments.local_run import LocalFleet, evolve, has_begun, has_ended
 
 log = logging.getLogger("dreamfleet.coordinator.iterate")
 
 
 @dataclass(frozen=True)
 class PhaseResult:
-    """What a phase called, told and made."""
+    """The commands that a phase ran, its figures, and the files that it made."""
 
     commands: tuple[Words, ...] = ()
     figures: dict[str, Any] | None = None
@@ -55,7 +55,7 @@ class PhaseResult:
 
 
 class PhaseRunner:
-    """The phases of an iteration at one moment of it: `commands` knows what is finished."""
+    """Runs phases of an iteration; `commands` knows what is finished."""
 
     def __init__(
         self, commands: Commands, local_fleet: Callable[[], LocalFleet], ask: Callable[[Words, Path], Any], stop: Stop
@@ -65,7 +65,7 @@ class PhaseRunner:
         self._layout, self._ledger, self._config = commands.layout, commands.ledger, commands.config
 
     def do(self, phase: Phase) -> PhaseResult:
-        """Do it, or do what is left of it."""
+        """Run a phase, or what is left of it."""
         number = phase.round
         self._link_data(number)
         done: dict[str, Callable[[int], PhaseResult]] = {
@@ -75,7 +75,7 @@ class PhaseRunner:
         return done[phase.name](number)
 
     def _link_data(self, number: int) -> None:
-        """The round's folder, which leads to the one data set."""
+        """Make the round's folder, with links to the one data set."""
         folder = self._layout.round(number)
         folder.mkdir(parents=True, exist_ok=True)
         for name in (EPISODES, ENCODED):
@@ -87,11 +87,11 @@ class PhaseRunner:
         return self._ask(words, self._layout.log(number, name))
 
     def _init(self, number: int) -> PhaseResult:
-        """The controller that the iteration goes on from, its world model, and what training goes on from."""
+        """Copy `--init`'s controller and world model, and write the checkpoints that training continues from."""
         layout, words = self._layout, self._commands.unbundle()
         controller, bundle = find_init(self._config.init, layout.runs)
         checkpoints = [layout.checkpoint(number, model) for model in (VAE, MDNRNN)]
-        for path in checkpoints:  # of a life that was killed
+        for path in checkpoints:  # of an attempt that was killed
             path.unlink(missing_ok=True)
         _copy(bundle.path, layout.bundle(number))
         self._call(number, INIT, words)
@@ -113,9 +113,9 @@ class PhaseRunner:
         return self._drives(number, DRIVE, self._commands.drive(pilots))
 
     def _drives(self, number: int, name: str, words: Words) -> PhaseResult:
-        told, known = self._call(number, name, words), self._ledger.files
+        answer, known = self._call(number, name, words), self._ledger.files
         new = [path for path in artefacts.drive_files(self._layout) if self._layout.relative(path) not in known]
-        return PhaseResult((words,), {"episodes": told["episodes"], "new": len(new)}, tuple(new))
+        return PhaseResult((words,), {"episodes": answer["episodes"], "new": len(new)}, tuple(new))
 
     def _vae(self, number: int) -> PhaseResult:
         if self._config.is_from_scratch(number) or self._config.vae != "keep":
@@ -125,10 +125,10 @@ class PhaseRunner:
         return PhaseResult(made=(path,))
 
     def _mdnrnn(self, number: int) -> PhaseResult:
-        self._encode(number)  # latents that went, were damaged or are of a later round's encoder; mostly none
+        self._encode(number)  # only what is missing, damaged, or of another encoder
         return self._train(number, MDNRNN)
 
-    def _train(self, number: int, model: str) -> PhaseResult:
+    def _train(self, number: int, model: Model) -> PhaseResult:
         words = self._commands.train(number, model)
         return PhaseResult((words,), self._call(number, model, words), (self._layout.checkpoint(number, model),))
 
@@ -138,12 +138,12 @@ class PhaseRunner:
         return PhaseResult((words,))
 
     def _bundle(self, number: int) -> PhaseResult:
-        self._encode(number)  # as before the training: recorded states are of latents too
+        self._encode(number)  # as before the training: recorded states need latents too
         words = self._commands.bundle(number)
-        told = self._call(number, BUNDLE, words)
+        answer = self._call(number, BUNDLE, words)
         provenance = Bundle.open(self._layout.bundle(number)).manifest.provenance
         facts = {name: provenance[name] for name in ("frames", "quality")}
-        return PhaseResult((words,), {"sha256": told["sha256"], **facts}, (self._layout.bundle(number),))
+        return PhaseResult((words,), {"sha256": answer["sha256"], **facts}, (self._layout.bundle(number),))
 
     def _gate(self, number: int) -> PhaseResult:
         refitted, gate_file = self._layout.refitted(number), self._layout.gate_file(number)
@@ -152,12 +152,12 @@ class PhaseRunner:
         unfitted = self._refit(number, fitting) if fitting else {}
         if unfitted:
             del commands["new"]["losses"]
-        told = {side: {what: self._measure(number, f"{side}-{what}", words) for what, words in each.items()}
+        answers = {side: {what: self._measure(number, f"{side}-{what}", words) for what, words in each.items()}
                 for side, each in commands.items()}  # fmt: skip
         if unfitted:
-            told["new"]["losses"] = unfitted
-        _write_json(gate_file, told)
-        figures = {side: gate.figures(each) for side, each in told.items()}
+            answers["new"]["losses"] = unfitted
+        _write_json(gate_file, answers)
+        figures = {side: gate.figures(each) for side, each in answers.items()}
         verdict = gate.judge(figures["old"], figures["new"])
         plain = {side: {name: each and asdict(each) for name, each in found.items()} for side, found in figures.items()}
         words = tuple(words for each in commands.values() for words in each.values())
@@ -165,7 +165,7 @@ class PhaseRunner:
         return PhaseResult((fitting, *words) if fitting else words, {**plain, **asdict(verdict)}, made)
 
     def _refit(self, number: int, words: Words) -> dict[str, Any]:
-        """Nothing, or why the last optimum cannot be fitted to the new model."""
+        """Refit the last optimum to the new model; empty, or why that failed."""
         try:
             self._call(number, "gate-refit", words)
         except UsageError as error:
@@ -173,7 +173,7 @@ class PhaseRunner:
         return {}
 
     def _measure(self, number: int, name: str, words: Words) -> dict[str, Any]:
-        """What `inspect` tells; drives that lose too few roads, or all of them at once, tell nothing."""
+        """The answer of `inspect`, or why it has none: drives may lose too few roads, or all at once."""
         try:
             return dict(self._call(number, f"gate-{name}", words))
         except UsageError as error:
@@ -182,25 +182,19 @@ class PhaseRunner:
     def _evolve(self, number: int) -> PhaseResult:
         layout, name = self._layout, self._layout.run_name(number)
         words: tuple[Words, ...] = ()
-        if not self._ended(number):
+        if not has_ended(layout.runs, name):
             local_fleet = self._local_fleet()
             log.info("run %s is reached at %s", name, ", ".join(local_fleet.listen))
             words = (self._run_command(number, local_fleet),)
-            evolve(words[0], name, local_fleet, layout.round(number) / "logs", self._stop)
+            evolve(name, words[0], local_fleet, layout.round(number) / "logs", self._stop)
         with open_run(layout.runs, name) as run:
             pilots, means = self._pilots(run, layout.means(number))
-            told = _describe_run(run)
+            figures = _describe_run(run)
         made = (layout.run(number) / RUN_BUNDLE, layout.optimum(number), *pilots)
-        return PhaseResult(words, {**told, "means": means}, made)
-
-    def _ended(self, number: int) -> bool:
-        if not path_exists(self._layout.run(number) / JOURNAL):
-            return False
-        with open_run(self._layout.runs, self._layout.run_name(number)) as run:
-            return run.ended is not None
+        return PhaseResult(words, {**figures, "means": means}, made)
 
     def _run_command(self, number: int, local_fleet: LocalFleet) -> Words:
-        if path_exists(self._layout.run(number) / JOURNAL):
+        if has_begun(self._layout.runs, self._layout.run_name(number)):
             return self._commands.resume_run(number, local_fleet.listen, local_fleet.security)
         start, subspace = None, None
         if self._config.go_on and not self._config.is_from_scratch(number):
@@ -212,7 +206,7 @@ class PhaseRunner:
         )
 
     def _find_subspace(self, number: int) -> Path | None:
-        """Where a round's search goes; `None`, everywhere, if its model foretells nothing of the last drives."""
+        """The subspace that a round searches; None if its model predicts nothing of the last drives."""
         path = self._layout.subspace(number)
         try:
             self._call(number, "subspace", self._commands.subspace(number, path))
@@ -232,17 +226,17 @@ class PhaseRunner:
             self._call(number, "refit", self._commands.refit(number, path))
 
     def _pilots(self, run: RunFolder, folder: Path) -> tuple[list[Path], list[int]]:
-        """The means that drive for the next round, as files beside a link to their world model; their generations."""
+        """Save the means that drive for the next round, beside a link to their world model; paths and generations."""
         reported = Controller.load(run.controller_path)
-        told = reported.provenance.get("generation")
-        others = other_means(run.evaluations(), told, self._config.means - 1)
+        generation = reported.provenance.get("generation")
+        others = other_means(run.evaluations(), generation, self._config.means - 1)
         vectors = [reported.parameters, *(run.evaluated_mean(each) for each in others)]
-        return self._save_pilots(reported, vectors, folder, run.bundle_path), [int(told or 0), *others]
+        return self._save_pilots(reported, vectors, folder, run.bundle_path), [int(generation or 0), *others]
 
     def _save_pilots(
         self, like: Controller, vectors: Sequence[NDArray[np.float32]], folder: Path, bundle: Path
     ) -> list[Path]:
-        """Controllers of these parameters, beside a link to their world model, which lies in the same layout."""
+        """Save controllers with these parameters, beside a link to their world model in the same folder."""
         folder.mkdir(parents=True, exist_ok=True)
         if not path_exists(folder / RUN_BUNDLE):
             (folder / RUN_BUNDLE).symlink_to(Path("..", "..", "..", self._layout.relative(bundle)))
@@ -253,7 +247,7 @@ class PhaseRunner:
 
 
 def find_init(name: str, runs_dir: Path) -> tuple[Controller, Bundle]:
-    """The controller that an iteration goes on from, and its world model; a `DreamfleetError` says what is missing."""
+    """The controller of `--init` and its world model; `DreamfleetError` if one is missing."""
     controller, beside = find_controller(name, runs_dir)
     try:
         bundle = find_bundle_of(controller, None, beside)
@@ -269,7 +263,7 @@ def find_init(name: str, runs_dir: Path) -> tuple[Controller, Bundle]:
 def other_means(evaluations: Sequence[StoredEvaluation], reported: int | None, count: int) -> list[int]:
     """The generations of evaluated means beside the reported one's: the last, then the best; of equals the first.
 
-    The last one is the dream's own optimum, whatever reality made of it: no drives teach the next model more.
+    The last one is the dream's optimum: its drives teach the next model most, however it scored in reality.
     """
     last = max((each.generation for each in evaluations), default=None)
     others = [each for each in evaluations if each.generation != reported]

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
 
-INIT = "init"  # of round 0: what an iteration goes on from
+INIT = "init"  # of round 0: copies --init
 COLLECT, TAKE, DRIVE = "collect", "take", "drive"  # random drives, the last run's kept ones, its means' own
-VAE, ENCODE, MDNRNN, BUNDLE, GATE, EVOLVE = "vae", "encode", "mdnrnn", "bundle", "gate", "evolve"
+VAE: Final = "vae"
+MDNRNN: Final = "mdnrnn"
+ENCODE, BUNDLE, GATE, EVOLVE = "encode", "bundle", "gate", "evolve"
 DATA = (COLLECT, TAKE, DRIVE)
 ALL = (*DATA, VAE, ENCODE, MDNRNN, BUNDLE, GATE, EVOLVE)
 
 
 class Phase(NamedTuple):
-    """A part of a round that is finished or not; rounds count from 1, and 0 is what was there before them."""
+    """A part of a round that is finished or not; rounds count from 1, and round 0 is `--init`."""
 
     round: int
     name: str
@@ -27,7 +29,7 @@ class Phase(NamedTuple):
 
     @classmethod
     def of(cls, text: str) -> Phase:
-        """The phase that is written so; `UsageError` if it is none."""
+        """Parse ROUND/PHASE; `UsageError` if it is no phase."""
         number, _, name = text.partition("/")
         known = (INIT,) if number == "0" else ALL
         if not (number.isascii() and number.isdigit() and len(number) < 10 and name in known):
@@ -62,17 +64,17 @@ class PhasePlan:
             yield from self.phases(number)
 
     def next(self, finished: Sequence[Any]) -> Phase | None:
-        """The first phase that is not finished; `None`: all are."""
+        """The first unfinished phase; None if all are finished."""
         done = set(finished)
         return next((each for each in self if each not in done and not self._is_superseded(each, done)), None)
 
     @staticmethod
     def _is_superseded(phase: Phase, done: set[Any]) -> bool:
-        """A gate that a finished evolution had not: its model counted then."""
+        """Whether it is a gate whose round has evolved without it, so that its model counts."""
         return phase.name == GATE and Phase(phase.round, EVOLVE) in done
 
     def phases_from(self, phase: Phase, finished: Sequence[Phase]) -> tuple[Phase, ...]:
-        """A finished phase and all behind it that were finished or begun; `UsageError` if it is not finished."""
+        """A finished phase and all later ones that were finished or begun; `UsageError` if it is not finished."""
         if phase not in finished:
             raise UsageError(
                 f"{phase} is not finished, so it cannot be done again; finished are {_format_phases(finished)}"

@@ -1,4 +1,4 @@
-"""An iteration from phase to phase: each is in the ledger before the next begins."""
+"""Run an iteration phase by phase; each is in the ledger before the next begins."""
 
 from __future__ import annotations
 
@@ -11,24 +11,25 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from dreamfleet.common.cli.model_commands import MODELS, Model, Words
+from dreamfleet.common.cli.verb_runner import ProcessRunner
 from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
 from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.host.stop_signals import Stop
 from dreamfleet.coordinator.experiments.iteration import artefacts
-from dreamfleet.coordinator.experiments.iteration.commands import Commands, Words
+from dreamfleet.coordinator.experiments.iteration.commands import Commands
 from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
 from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
 from dreamfleet.coordinator.experiments.iteration.ledger import FinishedPhase, IterationLedger
 from dreamfleet.coordinator.experiments.iteration.phases import PhaseRunner
 from dreamfleet.coordinator.experiments.iteration.plan import Phase, PhasePlan
 from dreamfleet.coordinator.experiments.local_run import LocalFleet
-from dreamfleet.coordinator.experiments.verb_process import run_for_json, run_verb
 
 log = logging.getLogger("dreamfleet.coordinator.iterate")
 
 
 class Iteration:
-    """One life of it, in a folder that is held."""
+    """An iteration in a folder that the caller has locked."""
 
     def __init__(
         self,
@@ -39,28 +40,29 @@ class Iteration:
         stop: Stop,
         network_flags: Words = (),
     ) -> None:
-        """`network_flags` are flags of its command that no ledger keeps: where workers connect, and how."""
+        """`network_flags` are not in the ledger, so the printed resume command repeats them."""
         self.ledger = ledger
         self._resume_command = shell_command("iterate", "--data", layout.root, *network_flags)
         self._layout, self._config, self._local_fleet, self._stop = layout, config, local_fleet, stop
+        self._runner = ProcessRunner(stop)
         self._plan = PhasePlan(config, bool(ledger.run.get("collect_every")))
 
     def redo(self, phase: Phase) -> None:
-        """Forget a finished phase and all behind it, and remove what they made."""
+        """Undo a finished phase and all after it, and remove the files that they made."""
         phases = self._plan.phases_from(phase, self.ledger.finished)
         self.ledger = artefacts.undo(self._layout, self.ledger, phases)
         self.ledger.save(self._layout.ledger)
 
     def begin(self) -> None:
-        """Look whether what is finished is still there; of a new one, whether training takes its flags.
+        """Check the files of finished phases, or a new iteration's training flags.
 
-        With `init` its first phase looks, for then they must fit a model that is there.
+        With `init` the first phase checks the flags, because they must fit the model that is there.
         """
         artefacts.check(self._layout, self.ledger)
         if self.ledger.entries or self._config.init:
             return
         commands = Commands(self._config, self._layout, self.ledger)
-        for model in ("vae", "mdnrnn"):
+        for model in MODELS:
             if getattr(self._config, f"{model}_flags"):
                 self._check_flags(commands.check_training(model), model)
 
@@ -70,7 +72,7 @@ class Iteration:
         on_finished: Callable[[FinishedPhase], None],
         on_line: Callable[[str], None],
     ) -> None:
-        """Do what is left; `on_begin` is called as a phase begins, `on_finished` when it is in the ledger.
+        """Run what is left; `on_begin` is called as a phase begins, `on_finished` when it is in the ledger.
 
         `on_line` gets each progress line of a phase's verbs.
         """
@@ -92,22 +94,22 @@ class Iteration:
 
     @contextmanager
     def _explain_errors(self, phase: Phase) -> Iterator[None]:
-        """Say of which phase an error is, and of a stop how it goes on."""
+        """Add the phase to an error, and to a stop the command that resumes."""
         try:
             yield
         except StoppedError as error:
             raise StoppedError(
-                f"{phase}: {error}; what is finished is kept, and goes on with: {self._resume_command}"
+                f"{phase}: {error}; what is finished is kept; resume with: {self._resume_command}"
             ) from error
         except DreamfleetError as error:
             raise type(error)(f"{phase}: {error}") from error
 
     def _ask(self, on_line: Callable[[str], None], words: Words, path: Path) -> Any:
         log.debug("dreamfleet %s", " ".join(words))
-        return run_for_json(words, path, self._stop, on_line)
+        return self._runner.run_for_json(words, path, on_line)
 
-    def _check_flags(self, words: Words, model: str) -> None:
+    def _check_flags(self, words: Words, model: Model) -> None:
         try:
-            run_verb(words, self._layout.root / "logs" / f"{model}.log", self._stop)
+            self._runner.run(words, self._layout.root / "logs" / f"{model}.log")
         except UsageError as error:
             raise UsageError(f"--{model}-flags: {error}") from error

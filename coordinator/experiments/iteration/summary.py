@@ -1,4 +1,4 @@
-"""What an iteration came to: a line a phase, a row a round."""
+"""What an iteration reached: one line per phase, one row per round."""
 
 from __future__ import annotations
 
@@ -36,26 +36,26 @@ def describe_outcome(entry: FinishedPhase) -> str:
     if entry.phase == GATE:
         return str(figures["why"])
     if entry.phase == EVOLVE:
-        told, ended = plural(figures["generations"], "generation"), figures["ended"]
-        return f"{told if ended == told else f'{told}, ended after {ended}'}; {format_score(figures['score'])}"
+        done, ended = plural(figures["generations"], "generation"), figures["ended"]
+        return f"{done if ended == done else f'{done}, ended after {ended}'}; {format_score(figures['score'])}"
     return ""
 
 
-def format_score(told: Mapping[str, Any] | None) -> str:
+def format_score(score: Mapping[str, Any] | None) -> str:
     """A run's best mean in reality."""
-    if told is None:
+    if score is None:
         return "not evaluated"
-    provisional = "" if told["confirmed"] else ", provisional"
-    error = f" ± {told['error']:.0f}" if told["episodes"] > 1 else ""  # of one track there is none
-    return f"{told['mean']:.0f}{error} on {plural(told['episodes'], 'track')}{provisional}"
+    provisional = "" if score["confirmed"] else ", provisional"
+    error = f" ± {score['error']:.0f}" if score["episodes"] > 1 else ""  # of one track there is none
+    return f"{score['mean']:.0f}{error} on {plural(score['episodes'], 'track')}{provisional}"
 
 
 def describe_rounds(layout: IterationFolder, ledger: IterationLedger) -> list[dict[str, Any]]:
-    """A row a round that was begun, for programs; round 0 is none."""
+    """One row per round that was begun, for JSON; round 0 has none."""
     return [_round(layout, ledger, number) for number in sorted({each.round for each in ledger.entries if each.round})]
 
 
-def table_rows(told: list[dict[str, Any]]) -> list[dict[str, object]]:
+def table_rows(rounds: list[dict[str, Any]]) -> list[dict[str, object]]:
     """The same rows for people: drives, the model's figures, the gate, the best mean in reality."""
     return [
         {
@@ -64,13 +64,13 @@ def table_rows(told: list[dict[str, Any]]) -> list[dict[str, object]]:
             KNOWS: _figure(each["gate"], KNOWS), LOSES: _figure(each["gate"], LOSES),
             "model": _model_state(each), "score": each["score"] and format_score(each["score"]),
         }
-        for each in told
+        for each in rounds
     ]  # fmt: skip
 
 
-def best_round(told: list[dict[str, Any]]) -> dict[str, Any] | None:
+def best_round(rounds: list[dict[str, Any]]) -> dict[str, Any] | None:
     """The round whose mean scored best; of equals the first. `None`: none was evaluated."""
-    scored = [each for each in told if each["score"] is not None]
+    scored = [each for each in rounds if each["score"] is not None]
     return max(scored, key=lambda each: each["score"]["mean"], default=None)
 
 
@@ -101,11 +101,11 @@ def _figure(gate: Mapping[str, Any] | None, name: str) -> str | None:
     return f"{found['value']:.2f} ± {found['error']:.2f}" if found else None
 
 
-def _model_state(told: Mapping[str, Any]) -> str | None:
-    """What became of a round's model; `None` while there is none, or none that was held to the last one yet."""
-    if told["gate"] is not None:
-        return "kept" if told["gate"]["kept"] else "refused"
-    return "kept" if told["evolved_in"] == told["round"] else None
+def _model_state(row: Mapping[str, Any]) -> str | None:
+    """Whether a round's model was kept; None while it is missing or not judged yet."""
+    if row["gate"] is not None:
+        return "kept" if row["gate"]["kept"] else "refused"
+    return "kept" if row["evolved_in"] == row["round"] else None
 
 
 def _seconds(seconds: float) -> str:

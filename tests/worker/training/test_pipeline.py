@@ -1,4 +1,4 @@
-"""None"""
+"""From drives to a bundle: each stage by itself, and the pipeline of all of them."""
 
 import argparse
 import json
@@ -171,10 +171,10 @@ def made(folder, preset):
 )
 def test_a_share_of_a_preset_becomes_a_bundle_of_its_own_layers(name, tmp_path, capsys):
     assert call("--data", tmp_path, "--preset", name, "--scale", SHARES[name], *FEW, "--json") == 0
-    told = json.loads(capsys.readouterr().out)
-    assert tuple(told["stages"]) == STAGES
+    answer = json.loads(capsys.readouterr().out)
+    assert tuple(answer["stages"]) == STAGES
     bundle, preset = made(tmp_path, name), PRESETS[name]
-    assert told["stages"]["bundle"]["sha256"] == bundle.sha256
+    assert answer["stages"]["bundle"]["sha256"] == bundle.sha256
     assert bundle.manifest.picture[0] == preset.collect.picture
     assert bundle.manifest.hidden == preset.mdnrnn_layers.hidden
     assert bundle.manifest.provenance["episodes"] >= 2
@@ -215,7 +215,7 @@ def test_a_share_of_every_amount_is_rounded_up():
     [
         (("--scale", "0"), "--scale must be above 0, to 1, not 0"),
         (("--scale", "2"), "--scale must be above 0, to 1, not 2"),
-        (("--vae-flags", "--dat other"), "--vae-flags: --data of a stage"),
+        (("--vae-flags", "--dat other"), "--vae-flags: leave out --data, which pipeline sets itself"),
         (("--collect-flags", "'"), "--collect-flags"),
         (("--preset", "dream"), "'dream' is a preset of run"),
     ],

@@ -30,8 +30,8 @@ def test_kinds_take_turns_and_own_flags_come_last():
     contrast = Contrast(seeds=(4, 5), mdnrnn_flags="--updates 9 --hidden 8")
     assert [each.name for each in contrast.trials] == ["plain-4", "attentive-4", "plain-5", "attentive-5"]
     words = contrast.training_flags(Trial("attentive", 5))
-    assert words == ("--updates", "9", "--hidden", "8", "--window", "8", "--hidden", "236", "--seed", "5")
-    assert contrast.evolution_flags(Trial("plain", 4)) == ("--preset", "dream", "--generations", "32", "--seed", "4")
+    assert words == ("--updates", "9", "--hidden", "8", "--window", "8", "--hidden", "236")
+    assert contrast.common_run_flags == ("--preset", "dream", "--generations", "32")
 
 
 @pytest.mark.parametrize(
@@ -40,9 +40,9 @@ def test_kinds_take_turns_and_own_flags_come_last():
         ({"kinds": (("alone", ""),)}, "twice or more"),
         ({"kinds": (("one", ""), ("one", "--hidden 8"))}, "--kind one is given twice"),
         ({"kinds": (("../up", ""), ("one", ""))}, "a name is of a-z"),
-        ({"kinds": (("one", "--seed 3"), ("two", ""))}, "--seed of each training is contrast's own"),
+        ({"kinds": (("one", "--seed 3"), ("two", ""))}, "leave out --seed, which contrast sets itself"),
         ({"kinds": (("one", "--hid 'x"), ("two", ""))}, "No closing quotation"),
-        ({"mdnrnn_flags": "--data elsewhere"}, "--data of each training"),
+        ({"mdnrnn_flags": "--data elsewhere"}, "leave out --data"),
         ({"seeds": ()}, "one at least"),
         ({"seeds": (1, 1)}, "different ones"),
         ({"seeds": (-1,)}, "must be from 0"),
@@ -69,7 +69,7 @@ def outcome(kind, seed, nats, score):
     return TrialResult(kind, seed, 1000, {"nats_per_dimension": nats}, score, 5.0, 16, score is not None)
 
 
-def test_kinds_are_told_apart_seed_by_seed():
+def test_kinds_are_compared_seed_by_seed():
     outcomes = [
         outcome("plain", 1, 0.96, 700.0), outcome("attentive", 1, 0.95, 720.0),
         outcome("plain", 2, 0.98, 500.0), outcome("attentive", 2, 0.97, 450.0),

@@ -33,9 +33,9 @@ def test_the_first_round_takes_the_presets_amounts():
 
 
 def test_each_round_trains_and_evolves_by_chance_of_its_own_on_one_data_set():
-    told = commands(seed=5)
-    assert [told.seed(Phase(1, name)) for name in ("collect", "vae", "mdnrnn", "evolve")] == [5, 5, 5, 6]
-    assert [told.seed(Phase(3, name)) for name in ("drive", "vae", "mdnrnn", "gate", "evolve")] == [5, 7, 7, 50_000, 8]
+    made = commands(seed=5)
+    assert [made.seed(Phase(1, name)) for name in ("collect", "vae", "mdnrnn", "evolve")] == [5, 5, 5, 6]
+    assert [made.seed(Phase(3, name)) for name in ("drive", "vae", "mdnrnn", "gate", "evolve")] == [5, 7, 7, 50_000, 8]
 
 
 def test_later_rounds_add_drives_to_those_that_there_are():
@@ -59,26 +59,26 @@ def test_later_training_goes_on_from_the_model_that_counts(vae, decoder_only):
 
 
 def test_updates_among_the_flags_of_every_round_count_in_later_rounds_too():
-    told = commands(*ROUND_2, vae_flags="--updates 20", mdnrnn_flags="--updates 10", mdnrnn_updates=5)
-    assert said(told.train(1, "vae")).endswith("--updates 20")
-    assert "--updates 20 --continue-from" in said(told.train(2, "vae"))
-    assert said(told.train(1, "mdnrnn")).endswith("--updates 10")
-    assert "--updates 5 --continue-from" in said(told.train(2, "mdnrnn")), "what is said of later rounds alone"
+    made = commands(*ROUND_2, vae_flags="--updates 20", mdnrnn_flags="--updates 10", mdnrnn_updates=5)
+    assert said(made.train(1, "vae")).endswith("--updates 20")
+    assert "--updates 20 --continue-from" in said(made.train(2, "vae"))
+    assert said(made.train(1, "mdnrnn")).endswith("--updates 10")
+    assert "--updates 5 --continue-from" in said(made.train(2, "mdnrnn")), "what is said of later rounds alone"
 
 
 def test_with_init_the_first_round_goes_on_as_later_ones_do():
-    told = commands(entry(0, "init", sha256="ab", controller="tiny"), init="tiny", vae="keep", mdnrnn_flags="--done")
-    assert said(told.unbundle()) == "unbundle data/rounds/00/bundle.zip --data data/rounds/00 --json"
-    train = said(told.train(1, "mdnrnn"))
+    made = commands(entry(0, "init", sha256="ab", controller="tiny"), init="tiny", vae="keep", mdnrnn_flags="--done")
+    assert said(made.unbundle()) == "unbundle data/rounds/00/bundle.zip --data data/rounds/00 --json"
+    train = said(made.train(1, "mdnrnn"))
     assert "--seed 0 --json --updates 600 --done --continue-from data/rounds/00/mdnrnn.safetensors" in train
-    vae, mdnrnn = (said(words) for words in told.check_trainings())
+    vae, mdnrnn = (said(words) for words in made.check_trainings())
     assert mdnrnn == f"{train} --summary"
     assert "--continue-from data/rounds/00/vae.safetensors --summary" in vae, "one that stays sees the drives too"
-    assert "--episodes 80" in said(told.drive([Path("0.npz")]))
-    assert said(told.refit(1, Path("moved.npz"))).startswith("refit data/rounds/00/controller.npz --to data/rounds/01/")
-    old = said(told.gate(1)["old"]["probe"])
+    assert "--episodes 80" in said(made.drive([Path("0.npz")]))
+    assert said(made.refit(1, Path("moved.npz"))).startswith("refit data/rounds/00/controller.npz --to data/rounds/01/")
+    old = said(made.gate(1)["old"]["probe"])
     assert old.startswith("inspect data/rounds/00/bundle.zip --probe --controller data/rounds/00/controller.npz")
-    assert "--bundle data/rounds/00/bundle.zip" in said(told.begin_run(1, (), ())), "no gate has passed another"
+    assert "--bundle data/rounds/00/bundle.zip" in said(made.begin_run(1, (), ())), "no gate has passed another"
     run = IterateConfig(init="tiny", run_flags="--generations 3", later_run_flags="--temperature 1")
     assert run.flags_of_run(1) == ("--generations", "3", "--temperature", "1")
 
@@ -114,25 +114,25 @@ def test_a_round_evolves_in_the_model_that_counts_with_a_seed_of_its_own():
     )
 
 
-def test_an_evolution_in_a_subspace_is_told_where_it_lies():
-    told = commands(*ROUND_2, entry(2, "bundle"), entry(2, "gate", kept=False), run_flags="--generations 3")
+def test_an_evolution_in_a_subspace_names_its_file():
+    made = commands(*ROUND_2, entry(2, "bundle"), entry(2, "gate", kept=False), run_flags="--generations 3")
     few = Path("few.npz")
-    words = said(told.subspace(2, few))
+    words = said(made.subspace(2, few))
     assert words == "subspace data/rounds/01/round-1.zip --data data --out few.npz --json", "of the model that counts"
-    assert "--init start.npz --subspace few.npz" in said(told.begin_run(2, (), (), Path("start.npz"), few))
+    assert "--init start.npz --subspace few.npz" in said(made.begin_run(2, (), (), Path("start.npz"), few))
     seeing = commands(*ROUND_2, views=8, subspace=True, go_on=True)
     assert "--data data --views 8 --out" in said(seeing.subspace(2, few))
 
 
 def test_later_rounds_may_evolve_otherwise_than_the_first():
-    told = commands(*ROUND_2, run_flags="--generations 32", later_run_flags="--generations 6 --temperature 1")
-    first, later = (said(told.begin_run(number, (), (), None)) for number in (1, 2))
+    made = commands(*ROUND_2, run_flags="--generations 32", later_run_flags="--generations 6 --temperature 1")
+    first, later = (said(made.begin_run(number, (), (), None)) for number in (1, 2))
     assert first.startswith("coordinator --generations 32 --run round-01")
     assert later.startswith("coordinator --generations 32 --generations 6 --temperature 1 --run round-02")
 
 
 @pytest.mark.parametrize("flags", ["--data elsewhere", "--updates 3 --seed=9", "--continue other.safetensors", "--new"])
-def test_what_a_training_is_told_by_the_iteration_is_no_flag_of_it(flags):
-    with pytest.raises(UsageError, match="of each training is iterate's own to give"):
+def test_flags_that_the_iteration_sets_itself_are_refused(flags):
+    with pytest.raises(UsageError, match="which iterate sets itself"):
         IterateConfig(vae_flags=flags)
     assert IterateConfig(run_flags=flags)

@@ -16,7 +16,7 @@ def both(knows=(0.8, 0.01), loses=(0.1, 0.02)):
         (both(knows=(0.9, 0.01), loses=(0.6, 0.05)), True),
         (both(knows=(0.779, 0.001)), False),
         (both(knows=(0.775, 0.02)), True),  # within two standard errors of the difference
-        (both(knows=(0.785, 0.0001)), True),  # told with certainty, and of no weight
+        (both(knows=(0.785, 0.0001)), True),  # certain, but too small to count
         (both(knows=(0.9, 0.01), loses=(0.0, 0.02)), False),  # better in one does not make up for the other
         (both(loses=None), True),
         (both(knows=(0.5, 0.01), loses=None), False),
@@ -27,7 +27,7 @@ def test_clearly_worse_is_two_standard_errors_and_a_margin(new, kept):
     assert judge(old, new).kept == kept
 
 
-def test_the_verdict_tells_the_figures():
+def test_the_verdict_names_the_figures():
     better, worse = both(loses=(0.6, 0.05)), both(knows=(0.1, 0.0), loses=(-1.0, 0.0))
     assert judge(both(), better).why == "knows 0.80 ± 0.01 -> 0.80 ± 0.01, loses 0.10 ± 0.02 -> 0.60 ± 0.05: kept"
     assert judge(both(), worse).why.endswith(": refused, clearly worse in knows and loses")

@@ -1,4 +1,4 @@
-"""What people and programs are told of the rounds."""
+"""Rounds, described for people and for programs."""
 
 from pathlib import Path
 
@@ -30,17 +30,17 @@ SECOND = (
 )
 
 
-def test_a_row_a_round_tells_drives_model_gate_and_score():
+def test_a_row_per_round_has_drives_model_gate_and_score():
     one, two = summary.table_rows(describe_rounds(*FIRST, *SECOND))
     assert list(one.values()) == [1, 620, 153_000, 0.96, 0.93, None, None, "kept", "812 ± 15 on 32 tracks"]
     assert list(two.values()) == [2, 700, 170_000, 0.96, 0.93, "0.80 ± 0.01", None, "refused", None]
 
 
 def test_a_round_says_whose_model_it_evolved_in():
-    told = describe_rounds(*FIRST, *SECOND, entry(2, "evolve", score={**SCORE, "mean": 900.0, "confirmed": False}))
-    assert [each["evolved_in"] for each in told] == [1, 1]
-    assert summary.best_round(told)["round"] == 2
-    assert summary.format_score(told[1]["score"]) == "900 ± 15 on 32 tracks, provisional"
+    rounds = describe_rounds(*FIRST, *SECOND, entry(2, "evolve", score={**SCORE, "mean": 900.0, "confirmed": False}))
+    assert [each["evolved_in"] for each in rounds] == [1, 1]
+    assert summary.best_round(rounds)["round"] == 2
+    assert summary.format_score(rounds[1]["score"]) == "900 ± 15 on 32 tracks, provisional"
 
 
 def test_a_score_of_one_track_has_no_standard_error():
@@ -66,5 +66,5 @@ def test_rounds_without_a_score_have_no_best_one():
         (entry(1, "encode"), "round 1  encode       2 s"),
     ],
 )
-def test_a_line_tells_round_phase_time_and_outcome(finished, said):
+def test_a_line_has_round_phase_time_and_outcome(finished, said):
     assert summary.format_entry(finished) == said

@@ -1,0 +1,102 @@
+"""Command lines of the verbs that make and evolve world models, which other verbs run one after the other. Pure.
+
+Each function returns the words behind `dreamfleet`. Of a flag that is given twice, the latter counts.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from dreamfleet.common.errors import UsageError
+
+Words = tuple[str, ...]
+Model = Literal["vae", "mdnrnn"]
+MODELS: tuple[Model, ...] = ("vae", "mdnrnn")
+
+
+def command(*parts: object) -> Words:
+    """A command line from words, numbers and paths."""
+    return tuple(map(str, parts))
+
+
+def options(**values: object) -> Words:
+    """`--name value` of each value that is not None; `_` in a name is `-`."""
+    return command(*(word for name, value in values.items() if value is not None for word in (_flag(name), value)))
+
+
+def collect(
+    data: Path, *more: object, preset: str, seed: int, episodes: object = None, steps: int | None = None,
+    jobs: int | None = None,
+) -> Words:  # fmt: skip
+    """Drives for the data set in `data`, until it has `episodes` of them."""
+    given = options(preset=preset, seed=seed, episodes=episodes, steps=steps, jobs=jobs)
+    return command("collect", "--data", data, *given, *more, "--json")
+
+
+def train(
+    model: Model, data: Path, *more: object, seed: int, preset: str | None = None, device: str | None = None
+) -> Words:
+    """The training of one model on the data set in `data`."""
+    return command("train", model, "--data", data, *options(preset=preset, device=device, seed=seed), "--json", *more)
+
+
+def encode(data: Path) -> Words:
+    """The latents of the drives in `data`."""
+    return command("encode", "--data", data, "--json")
+
+
+def bundle(data: Path, out: Path) -> Words:
+    """The models in `data` as one file."""
+    return command("bundle", "--data", data, "--out", out, "--json")
+
+
+def begin_run(
+    name: str, runs_dir: Path, listen: Sequence[str], *flags: object, world_model: Path | str,
+    as_json: bool = True, **more: object,
+) -> Words:  # fmt: skip
+    """The coordinator of a new run; `flags` come first, so that `more`, such as `seed`, counts."""
+    return command(
+        "coordinator", *flags, "--run", name, "--bundle", world_model, *options(**more),
+        *_run_place(runs_dir, listen, as_json=as_json),
+    )  # fmt: skip
+
+
+def resume_run(name: str, runs_dir: Path, listen: Sequence[str], *flags: object) -> Words:
+    """The coordinator of a run that was begun before."""
+    return command("coordinator", "--resume", name, *flags, *_run_place(runs_dir, listen, as_json=True))
+
+
+def worker(run: str, endpoint: str, slots: int, *more: object) -> Words:
+    """A worker of one run, reached at `endpoint`."""
+    return command("worker", "--connect", endpoint, "--run", run, "--slots", slots, *more)
+
+
+def evaluate(controller: Path, episodes: int, *more: object) -> Words:
+    """A controller on so many unseen tracks."""
+    return command("evaluate", "--controller", controller, "--episodes", episodes, *more)
+
+
+def split_flags(flag: str, text: str, owner: str = "", reserved: Sequence[str] = ()) -> Words:
+    """Flags of another verb that `flag` was given as one text.
+
+    `UsageError` if quotes do not match, or if one is in `reserved`, which `owner` sets itself.
+    """
+    try:
+        words = tuple(shlex.split(text))
+    except ValueError as error:
+        raise UsageError(f"{flag} {text!r}: {error}") from error
+    given = {word.partition("=")[0] for word in words if word.startswith("--")}
+    if taken := [each for each in reserved if any(each.startswith(word) for word in given)]:  # argparse takes prefixes
+        raise UsageError(f"{flag}: leave out {', '.join(taken)}, which {owner} sets itself")
+    return words
+
+
+def _run_place(runs_dir: Path, listen: Sequence[str], *, as_json: bool) -> Words:
+    return command("--runs-dir", runs_dir, *(("--json",) if as_json else ()), "--listen", *listen)
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
