@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.coordinator.optimisers.scalars import SCALARS, tag, untag
+from dreamfleet.coordinator.optimisers.checkpoint import SCALARS, tag, untag
 
 # Not state: options and callbacks come from the constructor; the clock, the logger, archives and the last population
 # with its fitness, which are large, change no sample.

@@ -3,7 +3,7 @@ import pytest
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
-from dreamfleet.coordinator.optimisers.normals import Normals
+from dreamfleet.coordinator.optimisers.pycma import Normals
 
 
 def config(**changes):

@@ -9,9 +9,7 @@ import pytest
 from dreamfleet.coordinator.optimisers.api import Search
 
 
-@pytest.mark.parametrize(
-    "module", ["optimisers.pycma", "optimisers.rate_adapted", "optimisers.separable", "optimisers.evolution"]
-)
+@pytest.mark.parametrize("module", ["optimisers.pycma", "optimisers.cmaes_library", "optimisers.evolution"])
 def test_a_class_shows_an_example_that_runs(module):
     found = import_module(f"dreamfleet.coordinator.{module}")
     failed, tried = doctest.testmod(found, extraglobs={"np": np, "Search": Search}, raise_on_error=True)
