@@ -98,8 +98,8 @@ class Pycma:
         arrays = dict(state)
         random = json.loads(str(arrays.pop("random")))
         self._begin(arrays["mean"].astype(np.float64))
-        if not pycma_state.is_before_first_tell(arrays):
-            # pycma builds some of its parts at the first ask and tell; they must be there to be overwritten.
+        if not pycma_state.is_before_first_update(arrays):
+            # pycma builds some of its parts in the first `ask` and `tell`; they must exist to be overwritten.
             self.ask()
             self.tell(np.arange(self._search.population, dtype=np.float64))
             pycma_state.restore(self._strategy, arrays)

@@ -57,8 +57,8 @@ def restore(strategy: Any, arrays: Mapping[str, NDArray[Any]]) -> None:
             _assign(owner, name, _value(path, about, arrays), written)
 
 
-def is_before_first_tell(arrays: Mapping[str, NDArray[Any]]) -> bool:
-    """Whether the strategy was never told anything: it lacks the parts that the first tell makes."""
+def is_before_first_update(arrays: Mapping[str, NDArray[Any]]) -> bool:
+    """Whether the strategy was never updated: it lacks the parts that the first update makes."""
     return int(untag(json.loads(str(arrays["about"]))["countiter"])) == 0
 
 

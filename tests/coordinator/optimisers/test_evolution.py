@@ -166,7 +166,7 @@ def test_impossible_settings_are_refused(changes):
 
 @pytest.mark.parametrize("search", [{"covariance": "full"}, {"covariance": "diagonal"}, {"optimiser": "cmaes-sep"},
                                     {"optimiser": "cmaes-lra"}])  # fmt: skip
-def test_the_axis_ratio_tells_how_far_from_round_a_search_is(search):
+def test_the_axis_ratio_shows_how_far_from_round_a_search_is(search):
     evolution = Evolution(config(dimension=4, population=16, **search))
     evolution.ask()
     assert evolution.axis_ratio == pytest.approx(1.0, rel=1e-3)
