@@ -1,4 +1,4 @@
-"""What an optimiser is: it asks for candidates, is told their fitness, and its state continues to the bit.
+"""The interface of an optimiser: it proposes candidates, learns from their fitness, and resumes to the bit.
 
 The only module that a third party imports. Register a class under the entry-point group `dreamfleet.optimisers`, or
 name it as `module:attribute`.

@@ -1,10 +1,11 @@
-"""An optimiser's state as a run's journal keeps it: its arrays under a head that says whose they are."""
+"""An optimiser's state as a run's journal stores it: arrays, and a head that names the optimiser."""
 
 from __future__ import annotations
 
 import io
 import json
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,17 +14,17 @@ from dreamfleet.common.errors import JournalError
 from dreamfleet.common.files.archives import ArchiveLimits, read_arrays
 from dreamfleet.common.printable import one_line
 from dreamfleet.coordinator.optimisers.api import State
-from dreamfleet.coordinator.optimisers.scalars import untag
 
 PREFIX = "optimiser."
+SCALARS = (bool, int, float, str, type(None), np.bool_, np.integer, np.floating)
 _LIMITS = ArchiveLimits(1 << 30, members=4096)  # bytes: more than SQLite keeps in one place
 
 
 @dataclass(frozen=True)
 class Head:
-    """Which optimiser wrote a state with what installed, its mean `(dimension,)` and its step size.
+    """The name and requirement of the optimiser that wrote a state, its mean `(dimension,)` and its step size.
 
-    A search in a subspace has an origin `(dimension,)` too, from which its coordinates count.
+    A search in a subspace also has an origin `(dimension,)`, the zero of its coordinates.
     """
 
     name: str
@@ -35,13 +36,13 @@ class Head:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A state between tell and ask; to pack it takes a while, which can be left for later."""
+    """A state between an update and the next `ask`. Packing it is slow, so the journal does that when it writes."""
 
     head: Head
     state: State
 
     def packed(self) -> bytes:
-        """As one `.npz`."""
+        """The bytes of one `.npz` archive."""
         head = {PREFIX + name: np.array(value) for name, value in vars(self.head).items() if value is not None}
         buffer = io.BytesIO()
         np.savez(buffer, **self.state, **head)  # type: ignore[arg-type]
@@ -49,7 +50,7 @@ class Checkpoint:
 
     @classmethod
     def unpack(cls, data: bytes) -> Checkpoint:
-        """Read what `packed` wrote, also of version 0.1; never pickle."""
+        """Read what `packed` wrote, in version 0.1 too; `JournalError` if it is damaged. Pickle is never loaded."""
         try:
             return cls._of(read_arrays(data, _LIMITS))
         except (ValueError, KeyError, TypeError, RecursionError) as error:
@@ -66,8 +67,29 @@ class Checkpoint:
 
 
 def _version_01_head(arrays: State) -> Head:
-    """The head of a state of version 0.1, which had pycma alone; takes its own words out of the arrays."""
+    """Move the head of a version 0.1 state, which is always of pycma, out of the arrays."""
     if "cma" not in arrays:
         raise JournalError("the journal's last state is damaged: it does not say which optimiser wrote it")
     sigma = untag(json.loads(str(arrays["about"]))["sigma"])
     return Head("cma", f"cma=={arrays.pop('cma')}", arrays["mean"].astype(np.float64), float(sigma))
+
+
+def tag(value: Any) -> list[Any]:
+    """A scalar with its type, for JSON that comes back with the same bits; floats are hexadecimal.
+
+    The type matters because Python's float and NumPy's do not take every operation through the same routine.
+    """
+    if isinstance(value, (float, np.floating)):
+        return [type(value).__name__, float(value).hex()]
+    if isinstance(value, (np.integer, np.bool_)):
+        return [type(value).__name__, value.item()]
+    return ["plain", value]
+
+
+def untag(tagged: list[Any]) -> Any:
+    """The scalar that `tag` wrote."""
+    kind, value = tagged
+    if kind == "plain":
+        return value
+    number = float.fromhex(value) if isinstance(value, str) else value
+    return number if kind == "float" else np.dtype(kind.rstrip("_")).type(number)

@@ -66,7 +66,7 @@ class EvolutionConfig:
 
 
 class Evolution:
-    """Maximises fitness by the run's optimiser; a checkpoint is taken between tell and ask.
+    """Maximises fitness by the run's optimiser; a checkpoint is taken between an update and the next `ask`.
 
     >>> evolution = Evolution(EvolutionConfig(dimension=3, population=4, sigma0=0.1, covariance="diagonal", seed=1))
     >>> candidates = evolution.ask()
@@ -77,7 +77,7 @@ class Evolution:
         self._config = config
         self._origin = np.zeros(config.dimension) if start is None else np.asarray(start, dtype=np.float64)
         self._optimiser = build_optimiser(config.optimiser, config.search(self._origin))
-        self._is_open = False  # asked, and not yet told
+        self._is_open = False  # after `ask`, before `tell`
 
     @property
     def mean(self) -> NDArray[np.float64]:

@@ -18,7 +18,6 @@ with catch_warnings():
 from dreamfleet.common.errors import UsageError
 from dreamfleet.coordinator.optimisers import pycma_state
 from dreamfleet.coordinator.optimisers.api import Search, State
-from dreamfleet.coordinator.optimisers.normals import Normals
 
 HISTORY = 100  # entries that stay of each of pycma's histories
 FURTHEST_FACTOR = 1e60  # from one: a factor that is further away is brought back
@@ -99,8 +98,8 @@ class Pycma:
         arrays = dict(state)
         random = json.loads(str(arrays.pop("random")))
         self._begin(arrays["mean"].astype(np.float64))
-        if not pycma_state.is_before_first_tell(arrays):
-            # pycma builds some of its parts at the first ask and tell; they must be there to be overwritten.
+        if not pycma_state.is_before_first_update(arrays):
+            # pycma builds some of its parts in the first `ask` and `tell`; they must exist to be overwritten.
             self.ask()
             self.tell(np.arange(self._search.population, dtype=np.float64))
             pycma_state.restore(self._strategy, arrays)
@@ -140,3 +139,39 @@ class Pycma:
                 f"cma needs a population of at least 3 for {self._search.dimension} parameters, not "
                 f"{self._search.population}: give --population"
             )
+
+
+class Normals:
+    """Standard normal samples for pycma's option `randn`, from a generator whose state can be stored.
+
+    Samples can be drawn ahead while the coordinator is idle; that changes no number.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._generator = np.random.Generator(np.random.PCG64(seed))
+        # The state before the draw, and the samples.
+        self._ahead: tuple[dict[str, Any], NDArray[np.float64]] | None = None
+
+    def __call__(self, *shape: int) -> NDArray[np.float64]:
+        """Draw an array of `shape`."""
+        if self._ahead is not None and self._ahead[1].shape == shape:
+            _, drawn = self._ahead
+            self._ahead = None
+            return drawn
+        self.state = self.state
+        return self._generator.standard_normal(shape)
+
+    def draw_ahead(self, *shape: int) -> None:
+        """Draw the array that the next call with `shape` will return."""
+        if self._ahead is None:
+            self._ahead = self.state, self._generator.standard_normal(shape)
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """The generator's state, as if nothing was drawn ahead."""
+        return self._ahead[0] if self._ahead is not None else dict(self._generator.bit_generator.state)
+
+    @state.setter
+    def state(self, state: dict[str, Any]) -> None:
+        self._ahead = None
+        self._generator.bit_generator.state = state

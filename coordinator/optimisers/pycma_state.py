@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.coordinator.optimisers.scalars import SCALARS, tag, untag
+from dreamfleet.coordinator.optimisers.checkpoint import SCALARS, tag, untag
 
 # Not state: options and callbacks come from the constructor; the clock, the logger, archives and the last population
 # with its fitness, which are large, change no sample.
@@ -57,8 +57,8 @@ def restore(strategy: Any, arrays: Mapping[str, NDArray[Any]]) -> None:
             _assign(owner, name, _value(path, about, arrays), written)
 
 
-def is_before_first_tell(arrays: Mapping[str, NDArray[Any]]) -> bool:
-    """Whether the strategy was never told anything: it lacks the parts that the first tell makes."""
+def is_before_first_update(arrays: Mapping[str, NDArray[Any]]) -> bool:
+    """Whether the strategy was never updated: it lacks the parts that the first update makes."""
     return int(untag(json.loads(str(arrays["about"]))["countiter"])) == 0
 
 

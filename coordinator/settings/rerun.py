@@ -1,4 +1,4 @@
-"""A run that is had a second time, by the receipt of the controller that it reported."""
+"""Re-run a run from the provenance in its controller."""
 
 from __future__ import annotations
 
@@ -133,12 +133,12 @@ class Rerun:
         return config
 
     def _both_classes(self, stored: RunFolder) -> tuple[str, str] | None:
-        """The one class of the hosts of the first time, and of this time; `None` where bits do not tell both."""
-        told = [each.largest[0].host_class for each in (self.receipt.classes, stored.classes)
+        """The one class of the hosts of the first time, and of this time; `None` if either is unknown or mixed."""
+        classes = [each.largest[0].host_class for each in (self.receipt.classes, stored.classes)
                 if each is not None and each.total == 1]  # fmt: skip
-        if len(told) < 2 or any(each.startswith(BY_FINGERPRINT) for each in told):
+        if len(classes) < 2 or any(each.startswith(BY_FINGERPRINT) for each in classes):
             return None
-        return told[0], told[1]
+        return classes[0], classes[1]
 
     def _describe_hosts(self, stored: RunFolder) -> str:
         """Whether its hosts are of the first time's class, as far as that is known; a part of a sentence."""

@@ -45,7 +45,7 @@ def stored_network(stored: RunFolder) -> Table:
 def choose_addresses(
     own: NetworkConfig, global_config: GlobalConfig, kept: Table, credentials: Credentials | None = None
 ) -> NetworkConfig:
-    """Where a coordinator is reached: as told, else as kept, else on this host alone.
+    """Where a coordinator is reached: as configured, else as stored with the run, else on this host alone.
 
     `connect` of the site says where everybody finds the router. A coordinator that listens is that router, and
     connects to another one only if its own flag or table says so. With a join file it is reached where that says.

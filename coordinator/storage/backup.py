@@ -19,6 +19,7 @@ from dreamfleet.common.files.locks import try_lock
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, ROLLOUTS
+from dreamfleet.coordinator.storage.journal_file import copy_database
 
 
 def back_up(source: RunFolder, target: Path) -> None:
@@ -107,10 +108,8 @@ def _copy_run(source: RunFolder, folder: Path) -> None:
 def _copy_journal(source: RunFolder, path: Path) -> None:
     where = f"{(source.path / JOURNAL).absolute().as_uri()}?mode=ro"
     try:
-        with closing(sqlite3.connect(where, uri=True)) as live, closing(sqlite3.connect(path)) as copy:
-            live.backup(copy)
-            copy.execute("PRAGMA journal_mode = DELETE")  # one file, without a log beside it
-            found = copy.execute("PRAGMA quick_check(1)").fetchone()[0]
+        with closing(sqlite3.connect(where, uri=True)) as live:
+            found, _ = copy_database(live, path)
     except sqlite3.Error as error:
         raise JournalError(f"the journal of run {source.name} cannot be copied to {path.parent}: {error}") from error
     if found != "ok":

@@ -16,12 +16,13 @@ from tempfile import gettempdir
 
 from dreamfleet.common.errors import DreamfleetError, JournalError
 from dreamfleet.common.runs.run_paths import JOURNAL
-from dreamfleet.coordinator.storage.journal import Journal, sqlite_side_files
+from dreamfleet.coordinator.storage.journal import Journal
+from dreamfleet.coordinator.storage.journal_file import sqlite_side_files
 from dreamfleet.coordinator.storage.served_bundle import ServedBundle
 
 log = logging.getLogger(__name__)
 CHECK_INTERVAL = 1.0  # seconds between two looks
-SETTLE = 0.3  # seconds in which whoever removes a folder is done with it
+SETTLE = 0.3  # seconds after which the removal of a folder is complete
 RESCUED = "rescued"
 
 Identity = tuple[int, int]
@@ -91,7 +92,7 @@ class FileWatch:
         return None
 
     def _rescue(self, folder: Path | None) -> str:
-        """Copy what the open connection holds to the first place that takes it; what to tell people."""
+        """Copy the data of the open connection to the first place that accepts it; returns the message for people."""
         failures = []
         for place in self._rescue_places(folder):
             try:

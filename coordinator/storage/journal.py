@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import secrets
 import shutil
 import sqlite3
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.errors import DreamfleetError, JournalError
+from dreamfleet.common.errors import JournalError
 from dreamfleet.common.files.atomic_write import atomic_write, fsync_path, reporting_unwritable_folder
 from dreamfleet.common.protocol.host_classes import HostClasses, class_from_fingerprint, count_results
 from dreamfleet.common.protocol.messages import Job, Result
@@ -35,6 +34,13 @@ from dreamfleet.coordinator.jobs.confirmation import Finalist
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollection
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
+from dreamfleet.coordinator.storage.journal_file import (
+    check_database,
+    copy_database,
+    file_stamp,
+    journal_errors,
+    sqlite_side_files,
+)
 
 sqlite3.register_adapter(Checkpoint, Checkpoint.packed)  # when it is written, not while workers wait
 
@@ -44,7 +50,7 @@ FINGERPRINT, HOST_CLASS = "fingerprint", "host_class"  # the facts' names
 
 @dataclass(frozen=True)
 class StoredOpenGeneration:
-    """A generation that was asked and not yet told: its state before `ask`, its seeds and its population."""
+    """A generation whose fitness is still incomplete: the state before `ask`, its seeds and its population."""
 
     number: int
     state: bytes
@@ -53,7 +59,7 @@ class StoredOpenGeneration:
 
 
 class Journal:
-    """Writes of one coordinator's life: they wait in memory, in order, until `commit` or until something is read."""
+    """The journal of one coordinator's life. Writes wait in memory, in order, until `commit` or the next read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -63,7 +69,7 @@ class Journal:
         self._effort: Effort | None = None  # of every result, once somebody asked
         self._counted: Counter[tuple[str, str]] | None = None  # results by class and fingerprint, likewise
         self._writes: list[tuple[str, list[tuple[Any, ...]]]] = []  # a statement, and a row for each time it runs
-        with _journal_errors(path):
+        with journal_errors(path):
             self._connection = sqlite3.connect(path, timeout=5)
             try:
                 schema.migrate(self._connection, schema.check_schema(self._connection, path))
@@ -97,7 +103,7 @@ class Journal:
                 with bundle.open("rb") as source, atomic_write(folder / BUNDLE) as copy:
                     shutil.copyfileobj(source, copy)
             aside.touch(mode=0o600)  # its log has the same mode
-            with _journal_errors(path), closing(sqlite3.connect(aside)) as connection:
+            with journal_errors(path), closing(sqlite3.connect(aside)) as connection:
                 schema.migrate(connection, 0)
                 connection.executemany("INSERT INTO run (key, value) VALUES (?, ?)", {**own, **(facts or {})}.items())
                 connection.commit()
@@ -115,31 +121,25 @@ class Journal:
 
         Only a commit of this connection writes there, so the file is looked into where its time or size is another's.
         """
-        if self._stamp in (None, _stamp(self.path)):
+        if self._stamp in (None, file_stamp(self.path)):
             return False
-        self._stamp = _stamp(self.path)
+        self._stamp = file_stamp(self.path)
         where = f"file:{self.path.absolute()}?mode=ro"  # what lies there, and not what this connection remembers
         try:
             with closing(sqlite3.connect(where, uri=True)) as reader:
-                sound = reader.execute("PRAGMA quick_check(1)").fetchone()[0] == "ok"
-                last = reader.execute("SELECT max(number) FROM generation").fetchone()[0]
+                return check_database(reader) != ("ok", self._opened)
         except sqlite3.Error:
             return True
-        return not sound or last != self._opened
 
     def save_copy(self, path: Path) -> None:
         """Write all that is committed into a new file, checked, whole or not at all."""
         aside = path.with_name(f".{path.name}.part")
         try:
-            with _journal_errors(path), closing(sqlite3.connect(aside)) as copy:
-                self._connection.backup(copy)
-                copy.execute("PRAGMA journal_mode = DELETE")  # one file, without a log beside it
-                found = copy.execute("PRAGMA quick_check(1)").fetchone()[0]
-                last = copy.execute("SELECT max(number) FROM generation").fetchone()[0]
-            if found != "ok" or last != self._opened:
-                raise JournalError("what the open connection still holds is not whole: restore the folder from a copy")
-            with aside.open("rb") as file:
-                os.fsync(file.fileno())
+            with journal_errors(path):
+                found = copy_database(self._connection, aside)
+            if found != ("ok", self._opened):
+                raise JournalError("the data of the open connection is not whole: restore the folder from a copy")
+            fsync_path(aside)
             aside.replace(path)
             fsync_path(path.parent)
         finally:
@@ -158,36 +158,36 @@ class Journal:
     def commit(self) -> None:
         """Make everything written so far durable."""
         self._flush()
-        own = self._stamp in (None, _stamp(self.path))
-        with _journal_errors(self.path):
+        own = self._stamp in (None, file_stamp(self.path))
+        with journal_errors(self.path):
             self._connection.commit()
         if own:  # else somebody wrote there since the last commit, which `is_overwritten` looks into
-            self._stamp = _stamp(self.path)
+            self._stamp = file_stamp(self.path)
 
     def fact(self, key: str) -> str | None:
         """One of the run's facts, such as `uid` or `fingerprint`."""
-        row = self._read("SELECT value FROM run WHERE key = ?", key).fetchone()
+        row = self._read_row("SELECT value FROM run WHERE key = ?", key)
         return None if row is None else str(row[0])
 
     def fingerprint(self) -> str | None:
-        """That of the first accepted result; `None` before it.
+        """The fingerprint of the host of the first accepted result; `None` before it.
 
-        Journals from before that was the rule name their first worker's, which means nothing without a result.
+        Older journals store their first worker's instead, which means nothing without a result.
         """
-        scored = self._read("SELECT 1 FROM result LIMIT 1").fetchone() is not None
+        scored = self._read_row("SELECT 1 FROM result LIMIT 1") is not None
         return self.fact(FINGERPRINT) if scored else None
 
     def host_class(self) -> str | None:
-        """That of the first accepted result; `None` before it.
+        """The class of the host of the first accepted result; `None` before it.
 
-        In journals from before there were classes its fingerprint tells it.
+        Older journals do not store classes; there it follows from the fingerprint.
         """
         fingerprint = self.fingerprint()
         return None if fingerprint is None else self.fact(HOST_CLASS) or class_from_fingerprint(fingerprint)
 
     @property
     def classes(self) -> HostClasses:
-        """What all results are of: read once, then counted with each."""
+        """The host classes of all results: read once, then counted with each."""
         if self._counted is None:
             self._counted = count_results(self._read(class_counts_query()))
         return HostClasses.of(self._counted)
@@ -212,13 +212,13 @@ class Journal:
         self.set_fact("incarnation", str(number))
         self.commit()
         self._incarnation = number
-        self._opened = self._read("SELECT max(number) FROM generation").fetchone()[0]
+        self._opened = self._read_row("SELECT max(number) FROM generation")[0]
         return number
 
     def open_generation(
         self, number: int, state: Checkpoint, sigma: float, seeds: Sequence[int], vectors: Sequence[bytes]
     ) -> None:
-        """Write a population, and the strategy's state from before it was asked; two states stay."""
+        """Write a population, and the strategy's state before `ask`; the two latest states stay."""
         self._write(
             "INSERT INTO generation (number, seeds, opened, sigma) VALUES (?, ?, ?, ?)",
             number, json.dumps(list(seeds)), time(), sigma,
@@ -230,7 +230,7 @@ class Journal:
         self._opened = number
 
     def close_generation(self, closed: StoredGeneration, fitness: NDArray[np.float64]) -> None:
-        """Write what the strategy is told."""
+        """Write the fitness that updates the strategy, and the generation's statistics."""
         self._write_all(
             "UPDATE candidate SET fitness = ? WHERE generation = ? AND number = ?",
             [(float(value), closed.number, index) for index, value in enumerate(fitness)],
@@ -244,7 +244,7 @@ class Journal:
     def add_result(
         self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int, host_class: str = ""
     ) -> None:
-        """Write an accepted result; without a class its fingerprint tells it."""
+        """Write an accepted result; without a class, the class follows from the fingerprint."""
         self._write(
             "INSERT INTO result (digest, kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, "
             "fingerprint, incarnation, host_class) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -259,19 +259,19 @@ class Journal:
 
     @property
     def effort(self) -> Effort:
-        """What all results took: summed up once, then counted with each, so that it costs the same however many."""
+        """The effort of all results: summed once, then counted with each, so that its cost does not grow."""
         if self._effort is None:
             settings = RunSettings.from_json(self.fact("settings") or "")
             rows = self._read(efforts_query(begun_stages(settings, *self.read_closed())))
             task = settings.task.task
-            told = (Effort.of(task, kind, *made, driven=bool(driven)) for kind, _, _, driven, *made in rows)
-            self._effort = sum(told, Effort())
+            efforts = (Effort.of(task, kind, *made, driven=bool(driven)) for kind, _, _, driven, *made in rows)
+            self._effort = sum(efforts, Effort())
         return self._effort
 
     def drop_excessive(self, horizon: int) -> int:
-        """Forget what older versions took in and what would spoil what is still to be told; how many results that is.
+        """Delete results beyond today's bounds, which older versions accepted; returns how many.
 
-        Those of closed generations were told, and stay.
+        Results of closed generations have already updated the strategy, and stay.
         """
         within = "abs(fitness) <= ? AND steps BETWEEN 0 AND CASE kind WHEN 'evaluate' THEN ? ELSE ? END"
         still = "kind != 'score' OR generation IN (SELECT number FROM generation WHERE closed IS NULL)"
@@ -307,17 +307,17 @@ class Journal:
 
     def last_generation(self) -> StoredOpenGeneration | None:
         """The generation that was open when the last incarnation ended; `None` in a new run."""
-        row = self._read("SELECT max(number) FROM generation").fetchone()
-        return None if row[0] is None else self.generation(row[0])
+        (number,) = self._read_row("SELECT max(number) FROM generation")
+        return None if number is None else self.generation(number)
 
     def generation(self, number: int) -> StoredOpenGeneration | None:
-        """One of the last two generations, as it was asked; `None` if its state is not kept any more."""
-        row = self._read(
+        """One of the last two generations, with the population that was sampled; `None` if its state is deleted."""
+        row = self._read_row(
             "SELECT state, seeds FROM generation JOIN strategy ON number = generation WHERE number = ?", number
-        ).fetchone()
+        )
         if row is None:
             return None
-        vectors = self._read("SELECT vector FROM candidate WHERE generation = ? ORDER BY number", number).fetchall()
+        vectors = self._read("SELECT vector FROM candidate WHERE generation = ? ORDER BY number", number)
         try:
             return StoredOpenGeneration(
                 number, row[0], tuple(json.loads(row[1])), tuple(vector for (vector,) in vectors)
@@ -355,12 +355,12 @@ class Journal:
             "SELECT min(generation), vector, episodes, mean FROM evaluation WHERE mean IS NOT NULL GROUP BY vector "
             "ORDER BY mean DESC, 1 LIMIT ?"
         )
-        rows = self._read(query, count).fetchall()
+        rows = self._read(query, count)
         return [Finalist(generation, vector, episodes, to_finite(mean)) for generation, vector, episodes, mean in rows]
 
     def evaluated_vector(self, generation: int) -> bytes:
         """The mean after a generation that was scheduled to be evaluated."""
-        (vector,) = self._read("SELECT vector FROM evaluation WHERE generation = ?", generation).fetchone()
+        (vector,) = self._read_row("SELECT vector FROM evaluation WHERE generation = ?", generation)
         return bytes(vector)
 
     def _write(self, statement: str, *values: Any) -> None:
@@ -374,59 +374,21 @@ class Journal:
 
     def _flush(self) -> None:
         writes, self._writes = self._writes, []
-        with _journal_errors(self.path):
+        with journal_errors(self.path):
             for statement, rows in writes:
                 self._connection.executemany(statement, rows)
 
-    def _read(self, query: str, *values: Any) -> _Rows:
+    def _read(self, query: str, *values: Any) -> list[Any]:
+        """All rows of a query: a damaged page raises its error here, not in the code that iterates over the rows."""
         self._flush()
-        with _journal_errors(self.path):
-            return _Rows(self._connection.execute(query, values).fetchall())
+        with journal_errors(self.path):
+            return self._connection.execute(query, values).fetchall()
 
-
-class _Rows(list[Any]):
-    """What was read, to its end: a damaged page shows while it is read, and not in whoever goes through the rows."""
-
-    def fetchone(self) -> Any:
-        """The first row, if there is one."""
-        return self[0] if self else None
-
-    def fetchall(self) -> list[Any]:
-        """All of them."""
-        return self
+    def _read_row(self, query: str, *values: Any) -> Any:
+        """The first row of a query; `None` if there is none."""
+        return next(iter(self._read(query, *values)), None)
 
 
 def _now() -> str:
     """ISO 8601, UTC."""
     return datetime.now(UTC).isoformat(timespec="seconds")
-
-
-def _stamp(path: Path) -> tuple[int, int] | None:
-    """When a file was written last, and how long it is; `None`: it is not there."""
-    try:
-        found = path.stat()
-    except OSError:
-        return None
-    return found.st_mtime_ns, found.st_size
-
-
-def sqlite_side_files(path: Path) -> tuple[Path, ...]:
-    """What SQLite may keep beside a database: its write-ahead log, that log's index, or a rollback journal."""
-    return tuple(path.with_name(path.name + end) for end in ("-wal", "-shm", "-journal"))
-
-
-@contextmanager
-def _journal_errors(path: Path) -> Iterator[None]:
-    """SQLite's errors as one line that says what to do."""
-    try:
-        yield
-    except DreamfleetError:
-        raise
-    except sqlite3.OperationalError as error:
-        raise JournalError(f"cannot write {path}: {error}; nothing counted that was not written before") from error
-    except sqlite3.IntegrityError as error:
-        raise JournalError(
-            f"{path} was not written: {error}; what was committed before is whole, and the run can be continued"
-        ) from error
-    except sqlite3.DatabaseError as error:
-        raise JournalError(f"{path} is damaged or no journal: {error}; restore it from a copy") from error

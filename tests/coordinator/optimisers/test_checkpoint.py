@@ -18,7 +18,7 @@ def test_a_state_of_the_first_version_continues_to_the_bit():
     assert np.array_equal(evolution.ask(), np.load(GOLDEN / "pycma-population-of-0.1.npy"))
 
 
-def test_a_state_of_the_first_version_tells_mean_and_step_size():
+def test_a_state_of_the_first_version_holds_mean_and_step_size():
     head = Checkpoint.unpack((GOLDEN / STATE).read_bytes()).head
     assert head.name == "cma"
     assert head.requirement == "cma==4.5.0"

@@ -111,7 +111,7 @@ def test_it_maximises_and_the_seed_makes_its_run(optimiser, covariance):
 
 
 @EVERY_OPTIMISER
-def test_it_begins_where_it_is_told_to(optimiser, covariance):
+def test_it_begins_at_the_given_mean(optimiser, covariance):
     start = np.linspace(-3, 3, 12)
     evolution = Evolution(config(optimiser, covariance), start)
     assert np.array_equal(evolution.mean, start)
@@ -119,7 +119,7 @@ def test_it_begins_where_it_is_told_to(optimiser, covariance):
     assert np.array_equal(again.mean, start)
     assert np.array_equal(again.ask(), evolution.ask())
     step(evolution, 0)
-    assert np.array_equal(start, np.linspace(-3, 3, 12)), "a start belongs to whoever gave it"
+    assert np.array_equal(start, np.linspace(-3, 3, 12)), "a start belongs to the caller"
 
 
 @EVERY_OPTIMISER
@@ -133,7 +133,7 @@ def test_working_ahead_changes_no_bit(optimiser, covariance):
 
 
 @EVERY_OPTIMISER
-def test_a_state_is_arrays_without_pickle_and_tells_mean_and_step_size(optimiser, covariance):
+def test_a_state_is_arrays_without_pickle_and_holds_mean_and_step_size(optimiser, covariance):
     evolution = Evolution(config(optimiser, covariance))
     step(evolution, 0)
     kept = evolution.state()

@@ -3,7 +3,7 @@ import pytest
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
-from dreamfleet.coordinator.optimisers.normals import Normals
+from dreamfleet.coordinator.optimisers.pycma import Normals
 
 
 def config(**changes):
@@ -169,7 +169,7 @@ def test_impossible_settings_are_refused(changes):
 
 @pytest.mark.parametrize("search", [{"covariance": "full"}, {"covariance": "diagonal"}, {"optimiser": "cmaes-sep"},
                                     {"optimiser": "cmaes-lra"}])  # fmt: skip
-def test_the_axis_ratio_tells_how_far_from_round_a_search_is(search):
+def test_the_axis_ratio_shows_how_far_from_round_a_search_is(search):
     evolution = Evolution(config(dimension=4, population=16, **search))
     evolution.ask()
     assert evolution.axis_ratio == pytest.approx(1.0, rel=1e-3)

@@ -87,10 +87,10 @@ def test_a_share_of_recorded_states_is_frozen_with_a_dream_and_can_be_configured
     ],
 )
 def test_recorded_states_that_there_are_not_are_refused_in_one_line(random_bundle, changes, says):
-    with pytest.raises(DreamfleetError) as told:
+    with pytest.raises(DreamfleetError) as error:
         RunConfig(**changes).settings(random_bundle)
-    assert says in str(told.value)
-    assert "\n" not in str(told.value)
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -138,10 +138,10 @@ def test_a_variant_that_says_nothing_leaves_the_words_of_the_first_version(rando
     ],
 )
 def test_a_variant_that_there_is_not_is_refused_in_one_line(random_bundle, changes, says):
-    with pytest.raises(UsageError) as told:
+    with pytest.raises(UsageError) as error:
         RunConfig(**changes).settings(random_bundle)
-    assert says in str(told.value)
-    assert "\n" not in str(told.value)
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 def test_a_start_that_drives_otherwise_is_refused_and_one_that_pays_otherwise_is_not(random_bundle):

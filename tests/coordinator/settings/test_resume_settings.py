@@ -83,7 +83,7 @@ def test_a_target_that_cannot_be_kept_is_refused(target):
         ({"listen": (HERE,)}, {"connect": (THERE,)}, {}, ((HERE,), ())),
     ],
 )
-def test_addresses_are_as_told_else_as_kept_else_this_host_alone(own, site, kept, addresses):
+def test_addresses_are_as_configured_else_as_stored_else_this_host_alone(own, site, kept, addresses):
     chosen = choose_addresses(NetworkConfig(**own), GlobalConfig(**site), kept)
     assert (chosen.listen, chosen.connect) == addresses
 

@@ -54,7 +54,7 @@ def make(tmp_path, random_bundle):
         each.journal.close()
 
 
-def test_it_tells_generations_effort_fingerprint_versions_and_seeds(make):
+def test_it_holds_generations_effort_fingerprint_versions_and_seeds(make):
     bench = make()
     receipt = read_run_provenance(bench.end())
     settings = bench.settings
@@ -138,16 +138,16 @@ def test_a_run_is_neither_compared_with_itself_nor_with_one_that_began_elsewhere
 def begun(bundle, **changes):
     """A controller of a run that has just begun."""
     settings = RunConfig(**changes).settings(bundle)
-    told = {"settings": asdict(settings), "generation": 0, "steps": 10}
+    provenance = {"settings": asdict(settings), "generation": 0, "steps": 10}
     still = np.zeros(settings.controller.size, np.float32)
-    return Controller(settings.controller, still, settings.task.task, bundle.sha256, told)
+    return Controller(settings.controller, still, settings.task.task, bundle.sha256, provenance)
 
 
 def test_a_run_that_closed_nothing_cannot_be_repeated(random_bundle):
     controller = begun(random_bundle)
-    told = {**controller.provenance, "receipt": {"generations": 0, "effort": {}}}
+    provenance = {**controller.provenance, "receipt": {"generations": 0, "effort": {}}}
     with pytest.raises(ControllerError, match="closed no generation"):
-        Rerun.of(replace(controller, provenance=told), random_bundle)
+        Rerun.of(replace(controller, provenance=provenance), random_bundle)
 
 
 def test_no_file_chooses_what_is_imported(random_bundle):
@@ -190,7 +190,7 @@ def test_whether_hosts_of_the_second_time_are_of_the_first_ones_class_is_said(ma
     assert f"of class {'a' * 16}, these are of {'b' * 16}" in again.compare(second.path).summary
 
 
-def test_a_result_is_counted_once_whoever_says_it_again(make):
+def test_a_result_is_counted_once_when_it_is_repeated(make):
     bench = make()
     for send in bench.run.worker_protocol.dispatch(bench.now):
         bench.given += [work.job for work in send.content.work]

@@ -74,7 +74,7 @@ NEXT = "\n[[stage]]\nhorizon = 50\n"
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "says"),
     [
         ("", "holds 0 stages, and a schedule has 1 to 32"),
         ("stage = []", "holds 0 stages"),
@@ -91,13 +91,13 @@ NEXT = "\n[[stage]]\nhorizon = 50\n"
         ("[[stage", "cannot be read as TOML"),
     ],
 )
-def test_what_no_schedule_can_be_is_one_line(read, text, told):
-    with pytest.raises(UsageError, match=told):
+def test_what_no_schedule_can_be_is_one_line(read, text, says):
+    with pytest.raises(UsageError, match=says):
         read(text)
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "says"),
     [
         ("[[stage]]\nhorizon = 3\n" + NEXT, "stage 1 never ends, and stage 2 would never begin"),
         ("[[stage]]\ngenerations = 3\n[[stage]]\ngenerations = 3\n", "stage 2 is the last and names an end"),
@@ -116,8 +116,8 @@ def test_what_no_schedule_can_be_is_one_line(read, text, told):
         ("[[stage]]\ngenerations = 2\n" + NEXT + "population = 2\n", "stage 2: cma needs a population of at least 3"),
     ],
 )
-def test_what_this_run_cannot_do_is_one_line(settings, text, told):
-    with pytest.raises(UsageError, match=told):
+def test_what_this_run_cannot_do_is_one_line(settings, text, says):
+    with pytest.raises(UsageError, match=says):
         settings(text)
 
 

@@ -40,10 +40,10 @@ class Staged(Evaluated):
     def outcome(self):
         with RunFolder(self.path) as run:
             numbers = [(number, index) for number in range(GENERATIONS) for index in range(SIZES[number])]
-            told = [(run.candidate(*each).tobytes(), run.fitness(*each)) for each in numbers]
+            found = [(run.candidate(*each).tobytes(), run.fitness(*each)) for each in numbers]
             kept = [(each.episode, each.seed, each.fitness) for place in numbers for each in run.results(*place)]
             begun = begun_stages(run.settings, run.history(), run.evaluations())
-            return told, kept, [each for each in run.evaluations() if each.generation % EVERY], begun
+            return found, kept, [each for each in run.evaluations() if each.generation % EVERY], begun
 
 
 @pytest.fixture
@@ -143,14 +143,14 @@ def test_the_log_says_when_a_stage_begins_and_why(staged):
 
 
 def test_the_status_says_which_stage_it_is_and_what_counts_there(staged):
-    bench, told = staged("night"), []
-    bench.drive(lambda _: 0, lambda: told.append(take_snapshot(bench.run, "night", {}, 0.0, 0.0).status))
-    seen = {(each.generation.stage.number, each.generation.stage.since) for each in told}
+    bench, found = staged("night"), []
+    bench.drive(lambda _: 0, lambda: found.append(take_snapshot(bench.run, "night", {}, 0.0, 0.0).status))
+    seen = {(each.generation.stage.number, each.generation.stage.since) for each in found}
     assert seen == {(number, since) for number, since in enumerate(BEGUN, 1)}
-    stage = told[-1].generation.stage
+    stage = found[-1].generation.stage
     assert (stage.total, stage.horizon, stage.patience, stage.population, stage.episodes) == (4, 600, 0, 8, 2)
     console = Console(file=io.StringIO(), width=120)
-    console.print(RunPanel(told[-1]))
+    console.print(RunPanel(found[-1]))
     shown = console.file.getvalue()
     assert "4 of 4, since generation 10" in shown
     assert "600 steps" in shown

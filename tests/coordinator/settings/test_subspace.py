@@ -43,7 +43,7 @@ def test_it_keeps_to_the_subspace_and_continues_to_the_bit(optimiser, covariance
     whole, first = (Evolution(config(optimiser, covariance), start) for _ in range(2))
     run(whole, range(12))
     run(first, range(5))
-    second = Evolution(config(optimiser, covariance))  # whoever continues a run does not know where its search began
+    second = Evolution(config(optimiser, covariance))  # a resumed run does not know where its search began
     second.restore(first.state().packed())
     run(second, range(5, 12))
     asked = whole.ask()

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from dreamfleet.coordinator.optimisers.api import Search
-from dreamfleet.coordinator.optimisers.rate_adapted import RateAdapted
-from dreamfleet.coordinator.optimisers.scalars import untag
-from dreamfleet.coordinator.optimisers.separable import Separable
+from dreamfleet.coordinator.optimisers.checkpoint import untag
+from dreamfleet.coordinator.optimisers.cmaes_library import RateAdapted, Separable
 
 LAMBDA = 8
 
