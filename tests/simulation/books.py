@@ -96,7 +96,8 @@ class Sendings:
             for number in member.unconfirmed if member.is_reachable else ():
                 batch = id(member), number
                 quiet = self._awake - max(self._last.get(batch, self._awake), free)
-                link = member.host_stats.transfer_seconds(sum(sent.content.size for sent in member.unconfirmed.values()))
+                size = sum(sent.content.size for sent in member.unconfirmed.values())
+                link = member.host_stats.transfer_seconds(size)
                 patience = (SENT_AGAIN_WITHIN + link) * min(2 ** (self._times[batch] - 1), MAX_PATIENCE)
                 _require(quiet <= patience, "a batch that was not seen is not sent again", "promptness")
 
