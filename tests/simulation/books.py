@@ -117,7 +117,7 @@ def check_worker(worker: Worker, now: float) -> None:
     vectors, queued = len(worker.backlog._vectors), len(worker.backlog.queued)
     _require(vectors <= queued + MAX_UNUSED_VECTORS, "a worker keeps vectors that no job needs", "memory")
     for digest in worker.outbox.digests if worker.nonce is not None and not worker.asking else ():
-        quiet = now - worker.told_at.get(digest, now)
+        quiet = now - worker.sent_at.get(digest, now)
         _require(quiet <= REPEATED_WITHIN, "a result without a verdict is not repeated", "promptness")
 
 
