@@ -73,7 +73,8 @@ def judge(seed):
     error = float(scores.std(ddof=1) / math.sqrt(len(scores)))
     return {
         "seed": seed, "settings": SETTINGS, "generation": confirmed.generation,
-        "reported": confirmed.mean, "error": confirmed.error, "episodes": confirmed.episodes, "best_evaluation": lucky.mean, "best_evaluation_error": lucky.error,
+        "reported": confirmed.mean, "error": confirmed.error, "episodes": confirmed.episodes,
+        "best_evaluation": lucky.mean, "best_evaluation_error": lucky.error,
         "fresh": float(scores.mean()), "fresh_error": error, "tracks": len(scores),
         "off_by": (confirmed.mean - float(scores.mean())) / math.hypot(confirmed.error, error),
         "seconds": [round(evolved - started, 1), round(time.monotonic() - evolved, 1)],
