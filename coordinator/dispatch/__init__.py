@@ -1,1 +1,1 @@
-"""Which worker gets which job: leases, credit, losses, speculative copies. Pure."""
+"""Which worker gets which job: leases, credit, lost workers, speculative copies. Pure."""

@@ -1,1 +1,1 @@
-"""What is to be scored: generations, evaluations, confirmations, collected rollouts. Pure."""
+"""What a run scores: generations, evaluations, confirmations and kept rollouts, as jobs. Pure."""

@@ -1,11 +1,11 @@
-"""Which evaluated mean a run reports, and what it is worth. Pure: scores in, work out.
+"""Which evaluated mean a run reports, with an unbiased score. Pure: scores in, work out.
 
-The best of many evaluations on few tracks is in part the luckiest. So the best few are driven again, by successive
-halving: all on some tracks, the better half of them on as many tracks more, until one is left. Whatever chose it has
-been kind to it, so its score comes from tracks that took no part in any choice.
+The best of many evaluations on few tracks is in part the luckiest. So the best few are driven again by successive
+halving: all on some tracks, the better half on as many more, until one is left. The tracks that chose it favour it, so
+its reported score comes from fresh tracks that chose nothing.
 
-Everything follows from the finished evaluations and from scores that the journal holds: a life of the coordinator that
-is interrupted anywhere goes on to the bit.
+R28: everything follows from finished evaluations and from scores in the journal, with fixed seeds. So a coordinator
+that restarts anywhere continues to the bit.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from dreamfleet.coordinator.jobs.work import Work, make_work
 
 FINALISTS = 4
 FindScores = Callable[[list[bytes]], Mapping[bytes, float]]
-"""Scores of those of these jobs that have one."""
+"""Finds the known scores of jobs, by digest."""
 
 
 @dataclass(frozen=True)
 class Finalist:
-    """The mean after `generation`, as float32 bytes, and its mean score on all tracks that have judged it so far."""
+    """The distribution's mean after `generation`, as float32 bytes, and its mean score on `episodes` tracks so far."""
 
     generation: int
     vector: bytes
@@ -37,25 +37,25 @@ class Finalist:
     mean: float
 
     def with_scores(self, scores: Sequence[float]) -> Finalist:
-        """With a round's scores added."""
+        """This finalist with a round's scores added."""
         episodes = self.episodes + len(scores)
         mean = fsum((self.mean * self.episodes, *scores)) / episodes
         return Finalist(self.generation, self.vector, episodes, mean)
 
 
 class Confirmation:
-    """One confirmation: rounds of about `episodes` episodes each, however many finalists are left.
+    """One confirmation: each round has about `episodes` episodes, shared by the finalists that are left.
 
-    `closed` is how many generations of the run are.
+    `closed` is the number of closed generations of the run.
     """
 
     def __init__(self, spec: TaskSpec, episodes: int, finalists: Sequence[Finalist], closed: int) -> None:
-        self.outcome: StoredConfirmation | None = None  # once there is one
+        self.outcome: StoredConfirmation | None = None  # at the end
         self._spec = spec
         self._episodes = episodes
         self._closed = closed
         self._remaining = list(finalists)
-        self._next = CHOOSING_OFFSET  # the first track of the next round that chooses
+        self._next = CHOOSING_OFFSET  # the first track of the next choosing round
         self._digests: list[bytes] = []  # of the open round, finalist by finalist
         self._scores: dict[bytes, float] = {}
 
@@ -83,11 +83,11 @@ class Confirmation:
 
     @property
     def in_progress(self) -> bool:
-        """Whether the open round still wants scores."""
+        """Whether scores of the open round are missing."""
         return len(self._scores) < len(self._digests)
 
     def advance(self, known: FindScores) -> list[Work]:
-        """Close the round, whose scores are all there, and open the next: its missing jobs; none with the outcome."""
+        """Close a complete round and open the next one; return its missing jobs, none once there is an outcome."""
         missing: list[Work] = []
         while self.outcome is None and not missing:
             if self._digests:
@@ -97,7 +97,7 @@ class Confirmation:
         return missing
 
     def record(self, digest: bytes, score: float) -> None:
-        """Take one accepted score."""
+        """Record one accepted score."""
         if digest in self._digests:
             self._scores[digest] = score
 
@@ -132,12 +132,12 @@ class Confirmation:
 
 
 def total_episodes(finalists: int, episodes: int) -> int:
-    """All that a confirmation of so many finalists drives, if its rounds are of about `episodes`."""
+    """Episodes of a whole confirmation of so many finalists, with rounds of about `episodes` episodes."""
     if finalists < 2:
         return finalists * episodes
     return finalists * max(1, episodes // finalists) + total_episodes(-(-finalists // 2), episodes)
 
 
-def _better_half(standing: Sequence[Finalist]) -> int:
-    """How many go on; none where one is left."""
-    return -(-len(standing) // 2) if len(standing) > 1 else 0
+def _better_half(finalists: Sequence[Finalist]) -> int:
+    """How many finalists go on; 0 if one is left."""
+    return -(-len(finalists) // 2) if len(finalists) > 1 else 0

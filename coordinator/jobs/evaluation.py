@@ -1,4 +1,7 @@
-"""Evaluations of the mean: whole episodes on the same validation tracks each time. Pure: results in, work out."""
+"""Evaluations of the mean: whole episodes on the same validation tracks each time. Pure: results in, work out.
+
+R28: an evaluation is computed only from accepted results on fixed tracks, so a restart gives the same value.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ class Evaluation:
     episodes: int
 
     def work(self, spec: TaskSpec) -> list[Work]:
-        """Its jobs."""
+        """The jobs of this evaluation."""
         return make_work(spec, "evaluate", self.generation, 0, self.vector, validation_seeds(self.episodes))
 
 
@@ -37,13 +40,13 @@ class OpenEvaluation:
 
 
 class Evaluations:
-    """A run's evaluations: those in progress, and those that are finished, by generation."""
+    """A run's evaluations: the open and the finished ones, by generation."""
 
     def __init__(self, finished: Iterable[StoredEvaluation] = ()) -> None:
         self.finished: dict[int, StoredEvaluation] = {}
         self._open: dict[int, OpenEvaluation] = {}
-        self.rows: tuple[StoredEvaluation, ...] = ()  # the finished ones by generation: never changed, but replaced
-        self._bests: list[StoredEvaluation] = []  # the best of each row and those before it
+        self.rows: tuple[StoredEvaluation, ...] = ()  # the finished ones by generation; replaced, never changed
+        self._bests: list[StoredEvaluation] = []  # for each row the best one up to it
         for each in finished:
             self.add(each)
 
@@ -51,7 +54,7 @@ class Evaluations:
         return len(self.rows)
 
     def add(self, each: StoredEvaluation) -> None:
-        """Take a finished evaluation; they finish nearly in the order of their generations."""
+        """Add a finished evaluation; they finish nearly in the order of their generations."""
         place = bisect(self.rows, each.generation, key=lambda row: row.generation)
         self.rows = (*self.rows[:place], each, *self.rows[place:])
         self.finished[each.generation] = each
@@ -61,26 +64,26 @@ class Evaluations:
             self._bests.append(row if row.mean > best.mean else best)
 
     def open(self, evaluation: Evaluation, spec: TaskSpec, known: Mapping[bytes, float]) -> list[Work]:
-        """Begin an evaluation of which some scores may be known already; its missing jobs."""
+        """Open an evaluation with the scores that are known already; return its missing jobs."""
         work = evaluation.work(spec)
         digests = [each.job.digest for each in work]
-        asked = {digest for each in self._open.values() for digest in each.digests}
+        wanted = {digest for each in self._open.values() for digest in each.digests}
         scores = {digest: known[digest] for digest in digests if digest in known}
         self._open[evaluation.generation] = OpenEvaluation(evaluation, digests, scores)
-        return [each for each in work if each.job.digest not in scores and each.job.digest not in asked]
+        return [each for each in work if each.job.digest not in scores and each.job.digest not in wanted]
 
     def record(self, digest: bytes, score: float) -> list[int]:
-        """Take one accepted score; the generations whose evaluations it is of.
+        """Record one accepted score; return the generations whose evaluations it belongs to.
 
-        A run that has converged evaluates the same mean again: its jobs are the same, and one score is each one's.
+        A run that has converged evaluates the same mean again: the jobs are the same, and each score counts for all.
         """
-        wanting = [generation for generation, each in self._open.items() if digest in each.digests]
-        for generation in wanting:
+        waiting = [generation for generation, each in self._open.items() if digest in each.digests]
+        for generation in waiting:
             self._open[generation].scores[digest] = score
-        return wanting
+        return waiting
 
     def finish(self, generation: int) -> tuple[StoredEvaluation, bytes] | None:
-        """End an evaluation that has all of its scores: what it gave, and the vector; `None` while it has not."""
+        """Close an evaluation whose scores are complete: its result and its vector; `None` while some are missing."""
         each = self._open[generation]
         if len(each.scores) < len(each.digests):
             return None
@@ -91,34 +94,34 @@ class Evaluations:
         return finished, each.evaluation.vector
 
     def is_open(self, generation: int) -> bool:
-        """Whether the evaluation of this generation's mean is in progress."""
+        """Whether the evaluation of this generation's mean is open."""
         return generation in self._open
 
     @property
     def open_count(self) -> int:
-        """Evaluations in progress."""
+        """How many evaluations are open."""
         return len(self._open)
 
     @property
     def progress(self) -> tuple[int, int]:
-        """Episodes of those in progress: done, wanted."""
+        """Episodes of the open evaluations: done, wanted."""
         opened = self._open.values()
         return sum(len(each.scores) for each in opened), sum(len(each.digests) for each in opened)
 
     @property
     def last(self) -> StoredEvaluation | None:
-        """The finished one of the latest generation."""
+        """The finished evaluation of the latest generation."""
         return self.rows[-1] if self.rows else None
 
     @property
     def best(self) -> StoredEvaluation | None:
-        """The finished one of the highest mean; of equals the earlier."""
+        """The finished evaluation with the highest mean; of equals the earliest."""
         return self._bests[-1] if self._bests else None
 
     def have_fallen_behind(self, count: int) -> bool:
-        """Whether the last `count` evaluations each lie clearly behind the best before them.
+        """Whether each of the last `count` evaluations is clearly below the best one before them.
 
-        That is how a dream that is being exploited looks: fitness in the dream goes on rising, reality falls.
+        This shows that the search exploits the dream: fitness in the dream rises while the real score falls.
         """
         if len(self.rows) <= count:
             return False

@@ -24,12 +24,12 @@ class CandidateScores:
 
 
 class Generation:
-    """Which candidate's which episode each digest is, and its fitness once known.
+    """A table of scores, a row for each candidate and a column for each episode, and the digest of each place.
 
-    With `racing` every candidate drives the first half of the episodes, and after this barrier the better half of the
-    candidates the others; of equals the one with the lower index goes on. `own` is the run's specification where
-    `spec`, at a raised temperature or in a later stage, is another. Of a dream's episodes a candidate drives the first
-    `driven` in the world that it dreams of.
+    With `racing` all candidates drive the first half of the episodes; after this barrier only the better half of the
+    candidates drives the second half. Of equals the one with the lower index goes on. `run_spec` is the run's
+    specification, if `spec` differs from it: at a raised temperature or in a later stage. In a dream the first `driven`
+    episodes are driven in the real world.
     """
 
     def __init__(
@@ -38,13 +38,15 @@ class Generation:
     ) -> None:  # fmt: skip
         self.number = number
         self.spec = spec
-        self.is_one_point = len(set(vectors)) == 1 < len(vectors)  # as they travel: nothing can be learned from it
+        self.is_one_point = (
+            len(set(vectors)) == 1 < len(vectors)
+        )  # compared as float32: nothing can be learned from equal ones
         parts = (spec.with_overrides(driven=True), seeds[:driven], 0), (spec, seeds[driven:], driven)
         self.work = [
             work
             for candidate, vector in enumerate(vectors)
-            for each, some, first in parts
-            for work in make_work(each, "score", number, candidate, vector, some, run_spec or spec, first)
+            for part_spec, part_seeds, first in parts
+            for work in make_work(part_spec, "score", number, candidate, vector, part_seeds, run_spec or spec, first)
         ]
         # Equal vectors have equal digests: one job then fills the place of each of them.
         self._places: dict[bytes, list[tuple[int, int]]] = {}
@@ -79,18 +81,24 @@ class Generation:
         return self.done == self.total
 
     def record(self, digest: bytes, fitness: float, steps: int) -> bool:
-        """Take one accepted result of this generation; whether it opened the second half."""
+        """Record one accepted result of this generation; return whether it opened the second half.
+
+        R27: the digest names the place that a result fills, so the order of arrival does not matter.
+        """
         for place in self._places[digest]:
             self._scores[place] = fitness
         self.steps += steps
         return self._open_second_half()
 
     def fitness(self) -> NDArray[np.float64]:
-        """What the strategy is told `(population,)`: the mean of each candidate's own episodes."""
+        """The fitness of each candidate, `(population,)`: the mean of its own episodes.
+
+        R27: a mean is taken over a whole row, so any order of results gives the same bits.
+        """
         return np.asarray(np.nanmean(self._scores, axis=1))
 
     def candidate_scores(self) -> CandidateScores:
-        """How each candidate is doing now."""
+        """The scores of all candidates so far."""
         scored = np.isfinite(self._scores)
         done = scored.sum(axis=1)
         with np.errstate(over="ignore"):  # of a generation that an older version closed

@@ -1,4 +1,4 @@
-"""Closed generations with running sums: what is asked of them costs the same however long a run is. Pure."""
+"""Closed generations with running sums, so that a query costs the same however long a run is. Pure."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ class History:
     """Every closed generation, oldest first; it only grows."""
 
     def __init__(self, rows: Iterable[StoredGeneration] = ()) -> None:
-        self.steps = 0  # environment steps of all of them
+        self.steps = 0  # environment steps of all generations
         self.seconds = 0.0
         self._rows: list[StoredGeneration] = []
         for row in rows:
             self.append(row)
 
     def append(self, row: StoredGeneration) -> None:
-        """Take the generation that has just been closed."""
+        """Add the generation that was just closed."""
         self._rows.append(row)
         self.steps = clamp_count(self.steps + row.steps)
         self.seconds = to_finite(self.seconds + row.seconds)
@@ -29,16 +29,16 @@ class History:
 
     @property
     def rows(self) -> Sequence[StoredGeneration]:
-        """All of them, not to be changed; nothing is copied."""
+        """All closed generations, not copied: do not change the list."""
         return self._rows
 
     @property
     def last(self) -> StoredGeneration | None:
-        """The one that was closed last."""
+        """The generation that was closed last."""
         return self._rows[-1] if self._rows else None
 
     def view(self) -> HistoryView:
-        """It as it is now, for other threads; nothing is copied."""
+        """A view of the history as it is now, for other threads; nothing is copied."""
         return HistoryView(self._rows, len(self._rows))
 
 

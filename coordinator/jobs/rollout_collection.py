@@ -1,4 +1,4 @@
-"""Rollouts of the mean that are kept: the next world model then learns from what evolved controllers see."""
+"""Rollouts of the mean that are kept, so that the next world model learns from what evolved controllers see."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ class RolloutCollection:
     episodes: int
 
     def work(self, spec: TaskSpec, run_seed: int, run_spec: TaskSpec | None = None) -> list[Work]:
-        """Its jobs; `run_spec` is the run's specification where `spec` is another."""
+        """The jobs of this collection; `run_spec` is the run's specification if `spec` differs from it."""
         seeds = [collection_seed(run_seed, self.generation, episode) for episode in range(self.episodes)]
         return make_work(spec, "collect", self.generation, 0, self.vector, seeds, run_spec)
 
 
 class RolloutCollections:
-    """A run's kept rollouts: which are still to come, and each one's file in the run's `folder` once it is whole."""
+    """A run's kept rollouts: which are missing, and their files in the run's `folder`."""
 
     def __init__(self, folder: Path) -> None:
         self.uploads = UploadAssembler()
         self._folder = folder
         self._missing: set[bytes] = set()  # digests
-        self._scheduled = 0  # rollouts, ever
+        self._scheduled = 0  # rollouts of the whole run
 
     def open(self, work: list[Work], known: Container[bytes]) -> list[Work]:
-        """Want these rollouts, of which some may be kept already; the missing jobs."""
+        """Want these rollouts; return the jobs of those that are not kept already."""
         missing = [each for each in work if each.job.digest not in known]
         self._scheduled += len(work)
         self._missing.update(each.job.digest for each in missing)
@@ -51,7 +51,7 @@ class RolloutCollections:
 
     @property
     def missing_count(self) -> int:
-        """Rollouts that are still to come."""
+        """How many rollouts are missing."""
         return len(self._missing)
 
     @property
@@ -60,7 +60,10 @@ class RolloutCollections:
         return self._scheduled - len(self._missing), self._scheduled
 
     def receive(self, worker: str, result: Result, work: Work | None) -> Result | None:
-        """The result as it may be judged, its rollout on disk if it has one; `None` while the rollout is on its way."""
+        """The result to judge, with its rollout saved; `None` while the rollout is on its way.
+
+        R6: the rollout is on disk before the result can get a verdict, so a crash loses no rollout.
+        """
         if work is None or work.job.kind != "collect" or result.fitness is None:
             return result
         if result.upload is None:

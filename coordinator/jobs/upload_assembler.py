@@ -1,6 +1,6 @@
-"""Rollouts on their way in: parts in any order, doubled or missing, until the whole has its hash. Pure.
+"""Rollouts that arrive in parts, in any order, repeated or missing, until the whole has its hash. Pure.
 
-Memory is bounded whatever arrives: so many uploads, so many bytes, and none that stands still for long.
+R26: memory is bounded whatever arrives: a number of uploads, a number of bytes, and a time without progress.
 """
 
 from __future__ import annotations
@@ -14,30 +14,30 @@ from dreamfleet.common.protocol.messages import MAX_PART, MAX_UPLOAD, UploadPart
 
 @dataclass(frozen=True)
 class UploadLimits:
-    """How much may be open at once, in uploads and bytes, and for how many seconds one may stand still."""
+    """The most open uploads, their most bytes, and the most seconds without a new part."""
 
     count: int = 64
     size: int = 4 * MAX_UPLOAD
-    idle: float = 60.0  # several of the longest pauses that a worker makes between repetitions
+    idle: float = 60.0  # several times the longest pause of a worker between repetitions
 
 
 @dataclass
 class PartialUpload:
-    """What has come of one job's file from one worker."""
+    """The parts of one job's file from one worker."""
 
     sha256: bytes
     total: int
-    grew_at: float  # when it last grew
+    grew_at: float  # when its last new part came
     parts: dict[int, bytes] = field(default_factory=dict)  # offset -> bytes
     whole: bytes | None = None
 
 
 class UploadAssembler:
-    """The open uploads, by worker and job; what is not taken in is counted by reason in `dropped`."""
+    """The open uploads by worker and job; `dropped` counts refused parts and uploads by reason."""
 
-    def __init__(self, config: UploadLimits | None = None) -> None:
+    def __init__(self, limits: UploadLimits | None = None) -> None:
         self.dropped: Counter[str] = Counter()
-        self._config = config or UploadLimits()
+        self._limits = limits or UploadLimits()
         self._open: dict[tuple[str, bytes], PartialUpload] = {}
 
     def __len__(self) -> int:
@@ -45,11 +45,14 @@ class UploadAssembler:
 
     @property
     def size(self) -> int:
-        """Bytes that the open uploads hold at most."""
+        """Bytes of the open uploads once they are whole."""
         return sum(upload.total for upload in self._open.values())
 
     def add(self, worker: str, part: UploadPart, now: float) -> None:
-        """Take in one part; the last one that was missing makes the whole, or ends it if its hash is another."""
+        """Add one part. The last missing one completes the upload, or drops it if the whole has another hash.
+
+        R26: an upload that exceeds a limit is not opened; its worker sends it again later.
+        """
         if not 0 < part.total <= MAX_UPLOAD:
             self.dropped["upload of a forbidden size"] += 1
             return
@@ -65,18 +68,18 @@ class UploadAssembler:
             self._finish(worker, part.digest, upload)
 
     def get_complete(self, worker: str, digest: bytes, sha256: bytes) -> bytes | None:
-        """The whole file of this hash, if this worker has sent it; it stays until `forget`."""
+        """The whole file with this hash, if this worker has sent it; it is kept until `forget`."""
         upload = self._open.get((worker, digest))
         return upload.whole if upload is not None and upload.sha256 == sha256 else None
 
     def forget(self, digest: bytes) -> None:
-        """The job is not wanted any more, from whomever."""
+        """Drop all uploads of a job that is wanted no more."""
         for key in [key for key in self._open if key[1] == digest]:
             del self._open[key]
 
     def tick(self, now: float) -> None:
-        """Let go of what stands still; its worker sends it again from the beginning."""
-        for key in [key for key, upload in self._open.items() if now - upload.grew_at > self._config.idle]:
+        """Drop uploads without progress; their workers send them again from the beginning."""
+        for key in [key for key, upload in self._open.items() if now - upload.grew_at > self._limits.idle]:
             del self._open[key]
             self.dropped["abandoned upload"] += 1
 
@@ -85,10 +88,10 @@ class UploadAssembler:
         upload = self._open.get(key)
         if upload is not None and (upload.sha256, upload.total) == (part.sha256, part.total):
             return upload
-        if upload is not None:  # driven again, to other bytes
+        if upload is not None:  # the episode was driven again, with another result
             del self._open[key]
             self.dropped["replaced upload"] += 1
-        if len(self._open) >= self._config.count or self.size + part.total > self._config.size:
+        if len(self._open) >= self._limits.count or self.size + part.total > self._limits.size:
             self.dropped["too many uploads"] += 1
             return None
         self._open[key] = PartialUpload(part.sha256, part.total, now)

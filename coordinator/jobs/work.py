@@ -1,4 +1,4 @@
-"""From a parameter vector and seeds to jobs."""
+"""Jobs, made from a parameter vector and seeds."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.protocol.messages import Job, Kind, TaskSpec
 
-STALL_SECONDS = 30.0
+STALL_SECONDS = 30.0  # without a step, after which a worker gives a job up
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Work:
 
 
 def vector_bytes(vector: NDArray[np.float64]) -> bytes:
-    """A parameter vector as it travels, is scored, hashed and journalled: float32, little-endian."""
+    """A parameter vector as float32 little-endian bytes: so it is sent, scored, hashed and journalled."""
     return vector.astype("<f4").tobytes()
 
 
@@ -31,11 +31,11 @@ def make_work(
     spec: TaskSpec, kind: Kind, generation: int, candidate: int, vector: bytes, seeds: Sequence[int],
     run_spec: TaskSpec | None = None, first: int = 0,
 ) -> list[Work]:  # fmt: skip
-    """One job an episode, numbered from `first` on; `seeds` holds one seed an episode.
+    """One job for each seed, an episode each, numbered from `first` on.
 
-    `run_spec` is the run's specification where `spec` is another.
-
-    A job names its temperature, horizon, patience and whether it is driven only where they are not the run's own.
+    `run_spec` is the run's specification if `spec` differs from it. A job names its temperature, horizon, patience and
+    whether it is driven only if they differ from the run's. R1: the digest covers kind, parameters, seeds and
+    specification, so a correct result is the same from any worker and still fits after a restart.
     """
     identity = hashlib.sha256(vector).digest()
     run_spec = run_spec or spec

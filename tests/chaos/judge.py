@@ -1,4 +1,4 @@
-"""Does a run tell the truth: the mean that it reports against the same controller on 100 tracks that nobody has seen.
+"""Is the reported mean unbiased: a run's figure against the same controller on 100 tracks that nobody has seen.
 
 python -m tests.chaos.judge --runs 20 --out build/judge.jsonl
 
@@ -34,7 +34,7 @@ SETTINGS = {
 }  # fmt: skip
 TRACKS = TEST[:100]
 PATIENCE = 1800  # seconds of a run at most
-LEAST = 0.9  # of the runs must tell the truth
+LEAST = 0.9  # of the runs must report a fair mean
 
 
 def evolve(processes, seed):
@@ -67,15 +67,16 @@ def judge(seed):
         name = evolve(processes, seed)
         evolved = time.monotonic()
         with open_run(processes.runs, name) as run:
-            told, lucky = run.confirmation(), best_evaluation(run.evaluations())
+            confirmed, lucky = run.confirmation(), best_evaluation(run.evaluations())
             controller = Controller.load(run.controller_path)
     scores = np.array(drive(controller))
     error = float(scores.std(ddof=1) / math.sqrt(len(scores)))
     return {
-        "seed": seed, "settings": SETTINGS, "generation": told.generation, "reported": told.mean, "error": told.error,
-        "episodes": told.episodes, "best_evaluation": lucky.mean, "best_evaluation_error": lucky.error,
+        "seed": seed, "settings": SETTINGS, "generation": confirmed.generation,
+        "reported": confirmed.mean, "error": confirmed.error, "episodes": confirmed.episodes,
+        "best_evaluation": lucky.mean, "best_evaluation_error": lucky.error,
         "fresh": float(scores.mean()), "fresh_error": error, "tracks": len(scores),
-        "off_by": (told.mean - float(scores.mean())) / math.hypot(told.error, error),
+        "off_by": (confirmed.mean - float(scores.mean())) / math.hypot(confirmed.error, error),
         "seconds": [round(evolved - started, 1), round(time.monotonic() - evolved, 1)],
     }  # fmt: skip
 
@@ -121,9 +122,9 @@ def main():
                 file=sys.stderr,
             )
     lines = finished(args.out)
-    told = summary([lines[seed] for seed in seeds])
-    print(json.dumps(told) if args.json else "\n".join(f"{name}: {value}" for name, value in told.items()))
-    return 0 if told["passed"] else 1
+    report = summary([lines[seed] for seed in seeds])
+    print(json.dumps(report) if args.json else "\n".join(f"{name}: {value}" for name, value in report.items()))
+    return 0 if report["passed"] else 1
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ def main() -> int:
     if arguments.replay:
         return _replay(arguments.replay)
     tally, report = run(arguments.schedules, arguments.seed, arguments.jobs, arguments.first)
-    found = [_told(outcome) for outcome in shrunk(tally, arguments.seed)]
+    found = [_describe(outcome) for outcome in shrunk(tally, arguments.seed)]
     if arguments.json:
         print(json.dumps(report | {"found": found}))
         return 1 if found else 0
@@ -42,13 +42,13 @@ def main() -> int:
 
 def _replay(text: str) -> int:
     outcome = play(Schedule.from_json(text))
-    told = _told(outcome)
-    print(f"{told['violation'] or 'no rule is broken'}\n{told['trace']}{outcome.now:.2f} virtual seconds, "
+    described = _describe(outcome)
+    print(f"{described['violation'] or 'no rule is broken'}\n{described['trace']}{outcome.now:.2f} virtual seconds, "
           f"{outcome.events} events, faults: {dict(outcome.happened)}")  # fmt: skip
     return 1 if outcome.violation else 0
 
 
-def _told(outcome: Outcome) -> dict[str, str]:
+def _describe(outcome: Outcome) -> dict[str, str]:
     violation = "" if outcome.violation is None else str(outcome.violation)
     return {"violation": violation, "schedule": outcome.schedule.to_json(), "trace": outcome.trace}
 

@@ -96,9 +96,8 @@ class Sendings:
             for number in member.unconfirmed if member.is_reachable else ():
                 batch = id(member), number
                 quiet = self._awake - max(self._last.get(batch, self._awake), free)
-                link = member.host_stats.transfer_seconds(
-                    sum(sent.content.size for sent in member.unconfirmed.values())
-                )
+                size = sum(sent.content.size for sent in member.unconfirmed.values())
+                link = member.host_stats.transfer_seconds(size)
                 patience = (SENT_AGAIN_WITHIN + link) * min(2 ** (self._times[batch] - 1), MAX_PATIENCE)
                 _require(quiet <= patience, "a batch that was not seen is not sent again", "promptness")
 
@@ -118,7 +117,7 @@ def check_worker(worker: Worker, now: float) -> None:
     vectors, queued = len(worker.backlog._vectors), len(worker.backlog.queued)
     _require(vectors <= queued + MAX_UNUSED_VECTORS, "a worker keeps vectors that no job needs", "memory")
     for digest in worker.outbox.digests if worker.nonce is not None and not worker.asking else ():
-        quiet = now - worker.told_at.get(digest, now)
+        quiet = now - worker.sent_at.get(digest, now)
         _require(quiet <= REPEATED_WITHIN, "a result without a verdict is not repeated", "promptness")
 
 

@@ -44,7 +44,7 @@ class Witness(Protocol):
 
     def opened(self, number: int, vectors: tuple[bytes, ...]) -> None: ...
     def counted(self, job: Job, result: Result) -> None: ...
-    def told(self, number: int, fitness: list[float]) -> None: ...
+    def check_fitness(self, number: int, fitness: list[float]) -> None: ...
     def evaluated(self, generation: int, mean: float, std: float) -> None: ...
 
 
@@ -114,7 +114,7 @@ class MemoryJournal:
         row = self._tables["generation"][closed.number]
         if "closed" in row:
             raise Violation("counted twice", f"generation {closed.number} was closed before")
-        self._witness.told(closed.number, fitness.tolist())
+        self._witness.check_fitness(closed.number, fitness.tolist())
         self._put("generation", closed.number, {**row, "closed": closed, "fitness": fitness.tolist()})
 
     def add_result(
@@ -181,7 +181,7 @@ class MemoryJournal:
     def _insert(self, table: str, key: Any, row: Any) -> None:
         """As a table with a primary key does."""
         if key in self._tables[table]:
-            raise Violation("counted twice", f"the journal's {table} holds {_told(key)} already")
+            raise Violation("counted twice", f"the journal's {table} holds {_key_text(key)} already")
         self._put(table, key, row)
 
     def _put(self, table: str, key: Any, row: Any) -> None:
@@ -196,5 +196,5 @@ def _apply(rows: dict[Any, Any], key: Any, row: Any) -> None:
         rows[key] = row
 
 
-def _told(key: Any) -> str:
+def _key_text(key: Any) -> str:
     return key.hex()[:12] if isinstance(key, bytes) else str(key)

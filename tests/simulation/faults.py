@@ -39,13 +39,13 @@ def _cut(world: World, fault: Fault) -> bool:
     world.links[host].cuts += 1
     world.later(fault.amount / 2, world.lose_sight, host)
     if worker is not None:
-        world.later(fault.amount, world.tell_coordinator, worker.identity, "gone")
+        world.later(fault.amount, world.send_to_coordinator, worker.identity, "gone")
     world.later(fault.seconds, _mend, world, host)
     return True
 
 
 def _cut_unnoticed(world: World, fault: Fault) -> bool:
-    """As a cut, but shorter than anybody's lease: nobody is told."""
+    """Like a cut, but shorter than any lease: neither side notices."""
     host = _host(world, fault)
     world.links[host].cuts += 1
     world.later(fault.seconds, _mend, world, host)
@@ -63,18 +63,18 @@ def _lose_token(world: World, fault: Fault) -> bool:
     if worker is None:
         return False
     if fault.amount < 0.6:
-        world.tell_coordinator(worker.identity, "gone")
+        world.send_to_coordinator(worker.identity, "gone")
     else:
         world.look(_host(world, fault), blink=True)
     return True
 
 
 def _late_token(world: World, fault: Fault) -> bool:
-    """A departure that is told `amount` seconds late, perhaps of one who has come back."""
+    """A departure that is reported `amount` seconds late, perhaps after the worker is back."""
     worker = _worker(world, fault)
     if worker is None:
         return False
-    world.later(fault.amount, world.tell_coordinator, worker.identity, "gone")
+    world.later(fault.amount, world.send_to_coordinator, worker.identity, "gone")
     return True
 
 
@@ -87,13 +87,13 @@ def _kill_worker(world: World, fault: Fault) -> bool:
 
 
 def _stop_worker(world: World, fault: Fault) -> bool:
-    """A process stands still, and goes on as if nothing had happened; beyond a lease both sides are told."""
+    """A process is suspended and goes on; if that takes longer than a lease, both sides notice."""
     worker, host = _worker(world, fault), _host(world, fault)
     if worker is None or worker.stopped:
         return False
     worker.stopped = True
     if fault.seconds > LEASE:
-        world.later(LEASE, world.tell_coordinator, worker.identity, "gone")
+        world.later(LEASE, world.send_to_coordinator, worker.identity, "gone")
     world.later(fault.seconds, _go_on, world, host, worker, fault.seconds > LEASE)
     return True
 
@@ -165,7 +165,7 @@ def _continue_coordinator(world: World, life: object, parted: bool) -> None:
     world.coordinator_stopped = False
     for host, worker in enumerate(world.workers):
         if parted and worker is not None:
-            world.tell_coordinator(worker.identity, "gone")
+            world.send_to_coordinator(worker.identity, "gone")
             world.look(host, blink=True)
     world._wakes.pop(-1, None)
     world.wake_coordinator(0.0)
@@ -199,7 +199,7 @@ def _stranger(world: World, fault: Fault) -> bool:
     worker = _worker(world, fault)
     identity = worker.identity if worker is not None else "stranger/0badc0de"
     result = Result(digest, 99.0, STEPS, 0.1, None, None)
-    world.tell_coordinator(identity, ResultBatch(run_uid=UID, incarnation=1, fingerprint="f", results=(result,)))
+    world.send_to_coordinator(identity, ResultBatch(run_uid=UID, incarnation=1, fingerprint="f", results=(result,)))
     return True
 
 

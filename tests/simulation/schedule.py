@@ -43,7 +43,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Fault:
-    """One disturbance. What `amount` means is told by the kind, in `faults.py`."""
+    """One disturbance. The kind decides what `amount` means, see `faults.py`."""
 
     at: float
     kind: str
@@ -99,10 +99,10 @@ class Schedule:
     @classmethod
     def from_json(cls, text: str) -> Schedule:
         """What `to_json` wrote."""
-        told = json.loads(text)
+        parsed = json.loads(text)
         known = {field.name for field in fields(Shape)}
-        shape = Shape(**{key: value for key, value in told["shape"].items() if key in known})
-        return cls(shape, tuple(Fault(*row) for row in told["faults"]), told["name"])
+        shape = Shape(**{key: value for key, value in parsed["shape"].items() if key in known})
+        return cls(shape, tuple(Fault(*row) for row in parsed["faults"]), parsed["name"])
 
     def without(self, start: int, end: int) -> Schedule:
         """The same without some of its faults."""

@@ -1,4 +1,4 @@
-"""What is true of a run whatever happens to it: what every episode gives, and what a fleet without faults would tell.
+"""What is true of a run whatever happens to it: what every episode gives, and what a fleet without faults computes.
 
 Restated here from the protocol, apart from the product's own code, so that a fault in that is not a fault in both.
 """
@@ -29,33 +29,33 @@ Named = tuple[float | None, int | None, int | None, bool | None]  # nothing is d
 
 
 class Strategy:
-    """A search that is cheap, exact, and depends on every bit that it is told."""
+    """A search that is cheap, exact, and depends on every bit of the fitness."""
 
     requirement = "simulated==1"
     options: ClassVar[Mapping[str, str]] = {}
 
     def __init__(self, search: Search) -> None:
         self._search = search
-        self.mean, self.sigma, self._told = search.mean, search.sigma0, 0
+        self.mean, self.sigma, self._count = search.mean, search.sigma0, 0
 
     def ask(self) -> Any:
-        source = np.random.Generator(np.random.PCG64([self._search.seed, self._told]))
+        source = np.random.Generator(np.random.PCG64([self._search.seed, self._count]))
         steps = source.standard_normal((self._search.population, self._search.dimension), dtype=np.float32)
         self._asked = self.mean + self.sigma * steps
         return self._asked
 
     def tell(self, fitness: Any) -> None:
         self.mean = fitness @ self._asked / fitness.sum()
-        self.sigma, self._told = self.sigma * 0.99, self._told + 1
+        self.sigma, self._count = self.sigma * 0.99, self._count + 1
 
     def prepare(self) -> None:
         pass
 
     def state(self) -> dict[str, Any]:
-        return {"mean": self.mean, "sigma": np.array(self.sigma), "told": np.array(self._told)}
+        return {"mean": self.mean, "sigma": np.array(self.sigma), "count": np.array(self._count)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        self.mean, self.sigma, self._told = state["mean"], float(state["sigma"]), int(state["told"])
+        self.mean, self.sigma, self._count = state["mean"], float(state["sigma"]), int(state["count"])
 
 
 @lru_cache(4096)
@@ -100,8 +100,8 @@ def fitness_of_job(job: Job) -> float:
 
 def _fitness(identity: bytes, seed: int, named: Named) -> float:
     content = seed, *(named if any(named[1:]) else named[:1])
-    told = hashlib.blake2b(identity + repr(content).encode(), digest_size=4).digest()
-    return 1.0 + int.from_bytes(told, "little") / 2**32
+    hashed = hashlib.blake2b(identity + repr(content).encode(), digest_size=4).digest()
+    return 1.0 + int.from_bytes(hashed, "little") / 2**32
 
 
 def rollout_of(vector: bytes, seed: int, size: int) -> bytes:
@@ -114,7 +114,7 @@ class Truth:
     """An undisturbed run, generation by generation."""
 
     vectors: list[tuple[bytes, ...]]
-    told: list[list[float]]
+    fitness: list[list[float]]
     evaluations: dict[int, StoredEvaluation]
     rollouts: dict[str, bytes]  # by the name of their file
     jobs: int  # that are counted
@@ -141,11 +141,11 @@ def _truth(shape: Shape) -> Truth:
         vectors = tuple(row.astype("<f4").tobytes() for row in strategy.ask())
         seeds = [training_seed(shape.run_seed, number, episode) for episode in range(episodes)]
         scores = [[fitness_of(vector, seed, named) for seed in seeds] for vector in vectors]
-        told, driven = _told(scores, racing)
+        fitness, driven = _fitness_and_driven(scores, racing)
         truth.vectors.append(vectors)
-        truth.told.append(told)
+        truth.fitness.append(fitness)
         counted |= {("score", vectors[candidate], seeds[episode]) for candidate, episode in driven}
-        strategy.tell(np.array(told))
+        strategy.tell(np.array(fitness))
         last = number == shape.generations - 1
         mean = strategy.mean.astype("<f4").tobytes()
         if _due(shape.evaluate_every, number, last and shape.ends):
@@ -157,7 +157,7 @@ def _truth(shape: Shape) -> Truth:
             seed = collection_seed(shape.run_seed, number, 0)
             truth.rollouts[f"{number:06d}-0000.npz"] = rollout_of(mean, seed, shape.rollout)
             counted.add(("collect", mean, seed))
-    # One more is asked for when the last is told, so that a run with wider limits could go on from it.
+    # A further generation is asked for at the end, so that a run with wider limits could go on from it.
     if not second and shape.anew and _first_is_over(shape, shape.generations, truth.evaluations):
         strategy = _second_search(shape, strategy)
     truth.vectors.append(tuple(row.astype("<f4").tobytes() for row in strategy.ask()))
@@ -177,7 +177,7 @@ def _second_search(shape: Shape, first: Strategy) -> Strategy:
     return Strategy(Search(first.mean, shape.population + 1, SECOND_SIGMA, search_seed(shape.run_seed, 2)))
 
 
-def _told(scores: list[list[float]], racing: bool) -> tuple[list[float], set[tuple[int, int]]]:
+def _fitness_and_driven(scores: list[list[float]], racing: bool) -> tuple[list[float], set[tuple[int, int]]]:
     """The mean of each candidate's own episodes, and which those are."""
     episodes = len(scores[0])
     first = (episodes + 1) // 2 if racing else episodes

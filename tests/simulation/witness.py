@@ -29,11 +29,11 @@ class Witness:
         if result.fitness != fitness_of_job(job):
             raise Violation("content", f"a {job.kind} of generation {job.generation} has a fitness of another content")
 
-    def told(self, number: int, fitness: list[float]) -> None:
-        """The strategy was told."""
-        if fitness != self.truth.told[number]:
+    def check_fitness(self, number: int, fitness: list[float]) -> None:
+        """The strategy got this fitness: compare it with the truth."""
+        if fitness != self.truth.fitness[number]:
             raise Violation(
-                "fitness", f"generation {number} is told {fitness}, without faults {self.truth.told[number]}"
+                "fitness", f"generation {number} got fitness {fitness}, without faults {self.truth.fitness[number]}"
             )
 
     def evaluated(self, generation: int, mean: float, std: float) -> None:

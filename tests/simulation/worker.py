@@ -107,7 +107,7 @@ class Worker:
     def _begin(self) -> None:
         self.backlog, self.outbox, self.uploads = Backlog(self._spec), Outbox(REPEAT), UploadQueue(REPEAT)
         self.turns: list[Turn | None] = [None] * self._shape.slots
-        self.told_at: dict[bytes, float] = {}  # when each result was last sent
+        self.sent_at: dict[bytes, float] = {}  # when each result was last sent
         self._given: Counter[bytes] = Counter()  # in how many batches each job came
         self._begun: Counter[bytes] = Counter()
         self._batches: set[tuple[int, int]] = set()  # that have come, by numbering
@@ -295,7 +295,7 @@ class Worker:
             self._send(self._beat(now))
         for results in self.outbox.due(now):
             self._send(ResultBatch(**head, fingerprint="f", results=results))
-            self.told_at.update((result.digest, now) for result in results)
+            self.sent_at.update((result.digest, now) for result in results)
         for piece in self.uploads.due(now):
             self._send(UploadPart(**head, **vars(piece)))
 

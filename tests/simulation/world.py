@@ -210,7 +210,7 @@ class World:
             life.run.resume()
 
     def _pause_finally(self) -> None:
-        """A run that shall fall silent is paused once its last generation is told."""
+        """A run that shall fall silent is paused once its last generation is closed."""
         life = self.coordinator
         if life is not None and not self.shape.ends and len(life.run.history) >= self.shape.generations:
             self._final_pause = True
@@ -254,11 +254,11 @@ class World:
                 self.scored.steps += turn.steps(self.now) * len(turn.work)
         self.workers[host] = None
         self._wakes.pop(host, None)
-        self.later(noticed, self.tell_coordinator, worker.identity, "gone")
+        self.later(noticed, self.send_to_coordinator, worker.identity, "gone")
         self.later(away, self.start_worker, host)
 
     def look(self, host: int, *, blink: bool = False) -> None:
-        """What a worker sees of coordinators now, told if it has changed, or after a `blink`."""
+        """Notify a worker of the coordinators that it sees, if they changed or after a `blink`."""
         worker, link, life = self.workers[host], self.links[host], self.coordinator
         if worker is None or worker.nonce is None:
             return
@@ -302,7 +302,7 @@ class World:
 
     # Between them.
 
-    def tell_coordinator(self, identity: str, message: Any) -> None:
+    def send_to_coordinator(self, identity: str, message: Any) -> None:
         """A message has arrived at whichever life is there."""
         if self.coordinator is not None:
             self._inbox.append((identity, message))
@@ -314,7 +314,7 @@ class World:
             if isinstance(message, tuple):
                 self.later(delay, self._hello, host, *message)
             else:
-                self.later(delay, self.tell_coordinator, identity, message)
+                self.later(delay, self.send_to_coordinator, identity, message)
 
     def _hello(self, host: int, request: HelloRequest, question: int) -> None:
         life = self.coordinator

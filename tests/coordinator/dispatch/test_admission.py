@@ -22,7 +22,7 @@ def test_a_familys_name_stands_for_all_its_members(tasks):
     assert find_refusal(hello(tasks=tasks, packages=PACKAGES), LANDER, None, PACKAGES) is None
 
 
-def test_who_does_not_know_the_task_is_told_what_to_install():
+def test_a_refusal_for_an_unknown_task_says_what_to_install():
     why, remedy = find_refusal(hello(tasks=("dream",)), LANDER, None)
     assert LANDER in why
     assert "it knows: dream" in why
@@ -41,7 +41,7 @@ def test_a_fingerprint_of_other_packages_is_asked_for_again_before_it_is_judged(
 
 
 @pytest.mark.parametrize(
-    ("told", "admitted", "may_join"),
+    ("host_class", "admitted", "may_join"),
     [
         ("a" * 16, None, True),
         ("a" * 16, "a" * 16, True),
@@ -52,8 +52,8 @@ def test_a_fingerprint_of_other_packages_is_asked_for_again_before_it_is_judged(
         ("", class_from_fingerprint("elsewhere"), False),
     ],
 )
-def test_a_strict_run_admits_its_own_class_and_who_does_not_know_its_own_yet(told, admitted, may_join):
-    found = find_refusal(hello(packages=PACKAGES, host_class=told), LANDER, admitted, PACKAGES)
+def test_a_strict_run_admits_its_own_class_and_workers_of_an_unknown_class(host_class, admitted, may_join):
+    found = find_refusal(hello(packages=PACKAGES, host_class=host_class), LANDER, admitted, PACKAGES)
     assert (found is None) == may_join
 
 
@@ -62,7 +62,7 @@ def test_another_worlds_package_does_not_change_a_fingerprint():
     assert fingerprint(("numpy",)) != fingerprint(("numpy", "gymnasium"))
 
 
-def test_refusals_are_news_once_are_bounded_and_end_with_admission():
+def test_refusals_are_logged_once_are_bounded_and_end_with_admission():
     refused_workers = RefusedWorkers()
     assert refused_workers.add("a/1", "no task")
     assert not refused_workers.add("a/2", "no task")

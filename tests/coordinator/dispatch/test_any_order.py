@@ -1,7 +1,7 @@
-"""Whatever is lost, doubled, late or restarted, a generation ends with the results of a fleet that loses nothing.
+"""Messages get lost, repeated or late, processes restart: each generation still ends with the results of a calm run.
 
-The workers are the real `Backlog` and `Outbox`; what is on the wire waits until a rule delivers it, drops it, or
-delivers it twice.
+The workers are the real `Backlog` and `Outbox`. A message waits until a rule delivers it, drops it, or delivers it
+twice.
 """
 
 from collections import Counter
@@ -33,8 +33,8 @@ def population(number):
     return [vector_bytes(np.arange(4.0) + number + candidate / 8) for candidate in range(3)]
 
 
-def slack_of(number):
-    """What the schedule wants beside the generation itself."""
+def background_work(number):
+    """The background jobs beside a generation: an evaluation and a kept rollout."""
     vector = population(number)[0]
     kinds = (("evaluate", (20000, 20001)), ("collect", (5000 + number,)))
     return [work for kind, seeds in kinds for work in make_work(SPEC, kind, number, 0, vector, seeds)]
@@ -57,10 +57,10 @@ class Worker:
     def __init__(self):
         self.backlog, self.outbox = Backlog(SPEC), Outbox(BEAT)
         self.running = []
-        self.joined = None  # the coordinator's life that it obeys
+        self.joined = None  # the coordinator's life that it joined
 
     def take(self, send):
-        """Whether to say hello, for the batch is of a numbering that it has not heard of."""
+        """Take a batch; return whether to say hello, because its numbering is unknown."""
         content = send.content
         batch = JobBatch(
             **HEAD, nonce="n", numbering=send.numbering, number=send.number,
@@ -94,7 +94,7 @@ class AnyOrder(RuleBasedStateMachine):
         super().__init__()
         self.now, self.life, self.lives = 0.0, 0, 0
         self.journal = {}  # digest -> fitness, on disk
-        self.told = []  # the fitness of closed generations
+        self.closed_fitness = []  # the fitness of closed generations
         self.number = 0
         self.workers = {}  # identity -> Worker
         self.hosts = {}  # name -> identity
@@ -102,17 +102,17 @@ class AnyOrder(RuleBasedStateMachine):
         self.begin()
 
     def begin(self):
-        """A coordinator's life, from the journal alone."""
+        """Start a coordinator from the journal alone."""
         self.life += 1
         self.fleet = Fleet(BEAT)
-        self.fleet.jobs.previous_epoch_until = self.number + 1 if self.life > 1 else -1  # as `Run` has it
+        self.fleet.jobs.previous_epoch_until = self.number + 1 if self.life > 1 else -1  # as `Run` sets it
         self.received, self.judged, self.sent = Counter(), Counter(), []
         for number in range(self.number):
-            self.fleet.jobs.offer(work for work in slack_of(number) if work.job.digest not in self.journal)
+            self.fleet.jobs.offer(work for work in background_work(number) if work.job.digest not in self.journal)
         self.open()
 
     def open(self):
-        """The generation that is being scored, with what the journal has of it."""
+        """Open the next generation, with the results that the journal has."""
         if self.number == GENERATIONS:
             self.fleet.drain_background = True
             return
@@ -145,7 +145,7 @@ class AnyOrder(RuleBasedStateMachine):
 
     @rule(name=names)
     def lose_token(self, name):
-        """The connection is cut; both live on."""
+        """The connection is cut; both processes live on."""
         if name in self.hosts:
             self.fleet.handle_departure(self.hosts[name], self.now)
 
@@ -164,7 +164,7 @@ class AnyOrder(RuleBasedStateMachine):
     def handle_heartbeat(self, name, steps=5, rate=100.0):
         identity = self.hosts.get(name)
         if identity is None or self.workers[identity].joined != self.life:
-            return  # the service drops what another life was told
+            return  # the service drops heartbeats to another life
         worker = self.workers[identity]
         beat = Heartbeat(
             **HEAD, nonce="n", numbering=worker.backlog.numbering, seen=worker.backlog.seen, capacity=SLOTS,
@@ -228,8 +228,8 @@ class AnyOrder(RuleBasedStateMachine):
             self.receive(identity, result)
 
     @rule(name=names, known=st.booleans())
-    def a_stranger_tells_a_result(self, name, known):
-        """Of a job that never was, from a worker that is or is not there."""
+    def a_stranger_sends_a_result(self, name, known):
+        """A result of an unknown job, from a known or unknown worker."""
         identity = self.hosts.get(name, "x/0badc0de") if known else "x/0badc0de"
         self.receive(identity, Result(b"never was" + bytes(23), 1e9, 10, 0.1, None, None))
 
@@ -242,14 +242,14 @@ class AnyOrder(RuleBasedStateMachine):
             self.journal[result.digest] = result.fitness
             if work.job.kind == "score":
                 self.generation.record(result.digest, result.fitness, result.steps)
-        if self.fleet.jobs.find_poison_job():
+        if self.fleet.jobs.find_pausing_failure():
             self.fleet.jobs.clear_failures()
         if self.generation.complete and self.number < GENERATIONS:
             self.close()
 
     def close(self):
-        self.told.append(self.generation.fitness().tolist())
-        self.fleet.jobs.offer(slack_of(self.number))
+        self.closed_fitness.append(self.generation.fitness().tolist())
+        self.fleet.jobs.offer(background_work(self.number))
         self.number += 1
         self.open()
 
@@ -268,7 +268,7 @@ class AnyOrder(RuleBasedStateMachine):
 
     @rule(name=names, noticed=st.booleans())
     def reconnect(self, name, noticed):
-        """The worker is out of sight, long enough or not for its jobs to be given away, and joins again."""
+        """A worker is out of sight, shortly or until its jobs are given away, and joins again."""
         if noticed:
             self.lose_token(name)
             self.wait(2 * DEPARTURE_GRACE)
@@ -292,7 +292,7 @@ class AnyOrder(RuleBasedStateMachine):
 
     @rule(finished=st.integers(0, 2 * SLOTS))
     def a_calm_second(self, finished):
-        """Everybody who is there beats, hears and works; what they have done stays on the wire."""
+        """All workers send heartbeats, receive batches and work; their results are not delivered yet."""
         self.wait(BEAT)
         for name in "abc":
             self.handle_heartbeat(name)
@@ -307,7 +307,7 @@ class AnyOrder(RuleBasedStateMachine):
 
     @rule(name=names)
     def a_faithful_worker_ends_it(self, name):
-        """From any state: the others go, nothing more is lost, and everything is finished."""
+        """From any state, one worker without faults finishes the whole run."""
         self.batches, self.results = [], []
         for other in "abc":
             self.kill_worker(other)
@@ -332,14 +332,14 @@ class AnyOrder(RuleBasedStateMachine):
         wanted = [
             work.job.digest
             for number in range(GENERATIONS)
-            for work in (*Generation(number, SPECS[number], population(number), SEEDS).work, *slack_of(number))
+            for work in (*Generation(number, SPECS[number], population(number), SEEDS).work, *background_work(number))
         ]
         assert self.journal == {digest: fitness_of(digest) for digest in wanted}
-        assert len(self.told) == GENERATIONS
+        assert len(self.closed_fitness) == GENERATIONS
 
     @invariant()
     def closed_generations_are_those_of_a_fleet_that_loses_nothing(self):
-        assert self.told == LOSSLESS[: len(self.told)]
+        assert self.closed_fitness == LOSSLESS[: len(self.closed_fitness)]
 
     @invariant()
     def at_most_two_hold_a_job_and_both_sides_agree(self):
@@ -350,7 +350,7 @@ class AnyOrder(RuleBasedStateMachine):
             assert all(member.identity in self.fleet.jobs[digest].holders for digest in member.leases)
 
     @invariant()
-    def what_fills_the_slack_is_counted(self):
+    def held_background_jobs_are_counted(self):
         held = [each for each in self.fleet.jobs.values() if each.holders and each.work.job.kind != "score"]
         assert self.fleet.jobs._background_held == len(held)
 

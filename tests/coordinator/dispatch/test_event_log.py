@@ -1,4 +1,4 @@
-"""What is told of workers and jobs: the ring alone, and what a fleet writes into it."""
+"""The event log: the bounded log alone, and the events that a fleet writes into it."""
 
 import pytest
 
@@ -18,13 +18,13 @@ def bench(tmp_path, random_bundle):
     made.journal.close()
 
 
-def told(bench, **asked):
+def events(bench, **asked):
     return [
         (each["what"], each["worker"], each["job"]) for each in answered(snapshot_of(bench), "story", **asked)["story"]
     ]
 
 
-def test_the_ring_is_bounded_and_a_view_does_not_change():
+def test_the_log_is_bounded_and_a_view_does_not_change():
     event_log = EventLog()
     for number in range(BLOCK * BLOCKS + 10):
         event_log.add(float(number), "back", "a/0")
@@ -38,45 +38,45 @@ def test_the_ring_is_bounded_and_a_view_does_not_change():
 
 def test_a_jobs_story_goes_from_given_to_accepted(bench):
     score(bench, 1)
-    (given,) = [each for each in told(bench, job="0/0") if each[0] == "accepted"]
+    (given,) = [each for each in events(bench, job="0/0") if each[0] == "accepted"]
     name = given[2]
     assert name.startswith("score 0/0/")
-    event_log = [each for each in told(bench, job="0/0") if each[2] == name]
+    event_log = [each for each in events(bench, job="0/0") if each[2] == name]
     assert [what for what, _, _ in event_log] == ["given", "accepted"]
-    assert {job.split()[1].rpartition("/")[0] for _, _, job in told(bench, job="0/1")} == {"0/1"}
+    assert {job.split()[1].rpartition("/")[0] for _, _, job in events(bench, job="0/1")} == {"0/1"}
 
 
-def test_jobs_of_a_silent_worker_are_told_as_given_out_again(bench):
+def test_jobs_of_a_silent_worker_are_logged_as_given_again(bench):
     sends = bench.run.worker_protocol.dispatch(bench.now)
     held = sum(len(send.content.work) for send in sends if send.identity == A)
     bench.handle_heartbeat(A)
     bench.now += SILENT_AFTER + 0.1
     bench.handle_heartbeat(B)
     bench.run.worker_protocol.tick(bench.now)
-    whats = [what for what, _, _ in told(bench, worker=A)]
+    whats = [what for what, _, _ in events(bench, worker=A)]
     assert whats[:1] == ["joined"]
     assert whats.count("given") == whats.count("seen") == whats.count("reissued") == held > 0
     assert "silent" in whats
     bench.handle_heartbeat(A)
-    assert told(bench, worker="a")[-1][:2] == ("back", A)
+    assert events(bench, worker="a")[-1][:2] == ("back", A)
 
 
-def test_a_worker_that_vanishes_is_told_and_a_stranger_is_not(bench):
+def test_a_worker_that_vanishes_is_logged_and_a_stranger_is_not(bench):
     bench.run.worker_protocol.handle_departure(B, bench.now)
     bench.now += 2 * DEPARTURE_GRACE
     bench.run.worker_protocol.tick(bench.now)
-    assert ("lost", B, "") in told(bench)
+    assert ("lost", B, "") in events(bench)
     status = read_status(answered(snapshot_of(bench)))
     assert (status.workers, status.worker_list[-1].worker) == (WorkerCount(1, 2, 1), B)
     assert (status.worker_list[-1].state, status.worker_list[-1].leases) == ("lost", 0)
     assert 'dreamfleet_workers{run="night",which="lost"} 1.0' in exposition(status)
-    assert [what for what, _, _ in told(bench, what="lost,joined")] == ["joined", "joined", "lost"]
-    before = len(told(bench))
+    assert [what for what, _, _ in events(bench, what="lost,joined")] == ["joined", "joined", "lost"]
+    before = len(events(bench))
     bench.deliver("stranger/00000009", Result(b"x" * 32, 1.0, 10, 0.1, None, None))
-    assert len(told(bench)) == before
+    assert len(events(bench)) == before
 
 
 @pytest.mark.parametrize("asked", [{"worker": "nobody"}, {"job": "9/9"}, {"job": "x/y"}, {"job": "7"}])
-def test_what_is_not_known_has_no_story_and_no_number_means_all(bench, asked):
+def test_unknown_workers_and_jobs_have_no_events_and_a_generation_alone_means_all(bench, asked):
     bench.run.worker_protocol.dispatch(bench.now)
-    assert bool(told(bench, **asked)) == (asked == {"job": "7"})
+    assert bool(events(bench, **asked)) == (asked == {"job": "7"})

@@ -21,7 +21,7 @@ from tests.support.samples import HEAD, SPEC
 
 
 class Fleet(_Fleet):
-    """Beats are of the numbering that their worker was welcomed with, if they name no other."""
+    """A heartbeat without a numbering gets that of its worker's welcome."""
 
     def handle_heartbeat(self, identity, beat, now):
         member = self.members.get(identity)
@@ -67,7 +67,7 @@ def digests(sends, name):
 
 
 def numbered(sends):
-    """Without those that only say that a worker is known."""
+    """Without the empty batches that only show that the coordinator is there."""
     return [send for send in sends if send.number]
 
 
@@ -75,7 +75,7 @@ def cancelled(sends, name):
     return [digest for send in sends if send.identity == name for digest in send.content.cancels]
 
 
-def test_no_work_before_the_first_beat():
+def test_no_work_before_the_first_heartbeat():
     fleet = Fleet(BEAT)
     fleet.jobs.offer(work(3))
     fleet.add_worker(A, 2, "f", 0.0)
@@ -132,11 +132,11 @@ def test_the_first_wanted_result_wins_and_the_others_copy_is_cancelled():
     assert fleet.handle_result(B, result(digest), 0.4)[0] == "duplicate"
 
 
-def test_a_result_nobody_wants_is_obsolete():
+def test_a_result_of_an_unwanted_job_is_obsolete():
     assert fleet_of(A).handle_result(A, result(b"x" * 32), 0.0)[0] == "obsolete"
 
 
-def test_a_departed_workers_jobs_are_issued_again_after_the_grace():
+def test_a_departed_workers_jobs_are_given_again_after_the_grace():
     fleet = fleet_of(A, B, jobs=2)
     (digest,) = digests(fleet.dispatch(0.0), A)
     fleet.handle_departure(A, 1.0)
@@ -147,7 +147,7 @@ def test_a_departed_workers_jobs_are_issued_again_after_the_grace():
     assert A not in fleet.members
 
 
-def test_who_vanishes_without_a_word_is_told_as_lost_until_he_is_back_or_for_minutes():
+def test_a_worker_that_vanishes_without_leaving_is_listed_as_lost_until_it_is_back_or_for_minutes():
     fleet = fleet_of(A, B)
 
     def vanish(name, now):
@@ -155,7 +155,7 @@ def test_who_vanishes_without_a_word_is_told_as_lost_until_he_is_back_or_for_min
         fleet.tick(now + 2 * DEPARTURE_GRACE)
 
     vanish(A, 1.0)
-    fleet.handle_heartbeat(B, beat(0), 2.0)  # drained: it says that it leaves
+    fleet.handle_heartbeat(B, beat(0), 2.0)  # it drains
     vanish(B, 2.0)
     assert list(fleet.lost) == [A]
     assert [each.what for each in fleet.event_log.view().latest()][:2] == ["left", "lost"]
@@ -173,7 +173,7 @@ def test_who_vanishes_without_a_word_is_told_as_lost_until_he_is_back_or_for_min
     assert not fleet.lost
 
 
-def test_so_many_lost_workers_are_told_and_no_more():
+def test_the_list_of_lost_workers_is_bounded():
     fleet = fleet_of(*(f"h{number}/0" for number in range(MAX_LOST + 3)))
     for name in list(fleet.members):
         fleet.handle_departure(name, 1.0)
@@ -182,7 +182,7 @@ def test_so_many_lost_workers_are_told_and_no_more():
     assert "h0/0" not in fleet.lost
 
 
-def test_a_silent_workers_jobs_are_issued_again_and_its_voice_brings_it_back():
+def test_a_silent_workers_jobs_are_given_again_and_a_heartbeat_brings_it_back():
     fleet = fleet_of(A, B, jobs=2)
     (digest,) = digests(fleet.dispatch(0.0), A)
     late = SILENT_AFTER * BEAT + 0.1
@@ -206,7 +206,7 @@ def test_a_suspended_host_is_not_taken_for_silence():
     assert not fleet.members[A].silent
 
 
-def test_a_job_that_two_beats_do_not_show_is_issued_again():
+def test_a_job_that_two_heartbeats_do_not_list_is_given_again():
     fleet = fleet_of(A, jobs=1)
     (digest,) = digests(fleet.dispatch(0.0), A)
     fleet.handle_heartbeat(A, beat(seen=1), 1.0)
@@ -215,7 +215,7 @@ def test_a_job_that_two_beats_do_not_show_is_issued_again():
     assert digests(fleet.dispatch(2.0), A) == [digest]
 
 
-def test_a_batch_that_was_not_seen_is_sent_again_under_its_number():
+def test_an_unconfirmed_batch_is_sent_again_under_its_number():
     fleet = fleet_of(A, jobs=1)
     (first,) = fleet.dispatch(0.0)
     fleet.handle_heartbeat(A, beat(seen=0), 1.0)
@@ -275,7 +275,7 @@ def test_evaluations_and_collected_drives_share_the_quarter():
 
 
 def uploading():
-    """A's only job is done, and its drive is on its way; B is idle."""
+    """A's jobs are done and their uploads are on the way; B is idle."""
     fleet = fleet_of(A, jobs=0)
     fleet.jobs.offer(work(2, "collect"))
     fleet.drain_background = True
@@ -305,7 +305,7 @@ def test_an_upload_that_never_comes_is_a_straggler():
     assert fleet.counts["copied"] == 1
 
 
-def test_a_paused_fleet_gives_nothing_and_still_judges():
+def test_a_paused_fleet_gives_no_jobs_and_still_judges_results():
     fleet = fleet_of(A)
     given = digests(fleet.dispatch(0.0), A)
     fleet.paused = True
@@ -411,14 +411,14 @@ def test_memory_stays_flat_through_a_hundred_thousand_generations_of_churn():
         fleet.handle_departure(name, now)
         fleet.tick(now + 0.06)
         fleet.notes.clear()
-        if generation in (10_000, 99_999):  # by the first the story is as long as it becomes
+        if generation in (10_000, 99_999):  # at the first the event log is full
             held.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
     assert held[1] - held[0] < 200_000
     assert set(fleet.members) == {A}
 
 
-def test_who_says_hello_and_never_beats_is_one_of_a_few_and_soon_forgotten():
+def test_guests_without_a_heartbeat_are_few_and_soon_forgotten():
     fleet = fleet_of(A)
     for number in range(20_000):
         fleet.add_worker(f"stranger/{number:08x}", 2**62, "f", 1.0)
@@ -428,10 +428,10 @@ def test_who_says_hello_and_never_beats_is_one_of_a_few_and_soon_forgotten():
         fleet.handle_heartbeat(A, beat(), float(now))
         fleet.tick(float(now))
     assert set(fleet.members) == {A}
-    assert not fleet.notes, "no log grows with what strangers call themselves"
+    assert not fleet.notes, "strangers cannot fill the log with names"
 
 
-def test_a_worker_that_beats_is_forgotten_only_after_a_long_silence():
+def test_a_member_is_forgotten_only_after_a_long_silence():
     fleet = fleet_of(A)
     given = digests(fleet.dispatch(0.0), A)
     for now in range(int(FORGET_AFTER)):
@@ -443,7 +443,7 @@ def test_a_worker_that_beats_is_forgotten_only_after_a_long_silence():
     assert fleet.handle_result(A, result(given[0]), 100.0)[0] == "accepted", "its results still count"
 
 
-def test_a_stranger_who_only_said_hello_keeps_no_failing_job_from_being_tried_again():
+def test_a_guest_keeps_no_failing_job_from_being_tried_again():
     fleet = fleet_of(A, jobs=1)
     (digest,) = digests(fleet.dispatch(0.0), A)
     fleet.add_worker(B, 4, "f", 0.0)
@@ -452,7 +452,7 @@ def test_a_stranger_who_only_said_hello_keeps_no_failing_job_from_being_tried_ag
 
 
 def known(fleet, name, seconds=0.1, at=0.0):
-    """Have a worker bring all that it is given back after so long."""
+    """Let a worker return all its jobs, each batch after `seconds`."""
     while given := digests(fleet.dispatch(at), name):
         at += seconds
         for digest in given:
@@ -460,7 +460,7 @@ def known(fleet, name, seconds=0.1, at=0.0):
     return at
 
 
-def test_an_idle_worker_hears_that_it_is_known_and_no_more_often_than_that():
+def test_an_idle_worker_gets_an_empty_batch_now_and_then():
     fleet = fleet_of(A, jobs=0)
     heard = []
     for tenth in range(100):
@@ -472,7 +472,7 @@ def test_an_idle_worker_hears_that_it_is_known_and_no_more_often_than_that():
     assert max(late - early for (early, _), (late, _) in pairwise(heard)) < SILENT_AFTER * BEAT
 
 
-def test_a_worker_that_says_nothing_is_told_nothing():
+def test_a_worker_that_sends_nothing_gets_nothing():
     fleet = fleet_of(A, jobs=0)
     fleet.dispatch(3.0)
     assert fleet.dispatch(9.0) == []
@@ -494,7 +494,7 @@ def test_a_large_batch_has_the_time_that_its_link_takes():
     assert fleet.members[A].host_stats.bandwidth > 35_000
 
 
-def test_what_a_later_batch_has_overtaken_was_lost_and_is_sent_again_at_once():
+def test_a_batch_that_a_later_one_has_overtaken_is_sent_again_at_once():
     fleet = fleet_of(A, jobs=2)
     (first,) = fleet.dispatch(0.0)
     fleet.jobs.offer(work(3, generation=1))
@@ -521,7 +521,7 @@ def test_a_worker_that_did_not_hear_the_answer_to_its_hello_is_given_work_at_onc
     assert not fleet.members[A].unconfirmed
 
 
-def test_a_hello_in_the_name_of_a_worker_that_beats_takes_nothing_from_it():
+def test_a_hello_in_the_name_of_a_live_worker_takes_nothing_from_it():
     fleet = fleet_of(A, jobs=4)
     (lost,) = fleet.dispatch(0.0)
     held, numbering = dict(fleet.members[A].leases), fleet.members[A].numbering
@@ -552,13 +552,13 @@ def test_a_result_counts_from_the_life_that_was_given_its_job_and_from_nobody_el
     fleet.handle_heartbeat(B, beat(seen=1, running=[of_b], unacked=[of_a]), 0.2)
     assert list(fleet.members[B].leases) == [of_b], "nor is it taken up because somebody shows it"
     assert fleet.handle_result(A, result(of_a), 0.3)[0] == "accepted"
-    (told,) = [each for send in fleet.dispatch(0.3) if send.identity == B for each in send.content.verdicts]
-    assert (told.digest, told.verdict) == (of_a, "refused")
+    (verdict,) = [each for send in fleet.dispatch(0.3) if send.identity == B for each in send.content.verdicts]
+    assert (verdict.digest, verdict.verdict) == (of_a, "refused")
     assert fleet.dropped == {"result of a stranger": 2, "result of a job that was not given": 1}
     assert fleet.counts["discarded_steps"] == 10, "a stranger's steps are not the fleet's"
 
 
-def test_what_an_earlier_life_gave_counts_once_its_worker_beats():
+def test_what_an_earlier_life_gave_counts_after_its_workers_first_heartbeat():
     fleet = Fleet(BEAT)
     fleet.jobs.previous_epoch_until = 1
     fleet.jobs.offer([*work(1), *work(1, generation=2)])
@@ -598,7 +598,7 @@ def test_a_job_with_more_steps_than_it_can_have_goes_to_others_and_its_late_resu
 
 
 @pytest.mark.parametrize("kind", ["score", "evaluate"])
-def test_a_job_that_is_held_by_growing_steps_is_copied_once_it_was_away_for_long(kind):
+def test_a_job_that_reports_ever_more_steps_is_copied_after_a_long_time(kind):
     fleet = fleet_of(A, B, jobs=0)
     fleet.drain_background = True
     fleet.jobs.offer(work(2, kind))
@@ -616,7 +616,7 @@ def test_a_job_that_is_held_by_growing_steps_is_copied_once_it_was_away_for_long
     assert LONGEST_HELD < copied[held] < LONGEST_HELD + 2 * LONGEST_HELD_TIMES
 
 
-def test_a_beat_that_has_seen_batches_that_nobody_sent_makes_them_count_anew():
+def test_a_heartbeat_that_confirms_batches_that_were_not_sent_starts_a_new_numbering():
     fleet = fleet_of(A, jobs=2)
     (first,) = fleet.dispatch(0.0)
     given = digests([first], A)
@@ -627,7 +627,7 @@ def test_a_beat_that_has_seen_batches_that_nobody_sent_makes_them_count_anew():
     assert (send.number, digests([send], A)) == (1, given[1:])
 
 
-def test_a_worker_that_was_silent_is_not_waited_for_to_see_what_is_not_sent_again():
+def test_after_a_silence_a_new_numbering_starts_at_one():
     fleet = fleet_of(A, jobs=4)
     lost = fleet.dispatch(0.0)[0]
     fleet.tick(0.5)
@@ -640,7 +640,7 @@ def test_a_worker_that_was_silent_is_not_waited_for_to_see_what_is_not_sent_agai
     assert send.number == 1
 
 
-def test_a_late_beat_from_before_a_hello_says_nothing_of_the_batches_since():
+def test_a_late_heartbeat_from_before_a_hello_confirms_no_later_batch():
     fleet = fleet_of(A, jobs=4)
     first = fleet.members[A].numbering
     fleet.handle_departure(A, 0.9)
@@ -654,7 +654,7 @@ def test_a_late_beat_from_before_a_hello_says_nothing_of_the_batches_since():
     assert list(fleet.members[A].leases) == given, "they are not missed in what cannot show them"
 
 
-def test_what_a_host_is_known_for_outlives_its_hello_and_its_worker():
+def test_a_hosts_record_outlives_a_hello_and_its_worker():
     fleet = fleet_of(A, jobs=3)
     known(fleet, A, seconds=0.5)
     host_stats = fleet.members[A].host_stats
@@ -667,7 +667,7 @@ def test_what_a_host_is_known_for_outlives_its_hello_and_its_worker():
     assert fleet.members["a/00000009"].host_stats == host_stats
 
 
-def test_a_newcomer_beside_a_known_worker_gets_a_copy_for_which_nobody_waits():
+def test_a_newcomer_beside_a_worker_with_a_record_gets_a_trial_copy():
     fleet = fleet_of(A, jobs=3)
     now = known(fleet, A)
     fleet.add_worker(B, 1, "f", now)
@@ -684,7 +684,7 @@ def test_a_newcomer_beside_a_known_worker_gets_a_copy_for_which_nobody_waits():
     assert fleet.members[B].host_stats.expected_seconds(1) == pytest.approx(3.0)
 
 
-def test_a_host_that_dies_again_and_again_is_given_what_it_brings_back_in_time():
+def test_a_host_that_is_lost_again_and_again_gets_only_what_it_returns_in_time():
     fleet = fleet_of(A, jobs=3)
     now = known(fleet, A, seconds=1.0)
     for life in range(3):

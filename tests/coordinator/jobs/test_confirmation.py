@@ -26,7 +26,7 @@ GENERATIONS = 6
 
 
 def number_of(data):
-    """Between 0 and 1, as if by chance."""
+    """A number between 0 and 1, pseudorandom."""
     return int.from_bytes(hashlib.sha256(data).digest()[:6], "little") / 2**48
 
 
@@ -96,10 +96,10 @@ def test_what_is_reported_was_driven_on_tracks_that_chose_nothing(make):
     assert not set(chosen) & {job.seeds[0] - VALIDATION.start for job in fresh}
     scores = [drive(job) for job in fresh]
     assert (confirmed.mean, confirmed.error) == (np.mean(scores), np.std(scores, ddof=1) / np.sqrt(8))
-    told = controller.provenance
-    assert (told["confirmed"], told["generation"]) == (True, confirmed.generation)
-    assert (told["validation_mean"], told["validation_error"]) == (confirmed.mean, confirmed.error)
-    assert told["validation_episodes"] == 8
+    provenance = controller.provenance
+    assert (provenance["confirmed"], provenance["generation"]) == (True, confirmed.generation)
+    assert (provenance["validation_mean"], provenance["validation_error"]) == (confirmed.mean, confirmed.error)
+    assert provenance["validation_episodes"] == 8
     assert len(evaluations) == GENERATIONS, "the evaluations stay what they were"
 
 
@@ -115,13 +115,13 @@ def test_the_best_few_drive_on_and_half_of_them_further(make):
     assert sorted(rounds[confirmed.generation])[:6] == list(range(CHOOSING_OFFSET, CHOOSING_OFFSET + 6))
 
 
-def test_the_episodes_that_the_end_takes_are_foretold(make):
+def test_the_episodes_that_the_end_takes_are_predicted(make):
     night = make()
     while not night.run.ending:
         night.step()
-    foretold, before = night.run.background_jobs.episodes_until_end(ending=True), {job.digest for job in night.judged}
+    predicted, before = night.run.background_jobs.episodes_until_end(ending=True), {job.digest for job in night.judged}
     night.end()
-    assert len({job.digest for job in night.judged} - before) == foretold > 3 * JUDGED.confirm_episodes - 1
+    assert len({job.digest for job in night.judged} - before) == predicted > 3 * JUDGED.confirm_episodes - 1
     assert night.run.background_jobs.episodes_until_end(ending=True) == 0
     assert [total_episodes(finalists, 16) for finalists in range(5)] == [0, 16, 32, 47, 48]
 
@@ -129,7 +129,7 @@ def test_the_episodes_that_the_end_takes_are_foretold(make):
 def test_the_luckiest_evaluation_is_found_out():
     """Ten means worth 500 each, and one worth 600 that had bad luck: confirmed is a fair score, not the luckiest."""
     rng = np.random.default_rng(3)
-    told, worth = [], []
+    errors, worth = [], []
     for _ in range(400):
         means = [500.0] * 10 + [600.0]
         seen = [float(np.mean(mean + 200 * rng.standard_normal(8))) for mean in means]
@@ -139,9 +139,9 @@ def test_the_luckiest_evaluation_is_found_out():
         while work := confirmation.advance(lambda _digests: {}):
             for each in work:
                 confirmation.record(each.job.digest, means[each.job.generation] + 200 * rng.standard_normal())
-        told.append(confirmation.outcome.mean - means[confirmation.outcome.generation])
+        errors.append(confirmation.outcome.mean - means[confirmation.outcome.generation])
         worth.append(max(seen) - means[best[0]])
-    assert abs(np.mean(told)) < 3 * np.std(told) / 20, "no bias"
+    assert abs(np.mean(errors)) < 3 * np.std(errors) / 20, "no bias"
     assert np.mean(worth) > 50, "which the best evaluation has"
 
 
@@ -180,9 +180,9 @@ def lived(path, bundle, kills):
         if steps in kills:
             bench.restart()
     confirmed, controller, evaluations = bench.outcome()
-    told = {name: value for name, value in controller.provenance.items() if name != "run_uid"}
+    provenance = {name: value for name, value in controller.provenance.items() if name != "run_uid"}
     bench.journal.close()
-    return confirmed, controller.sha256, told, evaluations
+    return confirmed, controller.sha256, provenance, evaluations
 
 
 @settings(max_examples=8, deadline=None)
@@ -198,9 +198,13 @@ def test_a_run_that_is_left_open_reports_a_provisional_score(make):
     bench.run.leave()
     confirmed, controller, evaluations = bench.outcome()
     best = max(evaluations, key=lambda each: each.mean)
-    told = controller.provenance
+    provenance = controller.provenance
     assert confirmed is None
-    assert (told["confirmed"], told["validation_mean"], told["validation_episodes"]) == (False, best.mean, 4)
+    assert (provenance["confirmed"], provenance["validation_mean"], provenance["validation_episodes"]) == (
+        False,
+        best.mean,
+        4,
+    )
 
 
 def test_a_run_that_ended_goes_on_and_is_confirmed_again(make):

@@ -87,15 +87,15 @@ def test_a_part_that_cannot_be_one_is_dropped_and_counted(changes, why):
 
 @given(st.lists(st.tuples(st.integers(0, 20), st.integers(1, MAX_UPLOAD)), max_size=60))
 def test_what_strangers_open_is_bounded_in_number_and_size(opened):
-    config = UploadLimits(count=4, size=MAX_UPLOAD)
-    uploads = UploadAssembler(config)
+    limits = UploadLimits(count=4, size=MAX_UPLOAD)
+    uploads = UploadAssembler(limits)
     for number, total in opened:
         part = replace(
             parts()[0], digest=bytes([number]) * 32, total=total, data=bytes(min(total, MAX_PART)), sha256=bytes(32)
         )
         uploads.add(f"w/{number:08x}", part, 0.0)
-        assert len(uploads) <= config.count
-        assert uploads.size <= config.size
+        assert len(uploads) <= limits.count
+        assert uploads.size <= limits.size
 
 
 def test_an_upload_that_stands_still_is_abandoned_and_makes_room():
