@@ -142,14 +142,15 @@ class Fleet:
     def handle_result(self, identity: str, result: Result, now: float) -> tuple[VerdictWord, Work | None]:
         """Judge one result; the work comes back when it is the first wanted one, for the journal."""
         member, self._now = self.members.get(identity), now
-        if self.find_job_for_result(identity, result) is None and (member is None or not member.has_beaten):
+        given = self.find_job_for_result(identity, result)
+        if given is None and (member is None or not member.has_beaten):
             self.dropped["result of a stranger"] += 1  # who says it again once the run knows him
             return "refused", None
         if member is not None:
             self._mark_heard(member, now)
             member.record_return(result)
         lease = None if member is None else member.leases.get(result.digest)
-        verdict, work = self._judge(identity, result)
+        verdict, work = self._judge(identity, result, given)
         if lease is not None and work is not None:
             self._tail.record_duration(now - lease.group.given_at, is_background=lease.is_background)
         if member is not None or verdict == "accepted":
@@ -277,10 +278,10 @@ class Fleet:
         if durable:
             member.verdicts = []
 
-    def _judge(self, identity: str, result: Result) -> tuple[VerdictWord, Work | None]:
+    def _judge(self, identity: str, result: Result, given: Work | None) -> tuple[VerdictWord, Work | None]:
         if result.digest not in self.jobs:
             return ("duplicate" if self.jobs.is_accepted(result.digest) else "obsolete"), None
-        if self.find_job_for_result(identity, result) is None:
+        if given is None:
             self.dropped["result of a job that was not given"] += 1
             return "refused", None
         if result.fitness is None:

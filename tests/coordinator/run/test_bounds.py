@@ -23,8 +23,8 @@ from dreamfleet.common.protocol.result_bounds import (
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.work import vector_bytes
 from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
-from dreamfleet.coordinator.service import status_json
-from dreamfleet.coordinator.service.status import take_snapshot
+from dreamfleet.coordinator.service.snapshot import take_snapshot
+from dreamfleet.coordinator.service.status import encode_part
 from tests.coordinator.run.test_run import SETTINGS, A, B, Bench
 from tests.support.samples import SPEC
 
@@ -44,11 +44,7 @@ def bench(tmp_path, random_bundle):
 
 def deliver_all(bench, numbers, kinds=("score", "evaluate", "collect")):
     fitness, steps, seconds = numbers
-    given = [
-        (send.identity, work.job)
-        for send in bench.run.worker_protocol.dispatch(bench.now)
-        for work in send.content.work
-    ]
+    given = [(send.identity, work.job) for send in bench.run.fleet.dispatch(bench.now) for work in send.content.work]
     for name, job in given:
         if job.kind in kinds:
             bench.deliver(name, Result(job.digest, fitness, steps, seconds, None, None))
@@ -61,7 +57,7 @@ def told(bench):
     """Every answer that the run gives, as it would travel."""
     snapshot = take_snapshot(bench.run, "night", {}, 1.0, bench.now)
     return {
-        part: json.loads(status_json.answer(snapshot, part, {}))
+        part: json.loads(encode_part(snapshot, part, {}))
         for part in ("", "history", "workers", "candidates", "generation", "best")
     }
 
@@ -83,11 +79,7 @@ def test_an_extreme_result_is_the_jobs_failure_with_its_reason_and_the_run_can_g
 
 @pytest.mark.parametrize("numbers", EXTREME.values(), ids=EXTREME)
 def test_what_an_older_coordinator_took_in_is_asked_for_again(bench, numbers):
-    given = [
-        (send.identity, work.job)
-        for send in bench.run.worker_protocol.dispatch(bench.now)
-        for work in send.content.work
-    ]
+    given = [(send.identity, work.job) for send in bench.run.fleet.dispatch(bench.now) for work in send.content.work]
     for name, job in given:
         bench.journal.add_result(job, Result(job.digest, *numbers, None, None), name, "f", 1)
     bench.journal.commit()
@@ -130,17 +122,15 @@ def test_a_pending_evaluation_of_an_older_coordinator_is_driven_again(bench):
 
 def test_slots_and_steps_without_bound_can_be_told(bench):
     for name in (A, B):
-        bench.run.worker_protocol.admit(HelloRequest(2, 2, "0", name, (SPEC.task,), "f", MAX_COUNT), bench.now)
-    bench.run.worker_protocol.counts["discarded_steps"] = 3 * MAX_COUNT
+        bench.run.admission.admit(HelloRequest(2, 2, "0", name, (SPEC.task,), "f", MAX_COUNT), bench.now)
+    bench.run.fleet.counts["discarded_steps"] = 3 * MAX_COUNT
     told(bench)
 
 
 def test_an_error_that_counts_too_many_steps_is_an_error(bench):
     for _ in range(3):
         given = [
-            (send.identity, each.job)
-            for send in bench.run.worker_protocol.dispatch(bench.now)
-            for each in send.content.work
+            (send.identity, each.job) for send in bench.run.fleet.dispatch(bench.now) for each in send.content.work
         ]
         for name, job in given[:1]:
             bench.deliver(name, Result(job.digest, None, MAX_COUNT, 0.1, "boom", None))

@@ -39,9 +39,9 @@ class Classed(Bench):
 
     def hello(self, name):
         """Why it is refused, if it is."""
-        found = self.run.worker_protocol.find_refusal(self.request(name), self.settings)
+        found = self.run.admission.find_refusal(self.request(name))
         if found is None:
-            self.run.worker_protocol.admit(self.request(name), self.now)
+            self.run.admission.admit(self.request(name), self.now)
             self.handle_heartbeat(name)
         return found
 
@@ -51,15 +51,12 @@ class Classed(Bench):
             run_uid=self.run.uid, incarnation=1, fingerprint=self.fingerprints[name], results=(result,),
             host_class=self.classes[name],
         )  # fmt: skip
-        self.run.worker_protocol.handle_results(name, batch, self.now)
+        self.worker_protocol.handle_results(name, batch, self.now)
         self.run.advance(self.now)
         self.run.commit()
 
     def given(self):
-        return {
-            send.identity: [work.job for work in send.content.work]
-            for send in self.run.worker_protocol.dispatch(self.now)
-        }
+        return {send.identity: [work.job for work in send.content.work] for send in self.run.fleet.dispatch(self.now)}
 
     def stored(self):
         with RunFolder(self.path) as folder:
@@ -84,7 +81,7 @@ class FromBefore(Classed):
 
 
 def test_a_hello_without_a_result_fixes_nothing(bench):
-    assert bench.run.worker_protocol.host_class is None
+    assert bench.run.admission.host_class is None
     bench.restart()
     assert bench.hello(A) is bench.hello(B) is None
 
@@ -95,18 +92,18 @@ def test_the_first_accepted_result_fixes_it_and_the_other_host_must_go(tmp_path,
     own = kind.classes[B] or class_from_fingerprint("elsewhere")
     jobs = bench.given()
     bench.deliver(B, done(jobs[B][0]))
-    assert (bench.run.worker_protocol.host_class, bench.run.worker_protocol.fingerprint) == (own, "elsewhere")
+    assert (bench.run.admission.host_class, bench.run.admission.fingerprint) == (own, "elsewhere")
     bench.deliver(A, done(jobs[A][0]))
     assert bench.run.generation.done == 1, "a result of another class does not count"
-    assert [member.identity for member in bench.run.worker_protocol.members] == [B]
+    assert list(bench.run.fleet.members) == [B]
     why, remedy = bench.hello(A)
     assert "classes differ" in why
     assert "--no-strict" in remedy
-    assert any("classes differ" in note for note in bench.run.worker_protocol.take_notes())
+    assert any("classes differ" in note for note in bench.run.take_notes())
     assert {job.digest for job in bench.given()[B]} >= {job.digest for job in jobs[A]}, "its jobs are free again"
-    assert bench.run.worker_protocol.failures == [], "it is no failure of the job"
+    assert bench.run.fleet.jobs.failures == [], "it is no failure of the job"
     bench.restart()
-    assert bench.run.worker_protocol.host_class == own
+    assert bench.run.admission.host_class == own
     assert bench.hello(B) is None
     bench.journal.close()
 
@@ -114,10 +111,10 @@ def test_the_first_accepted_result_fixes_it_and_the_other_host_must_go(tmp_path,
 def test_who_is_of_another_class_goes_before_it_is_given_anything(bench):
     jobs = bench.given()
     bench.deliver(B, done(jobs[B][0]))
-    bench.run.worker_protocol.remove_worker(A)
+    bench.run.fleet.remove_worker(A)
     assert bench.hello(A) is None, "it does not know its class yet"
     bench.find_out(A)
-    assert [member.identity for member in bench.run.worker_protocol.members] == [B]
+    assert list(bench.run.fleet.members) == [B]
     assert "classes differ" in bench.hello(A)[0]
 
 
@@ -141,16 +138,16 @@ def test_hosts_of_one_fingerprint_may_be_of_two_classes_and_of_two_fingerprints_
     bench.deliver(A, done(jobs[A][0]))
     assert bench.run.generation.done == 2
     assert bench.stored() == {"b" * 16}
-    (share,) = bench.run.worker_protocol.classes.largest
+    (share,) = bench.run.classes.largest
     assert (share.results, set(share.fingerprints)) == (2, {"here", "there"})
 
 
 def test_an_error_fixes_nothing(bench):
     jobs = bench.given()
     bench.deliver(B, Result(jobs[B][0].digest, None, 0, 0.1, "boom", None))
-    assert bench.run.worker_protocol.host_class is None
+    assert bench.run.admission.host_class is None
     bench.deliver(A, done(jobs[A][0]))
-    assert bench.run.worker_protocol.host_class == "a" * 16
+    assert bench.run.admission.host_class == "a" * 16
 
 
 def test_a_result_of_another_life_is_judged_before_its_worker_says_hello(bench):
@@ -173,10 +170,10 @@ def test_a_run_that_is_not_strict_takes_all_and_tells_of_which_class_each_result
     # Where the first to score knew nothing of classes the whole run goes by fingerprints, as do older journals.
     told = classes if classes[A] else {A: None, B: None}
     assert bench.stored() == {told[A] or class_from_fingerprint("here"), told[B] or class_from_fingerprint("elsewhere")}
-    assert bench.run.worker_protocol.classes.description == "mixed: 2 classes, 50.0%, 50.0% of results"
+    assert bench.run.classes.description == "mixed: 2 classes, 50.0%, 50.0% of results"
     bench.journal.close()
     with RunFolder(bench.path) as folder:
-        assert folder.classes == bench.run.worker_protocol.classes
+        assert folder.classes == bench.run.classes
 
 
 def test_a_journal_from_before_there_were_classes_goes_on_by_fingerprints(bench):
@@ -193,7 +190,7 @@ def test_a_journal_from_before_there_were_classes_goes_on_by_fingerprints(bench)
         assert folder.classes.description == "one class, by its fingerprint: to the bit"
     bench.journal = Journal(bench.path / "journal.sqlite")
     bench.begin()
-    assert bench.run.worker_protocol.host_class == class_from_fingerprint("here")
+    assert bench.run.admission.host_class == class_from_fingerprint("here")
     assert "classes differ" in bench.hello(B)[0]
     bench.deliver(A, done(bench.given()[A][0]))
     assert bench.run.generation.done == 2
@@ -204,7 +201,7 @@ def test_an_old_journal_that_a_hello_froze_is_free_again(bench):
     bench.journal.set_fact("fingerprint", "a host that never scored")
     bench.journal.commit()
     bench.restart()
-    assert bench.run.worker_protocol.host_class is None
+    assert bench.run.admission.host_class is None
 
 
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

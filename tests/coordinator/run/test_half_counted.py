@@ -16,9 +16,9 @@ def bench(tmp_path, random_bundle):
 
 def given_jobs(bench):
     """Both to one worker."""
-    bench.run.worker_protocol.handle_departure(B, bench.now)
+    bench.run.fleet.handle_departure(B, bench.now)
     bench.now += 1
-    bench.run.worker_protocol.tick(bench.now)
+    bench.run.tick(bench.now)
     return [(send.identity, work.job) for send in bench.run.fleet.dispatch(bench.now) for work in send.content.work]
 
 
@@ -28,7 +28,7 @@ def scored(job):
 
 def say(bench, worker, *results):
     batch = ResultBatch(run_uid=bench.run.uid, incarnation=1, fingerprint="f", results=results)
-    bench.run.worker_protocol.handle_results(worker, batch, bench.now)
+    bench.worker_protocol.handle_results(worker, batch, bench.now)
 
 
 def test_a_result_that_raises_before_it_counts_costs_no_other_one(bench, monkeypatch):

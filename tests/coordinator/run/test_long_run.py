@@ -8,12 +8,12 @@ from time import process_time
 import numpy as np
 import pytest
 
-from dreamfleet.common.protocol.messages import Heartbeat, HelloRequest, Result, ResultBatch
-from dreamfleet.coordinator.dispatch.fleet import Fleet
+from dreamfleet.common.protocol.messages import Heartbeat, HelloRequest, Intervals, Result, ResultBatch
 from dreamfleet.coordinator.run.run import Run
-from dreamfleet.coordinator.service import status_json
-from dreamfleet.coordinator.service.status import take_snapshot
-from dreamfleet.coordinator.settings.config import LimitsConfig
+from dreamfleet.coordinator.run.worker_protocol import WorkerProtocol
+from dreamfleet.coordinator.service.snapshot import take_snapshot
+from dreamfleet.coordinator.service.status import encode_status
+from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 from tests.coordinator.run.test_run import SETTINGS, A
 
@@ -26,24 +26,25 @@ class LongRun:
     def __init__(self, folder, bundle):
         folder.mkdir()
         settings = replace(SETTINGS, population=4, evaluate_every=1, collect_every=0)
-        self.run = Run(Journal.create(folder, settings, bundle), settings, LimitsConfig(), Fleet(1.0), 0.0)
+        self.run = Run(Journal.create(folder, settings, bundle), settings, LimitsConfig(), NetworkConfig(), 0.0)
+        self.worker_protocol = WorkerProtocol(self.run, "long", "n", Intervals(1.0, 1.0))
         self.now, self.seen = 0.0, 0
-        self.run.worker_protocol.admit(HelloRequest(2, 2, "0", A, (settings.task.task,), "f", 1), self.now)
+        self.run.admission.admit(HelloRequest(2, 2, "0", A, (settings.task.task,), "f", 1), self.now)
 
     def cost(self):
         """Processor time of one more generation, in seconds."""
         begun, closed = process_time(), len(self.run.history)
         while len(self.run.history) == closed:
             self.now += 0.01
-            self.run.worker_protocol.handle_heartbeat(A, self.handle_heartbeat(), self.now)
-            for send in self.run.worker_protocol.dispatch(self.now):
+            self.worker_protocol.handle_heartbeat(A, self.handle_heartbeat(), self.now)
+            for send in self.run.fleet.dispatch(self.now):
                 self.seen = max(self.seen, send.number)
                 self.answer(send.content.work)
             self.run.advance(self.now)
             self.run.commit()
-        status_json.status(take_snapshot(self.run, "long", {}, self.now, self.now))
+        encode_status(take_snapshot(self.run, "long", {}, self.now, self.now))
         self.run.take_closed()
-        self.run.worker_protocol.take_notes()
+        self.run.take_notes()
         return process_time() - begun
 
     def handle_heartbeat(self):
@@ -63,7 +64,7 @@ class LongRun:
     def answer(self, work):
         results = tuple(Result(each.job.digest, score(each), 10, 0.1, None, None) for each in work)
         batch = ResultBatch(run_uid=self.run.uid, incarnation=1, fingerprint="f", results=results)
-        self.run.worker_protocol.handle_results(A, batch, self.now)
+        self.worker_protocol.handle_results(A, batch, self.now)
 
 
 def score(work):

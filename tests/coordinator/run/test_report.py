@@ -28,7 +28,7 @@ class Reporting(Bench):
 
     def step(self):
         """One job, whichever comes first."""
-        for send in self.run.worker_protocol.dispatch(self.now):
+        for send in self.run.fleet.dispatch(self.now):
             self.given += [work.job for work in send.content.work]
         job = self.given.pop(0)
         fitness = SCORES[job.generation] if job.kind == "evaluate" else float(job.digest[0])
@@ -59,9 +59,9 @@ def make(tmp_path, random_bundle):
 
 def test_a_controller_is_there_from_the_first_closed_generation_on(make):
     bench = make(replace(EVALUATED, evaluate_every=0))
-    assert (bench.saved(), bench.run.controller_path) == (None, None)
+    assert (bench.saved(), bench.run.background_jobs.report.path) == (None, None)
     bench.close(1)
-    assert bench.run.controller_path == bench.path / CONTROLLER
+    assert bench.run.background_jobs.report.path == bench.path / CONTROLLER
     assert bench.saved().provenance["generation"] == 0
 
 
@@ -109,7 +109,7 @@ def test_a_limit_that_was_passed_already_writes_the_controller_and_the_reason(ma
     bench.limits = LimitsConfig(generations=2)
     bench.restart()
     assert bench.run.ended == "3 generations"
-    assert bench.run.controller_path == bench.path / CONTROLLER
+    assert bench.run.background_jobs.report.path == bench.path / CONTROLLER
     assert bench.saved() is not None
     with RunFolder(bench.path) as stored:
         assert stored.ended == "3 generations"

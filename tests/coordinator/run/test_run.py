@@ -14,15 +14,16 @@ from dreamfleet.common.protocol.messages import (
     TAG_BYTES,
     Heartbeat,
     HelloRequest,
+    Intervals,
     Result,
     ResultBatch,
     UploadPart,
 )
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.run.run import Run
-from dreamfleet.coordinator.settings.config import LimitsConfig
+from dreamfleet.coordinator.run.worker_protocol import WorkerProtocol
+from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 from tests.support.samples import SPEC
 
@@ -48,11 +49,13 @@ class Bench:
         self.begin()
 
     def begin(self):
-        self.run = Run(self.journal, self.settings, self.limits, Fleet(1.0), self.now, strict=self.strict)
+        network = NetworkConfig(beat=1.0, strict=self.strict)
+        self.run = Run(self.journal, self.settings, self.limits, network, self.now)
+        self.worker_protocol = WorkerProtocol(self.run, "night", "n", Intervals(1.0, 1.0))
         self.run.advance(self.now)
         self.run.commit()
         for name in (A, B):
-            self.run.worker_protocol.admit(self.request(name), self.now)
+            self.run.admission.admit(self.request(name), self.now)
             self.handle_heartbeat(name)
 
     def request(self, name):
@@ -70,7 +73,7 @@ class Bench:
         head = {"run_uid": self.run.uid, "incarnation": self.run.incarnation, "nonce": "n", "drawn_by": "-",
                 "numbering": member.numbering}  # fmt: skip
         tags = tuple(digest[:TAG_BYTES] for digest in unacked)
-        self.run.worker_protocol.handle_heartbeat(
+        self.worker_protocol.handle_heartbeat(
             name,
             Heartbeat(**head, seen=member.number, capacity=4, slots=4, queued=(), running=(), unacked=tags, load=0.0,
                  steps_per_second=0.0, host_class=host_class),
@@ -81,7 +84,7 @@ class Bench:
         batch = ResultBatch(
             run_uid=self.run.uid, incarnation=1, fingerprint="f", results=(result,), host_class=self.host_class
         )
-        self.run.worker_protocol.handle_results(name, batch, self.now)
+        self.worker_protocol.handle_results(name, batch, self.now)
         self.run.advance(self.now)
         self.run.commit()
 
@@ -91,7 +94,7 @@ class Bench:
         self.deliver(min(wanted.holders, default=A) if wanted else A, result)
 
     def upload(self, name, part):
-        self.run.worker_protocol.upload(name, part, self.now)
+        self.worker_protocol.handle_upload(name, part, self.now)
 
     def parts(self, job):
         data = drive_of(job)
@@ -148,7 +151,7 @@ def test_a_death_between_the_jobs_and_the_commit_loses_no_bit(bench):
         for work in send.content.work:
             results.append(Result(work.job.digest, float(work.job.candidate), 10, 0.1, None, None))
             batch = ResultBatch(run_uid=bench.run.uid, incarnation=1, fingerprint="f", results=(results[-1],))
-            bench.run.worker_protocol.handle_results(send.identity, batch, bench.now)
+            bench.worker_protocol.handle_results(send.identity, batch, bench.now)
     assert bench.run.advance(bench.now)
     early = bench.run.fleet.dispatch(bench.now, durable=False)
     assert not any(send.content.verdicts for send in early)
@@ -195,7 +198,7 @@ def test_parts_of_a_job_that_nobody_gave_are_dropped_and_counted(bench):
     part = bench.parts(job)[0]
     for stranger, each in (("x/0badc0de", part), (name, replace(part, digest=b"x" * 32))):
         bench.upload(stranger, each)
-    assert bench.run.worker_protocol.dropped == {"unwanted upload": 2}
+    assert bench.run.dropped == {"unwanted upload": 2}
     assert len(bench.run.background_jobs.rollout_collections.uploads) == 0
 
 
@@ -228,27 +231,27 @@ def fail(bench, name, digest, error):
 
 
 def test_a_pause_names_candidate_seed_every_worker_how_often_and_why(bench):
-    given = {send.identity: send.content.work for send in bench.run.worker_protocol.dispatch(bench.now)}
+    given = {send.identity: send.content.work for send in bench.run.fleet.dispatch(bench.now)}
     work = given[A][0]
     seed, name = work.job.seeds[0], f"candidate 0/{work.job.candidate}"
     fail(bench, A, work.job.digest, "boom")
     assert bench.run.paused is None
-    bench.run.worker_protocol.dispatch(bench.now)
+    bench.run.fleet.dispatch(bench.now)
     fail(bench, B, work.job.digest, "bang")
     assert bench.run.paused.startswith(
         f"{name}, seed {seed}, failed on two workers: {A} (once): boom; {B} (once): bang"
     )
     assert "dreamfleet resume" in bench.run.paused
-    assert f"paused: {bench.run.paused}" in bench.run.worker_protocol.take_notes()
+    assert f"paused: {bench.run.paused}" in bench.run.take_notes()
 
 
 def test_a_pause_on_the_only_worker_speaks_of_one_worker_and_three_times(bench):
-    bench.run.worker_protocol.handle_departure(B, bench.now)
+    bench.run.fleet.handle_departure(B, bench.now)
     bench.now += 1
-    bench.run.worker_protocol.tick(bench.now)
+    bench.run.tick(bench.now)
     digest = None
     while bench.run.paused is None:
-        for send in bench.run.worker_protocol.dispatch(bench.now):
+        for send in bench.run.fleet.dispatch(bench.now):
             digest = digest or (send.content.work[0].job.digest if send.content.work else None)
         fail(bench, A, digest, "boom")
     assert f"failed on one worker: {A} (3 times): boom" in bench.run.paused
@@ -285,7 +288,7 @@ def test_under_loss_doubling_late_parts_and_restarts_each_drive_is_kept_whole_on
             bench.handle_heartbeat(what[0], unacked=[jobs[what[1]].digest])
         elif kind == "wait":
             bench.now += what[0]
-            bench.run.worker_protocol.tick(bench.now)
+            bench.run.tick(bench.now)
             bench.run.advance(bench.now)
             bench.run.commit()
         elif kind == "restart" and bench.run.ended is None:

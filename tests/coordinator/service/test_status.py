@@ -14,8 +14,8 @@ from dreamfleet.common.serialization.validation import from_plain
 from dreamfleet.coordinator.dispatch.event_log import EventLog
 from dreamfleet.coordinator.jobs.generation import CandidateScores
 from dreamfleet.coordinator.jobs.history import History
-from dreamfleet.coordinator.service import status_json
-from dreamfleet.coordinator.service.status import Snapshot, mark_left, take_snapshot
+from dreamfleet.coordinator.service.snapshot import Snapshot, take_snapshot
+from dreamfleet.coordinator.service.status import encode_part, encode_status
 from tests.coordinator.run.test_run import SETTINGS, A, Bench
 from tests.support.samples import CLOSED, STATUS
 
@@ -32,7 +32,7 @@ def bench(tmp_path, random_bundle):
 def score(bench, count, fitness=lambda job: job.candidate + job.episode / 2):
     """So many jobs, one after the other."""
     while count:
-        for send in bench.run.worker_protocol.dispatch(bench.now):
+        for send in bench.run.fleet.dispatch(bench.now):
             bench.given = getattr(bench, "given", []) + [work.job for work in send.content.work]
         job = bench.given.pop(0)
         bench.answer(Result(job.digest, fitness(job), 10, 0.1, None, None))
@@ -44,7 +44,7 @@ def snapshot_of(bench):
 
 
 def answered(snapshot, part="", **parameters):
-    return read_document(status_json.answer(snapshot, part, {name: str(value) for name, value in parameters.items()}))
+    return read_document(encode_part(snapshot, part, {name: str(value) for name, value in parameters.items()}))
 
 
 def test_every_candidate_of_the_open_and_of_the_last_generation_is_told(bench):
@@ -112,7 +112,7 @@ def test_no_answer_is_longer_than_a_message_whatever_the_run(population, workers
     settings = replace(snapshot.status.settings, task=longest)
     snapshot = replace(snapshot, status=replace(snapshot.status, settings=settings))
     for part in PARTS:
-        payload = status_json.answer(snapshot, part, {})
+        payload = encode_part(snapshot, part, {})
         assert len(payload) <= MAX_MESSAGE, part
     status = read_status(answered(snapshot))
     assert status.population.total == population
@@ -181,7 +181,7 @@ def touched(bench, generations):
     )
     Rows.touched = 0
     snapshot = snapshot_of(bench)
-    status_json.status(snapshot)
+    encode_status(snapshot)
     assert bench.run._stop_reason(bench.run.generation) is None
     return Rows.touched
 
@@ -202,23 +202,23 @@ def test_the_best_answer_carries_the_controller_in_parts(bench):
 
 
 def test_a_run_that_is_left_open_says_so_and_one_that_ended_has_ended(bench):
-    assert mark_left(snapshot_of(bench)).status.state == "left"
+    assert snapshot_of(bench).as_left().status.state == "left"
     while bench.run.ended is None:
         score(bench, 1)
-    assert mark_left(snapshot_of(bench)).status.state == "ended"
-    assert json.loads(status_json.status(mark_left(snapshot_of(bench))))["why"] == "3 generations"
+    assert snapshot_of(bench).as_left().status.state == "ended"
+    assert json.loads(encode_status(snapshot_of(bench).as_left()))["why"] == "3 generations"
 
 
 def test_a_worker_is_told_with_the_time_of_a_job_its_round_trip_and_what_was_sent_again(bench):
     first = snapshot_of(bench).workers[0]
     assert (first.job_seconds, first.round_trip, first.resent) == (None, None, 0)
-    (send,) = [each for each in bench.run.worker_protocol.dispatch(0.0) if each.identity == A]
+    (send,) = [each for each in bench.run.fleet.dispatch(0.0) if each.identity == A]
     bench.now = 0.25
     bench.handle_heartbeat(A)
     assert snapshot_of(bench).workers[0].round_trip == 0.25
     bench.answer(Result(send.content.work[0].job.digest, 1.0, 10, 0.1, None, None))
-    bench.run.worker_protocol.dispatch(bench.now)  # its verdict, which no beat shows as seen
-    bench.run.worker_protocol.dispatch(bench.now + 30.0)
+    bench.run.fleet.dispatch(bench.now)  # its verdict, which no beat shows as seen
+    bench.run.fleet.dispatch(bench.now + 30.0)
     told = snapshot_of(bench).workers[0]
     assert (told.job_seconds, told.round_trip, told.resent) == (0.1, 0.25, 1)
     assert WorkerStatus(**answered(snapshot_of(bench), "workers")["workers"][0]) == told

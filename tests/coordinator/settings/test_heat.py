@@ -10,7 +10,7 @@ from rich.console import Console
 
 from dreamfleet.common.monitoring.status_panel import RunPanel
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.coordinator.service.status import take_snapshot
+from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.settings.config import LimitsConfig
 from dreamfleet.coordinator.verbs import fork
 from tests.coordinator.evaluated import EVERY, Evaluated

@@ -7,7 +7,7 @@ from datetime import UTC, datetime, timedelta
 from dreamfleet.common.monitoring.status import Throughput
 from dreamfleet.common.security.credentials import Credentials
 from dreamfleet.common.transport.network import Network
-from dreamfleet.coordinator.service.log_messages import summary, worker_command
+from dreamfleet.coordinator.service.run_log import summary, worker_command
 from tests.support.samples import STATUS
 
 
