@@ -1,4 +1,4 @@
-"""A fault of ours in the middle of one result: it costs no other result, and is never half of a run's state."""
+"""An exception while one result is handled loses no other result, and never leaves it half counted."""
 
 import pytest
 
@@ -15,7 +15,7 @@ def bench(tmp_path, random_bundle):
 
 
 def given_jobs(bench):
-    """Both to one worker."""
+    """Jobs, all given to one worker."""
     bench.run.fleet.handle_departure(B, bench.now)
     bench.now += 1
     bench.run.tick(bench.now)
@@ -26,12 +26,12 @@ def scored(job):
     return Result(job.digest, 1.0, 10, 0.1, None, None)
 
 
-def say(bench, worker, *results):
+def send(bench, worker, *results):
     batch = ResultBatch(run_uid=bench.run.uid, incarnation=1, fingerprint="f", results=results)
     bench.worker_protocol.handle_results(worker, batch, bench.now)
 
 
-def test_a_result_that_raises_before_it_counts_costs_no_other_one(bench, monkeypatch):
+def test_an_exception_before_a_result_counts_loses_no_other_result(bench, monkeypatch):
     (worker, first), (_, second) = given_jobs(bench)
     judge = bench.run.fleet.handle_result
 
@@ -42,15 +42,15 @@ def test_a_result_that_raises_before_it_counts_costs_no_other_one(bench, monkeyp
 
     monkeypatch.setattr(bench.run.fleet, "handle_result", stumble)
     with pytest.raises(ZeroDivisionError):
-        say(bench, worker, scored(first), scored(second))
-    assert first.digest in bench.run.fleet.jobs, "its worker says it again"
+        send(bench, worker, scored(first), scored(second))
+    assert first.digest in bench.run.fleet.jobs, "its worker repeats it"
     assert second.digest not in bench.run.fleet.jobs
     monkeypatch.undo()
-    say(bench, worker, scored(first), scored(second))
+    send(bench, worker, scored(first), scored(second))
     assert bench.run.generation.complete
 
 
-def test_a_result_that_raises_while_it_is_counted_ends_the_life_and_the_next_one_loses_nothing(bench, monkeypatch):
+def test_an_exception_while_a_result_is_counted_ends_the_incarnation_and_the_next_one_loses_nothing(bench, monkeypatch):
     (worker, first), (_, second) = given_jobs(bench)
 
     def stumble(*_):
@@ -58,7 +58,7 @@ def test_a_result_that_raises_while_it_is_counted_ends_the_life_and_the_next_one
 
     monkeypatch.setattr(bench.run.generation, "record", stumble)
     with pytest.raises(InternalError, match=r"ZeroDivisionError.*--resume"):
-        say(bench, worker, scored(first))
+        send(bench, worker, scored(first))
     bench.restart()
-    say(bench, worker, scored(first), scored(second))
+    send(bench, worker, scored(first), scored(second))
     assert bench.run.generation.complete

@@ -1,4 +1,4 @@
-"""What a generation costs the coordinator does not grow with the run: journal, history, evaluations and status."""
+"""A generation's cost does not grow with the run: journal, history, evaluations and status."""
 
 import logging
 from dataclasses import replace
@@ -17,11 +17,11 @@ from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 from tests.coordinator.run.test_run import SETTINGS, A
 
-BLOCK = 250  # generations of a reading
+BLOCK = 250  # generations of a measurement
 
 
 class LongRun:
-    """A run whose only worker answers at once; each generation is evaluated, and its status taken and asked."""
+    """A run whose only worker answers at once; each generation is evaluated and its status encoded."""
 
     def __init__(self, folder, bundle):
         folder.mkdir()
@@ -68,7 +68,7 @@ class LongRun:
 
 
 def score(work):
-    """How near a goal is that moves on, so that the search never converges."""
+    """The negative distance to a moving goal, so that the search never converges."""
     goal = np.cos(0.1 * work.job.generation)
     return -float(np.square(np.frombuffer(work.vector, "<f4") - goal).sum())
 
@@ -83,7 +83,7 @@ def blocks_of(folder, bundle, generations):
     "generations",
     [1_000, pytest.param(100_000, marks=[pytest.mark.long, pytest.mark.timeout(3600)])],
 )
-def test_a_late_generation_costs_what_an_early_one_does(tmp_path, random_bundle, generations):
+def test_a_late_generation_costs_no_more_than_an_early_one(tmp_path, random_bundle, generations):
     costs = blocks_of(tmp_path / "run", random_bundle.path, generations)
     logging.getLogger(__name__).info("ms: %s", [round(1000 * cost, 2) for cost in costs[:: max(len(costs) // 10, 1)]])
     assert min(costs[-2:]) < 1.5 * min(costs[:2])
