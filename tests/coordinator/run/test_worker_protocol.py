@@ -1,9 +1,10 @@
-"""An exception while one result is handled loses no other result, and never leaves it half counted."""
+"""Hellos, results and foreign messages; an exception while one result is handled leaves none half counted."""
 
 import pytest
 
 from dreamfleet.common.errors import InternalError
 from dreamfleet.common.protocol.messages import Result, ResultBatch
+from dreamfleet.common.serialization.constraints import MAX_TEXT
 from tests.coordinator.run.test_run import SETTINGS, B, Bench
 
 
@@ -62,3 +63,22 @@ def test_an_exception_while_a_result_is_counted_ends_the_incarnation_and_the_nex
     bench.restart()
     send(bench, worker, scored(first), scored(second))
     assert bench.run.generation.complete
+
+
+def test_a_malformed_hello_is_refused_and_a_hello_with_a_known_reason_admits_nobody(bench):
+    assert "not a hello" in bench.worker_protocol.answer_hello(None, None, bench.now).why
+    bench.run.fleet.remove_worker(B)
+    refused = bench.worker_protocol.answer_hello(bench.request(B), ("no " * 10_000, "wait"), bench.now)
+    assert (refused.accepted, refused.remedy, refused.spec) == (False, "wait", {})
+    assert len(refused.why) <= MAX_TEXT
+    assert B not in bench.run.fleet.members
+    welcome = bench.worker_protocol.answer_hello(bench.request(B), None, bench.now)
+    assert (welcome.accepted, welcome.numbering) == (True, bench.run.fleet.members[B].numbering)
+
+
+def test_a_message_for_another_run_is_dropped(bench):
+    (worker, job), _ = given_jobs(bench)
+    batch = ResultBatch(run_uid="0" * 32, incarnation=1, fingerprint="f", results=(scored(job),))
+    bench.worker_protocol.handle(worker, batch, bench.now)
+    assert bench.run.dropped == {"foreign run": 1}
+    assert job.digest in bench.run.fleet.jobs
