@@ -45,7 +45,9 @@ class Run:
         self._journal = journal
         self._unpublished: list[StoredGeneration] = []
         if dropped := journal.drop_excessive(longest_horizon(settings)):
-            self.fleet.notes.append(f"{dropped} results of an older version are too large to count: asked for again")
+            self.fleet.notes.append(
+                f"{dropped} results of an older version are too large to count: their jobs are scored again"
+            )
         self.admission = Admission(journal, settings, self.fleet, strict=network.strict)
         self._ending = self._stored_end_reason()  # the limit that is reached; only background jobs remain
         closed, evaluations = journal.read_closed()
@@ -221,7 +223,7 @@ class Run:
         return f"stage {stage.number} of {len(self._agenda.stages)} ({stage.description})"
 
     def _stop_reason(self, generation: Generation) -> str | None:
-        """Why the run ends before `generation` is scored; `None` if it goes on."""
+        """Why the run ends before `generation` is scored; `None` if it continues."""
         if generation.is_one_point:
             return f"converged: generation {generation.number} is one point; fork the run with a larger --sigma0"
         return self._reached_limit()

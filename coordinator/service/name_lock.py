@@ -116,6 +116,6 @@ class NameLock:
             else "stop the other one, rename this run's folder, or keep their routers apart"
         )
         return (
-            f"another coordinator serves {what} on this network, {who}: it goes on, this one leaves; nothing is lost, "
-            f"the journal is whole; {remedy}, then --resume"
+            f"another coordinator serves {what} on this network, {who}: it continues, this one leaves; nothing is "
+            f"lost, the journal is whole; {remedy}, then --resume"
         )

@@ -242,7 +242,7 @@ class Service:
             self._run.admission.refused_workers.add(request.worker, "its join file is revoked")
             return "its join file is revoked", "have another issued"
         if self._control.disbanding:
-            return "the run ends with its workers", "wait until somebody goes on with it"
+            return "the run ends with its workers", "wait until the run is resumed"
         return None
 
     def _is_revoked(self, worker: str) -> bool:
