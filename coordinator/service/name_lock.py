@@ -29,7 +29,7 @@ class NameLock:
         self._session = session
         self._run = run
         self._nonce = nonce
-        self._rivals = LeaderCheck(nonce, PATIENCE)
+        self._leader_check = LeaderCheck(nonce, PATIENCE)
         self._inbox: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._stack = stack
         watcher = session.liveliness().declare_subscriber(
@@ -40,9 +40,9 @@ class NameLock:
     def acquire(self) -> None:
         """Take the name; `RefusedError` if a live coordinator has it: a newcomer has nothing to lose."""
         until = monotonic() + DISCOVERY_SECONDS
-        while (now := monotonic()) < until or self._rivals.has_any:
+        while (now := monotonic()) < until or self._leader_check.has_any:
             self._listen(now, DISCOVERY_SECONDS / 10)
-            if self._rivals.live(now):
+            if self._leader_check.live(now):
                 raise RefusedError(f"run {self._run} has a live coordinator already: stop it, or choose another --run")
         token = self._session.liveliness().declare_token(keys.live_coordinator(self._run, self._nonce))
         self._stack.callback(token.undeclare)
@@ -50,7 +50,7 @@ class NameLock:
     def announce(self, run_uid: str, incarnation: int) -> None:
         """Identify this coordinator from now on, to every other one that asks."""
         note = ClaimNote(run_uid=run_uid, incarnation=incarnation, nonce=self._nonce, began=time())
-        self._rivals.own_note, payload = note, encode_json(note)
+        self._leader_check.own_note, payload = note, encode_json(note)
         key = keys.claim(self._run, self._nonce)
 
         def answer(query: zenoh.Query) -> None:
@@ -66,7 +66,7 @@ class NameLock:
     def check(self, now: float) -> None:
         """Raise `RefusedError` if another coordinator of this name continues, so that this one must leave."""
         self._listen(now, 0.0)
-        found = self._rivals.find_stronger(now)
+        found = self._leader_check.find_stronger(now)
         if found is not None:
             raise RefusedError(self._explain(found[1]))
 
@@ -78,19 +78,19 @@ class NameLock:
                 self._handle(*self._inbox.get_nowait(), now)
         except queue.Empty:
             pass
-        for nonce in self._rivals.due_to_ask(now):
+        for nonce in self._leader_check.due_to_ask(now):
             self._ask(nonce)
 
     def _handle(self, kind: str, event: Any, now: float) -> None:
         if kind == "token":
             nonce = str(event.key_expr).rsplit("/", 1)[-1]
             if event.kind == zenoh.SampleKind.DELETE:
-                self._rivals.vanish(nonce)
+                self._leader_check.vanish(nonce)
             else:
-                self._rivals.appear(nonce, now)
+                self._leader_check.appear(nonce, now)
             return
         try:
-            self._rivals.record_note(decode_json(ClaimNote, event))
+            self._leader_check.record_note(decode_json(ClaimNote, event))
         except MalformedError:
             return
 
@@ -99,14 +99,14 @@ class NameLock:
             if reply.ok is not None:
                 self._inbox.put(("note", reply.ok.payload.to_bytes()))
 
-        own = self._rivals.own_note
+        own = self._leader_check.own_note
         self._session.get(
             keys.claim(self._run, nonce), zenoh.handlers.Callback(record_note, indirect=False), timeout=TIMEOUT,
             payload=None if own is None else encode_json(own), encoding="application/json",
         )  # fmt: skip
 
     def _explain(self, other: ClaimNote | None) -> str:
-        own = self._rivals.own_note
+        own = self._leader_check.own_note
         same = other is not None and own is not None and other.run_uid == own.run_uid
         who = "of another version" if other is None else f"in incarnation {other.incarnation}"
         what = "this very run" if same else f"a run {self._run}"

@@ -60,7 +60,7 @@ class Service:
 
     def __init__(
         self, name: str, network: Network, intervals: Intervals, file_watch: FileWatch, bundle: ServedBundle | None,
-        metrics_port: str = "", revocations: RevocationWatcher | None = None,
+        metrics_port: str, revocations: RevocationWatcher,
     ) -> None:  # fmt: skip
         self._name = name
         self._file_watch = file_watch
@@ -182,7 +182,7 @@ class Service:
             self._handle(*self._events.get(timeout=TICK))
             until = monotonic() + LINGER
             for _ in range(MOST_EVENTS_PER_COMMIT):
-                left = until - monotonic() if self._run.fleet.jobs else 0.0  # without jobs a generation ends now
+                left = until - monotonic() if self._run.fleet.jobs else 0.0  # a complete generation does not wait
                 self._handle(*self._events.get(timeout=max(left, 0.0)))
         except queue.Empty:
             pass
@@ -247,12 +247,10 @@ class Service:
 
     def _is_revoked(self, worker: str) -> bool:
         """Whether the certificate of a worker's seat, which its name ends in, was revoked."""
-        return self._revocations is not None and worker_seat_identity(worker) in self._revocations.revoked_seats
+        return worker_seat_identity(worker) in self._revocations.revoked_seats
 
     def _check_revocations(self, now: float) -> None:
         """Remove workers whose certificates were revoked since the last look."""
-        if self._revocations is None:
-            return
         before = self._revocations.revoked_seats
         self._revocations.reload_if_changed(now)
         if self._revocations.revoked_seats != before:
