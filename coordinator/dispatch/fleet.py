@@ -129,14 +129,15 @@ class Fleet:
         it can stop repeating it.
         """
         member, self._now = self.members.get(identity), now
-        if self.find_job_for_result(identity, result) is None and (member is None or member.is_guest):
+        given = self.find_job_for_result(identity, result)
+        if given is None and (member is None or member.is_guest):
             self.dropped["result of a stranger"] += 1  # a worker of this run repeats it after its first heartbeat
             return "refused", None
         if member is not None:
             self._mark_heard(member, now)
             member.record_return(result)
         lease = None if member is None else member.leases.get(result.digest)
-        verdict, work = self._judge(identity, result)
+        verdict, work = self._judge(identity, result, given)
         if lease is not None and work is not None:
             self._speculation.record_duration(now - lease.group.given_at, is_background=lease.is_background)
         if member is not None or verdict == "accepted":
@@ -289,14 +290,14 @@ class Fleet:
         if durable:
             member.verdicts = []
 
-    def _judge(self, identity: str, result: Result) -> tuple[VerdictWord, Work | None]:
+    def _judge(self, identity: str, result: Result, given: Work | None) -> tuple[VerdictWord, Work | None]:
         """The verdict on a result, and its work if it is accepted.
 
         R4: only the first valid result of a wanted job is accepted. R8: an error is recorded, never a fitness.
         """
         if result.digest not in self.jobs:
             return ("duplicate" if self.jobs.is_accepted(result.digest) else "obsolete"), None
-        if self.find_job_for_result(identity, result) is None:
+        if given is None:
             self.dropped["result of a job that was not given"] += 1
             return "refused", None
         if result.fitness is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Set
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from enum import Enum, auto
 
@@ -278,18 +278,3 @@ class LostWorkers(dict[str, Member]):
         """Unlist the workers that were not heard for too long."""
         for name in [name for name, each in self.items() if now - each.last_heard > LOST_TIMEOUT]:
             del self[name]
-
-
-def episodes_per_second(members: Iterable[Member], seconds: Callable[[HostStats], float | None]) -> float | None:
-    """Episodes a second of the reachable members together; `seconds` is a host's time for one episode in one slot.
-
-    A member whose host has no such record counts as the mean of the others. `None` if no host has one.
-    """
-    slots, rate, measured = 0, 0.0, 0
-    for member in members:
-        if member.is_reachable:
-            slots += member.slots
-            if (each := seconds(member.host_stats)) is not None:
-                rate += member.slots / max(each, 1e-6)
-                measured += member.slots
-    return rate * slots / measured if measured else None

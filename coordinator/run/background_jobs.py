@@ -1,4 +1,4 @@
-"""What a run wants beside scoring: its mean evaluated, rollouts of it kept. It fills what scoring leaves idle."""
+"""Jobs that a run wants beside scoring, for idle slots: evaluate its mean, collect rollouts of it, confirm the end."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from dreamfleet.coordinator.storage.journal import Journal
 
 
 class BackgroundJobs:
-    """Evaluations and kept rollouts of one run, and the report that follows from the evaluations."""
+    """Evaluations, confirmation and kept rollouts of a run, and the report that follows from them."""
 
     def __init__(
         self, journal: Journal, settings: RunSettings, run_uid: str, history: History,
         evaluations: Iterable[StoredEvaluation], agenda: ScheduleState,
     ) -> None:  # fmt: skip
-        """`agenda` knows the terms of each generation before the means after it are wanted."""
+        """`agenda` knows the scoring parameters of each generation when it closes."""
         folder = journal.path.parent
         self.evaluations = Evaluations(evaluations)
         self.rollout_collections = RolloutCollections(folder)
@@ -43,25 +43,25 @@ class BackgroundJobs:
 
     @property
     def in_progress(self) -> bool:
-        """Whether anything is still to come of what was begun."""
+        """Whether any evaluation, collection or round of the confirmation is unfinished."""
         confirming = self._confirmation is not None and self._confirmation.in_progress
         return bool(self.evaluations.open_count or self.rollout_collections.missing_count or confirming)
 
     @property
     def confirmed(self) -> StoredConfirmation | None:
-        """The confirmed score of what is reported; `None` where what is reported is not confirmed."""
+        """The confirmed score of the reported mean; `None` if that is not confirmed."""
         found = self._confirmed
         return found if found is not None and found.covers(self.evaluations.best) else None
 
     @property
     def confirming(self) -> tuple[int, int]:
-        """Episodes of the confirmation's open round: done, wanted."""
+        """Episodes of the confirmation's open round: (done, wanted)."""
         return (0, 0) if self._confirmation is None else self._confirmation.progress
 
     def episodes_until_end(self, *, ending: bool) -> int:
-        """Episodes of means that are waited for when a limit is reached, as `ending` says it is: as far as is known.
+        """Estimate the episodes that remain once a limit is reached; `ending`: it is reached already.
 
-        Those of evaluations in progress, of the last one, and of the confirmation.
+        They are those of evaluations in progress, of the last evaluation, and of the confirmation.
         """
         settings, (done, wanted) = self._settings, self.evaluations.progress
         if self._confirmation is not None:
@@ -79,7 +79,7 @@ class BackgroundJobs:
         return "" if self._confirmation is None else self._confirmation.round_description
 
     def begin(self, mean: bytes, now: float) -> list[Work]:
-        """Continue where the last incarnation ended: what is reported, and the missing jobs."""
+        """Restore the report of the last incarnation; the jobs that are still missing."""
         if (last := self._history.last) is not None:
             self.report.generation_closed(last.number, mean, self._history.steps, now)
         if (judged := self.confirmed or self.evaluations.best) is not None:
@@ -90,7 +90,7 @@ class BackgroundJobs:
         return evaluations + [each for item in self._journal.scheduled_collections() for each in self._collect(item)]
 
     def schedule(self, generation: int, mean: bytes, now: float, *, last: bool) -> list[Work]:
-        """The jobs that are due after a generation was closed; after the `last` one all are."""
+        """The jobs that are due after a closed generation; after the `last` one all are."""
         settings, work = self._settings, []
         self.report.generation_closed(generation, mean, self._history.steps, now)
         if _is_due(settings.evaluate_every, generation, last=last):
@@ -104,7 +104,7 @@ class BackgroundJobs:
         return work
 
     def count(self, work: Work, result: Result) -> None:
-        """Take an accepted result, which is in the journal."""
+        """Count an accepted, journalled result."""
         if work.job.kind == "collect":
             self.rollout_collections.finish(result.digest)
             return
@@ -115,9 +115,9 @@ class BackgroundJobs:
             self._confirmation.record(result.digest, result.fitness)
 
     def confirm(self) -> list[Work]:
-        """The run is ending and nothing is in progress: the next jobs that confirm what it reports.
+        """The next jobs that confirm the reported mean; call it when a limit is reached and nothing is in progress.
 
-        None once it is confirmed, or where nothing was evaluated.
+        Empty once the mean is confirmed, or if nothing was evaluated.
         """
         closed = len(self._history)
         if self._confirmation is None:

@@ -1,4 +1,4 @@
-"""From the strategy to generations and back: what is asked is journalled, continued to the bit, and told."""
+"""A run's generations: ask the strategy for a population, journal it, and return the fitness to the strategy."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from dreamfleet.coordinator.storage.journal import Journal, StoredOpenGeneration
 
 
 class Generations:
-    """One generation is open at a time; `evaluations` are the finished ones, by generation, as they become known."""
+    """Opens and closes generations, one at a time; `evaluations` holds the finished ones by generation, and grows."""
 
     def __init__(
         self, journal: Journal, settings: RunSettings, agenda: ScheduleState, history: History,
         evaluations: Mapping[int, StoredEvaluation],
     ) -> None:  # fmt: skip
         self.history = history
-        self.scoring_params: ScoringParams  # of the generation that is open
-        self.last: CandidateScores | None = None  # of the generation that was closed last
+        self.scoring_params: ScoringParams  # of the open generation
+        self.last: CandidateScores | None = None  # of the last closed generation
         self._journal = journal
         self._settings = settings
         self._agenda = agenda
@@ -39,7 +39,7 @@ class Generations:
 
     @property
     def mean(self) -> bytes:
-        """The distribution's mean as it would travel."""
+        """The distribution's mean `(size,)` as float32 bytes."""
         return vector_bytes(self._strategy.mean)
 
     @property
@@ -49,15 +49,15 @@ class Generations:
 
     @property
     def axis_ratio(self) -> float | None:
-        """The longest axis of the strategy's distribution by the shortest; `None` where it does not say."""
+        """Ratio of the distribution's longest axis to its shortest; `None` if the strategy does not provide it."""
         return self._strategy.axis_ratio
 
     def prepare(self) -> None:
-        """Work ahead while workers are busy."""
+        """Prepare the next population while workers are busy."""
         self._strategy.prepare()
 
     def begin(self) -> Generation:
-        """The first generation of a new run, or the one that was open when the last incarnation ended."""
+        """Open the first generation of a new run, or restore the one that was open when the last incarnation ended."""
         stored = self._journal.last_generation()
         if stored is None:
             return self.open(0)
@@ -78,7 +78,7 @@ class Generations:
         return self._recall(stored, self.scoring_params)
 
     def open(self, number: int) -> Generation:
-        """Ask for the next population; it is written with the strategy's state from before."""
+        """Ask for the next population and journal it with the strategy's state before that."""
         self.scoring_params = scoring_params = self._terms(number)
         if number and scoring_params.begun.since == number and scoring_params.stage.starts_new_search:
             self._strategy = self._search(scoring_params.stage, self._strategy.mean)
@@ -91,7 +91,7 @@ class Generations:
         return self._generation(number, vectors, seeds, scoring_params)
 
     def close(self, generation: Generation, seconds: float) -> StoredGeneration:
-        """Tell the strategy what the generation gave; it took so many seconds."""
+        """Give the strategy the generation's fitness and journal the generation, which took `seconds`."""
         fitness = generation.fitness()
         closed = StoredGeneration(
             number=generation.number,

@@ -1,7 +1,7 @@
-"""What a run reports: never the luckiest sample.
+"""The controller that a run reports: never the luckiest sample.
 
-While it goes on, its best evaluated mean, which is provisional: the best of many looks is in part luck. As it ends, the
-mean that was confirmed, with a score that chose nothing. Without evaluations, the last mean.
+While the run goes on, its best evaluated mean; that is provisional, for the best of many scores is in part luck. At the
+end, the confirmed mean, with a score on which no choice was based. Without evaluations, the last mean.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, Stor
 from dreamfleet.common.runs.run_provenance import RECEIPT, RunProvenance
 from dreamfleet.common.serialization.optional_fields import to_dict
 
-SAVE_INTERVAL = 5.0  # seconds between two writings of a mean that was not evaluated: each waits for the disk
+SAVE_INTERVAL = 5.0  # seconds between two saves of means without evaluation: each waits for the disk
 
 
 @dataclass(frozen=True)
 class ValidationScore:
-    """A mean's score on validation tracks. Unless it is `confirmed`, these tracks also chose what they judge."""
+    """A mean's score on validation tracks. Unless it is `confirmed`, the mean was also chosen by these tracks."""
 
     mean: float
     error: float  # standard error of the mean
@@ -32,23 +32,23 @@ class ValidationScore:
 
     @classmethod
     def of(cls, found: StoredEvaluation | StoredConfirmation) -> ValidationScore:
-        """From what the journal holds."""
+        """From a journal record."""
         return cls(found.mean, found.error, found.episodes, isinstance(found, StoredConfirmation))
 
 
 @dataclass(frozen=True)
 class ReportedMean:
-    """A mean `(size,)`, as float32 bytes, with the generation that it is of and its score, if it has one."""
+    """A mean `(size,)`, as float32 bytes, with its generation and its score, if it has one."""
 
     run_uid: str
     settings: RunSettings
     generation: int
     vector: bytes
     judged: ValidationScore | None
-    steps: int  # environment steps that the run had made by then
+    steps: int  # environment steps of the run by then
 
     def controller(self) -> Controller:
-        """As it is saved."""
+        """The controller to save."""
         judged = self.judged
         provenance = {
             "run_uid": self.run_uid,
@@ -68,7 +68,7 @@ class ReportedMean:
 
 
 class ControllerWriter:
-    """Follows a run's means and keeps the file at `path` up to date; `receipt` is drawn up as it is written."""
+    """Keeps the reported controller in the file at `path`; `receipt` builds its provenance at each save."""
 
     def __init__(self, path: Path, run_uid: str, settings: RunSettings, receipt: Callable[[], RunProvenance]) -> None:
         self.current: ReportedMean | None = None  # `None` before the first generation is closed
@@ -78,10 +78,10 @@ class ControllerWriter:
         self._receipt = receipt
         self._saved: ReportedMean | None = None
         self._due = False
-        self._next = float("-inf")  # when a mean that was not evaluated may be written again
+        self._next = float("-inf")  # when a mean without evaluation may be saved again
 
     def generation_closed(self, generation: int, mean: bytes, steps: int, now: float) -> None:
-        """A generation was closed: its mean is reported, unless one was evaluated."""
+        """Report a closed generation's mean, unless an evaluated mean is reported."""
         judged = self.current.judged if self.current is not None else None
         if self.current is not None and judged is not None:
             generation, mean = self.current.generation, self.current.vector
@@ -91,23 +91,23 @@ class ControllerWriter:
             self._next = now + SAVE_INTERVAL
 
     def set_judged(self, found: StoredEvaluation | StoredConfirmation, mean: bytes, steps: int) -> None:
-        """A mean is the best of those that were evaluated, or was confirmed."""
+        """Report the best evaluated mean, or the confirmed one."""
         judged = ValidationScore.of(found)
         self.current = ReportedMean(self._run_uid, self._settings, found.generation, mean, judged, steps)
         self._due = True
 
     def finish(self) -> None:
-        """The run ends: whatever is reported now is to be written."""
+        """The run ends: what it reports now must be saved."""
         self._due = True
 
     def save(self, *, at_once: bool = False) -> None:
-        """Write the controller if it is due, or if it is not what the file holds and must be written `at_once`."""
+        """Save the controller if it is due; with `at_once`, whenever the file holds another one."""
         if self.current is None or self.current == self._saved or not (self._due or at_once):
             return
         controller = self.current.controller()
-        told = {**controller.provenance, RECEIPT: to_dict(self._receipt())}
+        provenance = {**controller.provenance, RECEIPT: to_dict(self._receipt())}
         try:
-            replace(controller, provenance=told).save(self._path)
+            replace(controller, provenance=provenance).save(self._path)
         except OSError as error:
             raise JournalError(
                 f"cannot write {self._path}: {error.strerror}; make room and continue the run"
@@ -116,5 +116,5 @@ class ControllerWriter:
 
     @property
     def path(self) -> Path | None:
-        """Where the reported controller lies; `None` before it was written."""
+        """The file of the reported controller; `None` before it was saved."""
         return self._path if self._saved is not None else None

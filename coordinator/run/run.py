@@ -1,47 +1,42 @@
-"""A run's life: ask, dispatch, journal, tell. Owns the pure parts; knows no transport.
+"""One incarnation of a run: it owns the fleet, the journal and the optimiser's generations. Knows no transport.
 
-Everything that happens is durable before anybody is told that it counts: `commit` comes before the verdicts. The jobs
-of a generation may leave before it: a coordinator that dies in between asks for the same population again.
+Everything that happens is durable before a worker hears that it counts: `commit` comes before the verdicts. The jobs
+of a generation may be sent before it is durable: a coordinator that dies in between asks for the same population again.
 """
 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from dataclasses import asdict
-from pathlib import Path
 
+from dreamfleet.common.printable import plural
+from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_folder import ENDING
-from dreamfleet.common.runs.scoring_params import ScheduleState, ScoringParams
+from dreamfleet.common.runs.scoring_params import ScheduleState
 from dreamfleet.common.runs.stages import longest_horizon
 from dreamfleet.coordinator.dispatch.fleet import Fleet
-from dreamfleet.coordinator.jobs.generation import CandidateScores, Generation
+from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.jobs.history import History
+from dreamfleet.coordinator.jobs.work import Work
+from dreamfleet.coordinator.run.admission import Admission
 from dreamfleet.coordinator.run.background_jobs import BackgroundJobs
 from dreamfleet.coordinator.run.generations import Generations
-from dreamfleet.coordinator.run.limits import stop_reason
-from dreamfleet.coordinator.run.worker_protocol import WorkerProtocol
-from dreamfleet.coordinator.settings.config import LimitsConfig
+from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 
 
 class Run:
-    """One incarnation of a run, new or continued."""
+    """One incarnation of a run, new or continued; `network` says how it treats its workers."""
 
     def __init__(
-        self,
-        journal: Journal,
-        settings: RunSettings,
-        limits: LimitsConfig,
-        fleet: Fleet,
-        now: float,
-        *,
-        strict: bool = False,
+        self, journal: Journal, settings: RunSettings, limits: LimitsConfig, network: NetworkConfig, now: float
     ) -> None:
         self.settings = settings
         self.limits = limits
-        self.fleet = fleet
+        self.fleet = Fleet(network.beat, network.evaluation_share)
         self.ended: str | None = None
         self.paused: str | None = None
         self.uid = journal.fact("uid") or ""
@@ -50,48 +45,22 @@ class Run:
         self._journal = journal
         self._unpublished: list[StoredGeneration] = []
         if dropped := journal.drop_excessive(longest_horizon(settings)):
-            fleet.notes.append(f"{dropped} results of an older version are too large to count: asked for again")
-        self._ending = self._stored_end_reason()  # the limit that is reached: only what is in the slack is waited for
+            self.fleet.notes.append(
+                f"{dropped} results of an older version are too large to count: their jobs are scored again"
+            )
+        self.admission = Admission(journal, settings, self.fleet, strict=network.strict)
+        self._ending = self._stored_end_reason()  # the limit that is reached; only background jobs remain
         closed, evaluations = journal.read_closed()
         self.history = History(closed)
         self._agenda = ScheduleState(settings)
         self.background_jobs = BackgroundJobs(journal, settings, self.uid, self.history, evaluations, self._agenda)
-        self.worker_protocol = WorkerProtocol(
-            journal,
-            self.incarnation,
-            fleet,
-            self.background_jobs,
-            self._record_score,
-            horizon=settings.task.horizon,
-            strict=strict,
-        )
         evaluated = self.background_jobs.evaluations.finished
-        self._generations = Generations(journal, settings, self._agenda, self.history, evaluated)
+        self.generations = Generations(journal, settings, self._agenda, self.history, evaluated)
         self.opened_at = now
-        self.generation = self._generations.begin()
-        if self.incarnation > 1:  # the last life may have given what follows too, and died before it was written
-            fleet.jobs.previous_epoch_until = self.generation.number + 1
+        self.generation = self.generations.begin()
+        if self.incarnation > 1:  # the last incarnation may have sent the next generation's jobs before it was durable
+            self.fleet.jobs.previous_epoch_until = self.generation.number + 1
         self._begin(now)
-
-    @property
-    def sigma(self) -> float:
-        """The strategy's overall step size."""
-        return self._generations.sigma
-
-    @property
-    def axis_ratio(self) -> float | None:
-        """The longest axis of the strategy's distribution by the shortest; `None` where it does not say."""
-        return self._generations.axis_ratio
-
-    @property
-    def scoring_params(self) -> ScoringParams:
-        """Those of the open generation."""
-        return self._generations.scoring_params
-
-    @property
-    def last(self) -> CandidateScores | None:
-        """How the candidates of the generation that was closed last did."""
-        return self._generations.last
 
     @property
     def best(self) -> StoredEvaluation | None:
@@ -100,32 +69,52 @@ class Run:
 
     @property
     def confirmed(self) -> StoredConfirmation | None:
-        """The confirmed score of what is reported; `None` where what is reported is not confirmed."""
+        """The confirmed score of the reported mean; `None` if that is not confirmed."""
         return self.background_jobs.confirmed
 
     @property
     def ending(self) -> bool:
-        """Whether a limit is reached: evaluations and the confirmation are all that is waited for."""
+        """Whether a limit is reached, so that only evaluations, kept rollouts and the confirmation remain."""
         return self._ending is not None
 
     @property
-    def controller_path(self) -> Path | None:
-        """Where the reported controller lies; `None` while there is none: no generation was ever closed."""
-        return self.background_jobs.report.path
+    def classes(self) -> HostClasses:
+        """The host classes of the accepted results."""
+        return self._journal.classes
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Results, heartbeats and parts of uploads that were dropped, by reason."""
+        return self.background_jobs.rollout_collections.uploads.dropped + self.fleet.dropped
 
     @property
     def state(self) -> str:
-        """In a word, as the status tells it."""
+        """The state in a word, as the status shows it."""
         if self.ended is not None:
             return "ended"
         if self.paused is not None:
             return "paused"
-        if not any(member.takes_jobs for member in self.worker_protocol.members):
+        if not any(member.takes_jobs for member in self.fleet.members.values()):
             return "waiting for workers"
         return "evaluating" if self.fleet.drain_background else "running"
 
+    def record_result(self, work: Work, result: Result, worker: str, fingerprint: str, host_class: str) -> None:
+        """Journal an accepted result, then count it for the generation or the background job that wants it."""
+        self._journal.add_result(work.job, result, worker, fingerprint, self.incarnation, host_class)
+        self.admission.adopt_class(host_class, fingerprint)
+        assert result.fitness is not None
+        if work.job.kind != "score":
+            self.background_jobs.count(work, result)
+        elif self.generation.record(result.digest, result.fitness, result.steps):  # it wants other jobs now
+            self.fleet.jobs.offer(self.generation.missing)
+
+    def tick(self, now: float) -> None:
+        """Let time pass: departed workers, silent workers, stalled uploads."""
+        self.fleet.tick(now)
+        self.background_jobs.rollout_collections.uploads.tick(now)
+
     def advance(self, now: float) -> bool:
-        """Close what is complete and open what follows; whether a generation was opened."""
+        """Close the complete generation and open the next one; whether a generation was opened."""
         closed = len(self.history)
         while self.ended is None and self.paused is None and self.generation.complete and not self._is_waiting:
             self._close(now)
@@ -137,32 +126,37 @@ class Run:
         return len(self.history) > closed
 
     def commit(self) -> None:
-        """Make everything so far durable; then the reported controller may be written."""
+        """Make everything so far durable, then write the reported controller if it is due."""
         self._journal.commit()
         self.background_jobs.report.save()
 
     def leave(self) -> None:
-        """Make everything durable before the coordinator goes."""
+        """Make everything durable and write the reported controller before the coordinator exits."""
         self._journal.commit()
         self.background_jobs.report.save(at_once=True)
 
     def prepare(self) -> None:
-        """Work ahead while workers are busy."""
-        self._generations.prepare()
+        """Prepare the next generation while workers are busy."""
+        self.generations.prepare()
 
     def pause(self, why: str) -> None:
-        """Dispatch nothing more until the run is resumed."""
+        """Stop dispatching until the run is resumed."""
         self.paused = why
         self.fleet.paused = True
         self.fleet.notes.append(f"paused: {why}")
 
     def resume(self) -> None:
-        """Go on; what failed is tried again anywhere."""
+        """Dispatch again; failed jobs may go to any worker again."""
         if self.paused is not None:
             self.fleet.notes.append("resumed")
         self.paused = None
         self.fleet.paused = False
         self.fleet.jobs.clear_failures()
+
+    def take_notes(self) -> list[str]:
+        """What happened since the last call, for the log."""
+        notes, self.fleet.notes = self.fleet.notes, []
+        return notes
 
     def take_closed(self) -> list[StoredGeneration]:
         """Generations closed since the last call."""
@@ -171,7 +165,7 @@ class Run:
 
     @property
     def _is_waiting(self) -> bool:
-        """Whether the run is ending, or the next generation's terms hang on an evaluation in progress."""
+        """Whether the run is ending, or an evaluation in progress decides the next generation's parameters."""
         deciding = self._agenda.required_evaluation(self.generation.number + 1)
         return self._ending is not None or (
             self.background_jobs.evaluations.is_open(deciding) and self.generation.complete
@@ -180,9 +174,9 @@ class Run:
     def _begin(self, now: float) -> None:
         generation = self.generation
         if len(self._agenda.stages) > 1:
-            self.fleet.notes.append(f"generation {generation.number} is in {self._stage_told}")
+            self.fleet.notes.append(f"generation {generation.number} is in {self._stage_text}")
         self._prepare_fleet(generation)
-        work = self.background_jobs.begin(self._generations.mean, now)
+        work = self.background_jobs.begin(self.generations.mean, now)
         if self._ending is None and not generation.done and (reason := self._stop_reason(generation)):
             self._begin_ending(reason)
         if self._ending is None:
@@ -195,11 +189,11 @@ class Run:
                 self.commit()
 
     def _close(self, now: float) -> None:
-        closed = self._generations.close(self.generation, now - self.opened_at)
+        closed = self.generations.close(self.generation, now - self.opened_at)
         self._unpublished.append(closed)
-        mean = self._generations.mean
-        # Opened also when the run ends here: a later life with wider limits then goes on from it.
-        generation = self._generations.open(closed.number + 1)
+        mean = self.generations.mean
+        # Opened even if the run ends here: a later incarnation with wider limits continues from it.
+        generation = self.generations.open(closed.number + 1)
         reason = self._stop_reason(generation)
         self.fleet.jobs.offer(self.background_jobs.schedule(closed.number, mean, now, last=reason is not None))
         self._note_stage_changes(generation)
@@ -213,32 +207,43 @@ class Run:
 
     def _prepare_fleet(self, generation: Generation) -> None:
         self.fleet.jobs.begin_generation(generation.number)
-        self.fleet.single_job = self.scoring_params.stage.driven == 1
+        self.fleet.single_job = self.generations.scoring_params.stage.driven == 1
 
     def _note_stage_changes(self, generation: Generation) -> None:
-        """Say for the log under which other terms a generation opens, and why."""
-        begun, number = self.scoring_params.begun, generation.number
+        """Note for the log that a generation opens in another stage, and why."""
+        begun, number = self.generations.scoring_params.begun, generation.number
         if begun.since == number:
-            self.fleet.notes.append(f"{self._stage_told} begins with generation {number} after {begun.why}")
+            self.fleet.notes.append(f"{self._stage_text} begins with generation {number} after {begun.why}")
 
     @property
-    def _stage_told(self) -> str:
-        stage = self.scoring_params.stage
+    def _stage_text(self) -> str:
+        stage = self.generations.scoring_params.stage
         return f"stage {stage.number} of {len(self._agenda.stages)} ({stage.description})"
 
-    def _record_score(self, result: Result) -> None:
-        assert result.fitness is not None
-        if self.generation.record(result.digest, result.fitness, result.steps):
-            self.fleet.jobs.offer(self.generation.missing)
-
     def _stop_reason(self, generation: Generation) -> str | None:
-        """Why the run ends before `generation` is scored; `None` if it goes on."""
+        """Why the run ends before `generation` is scored; `None` if it continues."""
         if generation.is_one_point:
             return f"converged: generation {generation.number} is one point; fork the run with a larger --sigma0"
-        return stop_reason(self.limits, self.history, self.background_jobs.evaluations)
+        return self._reached_limit()
+
+    def _reached_limit(self) -> str | None:
+        """The first limit that is reached, in words; `None` if none is. The cost does not grow with the run."""
+        limits, evaluations = self.limits, self.background_jobs.evaluations
+        if limits.generations and len(self.history) >= limits.generations:
+            return plural(len(self.history), "generation")
+        if limits.steps and self.history.steps >= limits.steps:
+            return f"{self.history.steps} environment steps"
+        if limits.minutes and self.history.seconds >= 60 * limits.minutes:
+            return plural(limits.minutes, "minute")
+        best = evaluations.best
+        if limits.target is not None and best is not None and best.mean >= limits.target:
+            return f"the mean of generation {best.generation} reached {best.mean:.1f}"
+        if best is not None and limits.parted and evaluations.have_fallen_behind(limits.parted):
+            return f"the evaluated mean fell behind generation {best.generation}'s"
+        return None
 
     def _finish(self) -> None:
-        """Where a limit is reached and its last evaluations are in: confirm what is reported, then end."""
+        """Once a limit is reached and no background job is left: confirm the reported mean, then end the run."""
         if self._ending is None or self.background_jobs.in_progress or self.ended is not None:
             return
         if work := self.background_jobs.confirm():
@@ -248,12 +253,12 @@ class Run:
             self._end()
 
     def _begin_ending(self, reason: str) -> None:
-        """A limit is reached. It is written with what reached it: by the last evaluations it may look otherwise."""
+        """Journal the reached limit with all limits: the last evaluations may make it look unreached again."""
         self._ending = reason
         self._journal.set_fact(ENDING, json.dumps([reason, asdict(self.limits)]))
 
     def _stored_end_reason(self) -> str | None:
-        """The limit that an earlier life reached; `None` where this one has other limits."""
+        """The limit that an earlier incarnation reached; `None` if this one has other limits."""
         reason, limits = json.loads(self._journal.fact(ENDING) or "[null, null]")
         return reason if limits == asdict(self.limits) else None
 

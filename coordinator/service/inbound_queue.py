@@ -1,8 +1,8 @@
-"""What has arrived and waits for the owner thread: bounded by kind, in count and in bytes. Pure: sizes and a clock in.
+"""Events that wait for the service's thread: bounded per kind, in count and in bytes. Pure: sizes and a clock in.
 
-Whatever comes over the wire is said again by whoever needs it to be heard: results and uploads until their verdict,
-beats each interval, hellos until they are answered; a departure that was overlooked shows as silence. So what is too
-much is dropped and counted: no flood fills the memory, and one of a kind leaves room for the others.
+Senders repeat what matters: results and uploads until their verdict, heartbeats at each interval, hellos until they are
+answered; a missed departure shows as silence. So events beyond a bound are dropped and counted: no flood fills the
+memory, and a flood of one kind leaves room for the others.
 """
 
 from __future__ import annotations
@@ -19,30 +19,30 @@ from dreamfleet.common.protocol.messages import MAX_MESSAGE
 
 @dataclass(frozen=True)
 class QueueLimit:
-    """How much of a kind may wait; and how many may come in a second, a burst aside."""
+    """How many events of a kind may wait, how many bytes, and how many may arrive a second after a burst."""
 
     count: int
     size: int  # bytes
     rate: float = math.inf
 
 
-HELLO_PATIENCE = 32  # events after which a hello is taken before others
+HELLO_PATIENCE = 32  # events after which a waiting hello goes first
 QUEUE_LIMITS = {
     "result": QueueLimit(2048, 16 << 20),
     "beat": QueueLimit(2048, 8 << 20),
     "upload": QueueLimit(512, 20 << 20),
     "token": QueueLimit(4096, 1),  # without a payload
-    "hello": QueueLimit(256, 4 << 20, 100.0),  # each costs what dozens of results cost, and who is not heard asks again
+    "hello": QueueLimit(256, 4 << 20, 100.0),  # each costs as much as dozens of results, and workers repeat it
     "control": QueueLimit(64, 1 << 20),
 }
 
 
 class InboundQueue:
-    """A queue that any thread may put into; one takes out."""
+    """A queue with many producer threads and one consumer."""
 
     def __init__(self, bounds: dict[str, QueueLimit] = QUEUE_LIMITS) -> None:
         self._bounds = bounds
-        self._wakeups: queue.SimpleQueue[None] = queue.SimpleQueue()  # one for each event, and for each wake
+        self._wakeups: queue.SimpleQueue[None] = queue.SimpleQueue()  # one for each event and each wake
         self._first: deque[tuple[str, Any, int]] = deque()
         self._later: deque[tuple[str, Any, int]] = deque()
         self._passed_over = 0
@@ -54,12 +54,12 @@ class InboundQueue:
 
     @property
     def dropped(self) -> Counter[str]:
-        """What was not taken in, by reason."""
+        """Dropped events, by reason."""
         with self._lock:
             return Counter(self._dropped)
 
     def put(self, kind: str, event: Any, size: int, now: float) -> bool:
-        """Take in an event of so many bytes; whether there was room for it."""
+        """Add an event of `size` bytes; whether there was room for it."""
         with self._lock:
             if why := self._drop_reason(kind, size, now):
                 self._dropped[why] += 1
@@ -75,7 +75,7 @@ class InboundQueue:
         self._wakeups.put(None)
 
     def get(self, timeout: float) -> tuple[str, Any]:
-        """The oldest event, hellos after all else but for one in a while; `queue.Empty` after `timeout` seconds."""
+        """Take the oldest event; hellos wait for the others, but not forever. `queue.Empty` after `timeout` seconds."""
         self._wakeups.get(timeout=timeout)
         with self._lock:
             hello = self._later and (not self._first or self._passed_over >= HELLO_PATIENCE)
@@ -97,7 +97,7 @@ class InboundQueue:
         return "" if bound.rate == math.inf or self._spend_token(kind, bound, now) else "too many in a second"
 
     def _spend_token(self, kind: str, bound: QueueLimit, now: float) -> bool:
-        """Whether one more may come now: as many as may wait at once, and then `rate` a second."""
+        """Take a token from the kind's bucket, which holds `count` and refills at `rate`; whether there was one."""
         left, then = self._budget[kind]
         left = min(left + bound.rate * max(now - then, 0.0), float(bound.count))
         enough = left >= 1.0

@@ -1,7 +1,7 @@
-"""Who of several coordinators of one name goes on. Pure: what is seen and said, and a clock in; who must leave out.
+"""Decide which of several coordinators of one name continues. Pure: tokens, notes and a clock in, a decision out.
 
-A token alone says little: it may linger after a coordinator that was killed. So each is asked who it is, and one that
-does not answer counts only once its token has outlived the lease.
+A token alone proves little: it may outlive a killed coordinator. So each coordinator is asked to identify itself, and
+one that does not answer counts only once its token has outlived the lease.
 """
 
 from __future__ import annotations
@@ -10,43 +10,43 @@ from dataclasses import dataclass, field
 
 from dreamfleet.common.protocol.messages import ClaimNote
 
-ASK_INTERVAL = 0.5  # seconds until one that did not answer is asked again
+ASK_INTERVAL = 0.5  # seconds before a coordinator that did not answer is asked again
 
 
 @dataclass
 class OtherCoordinator:
-    """Another coordinator's token."""
+    """A coordinator whose token is visible."""
 
-    since: float  # when it came into sight
+    since: float  # when its token appeared
     ask_at: float
     note: ClaimNote | None = None
 
 
 @dataclass
 class LeaderCheck:
-    """The other coordinators in sight of one, by nonce; a silent one counts as live after `patience` seconds."""
+    """The other visible coordinators, by nonce; a silent one counts as live after `patience` seconds."""
 
     own_nonce: str  # this coordinator's nonce
     patience: float
-    own_note: ClaimNote | None = None  # what this coordinator says of itself; `None` while it has not begun
+    own_note: ClaimNote | None = None  # identifies this coordinator; `None` until it serves a run
     _seen: dict[str, OtherCoordinator] = field(default_factory=dict)
 
     def appear(self, nonce: str, now: float) -> None:
-        """A token came into sight; one's own may come back after a cut, and is nobody's."""
+        """A token appeared; this coordinator's own, which may return after a network cut, is ignored."""
         if nonce != self.own_nonce:
             self._seen.setdefault(nonce, OtherCoordinator(now, now))
 
     def vanish(self, nonce: str) -> None:
-        """A token went out of sight."""
+        """A token disappeared."""
         self._seen.pop(nonce, None)
 
     def record_note(self, note: ClaimNote) -> None:
-        """One says who it is, in answer or as it asks; an answer that comes after its token went means nothing."""
+        """A coordinator identified itself, in an answer or a query; after its token disappeared this means nothing."""
         if (rival := self._seen.get(note.nonce)) is not None:
             rival.note = note
 
     def due_to_ask(self, now: float) -> list[str]:
-        """Whom to ask now."""
+        """The nonces to ask now."""
         found = [nonce for nonce, each in self._seen.items() if each.note is None and now >= each.ask_at]
         for nonce in found:
             self._seen[nonce].ask_at = now + ASK_INTERVAL
@@ -54,20 +54,20 @@ class LeaderCheck:
 
     @property
     def has_any(self) -> bool:
-        """Whether any token is in sight."""
+        """Whether any other token is visible."""
         return bool(self._seen)
 
     def live(self, now: float) -> list[tuple[str, ClaimNote | None]]:
-        """Those that live: each one's nonce and what it said, `None` if it says nothing."""
+        """The live coordinators: each one's nonce and note, `None` if it does not answer."""
         return [
             (nonce, each.note) for nonce, each in self._seen.items()
             if each.note is not None or now - each.since > self.patience
         ]  # fmt: skip
 
     def find_stronger(self, now: float) -> tuple[str, ClaimNote | None] | None:
-        """One that goes on where this coordinator leaves; `None` while there is none.
+        """A coordinator before which this one must leave; `None` if there is none.
 
-        One that does not say who it is does not know this rule either, and will not leave.
+        One that does not identify itself does not know this rule either, and will not leave.
         """
         for nonce, note in self.live(now):
             if note is None or self.own_note is None or rank(note) < rank(self.own_note):
@@ -76,9 +76,9 @@ class LeaderCheck:
 
 
 def rank(note: ClaimNote) -> tuple[int, float, str]:
-    """The lowest goes on: the latest incarnation, of equals the one that has served longest, of equals by nonce.
+    """Sort key: the lowest continues. The latest incarnation ranks first, then the longest serving, then by nonce.
 
-    Of one run the latest incarnation is the one that somebody continued last, and it holds what the earlier ones held
-    when it was begun. The order is total, so that of any number exactly one goes on.
+    The latest incarnation of a run is the one that was continued last, with all that the earlier ones held by then. The
+    order is total, so that exactly one coordinator continues.
     """
     return -note.incarnation, note.began, note.nonce

@@ -1,4 +1,4 @@
-"""From a request to a served run: the folder, its lock, its journal, the service."""
+"""Serve a run from a request: its folder, lock and journal, then the service."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ from dreamfleet.common.runs.run_paths import ARCHIVE, BUNDLE, JOURNAL, resume_co
 from dreamfleet.common.security.certificate_ledger import RevocationWatcher
 from dreamfleet.common.security.credentials import Credentials
 from dreamfleet.common.transport.session import Network
-from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.service.service import Service
 from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, LimitsConfig, NetworkConfig, RunConfig
@@ -35,26 +34,26 @@ from dreamfleet.coordinator.storage.served_bundle import ServedBundle
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What to serve; without `config` the run is continued."""
+    """The run to serve; without `config` it is a continued one."""
 
     name: str
     runs_dir: Path
     config: RunConfig | None
     limits: LimitsConfig
     network: NetworkConfig
-    start: StartPoint | None = None  # of a new run; it begins with zero parameters otherwise
+    start: StartPoint | None = None  # of a new run; without one it begins with zero parameters
     credentials: Credentials | None = None
     join: Path | None = None  # the file of the credentials
-    access_dir: Path = GlobalConfig.access_dir  # whose list says what is revoked
+    access_dir: Path = GlobalConfig.access_dir  # holds the list of revoked certificates
 
     @property
     def folder(self) -> Path:
-        """Where the run lies."""
+        """The run's folder."""
         return self.runs_dir / check_run_name(self.name)
 
     @property
     def with_absolute_paths(self) -> RunRequest:
-        """The same with paths that hold in whichever folder somebody is."""
+        """The same request with absolute paths, which hold in any working directory."""
         access = self.access_dir if self.access_dir == GlobalConfig.access_dir else self.access_dir.absolute()
         join = None if self.join is None else self.join.absolute()
         return replace(self, runs_dir=self.runs_dir.absolute(), join=join, access_dir=access)
@@ -66,7 +65,7 @@ class RunRequest:
 
 
 def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], None] = lambda _stop: None) -> Run:
-    """Serve a new or continued run until it ends or is stopped; `on_stoppable` is handed the way to stop it."""
+    """Serve a new or continued run until it ends or is stopped; `on_stoppable` receives the function that stops it."""
     folder = request.folder
     if request.config is not None and request.name == ARCHIVE:
         raise UsageError(f"{ARCHIVE!r} is where archived runs lie: choose another name")
@@ -81,9 +80,8 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
         )
         service = _service(request, file_watch, served)
         on_stoppable(service.stop)
-        fleet, strict = Fleet(request.network.beat, request.network.evaluation_share), request.network.strict
         try:
-            return service.serve(lambda: Run(journal, settings, request.limits, fleet, monotonic(), strict=strict))
+            return service.serve(lambda: Run(journal, settings, request.limits, request.network, monotonic()))
         except ConnectionFailedError as error:
             if request.config is None:
                 raise
@@ -101,10 +99,10 @@ def _service(request: RunRequest, file_watch: FileWatch, bundle: ServedBundle | 
 
 
 def _open_journal(request: RunRequest, folder: Path, settings: RunSettings, bundle: Bundle | None) -> Journal:
-    """The run's journal, with how it is served.
+    """Open the run's journal and write its limits, network settings and, of a new run, its start point.
 
-    It is written before anything else can fail, as is where a new run begins, in the transaction that makes the run: a
-    coordinator that finds its port taken, or is killed, is continued with all that it was told.
+    They are durable before anything else can fail: a coordinator that finds its port taken, or is killed, resumes with
+    all its settings.
     """
     facts = serving_facts(request.limits, request.network)
     if request.config is not None:
@@ -119,7 +117,7 @@ def _open_journal(request: RunRequest, folder: Path, settings: RunSettings, bund
 
 
 def _resolve_settings(request: RunRequest, folder: Path) -> tuple[RunSettings, Bundle | None]:
-    """What the run is, and its verified bundle if it has one."""
+    """The run's settings, and its verified bundle if its task needs one."""
     if request.config is not None:
         return _resolve_new_settings(request.config, request.start)
     with open_run(request.runs_dir, request.name) as stored:

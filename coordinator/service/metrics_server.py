@@ -1,4 +1,4 @@
-"""`/metrics` of a coordinator, in a thread of its own: read-only, from the latest snapshot."""
+"""`/metrics` of a coordinator: a read-only thread that answers from the latest snapshot."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from time import monotonic, sleep
 from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.monitoring.prometheus import CONTENT_TYPE, exposition
 from dreamfleet.common.transport.network import parse_metrics_address
-from dreamfleet.coordinator.service.status import Snapshot, full_status
+from dreamfleet.coordinator.service.snapshot import Snapshot
 
-PATIENCE = 5.0  # seconds for a whole question and its answer: one client at a time is answered
+PATIENCE = 5.0  # seconds for a request and its response: the server handles one client at a time
 POLL = 0.1  # seconds
-LONGEST = 90.0  # seconds that an ended run waits for whoever scrapes to hear of its end
+LONGEST = 90.0  # seconds that an ended run waits for its scraper to see that it ended
 
 
 @contextmanager
 def serve_metrics(where: str, snapshot: Callable[[], Snapshot], stopped: Callable[[], bool]) -> Iterator[None]:
-    """Answer at the address that `where` names; nowhere if it is empty. `ConnectionFailedError` where it is taken.
+    """Serve metrics at the address `where`, nothing if it is empty; `ConnectionFailedError` if the port is taken.
 
-    Who has scraped a run that has ended meanwhile may do so once more before the port is closed, if he comes as soon as
-    before and nobody has `stopped` the coordinator: else nobody would hear of the end and of the confirmed score.
+    After a run has ended, the port stays open for one more scrape, if a scraper keeps its interval and nobody has
+    `stopped` the coordinator. Otherwise no scraper would see the end and the confirmed score.
     """
     if not where:
         yield
@@ -51,7 +51,7 @@ def serve_metrics(where: str, snapshot: Callable[[], Snapshot], stopped: Callabl
 
 
 class ScrapeTimes:
-    """When somebody asked, and of which state he was told."""
+    """When a client scraped last, and the run state that it saw."""
 
     def __init__(self) -> None:
         self._at: float | None = None
@@ -59,12 +59,12 @@ class ScrapeTimes:
         self._state = ""
 
     def record(self, state: str, now: float) -> None:
-        """Somebody is told of a run of this state."""
+        """A client has scraped and seen this run state."""
         self._interval = 0.0 if self._at is None else now - self._at
         self._at, self._state = now, state
 
     def is_expected(self, since: float, now: float) -> bool:
-        """Whether somebody who asks again and again has yet to hear of a run that ended at `since`."""
+        """Whether a client that scrapes at intervals has yet to see that the run ended at `since`."""
         return self._state != "ended" and now - since < min(2 * self._interval, LONGEST)
 
 
@@ -74,7 +74,7 @@ class _MetricsServer(HTTPServer):
         self.scrapes = ScrapeTimes()
 
     def handle_error(self, *_: object) -> None:
-        """A client that leaves, or says nothing, is no news."""
+        """Log nothing when a client disconnects or sends nothing."""
 
 
 def _handler(snapshot: Callable[[], Snapshot]) -> type[BaseHTTPRequestHandler]:
@@ -84,7 +84,7 @@ def _handler(snapshot: Callable[[], Snapshot]) -> type[BaseHTTPRequestHandler]:
         sys_version = ""
 
         def handle(self) -> None:
-            """One question; who says it a byte at a time would keep others out, and the coordinator from its end."""
+            """Handle one request; a slow client is cut off, for it would block others and the coordinator's exit."""
             late = threading.Timer(PATIENCE, self._drop)
             late.daemon = True
             late.start()
@@ -94,14 +94,14 @@ def _handler(snapshot: Callable[[], Snapshot]) -> type[BaseHTTPRequestHandler]:
                 late.cancel()
 
         def _drop(self) -> None:
-            with suppress(OSError):  # it is gone
+            with suppress(OSError):  # already closed
                 self.connection.shutdown(socket.SHUT_RDWR)
 
-        def do_GET(self) -> None:  # the name is http.server's
+        def do_GET(self) -> None:  # http.server requires this name
             if self.path.partition("?")[0] != "/metrics":
-                self.send_error(HTTPStatus.NOT_FOUND, "there is /metrics")
+                self.send_error(HTTPStatus.NOT_FOUND, "there is only /metrics")
                 return
-            status = full_status(snapshot())
+            status = snapshot().full_status()
             body = exposition(status).encode()
             self.send_response(HTTPStatus.OK)
             self.send_header("Content-Type", CONTENT_TYPE)
@@ -112,6 +112,6 @@ def _handler(snapshot: Callable[[], Snapshot]) -> type[BaseHTTPRequestHandler]:
                 self.server.scrapes.record(status.state, monotonic())
 
         def log_message(self, *_: object) -> None:
-            """Every scrape would be a line."""
+            """Log no scrape."""
 
     return Handler

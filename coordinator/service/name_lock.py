@@ -1,4 +1,4 @@
-"""A coordinator's claim to its run's name on the wire, for as long as it serves: of two of one name one must leave."""
+"""A coordinator's claim to its run's name on the network: of two coordinators of one name, one must leave."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from dreamfleet.common.serialization.validation import MalformedError
 from dreamfleet.common.transport.session import LEASE_MS, enqueue_into
 from dreamfleet.coordinator.service.leader_check import LeaderCheck
 
-DISCOVERY_SECONDS = 0.3  # seconds in which the tokens that are there come into sight
-PATIENCE = LEASE_MS / 1000 + 1  # a token of one who is gone vanishes before
-TIMEOUT = 2.0  # seconds of a question
+DISCOVERY_SECONDS = 0.3  # seconds until all present tokens are visible
+PATIENCE = LEASE_MS / 1000 + 1  # seconds: the token of a dead coordinator vanishes earlier
+TIMEOUT = 2.0  # seconds of a query
 
 
 class NameLock:
-    """Watches the other coordinators' tokens; `stack` ends the watch, and first takes the own token back."""
+    """Holds the name and watches other coordinators' tokens; closing `stack` releases the name and ends the watch."""
 
     def __init__(self, session: zenoh.Session, run: str, nonce: str, stack: ExitStack) -> None:
         self._session = session
         self._run = run
         self._nonce = nonce
-        self._rivals = LeaderCheck(nonce, PATIENCE)
+        self._leader_check = LeaderCheck(nonce, PATIENCE)
         self._inbox: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._stack = stack
         watcher = session.liveliness().declare_subscriber(
@@ -38,25 +38,25 @@ class NameLock:
         stack.callback(watcher.undeclare)
 
     def acquire(self) -> None:
-        """Take the name; `RefusedError` if somebody who lives has it: a newcomer has nothing to lose."""
+        """Take the name; `RefusedError` if a live coordinator has it: a newcomer has nothing to lose."""
         until = monotonic() + DISCOVERY_SECONDS
-        while (now := monotonic()) < until or self._rivals.has_any:
+        while (now := monotonic()) < until or self._leader_check.has_any:
             self._listen(now, DISCOVERY_SECONDS / 10)
-            if self._rivals.live(now):
+            if self._leader_check.live(now):
                 raise RefusedError(f"run {self._run} has a live coordinator already: stop it, or choose another --run")
         token = self._session.liveliness().declare_token(keys.live_coordinator(self._run, self._nonce))
         self._stack.callback(token.undeclare)
 
     def announce(self, run_uid: str, incarnation: int) -> None:
-        """Say from now on who this coordinator is, to whoever asks."""
+        """Identify this coordinator from now on, to every other one that asks."""
         note = ClaimNote(run_uid=run_uid, incarnation=incarnation, nonce=self._nonce, began=time())
-        self._rivals.own_note, payload = note, encode_json(note)
+        self._leader_check.own_note, payload = note, encode_json(note)
         key = keys.claim(self._run, self._nonce)
 
         def answer(query: zenoh.Query) -> None:
-            """In the queryable's own thread: the loop may be busy."""
+            """Answer in Zenoh's thread: the service's loop may be busy."""
             with query:
-                if query.payload is not None:  # who asks says who it is
+                if query.payload is not None:  # the asking coordinator identifies itself
                     self._inbox.put(("note", query.payload.to_bytes()))
                 query.reply(key, payload, encoding="application/json")
 
@@ -64,33 +64,33 @@ class NameLock:
         self._stack.callback(queryable.undeclare)
 
     def check(self, now: float) -> None:
-        """`RefusedError` if another coordinator of this name goes on, so that this one leaves."""
+        """Raise `RefusedError` if another coordinator of this name continues, so that this one must leave."""
         self._listen(now, 0.0)
-        found = self._rivals.find_stronger(now)
+        found = self._leader_check.find_stronger(now)
         if found is not None:
             raise RefusedError(self._explain(found[1]))
 
     def _listen(self, now: float, wait: float) -> None:
-        """Take in what was seen and said, waiting for so many seconds at most; ask whoever is new."""
+        """Handle tokens and notes, waiting at most `wait` seconds for the first; ask new coordinators for theirs."""
         try:
             self._handle(*self._inbox.get(timeout=wait), now) if wait else self._handle(*self._inbox.get_nowait(), now)
             while True:
                 self._handle(*self._inbox.get_nowait(), now)
         except queue.Empty:
             pass
-        for nonce in self._rivals.due_to_ask(now):
+        for nonce in self._leader_check.due_to_ask(now):
             self._ask(nonce)
 
     def _handle(self, kind: str, event: Any, now: float) -> None:
         if kind == "token":
             nonce = str(event.key_expr).rsplit("/", 1)[-1]
             if event.kind == zenoh.SampleKind.DELETE:
-                self._rivals.vanish(nonce)
+                self._leader_check.vanish(nonce)
             else:
-                self._rivals.appear(nonce, now)
+                self._leader_check.appear(nonce, now)
             return
         try:
-            self._rivals.record_note(decode_json(ClaimNote, event))
+            self._leader_check.record_note(decode_json(ClaimNote, event))
         except MalformedError:
             return
 
@@ -99,14 +99,14 @@ class NameLock:
             if reply.ok is not None:
                 self._inbox.put(("note", reply.ok.payload.to_bytes()))
 
-        own = self._rivals.own_note
+        own = self._leader_check.own_note
         self._session.get(
             keys.claim(self._run, nonce), zenoh.handlers.Callback(record_note, indirect=False), timeout=TIMEOUT,
             payload=None if own is None else encode_json(own), encoding="application/json",
         )  # fmt: skip
 
     def _explain(self, other: ClaimNote | None) -> str:
-        own = self._rivals.own_note
+        own = self._leader_check.own_note
         same = other is not None and own is not None and other.run_uid == own.run_uid
         who = "of another version" if other is None else f"in incarnation {other.incarnation}"
         what = "this very run" if same else f"a run {self._run}"
@@ -116,6 +116,6 @@ class NameLock:
             else "stop the other one, rename this run's folder, or keep their routers apart"
         )
         return (
-            f"another coordinator serves {what} on this network, {who}: it goes on, this one leaves; nothing is lost, "
-            f"the journal is whole; {remedy}, then --resume"
+            f"another coordinator serves {what} on this network, {who}: it continues, this one leaves; nothing is "
+            f"lost, the journal is whole; {remedy}, then --resume"
         )

@@ -1,19 +1,15 @@
-"""The coordinator on Zenoh: one owner thread, one queue; callbacks only enqueue, or answer from a ready snapshot.
+"""The coordinator on Zenoh: callbacks only enqueue events, or answer from a snapshot; one thread handles the events.
 
-Life: startup (session, lock on the name, queryables) -> loop (events, advance, commit, dispatch) -> shutdown.
+Life: startup (session, name lock, queryables) -> loop (events, advance, commit, dispatch) -> shutdown.
 """
 
 from __future__ import annotations
 
 import logging
-import math
 import queue
 import secrets
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict
-from datetime import UTC, datetime
-from itertools import islice
 from time import monotonic
 from typing import Any
 
@@ -29,38 +25,34 @@ from dreamfleet.common.protocol.messages import (
     HelloRequest,
     Intervals,
     JobBatch,
-    Message,
     ResultBatch,
     UploadPart,
 )
+from dreamfleet.common.runs.records import StoredGeneration
 from dreamfleet.common.security.certificate_ledger import RevocationWatcher
-from dreamfleet.common.security.credentials import EXPIRY_WARNING, describe_time_left, worker_seat_identity
+from dreamfleet.common.security.credentials import worker_seat_identity
 from dreamfleet.common.serialization.validation import MalformedError
-from dreamfleet.common.transport.network import is_loopback
 from dreamfleet.common.transport.session import Network, open_session
-from dreamfleet.coordinator.dispatch.packing import BatchContent, OutgoingBatch
+from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
 from dreamfleet.coordinator.run.run import Run
-from dreamfleet.coordinator.service import status_json
+from dreamfleet.coordinator.run.worker_protocol import WorkerMessage, WorkerProtocol
+from dreamfleet.coordinator.service.control import Control
 from dreamfleet.coordinator.service.inbound_queue import InboundQueue
-from dreamfleet.coordinator.service.log_messages import summary, worker_command
 from dreamfleet.coordinator.service.metrics_server import serve_metrics
 from dreamfleet.coordinator.service.name_lock import NameLock
 from dreamfleet.coordinator.service.queryables import BundleServer, declare_status
-from dreamfleet.coordinator.service.reply_messages import control_reply, control_verb, hello_reply, malformed_hello
-from dreamfleet.coordinator.service.status import Snapshot, full_status, mark_left, take_snapshot
+from dreamfleet.coordinator.service.run_log import RunLog
+from dreamfleet.coordinator.service.snapshot import Snapshot, take_snapshot
+from dreamfleet.coordinator.service.status import encode_status
 from dreamfleet.coordinator.storage.file_watch import FileWatch
 from dreamfleet.coordinator.storage.served_bundle import ServedBundle
 
 log = logging.getLogger(__name__)
-TICK = 0.05  # seconds: the longest that a loss waits to be acted upon
+TICK = 0.05  # seconds: the longest that a lost worker waits to be noticed
 MOST_EVENTS_PER_COMMIT = 256  # events that share one commit at most
-LINGER = 0.005  # seconds that a commit waits for more to share it
+LINGER = 0.005  # seconds that a commit waits for more events to share it
 SNAPSHOT_INTERVAL = 0.2
-SUMMARY_INTERVAL = 60.0  # seconds from one line about the run to the next
-DISBAND_TIMEOUT = 10.0  # seconds that workers may take to leave a run that ends with them
-DAY = 86_400.0  # seconds from one warning of the join file's end to the next
-NO_WORKER_SECONDS = 5.0  # seconds without a worker after which the log says so
-_WORKER_MESSAGES: dict[str, type[Message]] = {"result": ResultBatch, "beat": Heartbeat, "upload": UploadPart}
+_WORKER_MESSAGES: dict[str, type[WorkerMessage]] = {"result": ResultBatch, "beat": Heartbeat, "upload": UploadPart}
 
 
 class Service:
@@ -68,7 +60,7 @@ class Service:
 
     def __init__(
         self, name: str, network: Network, intervals: Intervals, file_watch: FileWatch, bundle: ServedBundle | None,
-        metrics_port: str = "", revocations: RevocationWatcher | None = None,
+        metrics_port: str, revocations: RevocationWatcher,
     ) -> None:  # fmt: skip
         self._name = name
         self._file_watch = file_watch
@@ -82,67 +74,90 @@ class Service:
         self._events = InboundQueue()
         self._inbox = CountingDecoder()
         self._error_counter = ErrorCounter(log)
-        self._stopping = self._draining = False
-        self._disbanding_since: float | None = None  # every batch then says `leave`
-        self._leave_sent_at = -math.inf
-        self._evaluations_logged = 0
-        self._expiry_at = 0.0
+        self._stopping = False
 
     def stop(self) -> None:
         """End the loop soon; the run can be continued. Safe in a signal handler."""
         self._stopping = True
         self._events.wake()
 
-    def serve(self, run_maker: Callable[[], Run], on_ready: Callable[[Run], None] = lambda _run: None) -> Run:
-        """Claim the name on the wire, make the run, serve it; the run as it was when the service left."""
+    def serve(self, make_run: Callable[[], Run]) -> Run:
+        """Claim the name on the network, make the run, serve it; the run as it was at shutdown."""
         with ExitStack() as last, open_session(self._network) as session, ExitStack() as stack:
             self._name_lock = NameLock(session, self._name, self._nonce, stack)
             self._name_lock.acquire()
-            self._run = run_maker()
-            self._name_lock.announce(self._run.uid, self._run.incarnation)
-            self._worker_protocol = self._run.worker_protocol
-            self._started = self._no_worker_since = self._summary_logged_at = monotonic()
-            self._snapshot = self._take_snapshot()
-            last.enter_context(serve_metrics(self._metrics_port, lambda: self._snapshot, lambda: self._stopping))
-            declared = self._declare(session)
-            begun = {"run": self._name, "run_uid": self._run.uid, "incarnation": self._run.incarnation}
-            log.info("run %s, incarnation %d, generation %d", self._name, self._run.incarnation,
-                     self._run.generation.number, extra={"facts": {"event": "begin", **begun}})  # fmt: skip
-            if self._network.listen:
-                log.info("listening on %s", ", ".join(self._network.listen))
-                self._warn_if_insecure()
-            self._evaluations_logged = len(self._run.background_jobs.evaluations)
-            on_ready(self._run)
+            declared = self._start(session, make_run(), last)
             try:
                 self._loop(session)
-            except RefusedError:  # another coordinator of this name goes on; the run is whole
+            except RefusedError:  # another coordinator of this name continues; nothing of the run is lost
                 self._run.leave()
                 raise
-            self._file_watch.check(monotonic(), at_once=True)
-            self._run.leave()
-            self._snapshot = mark_left(self._take_snapshot())
-            for each in declared:
-                each.undeclare()
-            farewell = status_json.status(self._snapshot)
-            session.put(keys.event_status(self._name), farewell, encoding="application/json")
+            self._shut_down(session, declared)
         return self._run
 
-    def _declare(self, session: zenoh.Session) -> list[Any]:
-        name = self._name
+    def _start(self, session: zenoh.Session, run: Run, stack: ExitStack) -> list[Any]:
+        """Answer for the run from now on; what is declared on the session."""
+        self._run, name = run, self._name
+        self._name_lock.announce(run.uid, run.incarnation)
+        self._protocol = WorkerProtocol(run, name, self._nonce, self._intervals)
+        self._control = Control(run, name, self._intervals.beat, self.stop)
+        self._started = monotonic()
+        self._run_log = RunLog(run, name, self._network, self._started)
+        self._snapshot = self._take_snapshot()
+        stack.enter_context(serve_metrics(self._metrics_port, lambda: self._snapshot, lambda: self._stopping))
         subscribe, answer = session.declare_subscriber, session.declare_queryable
-        return [
-            *(subscribe(keys.all_workers(kind, name), self._enqueue(kind)) for kind in ("result", "beat", "upload")),
+        declared = [
+            *(subscribe(keys.all_workers(kind, name), self._enqueue(kind)) for kind in _WORKER_MESSAGES),
             session.liveliness().declare_subscriber(
                 keys.all_workers("live/worker", name), self._enqueue("token"), history=True
             ),
             answer(self._hello_key("*/*"), self._enqueue("hello")),
             answer(keys.control(name, "*"), self._enqueue("control")),
             *declare_status(session, name, lambda: self._snapshot, self._error_counter),
-            *self._serve_bundle(session),
         ]
+        if self._bundle is not None:
+            sha256 = run.settings.task.bundle
+            head = {"run_uid": run.uid, "incarnation": run.incarnation, "sha256": bytes.fromhex(sha256)}
+            server = BundleServer(self._bundle, keys.bundle(name, sha256), head)
+            declared.append(server.declare(session, self._error_counter))
+        self._run_log.begin()
+        return declared
+
+    def _loop(self, session: zenoh.Session) -> None:
+        snapshot_at = monotonic()
+        while not self._stopping and self._run.ended is None:
+            self._drain_events()
+            now = monotonic()
+            self._run.tick(now)
+            if self._run.advance(now):  # the new generation's jobs need not wait for the disk
+                self._put(session, self._run.fleet.dispatch(now, durable=False))
+            self._run.commit()
+            self._put(session, self._run.fleet.dispatch(now))
+            self._run.prepare()
+            # A new state is in the snapshot before it is announced: a client that hears of it and asks must see it.
+            if now - snapshot_at >= SNAPSHOT_INTERVAL or self._run.state != self._snapshot.status.state:
+                self._snapshot, snapshot_at = self._take_snapshot(), now
+                self._run_log.check(self._snapshot, now)
+            closed = self._run.take_closed()
+            self._publish(session, closed)
+            self._run_log.report_closed(closed)
+            self._run_log.write_notes()
+            self._put(session, self._control.advance(now))
+            self._file_watch.check(now)
+            self._name_lock.check(now)
+            self._check_revocations(now)
+
+    def _shut_down(self, session: zenoh.Session, declared: list[Any]) -> None:
+        """Make the run durable, stop answering, and publish the last status."""
+        self._file_watch.check(monotonic(), at_once=True)
+        self._run.leave()
+        self._snapshot = self._take_snapshot().as_left()
+        for each in declared:
+            each.undeclare()
+        session.put(keys.event_status(self._name), encode_status(self._snapshot), encoding="application/json")
 
     def _enqueue(self, kind: str) -> Any:
-        """A callback that only enqueues; what is too much is dropped, and a query then ends without an answer."""
+        """A callback that only enqueues; if the queue is full, the event is dropped, a query without an answer."""
 
         def enqueue(event: Any) -> None:
             size = len(event.payload) if event.payload is not None else 0
@@ -151,98 +166,31 @@ class Service:
 
         return zenoh.handlers.Callback(enqueue, indirect=False)
 
-    def _loop(self, session: zenoh.Session) -> None:
-        taken = monotonic()
-        while not self._stopping and self._run.ended is None:
-            self._drain_events()
-            now = monotonic()
-            self._worker_protocol.tick(now)
-            if self._run.advance(now):
-                self._put(
-                    session, self._worker_protocol.dispatch(now, durable=False)
-                )  # workers need not wait for the disk
-            self._run.commit()
-            self._put(session, self._worker_protocol.dispatch(now))
-            self._run.prepare()
-            # Before anything is said of it: who hears that a run is paused, and asks, is not told that it runs.
-            if now - taken >= SNAPSHOT_INTERVAL or self._run.state != self._snapshot.status.state:
-                self._snapshot, taken = self._take_snapshot(), now
-                self._warn_if_no_worker(now)
-                self._log_summary(now)
-            self._publish_closed(session)
-            self._write_notes()
-            if self._draining and not self._worker_protocol.lease_count:
-                self.stop()
-            self._disband(session, now)
-            self._file_watch.check(now)
-            self._name_lock.check(now)
-            self._check_revocations(now)
-
-    def _put(self, session: zenoh.Session, sends: list[OutgoingBatch]) -> None:
-        for send in sends:
+    def _put(self, session: zenoh.Session, batches: list[OutgoingBatch]) -> None:
+        for batch in batches:
             try:
-                batch = self._encode_batch(send)
-            except MalformedError as error:  # what this worker said led to it
-                self._error_counter.record("batch", error, send.identity)
-                self._worker_protocol.remove_worker(send.identity)
+                message = encode(self._protocol.job_batch(batch, leave=self._control.disbanding))
+            except MalformedError as error:  # caused by what this worker reported
+                self._error_counter.record("batch", error, batch.identity)
+                self._run.fleet.remove_worker(batch.identity)
                 continue
-            session.put(keys.job(self._name, send.identity), batch, encoding=encoding(JobBatch))
-
-    def _warn_if_insecure(self) -> None:
-        if not self._secured and not all(is_loopback(each) for each in self._network.listen):
-            log.warning("this is neither encrypted nor authenticated: anyone who reaches the port owns the run "
-                        "(docs/security.md)", extra={"facts": {"event": "insecure"}})  # fmt: skip
-
-    def _warn_if_no_worker(self, now: float) -> None:
-        """Say once that nobody works, when that has lasted a while: a run that stands still should not be silent."""
-        if self._run.state != "waiting for workers":
-            self._no_worker_since = now
-        elif now - self._no_worker_since > NO_WORKER_SECONDS:
-            self._no_worker_since = math.inf
-            command = worker_command(self._network, self._name, self._run.settings.task.task)
-            log.warning("no worker is there: the run waits for one; on any host: %s", command,
-                        extra={"facts": {"event": "no worker", "command": command}})  # fmt: skip
-
-    def _log_summary(self, now: float) -> None:
-        """One line a minute: who looks into the log sees how the run is."""
-        if now - self._summary_logged_at >= SUMMARY_INTERVAL:
-            self._summary_logged_at = now
-            text, facts = summary(full_status(self._snapshot))
-            log.info("%s", text, extra={"facts": facts})
-            self._warn_of_expiry(now)
-
-    def _warn_of_expiry(self, now: float) -> None:
-        """Say so once a day from a week before on: links break when a certificate ends."""
-        credentials = self._network.credentials
-        if credentials is None or now < self._expiry_at:
-            return
-        self._expiry_at = now + DAY
-        if (left := credentials.time_left(datetime.now(UTC))) < EXPIRY_WARNING:
-            facts = {"event": "expiry", "seconds": left.total_seconds()}
-            log.warning("this coordinator's join file: %s; issue another and start it again with that",
-                        describe_time_left(left), extra={"facts": facts})  # fmt: skip
-
-    def _write_notes(self) -> None:
-        for record in self._worker_protocol.take_notes():
-            log.info("%s", record)
+            session.put(keys.job(self._name, batch.identity), message, encoding=encoding(JobBatch))
 
     def _drain_events(self) -> None:
-        """Handle what has arrived, waiting at most a tick for the first; what follows closely shares its commit."""
+        """Handle the events that have arrived: wait at most a tick for the first, and briefly for more."""
         try:
             self._handle(*self._events.get(timeout=TICK))
             until = monotonic() + LINGER
             for _ in range(MOST_EVENTS_PER_COMMIT):
-                left = (
-                    until - monotonic() if self._worker_protocol.jobs else 0.0
-                )  # else a generation's end waits for us
+                left = until - monotonic() if self._run.fleet.jobs else 0.0  # a complete generation does not wait
                 self._handle(*self._events.get(timeout=max(left, 0.0)))
         except queue.Empty:
             pass
 
     def _handle(self, kind: str, event: Any) -> None:
-        """One event. What raises costs that event alone, for no message may end the run: its sender repeats it.
+        """Handle one event. An exception drops that event alone, for no message may end the run: its sender repeats it.
 
-        Our own expected failures pass: a journal that cannot be written ends the coordinator.
+        A `DreamfleetError` passes: a journal that cannot be written ends the coordinator.
         """
         try:
             self._handle_event(kind, event, monotonic())
@@ -257,139 +205,67 @@ class Service:
         if kind == "hello":
             self._handle_hello(event, now)
         elif kind == "control":
-            self._handle_control(event)
+            self._handle_control(event, now)
         elif kind == "token":
             if event.kind == zenoh.SampleKind.DELETE:
-                self._worker_protocol.handle_departure(keys.worker_from_key(str(event.key_expr)), now)
+                self._run.fleet.handle_departure(keys.worker_from_key(str(event.key_expr)), now)
         elif kind in _WORKER_MESSAGES:
             self._handle_worker_message(kind, event, now)
 
     def _handle_worker_message(self, kind: str, sample: zenoh.Sample, now: float) -> None:
-        """Pass on what a worker of this run says, if it is of the schema."""
         worker = keys.worker_from_key(str(sample.key_expr))
         if self._is_revoked(worker):
             self._inbox.dropped["revoked"] += 1
             return
-        message = self._inbox.decode(_WORKER_MESSAGES[kind], sample.payload.to_bytes())
-        if message is None or not self._is_own_run(message.run_uid):
-            return
-        if isinstance(message, ResultBatch):
-            self._worker_protocol.handle_results(worker, message, now)
-        elif isinstance(message, UploadPart):
-            self._worker_protocol.upload(worker, message, now)
-        elif isinstance(message, Heartbeat) and message.nonce == self._nonce:
-            self._worker_protocol.handle_heartbeat(worker, message, now)
-
-    def _is_own_run(self, run_uid: str) -> bool:
-        if run_uid != self._run.uid:
-            self._inbox.dropped["foreign run"] += 1
-        return run_uid == self._run.uid
-
-    def _is_revoked(self, worker: str) -> bool:
-        """Whether the seat that a worker's name ends in, to which the router holds it, was taken back."""
-        return self._revocations is not None and worker_seat_identity(worker) in self._revocations.revoked_seats
-
-    def _check_revocations(self, now: float) -> None:
-        """End the leases of workers whose seats were taken back since the last look."""
-        if self._revocations is None:
-            return
-        before = self._revocations.revoked_seats
-        self._revocations.reload_if_changed(now)
-        if self._revocations.revoked_seats != before:
-            for member in list(self._worker_protocol.members):
-                if self._is_revoked(member.identity):
-                    self._worker_protocol.remove_worker(member.identity)
+        message: WorkerMessage | None = self._inbox.decode(_WORKER_MESSAGES[kind], sample.payload.to_bytes())
+        if message is not None:
+            self._protocol.handle(worker, message, now)
 
     def _handle_hello(self, query: zenoh.Query, now: float) -> None:
         with query:
+            worker = keys.worker_from_key(str(query.key_expr))
             payload = query.payload.to_bytes() if query.payload is not None else b""
             request = self._inbox.decode_json(HelloRequest, payload)
-            refusal = malformed_hello(request) or self._identity_refusal(request, query)
-            if self._disbanding_since is not None:
-                refusal = refusal or ("the run ends with its workers", "wait until somebody goes on with it")
-            if request is not None and refusal is None:
-                refusal = self._worker_protocol.find_refusal(request, self._run.settings)
-            numbering = 0
-            if request is not None and refusal is None:
-                numbering = self._worker_protocol.admit(request, now)
-            why, remedy = refusal or ("", "")
-            reply = hello_reply(self._run, self._name, self._nonce, self._intervals, why, remedy, numbering)
-            key = self._hello_key(keys.worker_from_key(str(query.key_expr)))
-            query.reply(key, encode_json(reply), encoding="application/json")
+            refusal = None if request is None else self._find_refusal(request, worker)
+            reply = self._protocol.answer_hello(request, refusal, now)
+            query.reply(self._hello_key(worker), encode_json(reply), encoding="application/json")
 
     def _hello_key(self, worker: str) -> str:
-        """Where hello is said: in a secured fleet under a worker's own name."""
+        """The key of hellos: in a secured fleet each worker has its own."""
         return keys.secured_hello(self._name, worker) if self._secured else keys.hello(self._name)
 
-    def _identity_refusal(self, request: HelloRequest | None, query: zenoh.Query) -> tuple[str, str] | None:
-        """Why nobody of this name is let in, in a secured fleet, and what to do about it."""
-        if not self._secured or request is None:
-            return None
-        if request.worker != keys.worker_from_key(str(query.key_expr)):
+    def _find_refusal(self, request: HelloRequest, worker: str) -> tuple[str, str] | None:
+        """Why the service admits nobody of this name, and what to do about it; `worker` is named by the hello's key."""
+        if self._secured and request.worker != worker:
             return "it says hello in another's name", "update dreamfleet on the worker's host"
-        if self._is_revoked(request.worker):
-            self._worker_protocol.refused_workers.add(request.worker, "its join file is revoked")
+        if self._secured and self._is_revoked(request.worker):
+            self._run.admission.refused_workers.add(request.worker, "its join file is revoked")
             return "its join file is revoked", "have another issued"
+        if self._control.disbanding:
+            return "the run ends with its workers", "wait until the run is resumed"
         return None
 
-    def _handle_control(self, query: zenoh.Query) -> None:
-        verbs: dict[str, Callable[[], None]] = {
-            "pause": lambda: self._run.pause("by hand"),
-            "resume": self._resume,
-            "drain": self._drain_run,
-            "stop": self.stop,
-            "disband": self._start_disbanding,
-        }
+    def _is_revoked(self, worker: str) -> bool:
+        """Whether the certificate of a worker's seat, which its name ends in, was revoked."""
+        return worker_seat_identity(worker) in self._revocations.revoked_seats
+
+    def _check_revocations(self, now: float) -> None:
+        """Remove workers whose certificates were revoked since the last look."""
+        before = self._revocations.revoked_seats
+        self._revocations.reload_if_changed(now)
+        if self._revocations.revoked_seats != before:
+            for worker in list(self._run.fleet.members):
+                if self._is_revoked(worker):
+                    self._run.fleet.remove_worker(worker)
+
+    def _handle_control(self, query: zenoh.Query, now: float) -> None:
         with query:
-            query_key = str(query.key_expr)
-            reply = control_reply(self._name, query_key, verbs, self._file_watch.command)
-            if reply.accepted:
-                verbs[control_verb(query_key)]()
-            self._snapshot = self._take_snapshot()  # who asks after the answer sees what came of it
+            reply = self._control.obey(str(query.key_expr), self._file_watch.command, now)
+            self._snapshot = self._take_snapshot()  # a client that asks after this answer must see its effect
             query.reply(query.key_expr, encode_json(reply), encoding="application/json")
 
-    def _resume(self) -> None:
-        self._draining = False
-        self._run.resume()
-
-    def _drain_run(self) -> None:
-        self._draining = True
-        self._run.pause("draining")
-
-    def _start_disbanding(self) -> None:
-        self._run.pause("ending with its workers")
-        self._disbanding_since = monotonic()
-
-    def _disband(self, session: zenoh.Session, now: float) -> None:
-        """Tell the workers to leave, again and again; stop when all have, or take too long."""
-        if self._disbanding_since is None:
-            return
-        there = [each for each in self._worker_protocol.members if each.gone_since is None]
-        if not there or now - self._disbanding_since > DISBAND_TIMEOUT:
-            self.stop()
-        elif now - self._leave_sent_at >= self._intervals.beat:
-            self._leave_sent_at = now
-            self._put(session, [OutgoingBatch(each.identity, each.numbering, 0, BatchContent()) for each in there])
-
-    def _encode_batch(self, send: OutgoingBatch) -> bytes:
-        content = send.content
-        return encode(
-            JobBatch(
-                run_uid=self._run.uid,
-                incarnation=self._run.incarnation,
-                nonce=self._nonce,
-                numbering=send.numbering,
-                number=send.number,
-                vectors=tuple(content.vectors),
-                jobs=tuple(work.job for work in content.work),
-                cancels=tuple(content.cancels),
-                verdicts=tuple(content.verdicts),
-                leave=self._disbanding_since is not None,
-            )
-        )
-
-    def _publish_closed(self, session: zenoh.Session) -> None:
-        for closed in self._run.take_closed():
+    def _publish(self, session: zenoh.Session, generations: list[StoredGeneration]) -> None:
+        for closed in generations:
             event = GenerationEvent(
                 v=keys.PROTOCOL_VERSION,
                 run=self._name,
@@ -405,30 +281,10 @@ class Service:
                 environment_steps=self._run.history.steps,
             )
             session.put(keys.event_generation(self._name), encode_json(event), encoding="application/json")
-            log.info("generation %d: mean %.1f, best %.1f", closed.number, closed.mean, closed.best,
-                     extra={"facts": {"event": "generation", **asdict(closed)}})  # fmt: skip
-        evaluations = self._run.background_jobs.evaluations
-        if len(evaluations) > self._evaluations_logged:
-            for each in islice(evaluations.finished.values(), self._evaluations_logged, None):  # as they finished
-                log.info("evaluation of generation %d's mean: %.1f ± %.1f (standard error), %d episodes",
-                         each.generation, each.mean, each.error, each.episodes,
-                         extra={"facts": {"event": "evaluation", **asdict(each), "error": each.error}})  # fmt: skip
-            self._evaluations_logged = len(evaluations)
 
     def _take_snapshot(self) -> Snapshot:
         now = monotonic()
-        dropped = (
-            self._inbox.dropped + self._worker_protocol.dropped + self._events.dropped + self._error_counter.counts
-        )
+        dropped = self._inbox.dropped + self._run.dropped + self._events.dropped + self._error_counter.counts
         credentials = self._network.credentials
         expires = None if credentials is None else credentials.expires.timestamp()
         return take_snapshot(self._run, self._name, dropped, now - self._started, now, expires)
-
-    def _serve_bundle(self, session: zenoh.Session) -> list[Any]:
-        """Serve the run's world model, if its task needs one."""
-        sha256 = self._run.settings.task.bundle
-        if self._bundle is None:
-            return []
-        head = {"run_uid": self._run.uid, "incarnation": self._run.incarnation, "sha256": bytes.fromhex(sha256)}
-        server = BundleServer(self._bundle, keys.bundle(self._name, sha256), head)
-        return [server.declare(session, self._error_counter)]

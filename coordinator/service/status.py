@@ -1,238 +1,179 @@
-"""One immutable snapshot of a run; every view reads it and none touches the run.
-
-Taking one costs the same however long the run is. What may be long is cut into pages as it is asked for.
-"""
+"""Answers of the `status` keys, cut from a snapshot of the run: JSON that stays under the message limit. Pure."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import cache
+import base64
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, replace
+from typing import Any, Protocol, TypeVar
 
-from dreamfleet.common.host.packages import package_version
-from dreamfleet.common.monitoring.status import (
-    STATUS_SCHEMA_VERSION,
-    EpisodeProgress,
-    FailureStatus,
-    GenerationStatus,
-    Population,
-    StageStatus,
-    Status,
-    Throughput,
-    Waste,
-    WorkerCount,
-    WorkerStatus,
-)
-from dreamfleet.common.protocol.result_bounds import MAX_SECONDS, clamp_count
-from dreamfleet.common.runs.records import StoredEvaluation
-from dreamfleet.coordinator.dispatch.event_log import EventLogView
-from dreamfleet.coordinator.dispatch.member import Member, episodes_per_second
-from dreamfleet.coordinator.dispatch.pending_jobs import JobFailure, shorten
+from dreamfleet.common.monitoring.status import STATUS_SCHEMA_VERSION, Event, Population, WorkerStatus
+from dreamfleet.common.protocol.codec import encode_json
+from dreamfleet.common.protocol.messages import MAX_MESSAGE
+from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
+from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.coordinator.dispatch.event_log import FleetEvent
 from dreamfleet.coordinator.jobs.generation import CandidateScores
-from dreamfleet.coordinator.jobs.history import HistoryView
-from dreamfleet.coordinator.run.report import ReportedMean
-from dreamfleet.coordinator.run.run import Run
+from dreamfleet.coordinator.service.snapshot import Snapshot
 
-MOST_FAILURES, MOST_NAMED = 3, 3  # failed jobs that are told, and workers of each
-LONGEST = 200  # characters of an error
-RECENT = 60  # closed generations in the status
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """A run at one moment: its status without heads, and all that the heads and pages are cut from."""
-
-    status: Status
-    workers: tuple[WorkerStatus, ...]
-    history: HistoryView
-    evaluations: tuple[StoredEvaluation, ...]  # the finished ones
-    candidate_scores: CandidateScores
-    last: CandidateScores | None
-    reported: ReportedMean | None
-    event_log: EventLogView
-    now: float  # of the clock that the story tells time by
+PAGE_BYTES = 36_000  # of the rows of a page
+PAGE, CANDIDATES = 100, 1000  # rows of a page, candidates of a page
+HEAD_WORKERS, HEAD_HISTORY, HEAD_CANDIDATES = 11_000, 12_000, 6_000  # bytes of each list's first rows in the status
+PARAMETERS = 4_000  # parameters of a controller in one answer: 21 KB in base64
 
 
-def take_snapshot(
-    run: Run, name: str, dropped: Mapping[str, int], uptime: float, now: float, expires: float | None = None
-) -> Snapshot:
-    """The run as it is at `now`, seconds of the monotonic clock; `uptime` in seconds, `expires` since 1970."""
-    workers = tuple(_worker(member, now) for member in (*run.worker_protocol.members, *run.worker_protocol.lost))
-    candidate_scores = run.generation.candidate_scores()
-    status = _status(run, name, candidate_scores, now)
-    status = replace(status, uptime=round(uptime, 1), dropped=dict(dropped), expires=expires)
-    evaluations = run.background_jobs.evaluations.rows
-    return Snapshot(
-        status,
-        workers,
-        run.history.view(),
-        evaluations,
-        candidate_scores,
-        run.last,
-        run.background_jobs.report.current,
-        run.fleet.event_log.view(),
-        now,
+T = TypeVar("T")
+Row = TypeVar("Row", WorkerStatus, StoredGeneration, StoredEvaluation)
+
+
+class Parameters(Protocol):
+    """A query's parameters."""
+
+    def get(self, key: str) -> str | None:
+        """The value of a parameter; `None` if the query lacks it."""
+
+
+def encode_part(snapshot: Snapshot, part: str, parameters: Parameters) -> bytes:
+    """The JSON answer of a status key; the empty `part` is the whole status.
+
+    Long parts come in pages from `offset` on, `best` with a slice of the controller's parameters, and `story` with as
+    many of the last events as fit.
+    """
+    if part == "":
+        return encode_status(snapshot)
+    offset, limit = _number(parameters.get("offset"), 0), _number(parameters.get("limit"), 10**9)
+    documents: dict[str, Callable[[], dict[str, Any]]] = {
+        "generation": lambda: _generation(snapshot),
+        "workers": lambda: _workers(snapshot, offset, limit),
+        "history": lambda: _history(snapshot, offset, limit),
+        "evaluations": lambda: _evaluations(snapshot, offset, limit),
+        "candidates": lambda: _candidates(snapshot, parameters.get("generation"), offset, limit),
+        "best": lambda: _best(snapshot, offset),
+        "story": lambda: _story(snapshot, parameters),
+    }
+    head = {"schema": STATUS_SCHEMA_VERSION, "run": snapshot.status.run, "run_uid": snapshot.status.run_uid}
+    return json.dumps({**head, **documents[part]()}, allow_nan=False).encode()
+
+
+def encode_status(snapshot: Snapshot) -> bytes:
+    """The whole status; the lists show fewer rows if the rest is unusually long."""
+    share = 1.0
+    while True:
+        payload = encode_json(_with_heads(snapshot, share))
+        if len(payload) <= MAX_MESSAGE or share < 0.01:
+            return payload
+        share /= 2
+
+
+def _with_heads(snapshot: Snapshot, share: float) -> Any:
+    candidates = int(HEAD_CANDIDATES * share)
+    whole = snapshot.full_status()
+    return replace(
+        whole,
+        recent=tuple(reversed(_head(reversed(whole.recent), int(HEAD_HISTORY * share)))),
+        worker_list=tuple(_head(whole.worker_list, int(HEAD_WORKERS * share))),
+        population=_population(snapshot.candidate_scores, 0, CANDIDATES, candidates),
+        last_population=None if snapshot.last is None else _population(snapshot.last, 0, CANDIDATES, candidates),
     )
 
 
-def _status(run: Run, name: str, candidate_scores: CandidateScores, now: float) -> Status:
-    """The status without heads, and without what only the service knows."""
-    present = [member for member in run.worker_protocol.members if member.is_reachable]
-    evaluations, failures = run.background_jobs.evaluations, run.worker_protocol.failures
-    return Status(
-        schema=STATUS_SCHEMA_VERSION,
-        run=name,
-        run_uid=run.uid,
-        incarnation=run.incarnation,
-        package=_package(),
-        state=run.state,
-        why=run.paused or run.ended or "",
-        settings=run.settings,
-        limits=asdict(run.limits),
-        uptime=0.0,
-        generation=_open_generation(run, now),
-        generations=len(run.history),
-        last=run.history.last,
-        recent=(),
-        population=_empty_population(candidate_scores),
-        last_population=None if run.last is None else _empty_population(run.last),
-        evaluation=evaluations.last,
-        best=evaluations.best,
-        evaluations=len(evaluations),
-        evaluating=EpisodeProgress(*evaluations.progress),
-        collecting=EpisodeProgress(*run.background_jobs.rollout_collections.progress),
-        workers=WorkerCount(
-            len(present),
-            len(run.worker_protocol.members) + len(run.worker_protocol.lost),
-            len(run.worker_protocol.lost),
-        ),
-        worker_list=(),
-        slots=sum(member.slots for member in present),
-        fingerprint=run.worker_protocol.fingerprint,
-        throughput=_throughput(run, present),
-        waste=_waste(run.worker_protocol.counts),
-        failing=len(failures),
-        failures=tuple(_failure(each) for each in failures[:MOST_FAILURES]),
-        dropped={},
-        refused=_refused(run),
-        confirmed=run.confirmed,
-        confirming=EpisodeProgress(*run.background_jobs.confirming),
-        ending=run.ending,
-        closing=0 if run.ended is not None else run.background_jobs.episodes_until_end(ending=run.ending),
-        strict=run.worker_protocol.strict,
-        classes=run.worker_protocol.classes,
+def _generation(snapshot: Snapshot) -> dict[str, Any]:
+    last = snapshot.status.last
+    return {**asdict(snapshot.status.generation), "last": None if last is None else asdict(last)}
+
+
+def _workers(snapshot: Snapshot, offset: int, limit: int) -> dict[str, Any]:
+    rows = _head(snapshot.workers[offset : offset + min(limit, PAGE)], PAGE_BYTES)
+    return {"offset": offset, "total": len(snapshot.workers), "workers": [asdict(each) for each in rows]}
+
+
+def _history(snapshot: Snapshot, offset: int, limit: int) -> dict[str, Any]:
+    rows = _head(snapshot.history.part(offset, min(limit, PAGE)), PAGE_BYTES)
+    return {"offset": offset, "total": len(snapshot.history), "history": [asdict(each) for each in rows]}
+
+
+def _evaluations(snapshot: Snapshot, offset: int, limit: int) -> dict[str, Any]:
+    found = snapshot.evaluations
+    rows = _head(found[offset : offset + min(limit, PAGE)], PAGE_BYTES)
+    return {"offset": offset, "total": len(found), "evaluations": [asdict(each) for each in rows]}
+
+
+def _candidates(snapshot: Snapshot, generation: str | None, offset: int, limit: int) -> dict[str, Any]:
+    """Candidates of the open generation, or of the last closed one if `generation` is its number."""
+    last = snapshot.last
+    chosen = last if last is not None and generation == str(last.generation) else snapshot.candidate_scores
+    return asdict(_population(chosen, offset, min(limit, CANDIDATES), PAGE_BYTES))
+
+
+def _story(snapshot: Snapshot, parameters: Parameters) -> dict[str, Any]:
+    """The last events, the newest last: of a worker, a candidate's jobs (`generation/index`) or kinds, or all."""
+    worker, what = parameters.get("worker") or "", parameters.get("what") or ""
+    generation, slash, index = (parameters.get("job") or "").partition("/")
+    chosen = (_number(generation, -1), _number(index, -1)) if slash else None
+    found = list(snapshot.event_log.latest(worker, chosen, what.split(",") if what else ()))
+    plain = (asdict(_event(each, snapshot.now)) for each in found)
+    rows = _fitting(plain, PAGE_BYTES, lambda row: len(json.dumps(row)) + 2)
+    return {"total": len(found), "story": rows[::-1]}
+
+
+def _event(each: FleetEvent, now: float) -> Event:
+    job = "" if each.job is None else "{} {}/{}/{}".format(*each.job)
+    return Event(round(now - each.at, 3), each.what, each.worker, job)
+
+
+def _best(snapshot: Snapshot, offset: int) -> dict[str, Any]:
+    """The best evaluation and the reported controller, with its parameters from `offset` on."""
+    best, reported = snapshot.status.best, snapshot.reported
+    document = {"best": None if best is None else asdict(best), "evaluations": snapshot.status.evaluations}
+    confirmed = snapshot.status.confirmed
+    document["confirmed"] = None if confirmed is None else asdict(confirmed)
+    if reported is None:
+        return {**document, "controller": None}
+    controller = reported.controller()
+    part = controller.parameters[offset : offset + PARAMETERS].astype("<f4").tobytes()
+    about = {
+        "shape": to_dict(controller.shape),
+        "task": controller.task,
+        "bundle": controller.bundle,
+        "provenance": controller.provenance,
+        "options": controller.options,
+        "version": controller.version,
+        "sha256": controller.sha256,  # of all parameters: a client checks that its parts belong together
+        "dtype": "<f4",
+        "offset": offset,
+        "total": len(controller.parameters),
+        "parameters": base64.b64encode(part).decode(),
+    }
+    return {**document, "controller": about}
+
+
+def _population(candidate_scores: CandidateScores, offset: int, limit: int, size: int) -> Population:
+    """At most `limit` candidates from `offset` on, about `size` bytes of JSON at most."""
+    part = slice(offset, offset + limit)
+    columns = zip(
+        candidate_scores.done[part], candidate_scores.wanted[part], candidate_scores.fitness[part], strict=True
     )
+    rows = _fitting(columns, size, lambda row: len(json.dumps(row)) + 4)
+    done, wanted, fitness = zip(*rows, strict=True) if rows else ((), (), ())
+    return Population(candidate_scores.generation, offset, len(candidate_scores.done), done, wanted, fitness)
 
 
-def full_status(snapshot: Snapshot) -> Status:
-    """The status with all workers and the last closed generations, for who is bound by no message's length."""
-    recent = snapshot.history.part(max(len(snapshot.history) - RECENT, 0), RECENT)
-    return replace(snapshot.status, worker_list=snapshot.workers, recent=tuple(recent))
+def _head(rows: Iterable[Row], size: int) -> list[Row]:
+    """The first rows, `size` bytes of JSON at most."""
+    return _fitting(rows, size, lambda row: len(json.dumps(asdict(row))) + 2)
 
 
-def mark_left(snapshot: Snapshot) -> Snapshot:
-    """The last snapshot of a coordinator that leaves its run open."""
-    if snapshot.status.state == "ended":
-        return snapshot
-    return replace(snapshot, status=replace(snapshot.status, state="left"))
+def _fitting(rows: Iterable[T], size: int, measure: Callable[[T], int]) -> list[T]:
+    """As many of the first rows as fit into `size` bytes, but at least one."""
+    kept: list[T] = []
+    for row in rows:
+        size -= measure(row)
+        if size < 0 and kept:
+            break
+        kept.append(row)
+    return kept
 
 
-def _open_generation(run: Run, now: float) -> GenerationStatus:
-    return GenerationStatus(
-        number=run.generation.number,
-        episodes_done=run.generation.done,
-        episodes=run.generation.total,
-        seconds=round(max(now - run.opened_at, 0.0), 1),
-        sigma=run.sigma,
-        temperature=run.generation.spec.temperature,
-        stage=_stage(run),
-        axis_ratio=None if run.axis_ratio is None else round(run.axis_ratio, 3),
-    )
-
-
-def _stage(run: Run) -> StageStatus | None:
-    total, begun = len(run.settings.stages), run.scoring_params.begun
-    stage = begun.stage
-    if not total:
-        return None
-    within = stage.horizon, stage.patience, stage.population, stage.episodes, stage.racing
-    return StageStatus(stage.number, total, begun.since, *within, stage.driven)
-
-
-def _empty_population(candidate_scores: CandidateScores) -> Population:
-    return Population(candidate_scores.generation, 0, len(candidate_scores.done), (), (), ())
-
-
-def _throughput(run: Run, present: Sequence[Member]) -> Throughput:
-    rate = sum(member.steps_per_second for member in present)
-    steps = clamp_count(run.history.steps + run.generation.steps)
-    return Throughput(
-        steps_per_second=round(rate, 1),
-        environment_steps=steps,
-        seconds=min(round(run.history.seconds, 1), MAX_SECONDS),
-        episodes_per_second=_rounded(episodes_per_second(present, lambda host_stats: host_stats.job_seconds)),
-        evaluation_episodes_per_second=_rounded(
-            episodes_per_second(present, lambda host_stats: host_stats.evaluation_seconds)
-        ),
-    )
-
-
-def _rounded(rate: float | None) -> float | None:
-    return None if rate is None else round(rate, 4)
-
-
-def _refused(run: Run) -> dict[str, str]:
-    latest = list(run.worker_protocol.refused_workers.latest.items())[-MOST_NAMED:]
-    return {name: shorten(why, LONGEST) for name, why in latest}
-
-
-def _waste(counts: Mapping[str, int]) -> Waste:
-    discarded, accepted = counts["discarded_steps"], counts["accepted_steps"]
-    return Waste(
-        discarded_steps=clamp_count(discarded),
-        share=round(discarded / (discarded + accepted), 4) if discarded else 0.0,
-        reissued=counts["reissued"],
-        recalled=counts["recalled"],
-        copied=counts["copied"],
-        duplicate=counts["duplicate"],
-        obsolete=counts["obsolete"],
-        errors=counts["errors"],
-        resent_batches=counts["resent_batches"],
-        silences=counts["silences"],
-    )
-
-
-def _failure(failure: JobFailure) -> FailureStatus:
-    job, names = failure.work.job, list(failure.errors)[:MOST_NAMED]
-    return FailureStatus(
-        candidate=f"{job.generation}/{job.candidate}",
-        kind=job.kind,
-        seeds=job.seeds,
-        errors={name: shorten(failure.errors[name], LONGEST) for name in names},
-        attempts={name: failure.attempts[name] for name in names},
-    )
-
-
-def _worker(member: Member, now: float) -> WorkerStatus:
-    return WorkerStatus(
-        worker=member.identity,
-        state="lost" if member.gone_since is not None else "silent" if member.silent else "present",
-        slots=member.slots,
-        leases=len(member.leases),
-        finished=member.finished,
-        steps_per_second=round(member.steps_per_second, 1) if member.is_reachable else 0.0,
-        load=round(member.load, 2),
-        drawn_by=member.drawn_by,
-        heard=round(now - member.last_heard, 1),
-        fingerprint=member.fingerprint,
-        job_seconds=None if member.host_stats.job_seconds is None else round(member.host_stats.job_seconds, 4),
-        round_trip=None if member.host_stats.round_trip is None else round(member.host_stats.round_trip, 4),
-        resent=member.resent,
-        host_class=member.host_class,
-    )
-
-
-@cache
-def _package() -> str | None:
-    """Found out once: it costs 5 ms."""
-    return package_version("dreamfleet")
+def _number(text: str | None, default: int) -> int:
+    return int(text) if text is not None and text.isdecimal() and len(text) < 19 else default

@@ -49,7 +49,7 @@ class Evaluated(Bench):
         def deliver(name, result):
             fate = chance.random()
             batch = ResultBatch(run_uid=self.run.uid, incarnation=1, fingerprint="f", results=(result,))
-            self.run.worker_protocol.handle_results(name, batch, self.now)
+            self.worker_protocol.handle_results(name, batch, self.now)
             self.run.advance(self.now)
             if fate > 0.2 or self.run.ended is not None:
                 self.run.commit()

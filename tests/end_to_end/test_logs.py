@@ -7,7 +7,7 @@ import pytest
 
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.transport.session import Network, open_session
-from dreamfleet.coordinator.service.status_json import answer
+from dreamfleet.coordinator.service.status import encode_part
 from tests.support import tasks
 from tests.support.served import snapshot
 
@@ -84,7 +84,7 @@ def test_the_events_of_a_killed_workers_jobs_are_printed_while_the_run_lives(pro
 
 
 def test_a_coordinator_from_before_stories_is_said_to_be_old_and_not_absent(processes):
-    status = answer(snapshot(), "", {})
+    status = encode_part(snapshot(), "", {})
     with open_session(Network(listen=(processes.endpoint,))) as session:
         key = keys.status("night")
         session.declare_queryable(key, lambda query: query.reply(key, status))

@@ -10,14 +10,14 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, cast
 from unittest.mock import patch
 
-from dreamfleet.common.protocol.messages import Heartbeat, HelloRequest, JobBatch, ResultBatch, UploadPart
-from dreamfleet.coordinator.dispatch.fleet import Fleet
+from dreamfleet.common.protocol.messages import HelloRequest, Intervals, JobBatch
 from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
 from dreamfleet.coordinator.jobs import rollout_collection
 from dreamfleet.coordinator.optimisers import evolution
 from dreamfleet.coordinator.run.report import ControllerWriter
 from dreamfleet.coordinator.run.run import Run
-from dreamfleet.coordinator.settings.config import LimitsConfig
+from dreamfleet.coordinator.run.worker_protocol import WorkerProtocol
+from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 from tests.simulation.disk import Disk, MemoryJournal, Witness
 from tests.simulation.schedule import Shape
@@ -48,63 +48,45 @@ class Coordinator:
 
     def __init__(self, disk: Disk, witness: Witness, shape: Shape, life: int, now: float) -> None:
         self.nonce = f"{life:016x}"
-        self.fleet = Fleet(BEAT)
         limits = LimitsConfig(generations=shape.generations if shape.ends else 0)
         journal = cast(Journal, MemoryJournal(disk, witness))
-        self.run = Run(journal, settings_of(shape), limits, self.fleet, now)
-        self.worker_protocol = self.run.worker_protocol
+        self.run = Run(journal, settings_of(shape), limits, NetworkConfig(beat=BEAT), now)
+        self.fleet = self.run.fleet
+        self.worker_protocol = WorkerProtocol(self.run, "simulated", self.nonce, Intervals(BEAT, REPEAT))
         self.draining = False
 
     def hear(self, worker: str, message: Any, now: float) -> None:
         """One event, as `Service._handle` takes it; hello is `welcome`."""
-        if isinstance(message, ResultBatch):
-            self.worker_protocol.handle_results(worker, message, now)
-        elif isinstance(message, Heartbeat):
-            if message.nonce == self.nonce:
-                self.worker_protocol.handle_heartbeat(worker, message, now)
-        elif isinstance(message, UploadPart):
-            self.worker_protocol.upload(worker, message, now)
+        if message == "gone":
+            self.fleet.handle_departure(worker, now)
         else:
-            assert message == "gone"
-            self.worker_protocol.handle_departure(worker, now)
+            self.worker_protocol.handle(worker, message, now)
 
     def welcome(self, request: HelloRequest, now: float) -> int | None:
         """How its batches are numbered; `None` where the worker may not join."""
-        if self.worker_protocol.find_refusal(request, self.run.settings):
-            return None
-        return self.worker_protocol.admit(request, now)
+        reply = self.worker_protocol.answer_hello(request, None, now)
+        return reply.numbering if reply.accepted else None
 
     def turn(self, now: float) -> Iterator[Step]:
         """What follows the events in a turn of the loop, step by step: a life may end between any two."""
         yield None
-        self.worker_protocol.tick(now)
+        self.run.tick(now)
         if self.run.advance(now):
             yield OPENED
-            yield from self.worker_protocol.dispatch(now, durable=False)
+            yield from self.fleet.dispatch(now, durable=False)
         yield None
         self.run.commit()
         yield COMMITTED
-        yield from self.worker_protocol.dispatch(now)
+        yield from self.fleet.dispatch(now)
         self.run.prepare()
         self.run.take_closed()
-        self.worker_protocol.take_notes()
+        self.run.take_notes()
 
     def batch(self, send: OutgoingBatch) -> JobBatch:
         """A send as it travels."""
-        content = send.content
-        return JobBatch(
-            run_uid=self.run.uid,
-            incarnation=self.run.incarnation,
-            nonce=self.nonce,
-            numbering=send.numbering,
-            number=send.number,
-            vectors=tuple(content.vectors),
-            jobs=tuple(work.job for work in content.work),
-            cancels=tuple(content.cancels),
-            verdicts=tuple(content.verdicts),
-        )
+        return self.worker_protocol.job_batch(send)
 
     @property
     def over(self) -> bool:
         """Whether this life leaves by itself: the run has ended, or a drain is done."""
-        return self.run.ended is not None or (self.draining and not self.worker_protocol.lease_count)
+        return self.run.ended is not None or (self.draining and not self.fleet.lease_count)

@@ -99,24 +99,25 @@ def fleet_forgets_to_queue_what_a_lost_worker_held(_original):
 
 @mutant(Fleet, "_judge")
 def fleet_accepts_what_it_has_accepted_already(original):
-    def judge(self, identity, result):
+    def judge(self, identity, result, given):
         work = self.jobs.work(result.digest)
         works = self.__dict__.setdefault("mutated", {})
         if work is not None:
             works[result.digest] = work
         elif self.jobs.is_accepted(result.digest) and result.digest in works:
             return "accepted", works[result.digest]
-        return original(self, identity, result)
+        return original(self, identity, result, given)
 
     return judge
 
 
 @mutant(Fleet, "_judge")
 def fleet_believes_every_result_of_the_generation_that_is_open(original):
-    def judge(self, identity, result):
+    def judge(self, identity, result, given):
         if result.digest not in self.jobs and result.fitness is not None and self.jobs:
-            return original(self, identity, replace(result, digest=next(iter(self.jobs))))
-        return original(self, identity, result)
+            result = replace(result, digest=next(iter(self.jobs)))
+            given = self.find_job_for_result(identity, result)
+        return original(self, identity, result, given)
 
     return judge
 

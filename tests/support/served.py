@@ -12,7 +12,7 @@ from dreamfleet.coordinator.dispatch.event_log import EventLog
 from dreamfleet.coordinator.jobs.generation import CandidateScores
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.service.queryables import declare_status
-from dreamfleet.coordinator.service.status import Snapshot
+from dreamfleet.coordinator.service.snapshot import Snapshot
 from tests.support.samples import CLOSED, STATUS
 
 WORKER = STATUS.worker_list[0]

@@ -47,12 +47,12 @@ def test_a_jobs_story_goes_from_given_to_accepted(bench):
 
 
 def test_jobs_of_a_silent_worker_are_logged_as_given_again(bench):
-    sends = bench.run.worker_protocol.dispatch(bench.now)
+    sends = bench.run.fleet.dispatch(bench.now)
     held = sum(len(send.content.work) for send in sends if send.identity == A)
     bench.handle_heartbeat(A)
     bench.now += SILENT_AFTER + 0.1
     bench.handle_heartbeat(B)
-    bench.run.worker_protocol.tick(bench.now)
+    bench.run.tick(bench.now)
     whats = [what for what, _, _ in events(bench, worker=A)]
     assert whats[:1] == ["joined"]
     assert whats.count("given") == whats.count("seen") == whats.count("reissued") == held > 0
@@ -62,9 +62,9 @@ def test_jobs_of_a_silent_worker_are_logged_as_given_again(bench):
 
 
 def test_a_worker_that_vanishes_is_logged_and_a_stranger_is_not(bench):
-    bench.run.worker_protocol.handle_departure(B, bench.now)
+    bench.run.fleet.handle_departure(B, bench.now)
     bench.now += 2 * DEPARTURE_GRACE
-    bench.run.worker_protocol.tick(bench.now)
+    bench.run.tick(bench.now)
     assert ("lost", B, "") in events(bench)
     status = read_status(answered(snapshot_of(bench)))
     assert (status.workers, status.worker_list[-1].worker) == (WorkerCount(1, 2, 1), B)
@@ -78,5 +78,5 @@ def test_a_worker_that_vanishes_is_logged_and_a_stranger_is_not(bench):
 
 @pytest.mark.parametrize("asked", [{"worker": "nobody"}, {"job": "9/9"}, {"job": "x/y"}, {"job": "7"}])
 def test_unknown_workers_and_jobs_have_no_events_and_a_generation_alone_means_all(bench, asked):
-    bench.run.worker_protocol.dispatch(bench.now)
+    bench.run.fleet.dispatch(bench.now)
     assert bool(events(bench, **asked)) == (asked == {"job": "7"})

@@ -45,7 +45,7 @@ class Judging(Bench):
         super().begin()
 
     def step(self):
-        for send in self.run.worker_protocol.dispatch(self.now):
+        for send in self.run.fleet.dispatch(self.now):
             self.held += [work.job for work in send.content.work]
         job = self.held.pop(0)
         fitness = drive(job) if job.kind == "evaluate" else float(job.digest[0])

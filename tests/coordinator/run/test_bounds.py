@@ -1,4 +1,4 @@
-"""Extreme numbers are the failure of their job, and never the end of a run; nor are those in older journals."""
+"""Extreme numbers fail their job, and never end a run; nor do those in older journals."""
 
 import json
 import sqlite3
@@ -23,8 +23,8 @@ from dreamfleet.common.protocol.result_bounds import (
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.work import vector_bytes
 from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
-from dreamfleet.coordinator.service import status_json
-from dreamfleet.coordinator.service.status import take_snapshot
+from dreamfleet.coordinator.service.snapshot import take_snapshot
+from dreamfleet.coordinator.service.status import encode_part
 from tests.coordinator.run.test_run import SETTINGS, A, B, Bench
 from tests.support.samples import SPEC
 
@@ -44,11 +44,7 @@ def bench(tmp_path, random_bundle):
 
 def deliver_all(bench, numbers, kinds=("score", "evaluate", "collect")):
     fitness, steps, seconds = numbers
-    given = [
-        (send.identity, work.job)
-        for send in bench.run.worker_protocol.dispatch(bench.now)
-        for work in send.content.work
-    ]
+    given = [(send.identity, work.job) for send in bench.run.fleet.dispatch(bench.now) for work in send.content.work]
     for name, job in given:
         if job.kind in kinds:
             bench.deliver(name, Result(job.digest, fitness, steps, seconds, None, None))
@@ -57,37 +53,33 @@ def deliver_all(bench, numbers, kinds=("score", "evaluate", "collect")):
     return given
 
 
-def told(bench):
-    """Every answer that the run gives, as it would travel."""
+def answers_of(bench):
+    """Every answer of the run's status keys, decoded."""
     snapshot = take_snapshot(bench.run, "night", {}, 1.0, bench.now)
     return {
-        part: json.loads(status_json.answer(snapshot, part, {}))
+        part: json.loads(encode_part(snapshot, part, {}))
         for part in ("", "history", "workers", "candidates", "generation", "best")
     }
 
 
 @pytest.mark.parametrize("numbers", EXTREME.values(), ids=EXTREME)
 @pytest.mark.parametrize("kind", ["score", "evaluate"])
-def test_an_extreme_result_is_the_jobs_failure_with_its_reason_and_the_run_can_go_on(bench, numbers, kind):
+def test_an_extreme_result_fails_its_job_with_the_reason_and_the_run_can_continue(bench, numbers, kind):
     while bench.run.paused is None and deliver_all(bench, numbers, (kind,)):
-        told(bench)
+        answers_of(bench)
     assert "fitness" in bench.run.paused or "steps" in bench.run.paused
-    assert told(bench)[""]["state"] == "paused"
+    assert answers_of(bench)[""]["state"] == "paused"
     bench.restart()
     assert bench.run.paused is None
     while bench.run.ended is None:
         assert deliver_all(bench, (1.0, 10, 0.1))
-        told(bench)
+        answers_of(bench)
     assert bench.run.ended == "2 generations"
 
 
 @pytest.mark.parametrize("numbers", EXTREME.values(), ids=EXTREME)
-def test_what_an_older_coordinator_took_in_is_asked_for_again(bench, numbers):
-    given = [
-        (send.identity, work.job)
-        for send in bench.run.worker_protocol.dispatch(bench.now)
-        for work in send.content.work
-    ]
+def test_excessive_results_of_an_older_coordinator_are_scored_again(bench, numbers):
+    given = [(send.identity, work.job) for send in bench.run.fleet.dispatch(bench.now) for work in send.content.work]
     for name, job in given:
         bench.journal.add_result(job, Result(job.digest, *numbers, None, None), name, "f", 1)
     bench.journal.commit()
@@ -95,10 +87,10 @@ def test_what_an_older_coordinator_took_in_is_asked_for_again(bench, numbers):
     assert bench.run.generation.done == 0
     while bench.run.ended is None:
         assert deliver_all(bench, (1.0, 10, 0.1))
-        told(bench)
+        answers_of(bench)
 
 
-def test_closed_generations_and_evaluations_of_an_older_coordinator_can_be_told(bench):
+def test_excessive_generations_and_evaluations_of_an_older_coordinator_can_be_encoded(bench):
     deliver_all(bench, (1.0, 10, 0.1))
     while len(bench.run.history) < 1:
         deliver_all(bench, (1.0, 10, 0.1))
@@ -111,14 +103,14 @@ def test_closed_generations_and_evaluations_of_an_older_coordinator_can_be_told(
     bench.restart()
     bench.now += 1
     deliver_all(bench, (1.0, 10, 0.1))
-    told(bench)
+    answers_of(bench)
     while bench.run.ended is None:
         assert deliver_all(bench, (1.0, 10, 0.1))
     bench.run.leave()
-    told(bench)
+    answers_of(bench)
 
 
-def test_a_pending_evaluation_of_an_older_coordinator_is_driven_again(bench):
+def test_a_pending_excessive_evaluation_of_an_older_coordinator_is_driven_again(bench):
     evaluation = Evaluation(0, vector_bytes(np.zeros(SETTINGS.controller.size)), 2)
     for work in evaluation.work(SPEC):
         bench.journal.add_result(work.job, Result(work.job.digest, 1.7e308, 10, 0.1, None, None), A, "f", 1)
@@ -128,27 +120,25 @@ def test_a_pending_evaluation_of_an_older_coordinator_is_driven_again(bench):
     assert bench.run.background_jobs.evaluations.progress == (0, 2)
 
 
-def test_slots_and_steps_without_bound_can_be_told(bench):
+def test_huge_counts_of_slots_and_steps_can_be_encoded(bench):
     for name in (A, B):
-        bench.run.worker_protocol.admit(HelloRequest(2, 2, "0", name, (SPEC.task,), "f", MAX_COUNT), bench.now)
-    bench.run.worker_protocol.counts["discarded_steps"] = 3 * MAX_COUNT
-    told(bench)
+        bench.run.admission.admit(HelloRequest(2, 2, "0", name, (SPEC.task,), "f", MAX_COUNT), bench.now)
+    bench.run.fleet.counts["discarded_steps"] = 3 * MAX_COUNT
+    answers_of(bench)
 
 
-def test_an_error_that_counts_too_many_steps_is_an_error(bench):
+def test_an_error_with_too_many_steps_is_an_error(bench):
     for _ in range(3):
         given = [
-            (send.identity, each.job)
-            for send in bench.run.worker_protocol.dispatch(bench.now)
-            for each in send.content.work
+            (send.identity, each.job) for send in bench.run.fleet.dispatch(bench.now) for each in send.content.work
         ]
         for name, job in given[:1]:
             bench.deliver(name, Result(job.digest, None, MAX_COUNT, 0.1, "boom", None))
-        told(bench)
+        answers_of(bench)
 
 
 @given(st.floats(), st.integers(), st.floats())
-def test_what_does_not_exceed_can_be_summed_over_the_largest_run(fitness, steps, seconds):
+def test_accepted_numbers_can_be_summed_over_the_largest_run(fitness, steps, seconds):
     if rejection_reason(fitness, steps, seconds, 1000) is None:
         assert abs(fitness) <= LARGEST_FITNESS
         assert 0 <= steps <= max_steps(1000)
@@ -157,14 +147,14 @@ def test_what_does_not_exceed_can_be_summed_over_the_largest_run(fitness, steps,
 
 
 @given(st.integers(), st.floats())
-def test_what_is_told_can_be_encoded(steps, value):
+def test_clamped_numbers_can_be_encoded(steps, value):
     assert 0 <= clamp_count(steps) <= MAX_COUNT
     assert np.isfinite(to_finite(value))
     assert encode_json(replace(HelloRequest(2, 2, "0", A, (), "f", 1), slots=clamp_count(steps)))
 
 
 @pytest.mark.parametrize("optimiser", ["cma", "cmaes-sep", "cmaes-lra"])
-def test_an_optimiser_takes_whatever_is_within_the_bounds(optimiser):
+def test_an_optimiser_accepts_all_fitness_within_the_bounds(optimiser):
     evolution = Evolution(EvolutionConfig(6, 8, 0.1, "diagonal", 1, optimiser))
     for scale in (LARGEST_FITNESS, 1.0, 1e-300):
         for _ in range(20):

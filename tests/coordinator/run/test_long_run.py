@@ -1,4 +1,4 @@
-"""What a generation costs the coordinator does not grow with the run: journal, history, evaluations and status."""
+"""A generation's cost does not grow with the run: journal, history, evaluations and status."""
 
 import logging
 from dataclasses import replace
@@ -8,42 +8,43 @@ from time import process_time
 import numpy as np
 import pytest
 
-from dreamfleet.common.protocol.messages import Heartbeat, HelloRequest, Result, ResultBatch
-from dreamfleet.coordinator.dispatch.fleet import Fleet
+from dreamfleet.common.protocol.messages import Heartbeat, HelloRequest, Intervals, Result, ResultBatch
 from dreamfleet.coordinator.run.run import Run
-from dreamfleet.coordinator.service import status_json
-from dreamfleet.coordinator.service.status import take_snapshot
-from dreamfleet.coordinator.settings.config import LimitsConfig
+from dreamfleet.coordinator.run.worker_protocol import WorkerProtocol
+from dreamfleet.coordinator.service.snapshot import take_snapshot
+from dreamfleet.coordinator.service.status import encode_status
+from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 from tests.coordinator.run.test_run import SETTINGS, A
 
-BLOCK = 250  # generations of a reading
+BLOCK = 250  # generations of a measurement
 
 
 class LongRun:
-    """A run whose only worker answers at once; each generation is evaluated, and its status taken and asked."""
+    """A run whose only worker answers at once; each generation is evaluated and its status encoded."""
 
     def __init__(self, folder, bundle):
         folder.mkdir()
         settings = replace(SETTINGS, population=4, evaluate_every=1, collect_every=0)
-        self.run = Run(Journal.create(folder, settings, bundle), settings, LimitsConfig(), Fleet(1.0), 0.0)
+        self.run = Run(Journal.create(folder, settings, bundle), settings, LimitsConfig(), NetworkConfig(), 0.0)
+        self.worker_protocol = WorkerProtocol(self.run, "long", "n", Intervals(1.0, 1.0))
         self.now, self.seen = 0.0, 0
-        self.run.worker_protocol.admit(HelloRequest(2, 2, "0", A, (settings.task.task,), "f", 1), self.now)
+        self.run.admission.admit(HelloRequest(2, 2, "0", A, (settings.task.task,), "f", 1), self.now)
 
     def cost(self):
         """Processor time of one more generation, in seconds."""
         begun, closed = process_time(), len(self.run.history)
         while len(self.run.history) == closed:
             self.now += 0.01
-            self.run.worker_protocol.handle_heartbeat(A, self.handle_heartbeat(), self.now)
-            for send in self.run.worker_protocol.dispatch(self.now):
+            self.worker_protocol.handle_heartbeat(A, self.handle_heartbeat(), self.now)
+            for send in self.run.fleet.dispatch(self.now):
                 self.seen = max(self.seen, send.number)
                 self.answer(send.content.work)
             self.run.advance(self.now)
             self.run.commit()
-        status_json.status(take_snapshot(self.run, "long", {}, self.now, self.now))
+        encode_status(take_snapshot(self.run, "long", {}, self.now, self.now))
         self.run.take_closed()
-        self.run.worker_protocol.take_notes()
+        self.run.take_notes()
         return process_time() - begun
 
     def handle_heartbeat(self):
@@ -63,11 +64,11 @@ class LongRun:
     def answer(self, work):
         results = tuple(Result(each.job.digest, score(each), 10, 0.1, None, None) for each in work)
         batch = ResultBatch(run_uid=self.run.uid, incarnation=1, fingerprint="f", results=results)
-        self.run.worker_protocol.handle_results(A, batch, self.now)
+        self.worker_protocol.handle_results(A, batch, self.now)
 
 
 def score(work):
-    """How near a goal is that moves on, so that the search never converges."""
+    """The negative distance to a moving goal, so that the search never converges."""
     goal = np.cos(0.1 * work.job.generation)
     return -float(np.square(np.frombuffer(work.vector, "<f4") - goal).sum())
 
@@ -83,7 +84,7 @@ def blocks_of(folder, bundle, generations):
     "generations",
     [1_000, pytest.param(100_000, marks=[pytest.mark.long, pytest.mark.timeout(3600)])],
 )
-def test_a_late_generation_costs_what_an_early_one_does(tmp_path, random_bundle, generations):
+def test_a_late_generation_costs_no_more_than_an_early_one(tmp_path, random_bundle, generations):
     costs = blocks_of(tmp_path / "run", random_bundle.path, generations)
     logging.getLogger(__name__).info("ms: %s", [round(1000 * cost, 2) for cost in costs[:: max(len(costs) // 10, 1)]])
     assert min(costs[-2:]) < 1.5 * min(costs[:2])

@@ -1,4 +1,4 @@
-"""The reported controller: there from the first closed generation on, and what the journal holds."""
+"""The reported controller: present from the first closed generation on, and in step with the journal."""
 
 from dataclasses import replace
 
@@ -28,15 +28,15 @@ class Reporting(Bench):
         super().begin()
 
     def step(self):
-        """One job, whichever comes first."""
-        for send in self.run.worker_protocol.dispatch(self.now):
+        """Answer the first job."""
+        for send in self.run.fleet.dispatch(self.now):
             self.given += [work.job for work in send.content.work]
         job = self.given.pop(0)
         fitness = SCORES[job.generation] if job.kind == "evaluate" else float(job.digest[0])
         self.answer(Result(job.digest, fitness, 10, 0.1, None, None))
 
     def close(self, generations):
-        """Until so many generations are closed and nothing is being evaluated."""
+        """Answer jobs until so many generations are closed and no background job is in progress."""
         while len(self.run.history) < generations or self.run.background_jobs.in_progress:
             self.step()
 
@@ -60,13 +60,13 @@ def make(tmp_path, random_bundle):
 
 def test_a_controller_is_there_from_the_first_closed_generation_on(make):
     bench = make(replace(EVALUATED, evaluate_every=0))
-    assert (bench.saved(), bench.run.controller_path) == (None, None)
+    assert (bench.saved(), bench.run.background_jobs.report.path) == (None, None)
     bench.close(1)
-    assert bench.run.controller_path == bench.path / CONTROLLER
+    assert bench.run.background_jobs.report.path == bench.path / CONTROLLER
     assert bench.saved().provenance["generation"] == 0
 
 
-def test_a_mean_that_was_not_evaluated_is_written_at_a_pace_and_once_more_as_the_coordinator_leaves(make):
+def test_a_mean_without_evaluation_is_saved_at_intervals_and_as_the_coordinator_leaves(make):
     bench = make(replace(EVALUATED, evaluate_every=0))
     bench.close(3)
     assert bench.saved().provenance["generation"] == 0
@@ -90,7 +90,7 @@ def test_after_every_evaluation_the_file_holds_the_best_evaluated_mean(make):
     assert np.array_equal(bench.saved().parameters, np.frombuffer(vector, "<f4"))
 
 
-def test_what_is_reported_survives_a_restart(make):
+def test_the_report_survives_a_restart(make):
     bench = make()
     bench.close(3)
     bench.run.leave()
@@ -103,20 +103,20 @@ def test_what_is_reported_survives_a_restart(make):
 
 
 @pytest.mark.parametrize("every", [0, 2])
-def test_a_limit_that_was_passed_already_writes_the_controller_and_the_reason(make, every):
+def test_a_run_that_resumes_beyond_its_limit_writes_the_controller_and_the_reason(make, every):
     bench = make(replace(EVALUATED, evaluate_every=every))
     bench.close(3)
     (bench.path / CONTROLLER).unlink()
     bench.limits = LimitsConfig(generations=2)
     bench.restart()
     assert bench.run.ended == "3 generations"
-    assert bench.run.controller_path == bench.path / CONTROLLER
+    assert bench.run.background_jobs.report.path == bench.path / CONTROLLER
     assert bench.saved() is not None
     with RunFolder(bench.path) as stored:
         assert stored.ended == "3 generations"
 
 
-def test_an_open_run_has_a_controller_to_evaluate_and_record_and_says_when_it_has_none_yet(make):
+def test_an_open_run_has_a_controller_once_a_generation_is_closed(make):
     bench = make()
     with pytest.raises(ControllerError, match="no controller yet"):
         find_controller(bench.path.name, bench.path.parent)
@@ -127,7 +127,7 @@ def test_an_open_run_has_a_controller_to_evaluate_and_record_and_says_when_it_ha
     assert beside.exists()
 
 
-def test_another_run_begins_at_the_mean_of_an_open_one_and_at_the_report_of_an_ended_one(make):
+def test_a_new_run_starts_from_the_mean_of_an_open_run_and_from_the_report_of_an_ended_one(make):
     bench = make()
     bench.close(3)
     opened = find_start(bench.path.name, bench.path.parent)

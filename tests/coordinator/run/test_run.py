@@ -1,4 +1,4 @@
-"""A run's life against its journal, without a transport."""
+"""A run with its worker protocol and its journal, without a transport."""
 
 import hashlib
 import json
@@ -14,15 +14,16 @@ from dreamfleet.common.protocol.messages import (
     TAG_BYTES,
     Heartbeat,
     HelloRequest,
+    Intervals,
     Result,
     ResultBatch,
     UploadPart,
 )
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.run.run import Run
-from dreamfleet.coordinator.settings.config import LimitsConfig
+from dreamfleet.coordinator.run.worker_protocol import WorkerProtocol
+from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 from tests.support.samples import SPEC
 
@@ -35,10 +36,10 @@ SETTINGS = RunSettings(
 
 
 class Bench:
-    """A run in a folder, driven by hand; time stands still unless it is moved."""
+    """A run in a folder; a test delivers its messages and moves its clock."""
 
     strict = False
-    host_class = None  # of both workers; `None`: they know nothing of classes
+    host_class = None  # of both workers; `None`: they report no class
 
     def __init__(self, path, bundle, settings=SETTINGS, generations=1):
         self.path, self.now = path, 0.0
@@ -48,18 +49,20 @@ class Bench:
         self.begin()
 
     def begin(self):
-        self.run = Run(self.journal, self.settings, self.limits, Fleet(1.0), self.now, strict=self.strict)
+        network = NetworkConfig(beat=1.0, strict=self.strict)
+        self.run = Run(self.journal, self.settings, self.limits, network, self.now)
+        self.worker_protocol = WorkerProtocol(self.run, "night", "n", Intervals(1.0, 1.0))
         self.run.advance(self.now)
         self.run.commit()
         for name in (A, B):
-            self.run.worker_protocol.admit(self.request(name), self.now)
+            self.run.admission.admit(self.request(name), self.now)
             self.handle_heartbeat(name)
 
     def request(self, name):
         return HelloRequest(2, 2, "0", name, (SPEC.task,), "f", 1)
 
     def restart(self):
-        """Killed: what was not committed never was."""
+        """Kill the coordinator, which loses everything that is not committed, and begin the next incarnation."""
         self.journal.close()
         self.journal = Journal(self.path / "journal.sqlite")
         self.begin()
@@ -70,7 +73,7 @@ class Bench:
         head = {"run_uid": self.run.uid, "incarnation": self.run.incarnation, "nonce": "n", "drawn_by": "-",
                 "numbering": member.numbering}  # fmt: skip
         tags = tuple(digest[:TAG_BYTES] for digest in unacked)
-        self.run.worker_protocol.handle_heartbeat(
+        self.worker_protocol.handle_heartbeat(
             name,
             Heartbeat(**head, seen=member.number, capacity=4, slots=4, queued=(), running=(), unacked=tags, load=0.0,
                  steps_per_second=0.0, host_class=host_class),
@@ -81,17 +84,17 @@ class Bench:
         batch = ResultBatch(
             run_uid=self.run.uid, incarnation=1, fingerprint="f", results=(result,), host_class=self.host_class
         )
-        self.run.worker_protocol.handle_results(name, batch, self.now)
+        self.worker_protocol.handle_results(name, batch, self.now)
         self.run.advance(self.now)
         self.run.commit()
 
     def answer(self, result):
-        """From one of those that hold the job."""
+        """Deliver a result from a worker that holds the job."""
         wanted = self.run.fleet.jobs.get(result.digest)
         self.deliver(min(wanted.holders, default=A) if wanted else A, result)
 
     def upload(self, name, part):
-        self.run.worker_protocol.upload(name, part, self.now)
+        self.worker_protocol.handle_upload(name, part, self.now)
 
     def parts(self, job):
         data = drive_of(job)
@@ -108,7 +111,7 @@ class Bench:
         return [(send.identity, each.digest, each.verdict) for send in sends for each in send.content.verdicts]
 
     def reach_collection(self):
-        """Score the only generation; the jobs that collect, and who holds each."""
+        """Score the only generation; the collection jobs, each with its holder."""
         while not self.run.fleet.drain_background:
             for send in self.run.fleet.dispatch(self.now):
                 for work in send.content.work:
@@ -127,7 +130,7 @@ class Bench:
 
 
 def drive_of(job):
-    """Two parts and a bit, a pure function of the job."""
+    """A rollout of a little more than two parts, a pure function of the job."""
     return hashlib.sha256(job.digest).digest() * (2 * MAX_PART // 32) + job.digest
 
 
@@ -142,13 +145,13 @@ def bench(tmp_path, random_bundle):
     made.journal.close()
 
 
-def test_a_death_between_the_jobs_and_the_commit_loses_no_bit(bench):
+def test_a_kill_between_dispatch_and_commit_loses_nothing(bench):
     results = []
     for send in bench.run.fleet.dispatch(bench.now):
         for work in send.content.work:
             results.append(Result(work.job.digest, float(work.job.candidate), 10, 0.1, None, None))
             batch = ResultBatch(run_uid=bench.run.uid, incarnation=1, fingerprint="f", results=(results[-1],))
-            bench.run.worker_protocol.handle_results(send.identity, batch, bench.now)
+            bench.worker_protocol.handle_results(send.identity, batch, bench.now)
     assert bench.run.advance(bench.now)
     early = bench.run.fleet.dispatch(bench.now, durable=False)
     assert not any(send.content.verdicts for send in early)
@@ -156,13 +159,13 @@ def test_a_death_between_the_jobs_and_the_commit_loses_no_bit(bench):
 
     bench.restart()
     assert bench.run.generation.number == 0, "nothing was durable"
-    for result in results:  # without a verdict a worker says them again
+    for result in results:  # without a verdict a worker repeats them
         bench.deliver(A, result)
     assert [work.vector for work in bench.run.generation.work] == opened
     assert {digest for _, digest, verdict in bench.verdicts() if verdict == "accepted"} == {r.digest for r in results}
 
 
-def test_a_result_has_no_verdict_before_its_drive_is_on_disk(bench):
+def test_a_result_has_no_verdict_before_its_rollout_is_on_disk(bench):
     (name, job), _ = bench.reach_collection()
     bench.verdicts()
     bench.deliver(name, result_of(job))
@@ -179,7 +182,7 @@ def test_a_result_has_no_verdict_before_its_drive_is_on_disk(bench):
     assert len(bench.run.background_jobs.rollout_collections.uploads) == 0
 
 
-def test_the_end_waits_for_every_drive(bench):
+def test_the_end_waits_for_every_rollout(bench):
     jobs = bench.reach_collection()
     for name, job in jobs:
         assert bench.run.ended is None
@@ -190,16 +193,16 @@ def test_the_end_waits_for_every_drive(bench):
     assert bench.kept() == [drive_of(job) for _, job in jobs]
 
 
-def test_parts_of_a_job_that_nobody_gave_are_dropped_and_counted(bench):
+def test_upload_parts_of_a_job_that_was_not_given_are_dropped_and_counted(bench):
     (name, job), _ = bench.reach_collection()
     part = bench.parts(job)[0]
     for stranger, each in (("x/0badc0de", part), (name, replace(part, digest=b"x" * 32))):
         bench.upload(stranger, each)
-    assert bench.run.worker_protocol.dropped == {"unwanted upload": 2}
+    assert bench.run.dropped == {"unwanted upload": 2}
     assert len(bench.run.background_jobs.rollout_collections.uploads) == 0
 
 
-def test_a_drive_without_its_upload_is_an_error(bench):
+def test_a_collected_rollout_without_its_upload_is_an_error(bench):
     (name, job), _ = bench.reach_collection()
     bench.verdicts()
     bench.deliver(name, replace(result_of(job), upload=None))
@@ -207,7 +210,7 @@ def test_a_drive_without_its_upload_is_an_error(bench):
     assert "not kept" in next(iter(bench.run.fleet.jobs.failures[0].errors.values()))
 
 
-def test_a_restart_in_mid_upload_asks_again_and_what_was_kept_stays(bench):
+def test_a_restart_during_an_upload_repeats_it_and_keeps_finished_rollouts(bench):
     (name, job), (_, other) = bench.reach_collection()
     for part in bench.parts(job):
         bench.upload(name, part)
@@ -215,7 +218,7 @@ def test_a_restart_in_mid_upload_asks_again_and_what_was_kept_stays(bench):
     bench.upload(name, bench.parts(other)[0])
     bench.restart()
     assert bench.run.background_jobs.rollout_collections.progress == (1, DRIVES)
-    bench.handle_heartbeat(B, unacked=[other.digest])  # it was driven in the last life
+    bench.handle_heartbeat(B, unacked=[other.digest])  # it was driven in the last incarnation
     for part in bench.parts(other):
         bench.upload(B, part)
     bench.deliver(B, result_of(other))
@@ -228,27 +231,27 @@ def fail(bench, name, digest, error):
 
 
 def test_a_pause_names_candidate_seed_every_worker_how_often_and_why(bench):
-    given = {send.identity: send.content.work for send in bench.run.worker_protocol.dispatch(bench.now)}
+    given = {send.identity: send.content.work for send in bench.run.fleet.dispatch(bench.now)}
     work = given[A][0]
     seed, name = work.job.seeds[0], f"candidate 0/{work.job.candidate}"
     fail(bench, A, work.job.digest, "boom")
     assert bench.run.paused is None
-    bench.run.worker_protocol.dispatch(bench.now)
+    bench.run.fleet.dispatch(bench.now)
     fail(bench, B, work.job.digest, "bang")
     assert bench.run.paused.startswith(
         f"{name}, seed {seed}, failed on two workers: {A} (once): boom; {B} (once): bang"
     )
     assert "dreamfleet resume" in bench.run.paused
-    assert f"paused: {bench.run.paused}" in bench.run.worker_protocol.take_notes()
+    assert f"paused: {bench.run.paused}" in bench.run.take_notes()
 
 
-def test_a_pause_on_the_only_worker_speaks_of_one_worker_and_three_times(bench):
-    bench.run.worker_protocol.handle_departure(B, bench.now)
+def test_a_pause_on_the_only_worker_names_one_worker_and_three_failures(bench):
+    bench.run.fleet.handle_departure(B, bench.now)
     bench.now += 1
-    bench.run.worker_protocol.tick(bench.now)
+    bench.run.tick(bench.now)
     digest = None
     while bench.run.paused is None:
-        for send in bench.run.worker_protocol.dispatch(bench.now):
+        for send in bench.run.fleet.dispatch(bench.now):
             digest = digest or (send.content.work[0].job.digest if send.content.work else None)
         fail(bench, A, digest, "boom")
     assert f"failed on one worker: {A} (3 times): boom" in bench.run.paused
@@ -268,7 +271,7 @@ STEPS = st.one_of(
 @pytest.mark.slow
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(steps=st.lists(STEPS, max_size=40))
-def test_under_loss_doubling_late_parts_and_restarts_each_drive_is_kept_whole_once(
+def test_under_loss_duplication_late_parts_and_restarts_each_rollout_is_kept_whole_once(
     tmp_path_factory, random_bundle, steps
 ):
     bench = Bench(tmp_path_factory.mktemp("run") / "night", random_bundle.path)
@@ -285,16 +288,16 @@ def test_under_loss_doubling_late_parts_and_restarts_each_drive_is_kept_whole_on
             bench.handle_heartbeat(what[0], unacked=[jobs[what[1]].digest])
         elif kind == "wait":
             bench.now += what[0]
-            bench.run.worker_protocol.tick(bench.now)
+            bench.run.tick(bench.now)
             bench.run.advance(bench.now)
             bench.run.commit()
         elif kind == "restart" and bench.run.ended is None:
             bench.restart()
         accepted += [digest for _, digest, verdict in bench.verdicts() if verdict == "accepted"]
         whole = {drive_of(job) for job in jobs}
-        assert set(bench.kept()) <= whole, "what counts is whole"
+        assert set(bench.kept()) <= whole, "a counted rollout is whole"
         assert len(bench.kept()) == bench.run.background_jobs.rollout_collections.progress[0]
-    for name, job in given:  # two rounds that come through: a spoilt part ends the first
+    for name, job in given:  # two undisturbed rounds: a spoilt part ends the first
         for _ in range(2):
             bench.handle_heartbeat(name, unacked=[job.digest])
             for part in bench.parts(job):
@@ -307,8 +310,8 @@ def test_under_loss_doubling_late_parts_and_restarts_each_drive_is_kept_whole_on
     bench.journal.close()
 
 
-def test_a_run_whose_population_is_one_point_ends_and_says_so(tmp_path, random_bundle):
-    """Where all fitness is equal the step size falls until nothing is left to learn; later it would underflow."""
+def test_a_run_whose_population_is_one_point_ends_with_that_reason(tmp_path, random_bundle):
+    """With equal fitness the step size falls until the population is one point; later it would underflow."""
     settings = replace(SETTINGS, population=4, collect_every=0, sigma0=1e-30)
     bench = Bench(tmp_path / "night", random_bundle.path, settings, generations=0)
     for _ in range(2):
@@ -323,8 +326,8 @@ def test_a_run_whose_population_is_one_point_ends_and_says_so(tmp_path, random_b
         assert bench.run.ended
 
 
-def test_a_limit_that_was_reached_stays_reached_when_the_last_evaluation_says_otherwise(tmp_path, random_bundle):
-    """`--parted` looks at the latest evaluations: the one that the end itself called for may be better again."""
+def test_a_reached_limit_stays_reached_when_the_last_evaluation_contradicts_it(tmp_path, random_bundle):
+    """`--parted` reads the latest evaluations: the last one, which the end itself schedules, may be better again."""
     settings = replace(SETTINGS, collect_every=0, evaluate_every=1, evaluation_episodes=4, confirm_episodes=8)
     bench = Bench(tmp_path / "night", random_bundle.path, settings, generations=0)
     bench.limits = LimitsConfig(parted=1)

@@ -31,7 +31,7 @@ def test_a_kind_is_bounded_in_bytes_and_so_is_each_message():
     assert arrivals.dropped == {"oversize": 1, "too many at once": 1}
 
 
-def test_a_burst_of_hellos_is_taken_and_then_so_many_a_second():
+def test_hellos_may_arrive_in_a_burst_and_then_at_a_bounded_rate():
     arrivals = InboundQueue({"hello": QueueLimit(10, 1000, 5.0)})
     assert sum(arrivals.put("hello", n, 1, 0.0) for n in range(20)) == 10
     assert len(taken(arrivals)) == 10
@@ -40,7 +40,7 @@ def test_a_burst_of_hellos_is_taken_and_then_so_many_a_second():
     assert arrivals.dropped["too many in a second"] == 35
 
 
-def test_a_hello_lets_others_pass_but_not_for_ever():
+def test_a_hello_waits_for_other_events_but_not_forever():
     arrivals = InboundQueue({"hello": QueueLimit(10, 1000), "beat": QueueLimit(100, 1000)})
     arrivals.put("hello", 0, 1, 0.0)
     for number in range(2 * HELLO_PATIENCE):
@@ -56,5 +56,5 @@ def test_a_wake_is_never_dropped():
 
 
 @pytest.mark.parametrize("kind", QUEUE_LIMITS)
-def test_what_may_wait_is_a_small_part_of_a_hosts_memory(kind):
+def test_the_bounds_are_a_small_part_of_a_hosts_memory(kind):
     assert QUEUE_LIMITS[kind].size <= 32 << 20

@@ -1,4 +1,4 @@
-"""Of any number of coordinators that see each other exactly one goes on, whatever they see of those that are gone."""
+"""Of coordinators that see each other exactly one continues, whatever tokens of dead ones they see."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,7 +17,7 @@ def rivals(own):
     return LeaderCheck(own.nonce, PATIENCE, own)
 
 
-def test_ones_own_token_that_comes_back_after_a_cut_is_nobodys():
+def test_the_own_token_that_returns_after_a_network_cut_is_ignored():
     mine = rivals(note("a"))
     mine.appear("a", 0.0)
     mine.record_note(note("a"))
@@ -25,7 +25,7 @@ def test_ones_own_token_that_comes_back_after_a_cut_is_nobodys():
     assert mine.find_stronger(100.0) is None
 
 
-def test_a_token_that_lingers_after_a_killed_predecessor_ends_nothing():
+def test_a_lingering_token_of_a_killed_predecessor_ends_nothing():
     mine = rivals(note("b", incarnation=2))
     mine.appear("a", 0.0)
     assert mine.find_stronger(PATIENCE - 0.1) is None
@@ -34,7 +34,7 @@ def test_a_token_that_lingers_after_a_killed_predecessor_ends_nothing():
     assert mine.find_stronger(100.0) is None
 
 
-def test_one_that_answers_counts_at_once_and_one_that_does_not_once_its_lease_is_over():
+def test_a_coordinator_counts_once_it_answers_or_once_its_lease_is_over():
     mine = rivals(note("b"))
     mine.appear("a", 0.0)
     assert mine.due_to_ask(0.0) == ["a"]
@@ -48,7 +48,7 @@ def test_one_that_answers_counts_at_once_and_one_that_does_not_once_its_lease_is
     assert mine.due_to_ask(9.0) == []
 
 
-def test_of_one_run_the_life_that_was_continued_last_goes_on():
+def test_the_latest_incarnation_of_a_run_continues():
     old, new = note("a", incarnation=1, began=1.0), note("b", incarnation=2, began=500.0)
     for own, other, leaves in ((old, new, True), (new, old, False)):
         mine = rivals(own)
@@ -64,7 +64,7 @@ NOTES = st.lists(
 
 
 @given(NOTES)
-def test_exactly_one_of_those_that_know_each_other_goes_on(notes):
+def test_exactly_one_of_several_coordinators_continues(notes):
     stay = []
     for own in notes:
         mine = rivals(own)

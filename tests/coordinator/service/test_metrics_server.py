@@ -1,4 +1,4 @@
-"""`/metrics` of a coordinator: clients that keep its thread to themselves, and how long it waits for who scrapes."""
+"""`/metrics` of a coordinator: slow clients, and how long an ended run waits for its scraper."""
 
 import socket
 import threading
@@ -10,7 +10,7 @@ from tests.support.processes import DEADLINE, free_port
 from tests.support.served import snapshot
 
 
-def test_who_asks_a_byte_at_a_time_holds_up_neither_others_nor_the_end(monkeypatch):
+def test_a_client_that_sends_a_byte_at_a_time_delays_neither_others_nor_the_end(monkeypatch):
     monkeypatch.setattr(metrics_server, "PATIENCE", 0.5)
     port, over = free_port(), threading.Event()
 
@@ -36,7 +36,7 @@ def test_who_asks_a_byte_at_a_time_holds_up_neither_others_nor_the_end(monkeypat
     thread.join()
 
 
-def test_the_end_is_kept_for_who_asks_again_and_again_until_he_has_heard():
+def test_an_ended_run_waits_until_its_scraper_has_seen_the_end():
     scrapes = ScrapeTimes()
     assert not scrapes.is_expected(0.0, 0.0)
     scrapes.record("running", 0.0)
@@ -48,7 +48,7 @@ def test_the_end_is_kept_for_who_asks_again_and_again_until_he_has_heard():
     assert not scrapes.is_expected(20.0, 30.0)
 
 
-def test_it_is_not_kept_for_ever():
+def test_an_ended_run_does_not_wait_forever():
     scrapes = ScrapeTimes()
     scrapes.record("running", 0.0)
     scrapes.record("running", 3600.0)

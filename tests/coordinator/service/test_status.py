@@ -14,8 +14,8 @@ from dreamfleet.common.serialization.validation import from_plain
 from dreamfleet.coordinator.dispatch.event_log import EventLog
 from dreamfleet.coordinator.jobs.generation import CandidateScores
 from dreamfleet.coordinator.jobs.history import History
-from dreamfleet.coordinator.service import status_json
-from dreamfleet.coordinator.service.status import Snapshot, mark_left, take_snapshot
+from dreamfleet.coordinator.service.snapshot import Snapshot, take_snapshot
+from dreamfleet.coordinator.service.status import encode_part, encode_status
 from tests.coordinator.run.test_run import SETTINGS, A, Bench
 from tests.support.samples import CLOSED, STATUS
 
@@ -30,9 +30,9 @@ def bench(tmp_path, random_bundle):
 
 
 def score(bench, count, fitness=lambda job: job.candidate + job.episode / 2):
-    """So many jobs, one after the other."""
+    """Answer `count` jobs, one after the other."""
     while count:
-        for send in bench.run.worker_protocol.dispatch(bench.now):
+        for send in bench.run.fleet.dispatch(bench.now):
             bench.given = getattr(bench, "given", []) + [work.job for work in send.content.work]
         job = bench.given.pop(0)
         bench.answer(Result(job.digest, fitness(job), 10, 0.1, None, None))
@@ -44,10 +44,10 @@ def snapshot_of(bench):
 
 
 def answered(snapshot, part="", **parameters):
-    return read_document(status_json.answer(snapshot, part, {name: str(value) for name, value in parameters.items()}))
+    return read_document(encode_part(snapshot, part, {name: str(value) for name, value in parameters.items()}))
 
 
-def test_every_candidate_of_the_open_and_of_the_last_generation_is_told(bench):
+def test_the_status_holds_every_candidate_of_the_open_and_of_the_last_generation(bench):
     before = read_status(answered(snapshot_of(bench)))
     assert before.population == Population(0, 0, 4, (0,) * 4, (2,) * 4, (None,) * 4)
     assert before.last_population is None
@@ -63,7 +63,7 @@ def test_every_candidate_of_the_open_and_of_the_last_generation_is_told(bench):
     assert after.last == after.recent[-1]
 
 
-def test_a_restart_knows_the_last_generations_candidates_again(bench):
+def test_a_restart_restores_the_last_generations_candidates(bench):
     score(bench, 8)
     before = snapshot_of(bench)
     bench.restart()
@@ -100,19 +100,19 @@ def large(population, workers, generations, text="x"):
     event_log = EventLog()
     for number in range(3 * workers):
         event_log.add(number / 10, "accepted", fleet[number % workers].worker)
-    told = History(rows(generations)).view(), looks(generations)
-    return Snapshot(status, fleet, *told, candidate_scores, last, None, event_log.view(), 1e6)
+    closed = History(rows(generations)).view(), looks(generations)
+    return Snapshot(status, fleet, *closed, candidate_scores, last, None, event_log.view(), 1e6)
 
 
 @pytest.mark.parametrize(("population", "workers", "generations"), [(4, 1, 1), (100_000, 2000, 5000)])
 @pytest.mark.parametrize("text", ["x", "\N{SNOWMAN}", "\N{ROLLING ON THE FLOOR LAUGHING}"])
-def test_no_answer_is_longer_than_a_message_whatever_the_run(population, workers, generations, text):
+def test_no_answer_is_longer_than_a_message_however_large_the_run(population, workers, generations, text):
     snapshot = large(population, workers, generations, text)
     longest = replace(snapshot.status.settings.task, options="x" * MAX_OPTIONS)
     settings = replace(snapshot.status.settings, task=longest)
     snapshot = replace(snapshot, status=replace(snapshot.status, settings=settings))
     for part in PARTS:
-        payload = status_json.answer(snapshot, part, {})
+        payload = encode_part(snapshot, part, {})
         assert len(payload) <= MAX_MESSAGE, part
     status = read_status(answered(snapshot))
     assert status.population.total == population
@@ -130,14 +130,14 @@ def collected(snapshot, part, column, **parameters):
     return found
 
 
-def test_pages_together_are_everything_and_come_from_the_same_moment():
+def test_the_pages_of_a_snapshot_together_hold_everything():
     snapshot = large(3000, 150, 250)
     assert [each["worker"] for each in collected(snapshot, "workers", "workers")] == [
         each.worker for each in snapshot.workers
     ]
     assert [from_plain(StoredGeneration, each) for each in collected(snapshot, "history", "history")] == rows(250)
-    told = collected(snapshot, "evaluations", "evaluations")
-    assert tuple(from_plain(StoredEvaluation, each) for each in told) == looks(250)
+    found = collected(snapshot, "evaluations", "evaluations")
+    assert tuple(from_plain(StoredEvaluation, each) for each in found) == looks(250)
     for candidate_scores in (snapshot.candidate_scores, snapshot.last):
         asked = {"generation": candidate_scores.generation}
         assert collected(snapshot, "candidates", "fitness", **asked) == candidate_scores.fitness
@@ -145,14 +145,14 @@ def test_pages_together_are_everything_and_come_from_the_same_moment():
 
 
 @pytest.mark.parametrize("damage", ["-1", "x", "1e9", "9" * 40, ""])
-def test_parameters_that_are_no_numbers_mean_the_beginning(damage):
+def test_malformed_page_parameters_mean_the_first_page(damage):
     snapshot = large(4, 1, 3)
     for part in PARTS:
         assert answered(snapshot, part, offset=damage, limit=damage) == answered(snapshot, part)
 
 
 class Rows(list):
-    """Counts every row that is looked at."""
+    """Counts every row that is read."""
 
     touched = 0
 
@@ -168,7 +168,7 @@ class Rows(list):
 
 
 def touched(bench, generations):
-    """Rows of the history and of evaluations that a snapshot, an answer and the stop reason look at."""
+    """Rows of the history and of evaluations that a snapshot, an answer and the stop reason read."""
     bench.run.history.__init__(rows(generations))
     evaluations = bench.run.background_jobs.evaluations
     evaluations.__init__(
@@ -181,7 +181,7 @@ def touched(bench, generations):
     )
     Rows.touched = 0
     snapshot = snapshot_of(bench)
-    status_json.status(snapshot)
+    encode_status(snapshot)
     assert bench.run._stop_reason(bench.run.generation) is None
     return Rows.touched
 
@@ -201,24 +201,24 @@ def test_the_best_answer_carries_the_controller_in_parts(bench):
     assert about["provenance"]["generation"] == 0
 
 
-def test_a_run_that_is_left_open_says_so_and_one_that_ended_has_ended(bench):
-    assert mark_left(snapshot_of(bench)).status.state == "left"
+def test_the_last_snapshot_says_left_unless_the_run_has_ended(bench):
+    assert snapshot_of(bench).as_left().status.state == "left"
     while bench.run.ended is None:
         score(bench, 1)
-    assert mark_left(snapshot_of(bench)).status.state == "ended"
-    assert json.loads(status_json.status(mark_left(snapshot_of(bench))))["why"] == "3 generations"
+    assert snapshot_of(bench).as_left().status.state == "ended"
+    assert json.loads(encode_status(snapshot_of(bench).as_left()))["why"] == "3 generations"
 
 
-def test_a_worker_is_told_with_the_time_of_a_job_its_round_trip_and_what_was_sent_again(bench):
+def test_a_workers_status_holds_its_job_seconds_round_trip_and_resent_batches(bench):
     first = snapshot_of(bench).workers[0]
     assert (first.job_seconds, first.round_trip, first.resent) == (None, None, 0)
-    (send,) = [each for each in bench.run.worker_protocol.dispatch(0.0) if each.identity == A]
+    (send,) = [each for each in bench.run.fleet.dispatch(0.0) if each.identity == A]
     bench.now = 0.25
     bench.handle_heartbeat(A)
     assert snapshot_of(bench).workers[0].round_trip == 0.25
     bench.answer(Result(send.content.work[0].job.digest, 1.0, 10, 0.1, None, None))
-    bench.run.worker_protocol.dispatch(bench.now)  # its verdict, which no beat shows as seen
-    bench.run.worker_protocol.dispatch(bench.now + 30.0)
-    told = snapshot_of(bench).workers[0]
-    assert (told.job_seconds, told.round_trip, told.resent) == (0.1, 0.25, 1)
-    assert WorkerStatus(**answered(snapshot_of(bench), "workers")["workers"][0]) == told
+    bench.run.fleet.dispatch(bench.now)  # its verdict, which no beat shows as seen
+    bench.run.fleet.dispatch(bench.now + 30.0)
+    last = snapshot_of(bench).workers[0]
+    assert (last.job_seconds, last.round_trip, last.resent) == (0.1, 0.25, 1)
+    assert WorkerStatus(**answered(snapshot_of(bench), "workers")["workers"][0]) == last

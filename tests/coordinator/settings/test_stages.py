@@ -14,7 +14,7 @@ from dreamfleet.common.runs.records import StageSettings
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.scoring_params import scoring_params_of
 from dreamfleet.common.runs.stages import begun_stages
-from dreamfleet.coordinator.service.status import take_snapshot
+from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.settings.config import LimitsConfig
 from dreamfleet.coordinator.verbs import fork
 from tests.coordinator.evaluated import EVERY, Evaluated
@@ -163,11 +163,11 @@ def test_a_search_that_begins_anew_begins_at_the_mean_and_draws_other_numbers(st
     while bench.run.generation.number == 0:
         bench.fetch()
         bench.finish(0)
-    before = bench.run._generations.mean
-    assert bench.run.sigma == 0.1
+    before = bench.run.generations.mean
+    assert bench.run.generations.sigma == 0.1
     assert {work.vector for work in first.work}.isdisjoint(work.vector for work in bench.run.generation.work)
     bench.restart()
-    assert bench.run._generations.mean == before
+    assert bench.run.generations.mean == before
 
 
 def test_a_kept_drive_is_driven_as_the_candidates_of_its_generation(staged):
@@ -216,7 +216,7 @@ def test_a_fork_begins_with_the_stage_that_its_run_is_in_and_goes_on_with_the_ot
     settings = forked(bench, monkeypatch)
     assert settings["stages"] == (StageSettings(score=500.0), *STAGES[2:])
     assert [settings[name] for name in ("horizon", "patience", "episodes", "racing")] == [400, 0, 2, True]
-    assert settings["sigma0"] == bench.run.sigma
+    assert settings["sigma0"] == bench.run.generations.sigma
 
 
 def test_a_fork_of_the_last_stage_has_no_schedule(staged, monkeypatch):

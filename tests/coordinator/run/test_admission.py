@@ -1,4 +1,4 @@
-"""A run's class is that of its first accepted result; of a strict one every accepted result has it."""
+"""The first accepted result fixes a run's class; in a strict run all accepted results are of that class."""
 
 import sqlite3
 from dataclasses import replace
@@ -25,41 +25,38 @@ class Classed(Bench):
     strict = True
 
     def begin(self):
-        self.told = {A: "", B: ""}
+        self.announced = {A: "", B: ""}
         super().begin()
 
     def find_out(self, name):
-        """Its children have, and its beat says so."""
-        self.told[name] = self.classes[name]
+        """The worker's child processes find its class, and its heartbeat says so."""
+        self.announced[name] = self.classes[name]
         self.handle_heartbeat(name, host_class=self.classes[name])
 
     def request(self, name):
-        known = self.classes[name] and self.told[name]  # a worker finds it out after it has joined
+        known = self.classes[name] and self.announced[name]  # a worker finds out its class after it has joined
         return HelloRequest(2, 2, "0", name, (SPEC.task,), self.fingerprints[name], 1, host_class=known)
 
     def hello(self, name):
-        """Why it is refused, if it is."""
-        found = self.run.worker_protocol.find_refusal(self.request(name), self.settings)
+        """Why the worker is refused; `None` if it may join."""
+        found = self.run.admission.find_refusal(self.request(name))
         if found is None:
-            self.run.worker_protocol.admit(self.request(name), self.now)
+            self.run.admission.admit(self.request(name), self.now)
             self.handle_heartbeat(name)
         return found
 
     def deliver(self, name, result):
-        self.told[name] = self.classes[name]
+        self.announced[name] = self.classes[name]
         batch = ResultBatch(
             run_uid=self.run.uid, incarnation=1, fingerprint=self.fingerprints[name], results=(result,),
             host_class=self.classes[name],
         )  # fmt: skip
-        self.run.worker_protocol.handle_results(name, batch, self.now)
+        self.worker_protocol.handle_results(name, batch, self.now)
         self.run.advance(self.now)
         self.run.commit()
 
     def given(self):
-        return {
-            send.identity: [work.job for work in send.content.work]
-            for send in self.run.worker_protocol.dispatch(self.now)
-        }
+        return {send.identity: [work.job for work in send.content.work] for send in self.run.fleet.dispatch(self.now)}
 
     def stored(self):
         with RunFolder(self.path) as folder:
@@ -78,50 +75,50 @@ def done(job):
 
 
 class FromBefore(Classed):
-    """Workers of before there were classes."""
+    """Workers of a version without classes."""
 
     classes = {A: None, B: None}  # noqa: RUF012
 
 
-def test_a_hello_without_a_result_fixes_nothing(bench):
-    assert bench.run.worker_protocol.host_class is None
+def test_a_hello_alone_does_not_fix_the_class(bench):
+    assert bench.run.admission.host_class is None
     bench.restart()
     assert bench.hello(A) is bench.hello(B) is None
 
 
 @pytest.mark.parametrize("kind", [Classed, FromBefore])
-def test_the_first_accepted_result_fixes_it_and_the_other_host_must_go(tmp_path, random_bundle, kind):
+def test_the_first_accepted_result_fixes_the_class_and_the_other_host_is_removed(tmp_path, random_bundle, kind):
     bench = kind(tmp_path / "night", random_bundle.path, PLAIN)
     own = kind.classes[B] or class_from_fingerprint("elsewhere")
     jobs = bench.given()
     bench.deliver(B, done(jobs[B][0]))
-    assert (bench.run.worker_protocol.host_class, bench.run.worker_protocol.fingerprint) == (own, "elsewhere")
+    assert (bench.run.admission.host_class, bench.run.admission.fingerprint) == (own, "elsewhere")
     bench.deliver(A, done(jobs[A][0]))
     assert bench.run.generation.done == 1, "a result of another class does not count"
-    assert [member.identity for member in bench.run.worker_protocol.members] == [B]
+    assert list(bench.run.fleet.members) == [B]
     why, remedy = bench.hello(A)
     assert "classes differ" in why
     assert "--no-strict" in remedy
-    assert any("classes differ" in note for note in bench.run.worker_protocol.take_notes())
+    assert any("classes differ" in note for note in bench.run.take_notes())
     assert {job.digest for job in bench.given()[B]} >= {job.digest for job in jobs[A]}, "its jobs are free again"
-    assert bench.run.worker_protocol.failures == [], "it is no failure of the job"
+    assert bench.run.fleet.jobs.failures == [], "it is no failure of the job"
     bench.restart()
-    assert bench.run.worker_protocol.host_class == own
+    assert bench.run.admission.host_class == own
     assert bench.hello(B) is None
     bench.journal.close()
 
 
-def test_who_is_of_another_class_goes_before_it_is_given_anything(bench):
+def test_a_worker_of_another_class_is_removed_before_it_gets_work(bench):
     jobs = bench.given()
     bench.deliver(B, done(jobs[B][0]))
-    bench.run.worker_protocol.remove_worker(A)
+    bench.run.fleet.remove_worker(A)
     assert bench.hello(A) is None, "it does not know its class yet"
     bench.find_out(A)
-    assert [member.identity for member in bench.run.worker_protocol.members] == [B]
+    assert list(bench.run.fleet.members) == [B]
     assert "classes differ" in bench.hello(A)[0]
 
 
-def test_a_worker_from_before_there_were_classes_cannot_join_a_strict_run_of_one(bench):
+def test_a_worker_without_a_class_cannot_join_a_strict_run_with_one(bench):
     jobs = bench.given()
     bench.deliver(B, done(jobs[B][0]))
     bench.classes = {A: None, B: "b" * 16}
@@ -136,21 +133,21 @@ def test_hosts_of_one_fingerprint_may_be_of_two_classes_and_of_two_fingerprints_
     bench.deliver(A, done(jobs[A][0]))
     assert bench.run.generation.done == 1
     bench.fingerprints, bench.classes = {A: "there", B: "here"}, {A: "b" * 16, B: "b" * 16}
-    bench.told[A] = ""
+    bench.announced[A] = ""
     assert bench.hello(A) is None
     bench.deliver(A, done(jobs[A][0]))
     assert bench.run.generation.done == 2
     assert bench.stored() == {"b" * 16}
-    (share,) = bench.run.worker_protocol.classes.largest
+    (share,) = bench.run.classes.largest
     assert (share.results, set(share.fingerprints)) == (2, {"here", "there"})
 
 
-def test_an_error_fixes_nothing(bench):
+def test_an_error_does_not_fix_the_class(bench):
     jobs = bench.given()
     bench.deliver(B, Result(jobs[B][0].digest, None, 0, 0.1, "boom", None))
-    assert bench.run.worker_protocol.host_class is None
+    assert bench.run.admission.host_class is None
     bench.deliver(A, done(jobs[A][0]))
-    assert bench.run.worker_protocol.host_class == "a" * 16
+    assert bench.run.admission.host_class == "a" * 16
 
 
 def test_a_result_of_another_life_is_judged_before_its_worker_says_hello(bench):
@@ -162,7 +159,7 @@ def test_a_result_of_another_life_is_judged_before_its_worker_says_hello(bench):
 
 
 @pytest.mark.parametrize("classes", [{A: "a" * 16, B: "b" * 16}, {A: None, B: "b" * 16}, {A: "a" * 16, B: None}])
-def test_a_run_that_is_not_strict_takes_all_and_tells_of_which_class_each_result_is(tmp_path, random_bundle, classes):
+def test_a_run_that_is_not_strict_accepts_all_classes_and_records_each_results_class(tmp_path, random_bundle, classes):
     kind = type("Open", (Classed,), {"strict": False, "classes": classes})
     bench = kind(tmp_path / "night", random_bundle.path, PLAIN)
     jobs = bench.given()
@@ -170,16 +167,19 @@ def test_a_run_that_is_not_strict_takes_all_and_tells_of_which_class_each_result
         bench.deliver(name, done(jobs[name][0]))
     assert bench.run.generation.done == 2
     assert bench.hello(A) is bench.hello(B) is None
-    # Where the first to score knew nothing of classes the whole run goes by fingerprints, as do older journals.
-    told = classes if classes[A] else {A: None, B: None}
-    assert bench.stored() == {told[A] or class_from_fingerprint("here"), told[B] or class_from_fingerprint("elsewhere")}
-    assert bench.run.worker_protocol.classes.description == "mixed: 2 classes, 50.0%, 50.0% of results"
+    # If the first accepted result had no class, the whole run uses fingerprints, as older journals do.
+    counted = classes if classes[A] else {A: None, B: None}
+    assert bench.stored() == {
+        counted[A] or class_from_fingerprint("here"),
+        counted[B] or class_from_fingerprint("elsewhere"),
+    }
+    assert bench.run.classes.description == "mixed: 2 classes, 50.0%, 50.0% of results"
     bench.journal.close()
     with RunFolder(bench.path) as folder:
-        assert folder.classes == bench.run.worker_protocol.classes
+        assert folder.classes == bench.run.classes
 
 
-def test_a_journal_from_before_there_were_classes_goes_on_by_fingerprints(bench):
+def test_a_journal_without_classes_continues_with_fingerprints(bench):
     jobs = bench.given()
     bench.deliver(A, done(jobs[A][0]))
     bench.journal.close()
@@ -193,18 +193,18 @@ def test_a_journal_from_before_there_were_classes_goes_on_by_fingerprints(bench)
         assert folder.classes.description == "one class, by its fingerprint: to the bit"
     bench.journal = Journal(bench.path / "journal.sqlite")
     bench.begin()
-    assert bench.run.worker_protocol.host_class == class_from_fingerprint("here")
+    assert bench.run.admission.host_class == class_from_fingerprint("here")
     assert "classes differ" in bench.hello(B)[0]
     bench.deliver(A, done(bench.given()[A][0]))
     assert bench.run.generation.done == 2
     assert bench.stored() == {class_from_fingerprint("here")}
 
 
-def test_an_old_journal_that_a_hello_froze_is_free_again(bench):
+def test_an_old_journal_with_the_class_of_a_hello_has_no_class_again(bench):
     bench.journal.set_fact("fingerprint", "a host that never scored")
     bench.journal.commit()
     bench.restart()
-    assert bench.run.worker_protocol.host_class is None
+    assert bench.run.admission.host_class is None
 
 
 @pytest.mark.slow

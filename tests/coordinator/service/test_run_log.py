@@ -1,4 +1,4 @@
-"""What a coordinator's log says of a run."""
+"""A coordinator's log of its run: the summary line and the worker command."""
 
 import dataclasses
 import socket
@@ -7,11 +7,11 @@ from datetime import UTC, datetime, timedelta
 from dreamfleet.common.monitoring.status import Throughput
 from dreamfleet.common.security.credentials import Credentials
 from dreamfleet.common.transport.network import Network
-from dreamfleet.coordinator.service.log_messages import summary, worker_command
+from dreamfleet.coordinator.service.run_log import summary, worker_command
 from tests.support.samples import STATUS
 
 
-def test_one_line_tells_generation_score_speed_workers_and_what_is_left():
+def test_the_summary_shows_generation_score_speed_workers_and_time_left():
     status = dataclasses.replace(STATUS, limits={"minutes": 30.0}, throughput=Throughput(987.5, 448000, 1080.0))
     text, facts = summary(status)
     assert text == (
@@ -22,7 +22,7 @@ def test_one_line_tells_generation_score_speed_workers_and_what_is_left():
     assert "nothing evaluated yet" in summary(dataclasses.replace(STATUS, best=None))[0]
 
 
-def test_the_command_names_an_address_that_others_reach():
+def test_the_worker_command_names_an_address_that_other_hosts_reach():
     assert worker_command(Network(listen=("tcp/127.0.0.1:7447",)), "night", "car-racing") == (
         "dreamfleet worker --run night --connect tcp/127.0.0.1:7447"
     )
@@ -34,7 +34,7 @@ def test_the_command_names_an_address_that_others_reach():
     assert "tcp/router:1" in worker_command(Network(connect=("tcp/router:1",)), "night", "car-racing")
 
 
-def test_in_a_fleet_with_join_files_the_workers_own_says_where():
+def test_with_join_files_the_worker_command_names_the_workers_own():
     credentials = Credentials("coordinator", 1, "home", datetime.now(UTC) + timedelta(days=90), "")
     command = worker_command(Network(listen=("tls/0.0.0.0:7447",), credentials=credentials), "night", "car-racing")
     assert command == "dreamfleet worker --run night --join FILE"

@@ -1,0 +1,96 @@
+"""Which hosts may add to a run: those that know its task and, if the run is strict, compute like its first host."""
+
+from __future__ import annotations
+
+from dreamfleet.common.protocol.host_classes import effective_class
+from dreamfleet.common.protocol.messages import HelloRequest
+from dreamfleet.common.runs.records import RunSettings
+from dreamfleet.coordinator.dispatch.admission import RefusedWorkers, class_mismatch, find_refusal
+from dreamfleet.coordinator.dispatch.fleet import Fleet
+from dreamfleet.coordinator.dispatch.member import Member
+from dreamfleet.coordinator.storage.journal import FINGERPRINT, HOST_CLASS, Journal
+
+
+class Admission:
+    """Admits workers to a run's fleet and removes those of a foreign class; only a `strict` run has foreign classes."""
+
+    def __init__(self, journal: Journal, settings: RunSettings, fleet: Fleet, *, strict: bool) -> None:
+        self.strict = strict
+        self.refused_workers = RefusedWorkers()
+        # Of the first accepted result; `None` before it.
+        self.fingerprint, self.host_class = journal.fingerprint(), journal.host_class()
+        self._journal = journal
+        self._settings = settings
+        self._fleet = fleet
+
+    def find_refusal(self, request: HelloRequest) -> tuple[str, str] | None:
+        """Why a worker cannot join and what to do about it; `None` if it may."""
+        settings = self._settings
+        admitted = self.host_class if self.strict else None
+        found = find_refusal(request, settings.task.task, admitted, settings.packages)
+        final = request.packages == settings.packages  # otherwise the worker says hello again with these packages
+        if found is not None and final and self.refused_workers.add(request.worker, found[0]):
+            self._fleet.notes.append(f"refused worker {request.worker}: {found[0]}")
+        return found
+
+    def admit(self, request: HelloRequest, now: float) -> int:
+        """Add a worker to the fleet; the number that its batches will carry."""
+        self.refused_workers.remove(request.worker)
+        known = self._fleet.members.get(request.worker)
+        numbering = self._fleet.add_worker(request.worker, request.slots, request.fingerprint, now)
+        if (member := self._fleet.members[request.worker]) is not known:
+            member.host_class = self.class_of(request.host_class, request.fingerprint)
+        return numbering
+
+    def update_class(self, worker: str, host_class: str | None) -> None:
+        """Note the class that a heartbeat names, and remove a worker whose class is foreign."""
+        member = self._fleet.members.get(worker)
+        if member is not None and host_class:
+            member.host_class = self.class_of(host_class, member.fingerprint)
+            self._enforce_class(member)
+
+    def class_of(self, host_class: str | None, fingerprint: str) -> str:
+        """The class under which this run counts a host; empty if it is not known yet."""
+        return effective_class(host_class, fingerprint, self.host_class)
+
+    def distrust_reason(self, worker: str, host_class: str, fingerprint: str) -> str | None:
+        """Why results that name this class and fingerprint do not count; `None` if they may.
+
+        Anybody can send messages in a worker's name: a fingerprint other than that of the worker's hello is not its.
+        """
+        member = self._fleet.members.get(worker)
+        if member is not None and member.fingerprint != fingerprint:
+            return "result of another fingerprint than its worker's"
+        if self._accepts_class(host_class):
+            return None
+        if member is not None and not (member.host_class and self._accepts_class(member.host_class)):
+            self._remove_foreign_class(worker, host_class, fingerprint)
+        return "result of another class than the run's"
+
+    def adopt_class(self, host_class: str, fingerprint: str) -> None:
+        """Make the first accepted result's class and fingerprint the run's, in the transaction that writes it."""
+        if self.host_class is not None:
+            return
+        self.host_class, self.fingerprint = host_class, fingerprint
+        self._journal.set_fact(HOST_CLASS, host_class)
+        self._journal.set_fact(FINGERPRINT, fingerprint)
+        for member in list(self._fleet.members.values()):
+            member.host_class = self.class_of(member.host_class, member.fingerprint)
+            self._enforce_class(member)
+
+    def _accepts_class(self, host_class: str) -> bool:
+        return not self.strict or self.host_class in (None, host_class)
+
+    def _enforce_class(self, member: Member) -> None:
+        if member.host_class and not self._accepts_class(member.host_class):
+            self._remove_foreign_class(member.identity, member.host_class, member.fingerprint)
+
+    def _remove_foreign_class(self, worker: str, host_class: str, fingerprint: str) -> None:
+        """Remove a worker of another class: it says hello again, and the refusal explains why and what to do.
+
+        Its results get no verdict, so that it does not take silence for success.
+        """
+        why, _ = class_mismatch(self.host_class, host_class, fingerprint)
+        self._fleet.remove_worker(worker)
+        if self.refused_workers.add(worker, why):
+            self._fleet.notes.append(f"worker {worker} must go: {why}")

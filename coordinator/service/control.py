@@ -1,0 +1,87 @@
+"""The control verbs that steer a run: pause, resume, drain, stop, disband. No transport."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from dreamfleet.common.printable import truncate
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.messages import ControlReply
+from dreamfleet.common.serialization.validation import MAX_TEXT
+from dreamfleet.coordinator.dispatch.packing import BatchContent, OutgoingBatch
+from dreamfleet.coordinator.run.run import Run
+
+LONGEST_VERB = 60  # characters of an unknown verb in the reply
+LEAVING_VERBS = ("drain", "stop", "disband")
+DISBAND_TIMEOUT = 10.0  # seconds that workers may take to leave a disbanded run
+
+
+class Control:
+    """Obeys control verbs, and sees draining and disbanding through until it calls `stop`."""
+
+    def __init__(self, run: Run, name: str, beat: float, stop: Callable[[], None]) -> None:
+        self._run = run
+        self._name = name
+        self._beat = beat
+        self._stop = stop
+        self._verbs: dict[str, Callable[[], None]] = {
+            "pause": lambda: run.pause("by hand"),
+            "resume": self._resume,
+            "drain": self._drain,
+            "stop": stop,
+            "disband": self._disband,
+        }
+        self._draining = False
+        self._disbanding_since: float | None = None
+        self._leave_sent_at = -math.inf
+        self._now = 0.0
+
+    @property
+    def disbanding(self) -> bool:
+        """Whether every batch asks its worker to leave."""
+        return self._disbanding_since is not None
+
+    def obey(self, query_key: str, resume_command: str, now: float) -> ControlReply:
+        """Obey the verb of a query's key expression; an unknown one, or one for several runs, is refused.
+
+        The reply to a verb that ends the coordinator holds `resume_command`.
+        """
+        self._now, verb = now, query_key.rsplit("/", 1)[-1]
+        why, again = "", ""
+        if query_key != keys.control(self._name, verb):
+            why = f"one run is steered at a time, by its own key: ask {keys.control(self._name, 'VERB')}"
+        elif verb not in self._verbs:
+            known = ", ".join(self._verbs)
+            why = f"{truncate(verb, LONGEST_VERB)!r} is no control verb of this version; it knows: {known}"
+        else:
+            self._verbs[verb]()
+            if verb in LEAVING_VERBS and len(resume_command) <= MAX_TEXT and resume_command.isprintable():
+                again = resume_command
+        return ControlReply(v=keys.PROTOCOL_VERSION, run=self._name, accepted=not why, why=why, again=again)
+
+    def advance(self, now: float) -> list[OutgoingBatch]:
+        """Stop once draining or disbanding is done; batches that ask the workers to leave, repeated every beat."""
+        if self._draining and not self._run.fleet.lease_count:
+            self._stop()
+        if self._disbanding_since is None:
+            return []
+        present = [each for each in self._run.fleet.members.values() if each.gone_since is None]
+        if not present or now - self._disbanding_since > DISBAND_TIMEOUT:
+            self._stop()
+        elif now - self._leave_sent_at >= self._beat:
+            self._leave_sent_at = now
+            return [OutgoingBatch(each.identity, each.numbering, 0, BatchContent()) for each in present]
+        return []
+
+    def _resume(self) -> None:
+        self._draining = False
+        self._run.resume()
+
+    def _drain(self) -> None:
+        self._draining = True
+        self._run.pause("draining")
+
+    def _disband(self) -> None:
+        self._run.pause("ending with its workers")
+        self._disbanding_since = self._now

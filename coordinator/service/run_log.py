@@ -1,0 +1,130 @@
+"""What a coordinator logs about its run while it serves it."""
+
+from __future__ import annotations
+
+import logging
+import math
+import shlex
+import socket
+from collections.abc import Iterable
+from dataclasses import asdict
+from datetime import UTC, datetime
+from itertools import islice
+from typing import Any
+
+from dreamfleet.common.monitoring.eta import estimate_eta, summarise_status
+from dreamfleet.common.monitoring.status import Status
+from dreamfleet.common.protocol.tasks import is_unregistered
+from dreamfleet.common.runs.records import StoredGeneration
+from dreamfleet.common.security.credentials import EXPIRY_WARNING, Credentials, describe_time_left
+from dreamfleet.common.transport.network import Network, is_loopback
+from dreamfleet.coordinator.run.run import Run
+from dreamfleet.coordinator.service.snapshot import Snapshot
+
+log = logging.getLogger(__name__)
+WILDCARD_HOSTS = ("0.0.0.0", "[::]")  # noqa: S104 - compared with addresses, never listened on
+SUMMARY_INTERVAL = 60.0  # seconds from one summary line to the next
+DAY = 86_400.0  # seconds from one warning that the join file expires to the next
+NO_WORKER_SECONDS = 5.0  # seconds without a worker before the log says so
+
+
+class RunLog:
+    """Logs a run's begin, generations, evaluations and notes, a summary every minute, and what needs attention."""
+
+    def __init__(self, run: Run, name: str, network: Network, now: float) -> None:
+        self._run = run
+        self._name = name
+        self._network = network
+        self._evaluations_logged = len(run.background_jobs.evaluations)
+        self._summary_at = now
+        self._no_worker_since = now
+        self._expiry_at = 0.0
+
+    def begin(self) -> None:
+        """The run is served from now on."""
+        run, listen = self._run, self._network.listen
+        facts = {"event": "begin", "run": self._name, "run_uid": run.uid, "incarnation": run.incarnation}
+        log.info("run %s, incarnation %d, generation %d", self._name, run.incarnation, run.generation.number,
+                 extra={"facts": facts})  # fmt: skip
+        if listen:
+            log.info("listening on %s", ", ".join(listen))
+            if self._network.credentials is None and not all(is_loopback(each) for each in listen):
+                log.warning("this is neither encrypted nor authenticated: anyone who reaches the port owns the run "
+                            "(docs/security.md)", extra={"facts": {"event": "insecure"}})  # fmt: skip
+
+    def report_closed(self, generations: Iterable[StoredGeneration]) -> None:
+        """Log these closed generations, and the evaluations that have finished since the last call."""
+        for closed in generations:
+            log.info("generation %d: mean %.1f, best %.1f", closed.number, closed.mean, closed.best,
+                     extra={"facts": {"event": "generation", **asdict(closed)}})  # fmt: skip
+        evaluations = self._run.background_jobs.evaluations
+        if len(evaluations) > self._evaluations_logged:
+            for each in islice(evaluations.finished.values(), self._evaluations_logged, None):  # as they finished
+                log.info("evaluation of generation %d's mean: %.1f ± %.1f (standard error), %d episodes",
+                         each.generation, each.mean, each.error, each.episodes,
+                         extra={"facts": {"event": "evaluation", **asdict(each), "error": each.error}})  # fmt: skip
+            self._evaluations_logged = len(evaluations)
+
+    def write_notes(self) -> None:
+        """Log the run's notes since the last call."""
+        for note in self._run.take_notes():
+            log.info("%s", note)
+
+    def check(self, snapshot: Snapshot, now: float) -> None:
+        """Log what is due: a warning that no worker is present, the minute's summary, the join file's expiry."""
+        self._warn_if_no_worker(now)
+        if now - self._summary_at >= SUMMARY_INTERVAL:
+            self._summary_at = now
+            text, facts = summary(snapshot.full_status())
+            log.info("%s", text, extra={"facts": facts})
+            if self._network.credentials is not None and now >= self._expiry_at:
+                self._expiry_at = now + DAY
+                _warn_of_expiry(self._network.credentials)
+
+    def _warn_if_no_worker(self, now: float) -> None:
+        """Warn once per spell without workers: a run that stands still should not be silent."""
+        if self._run.state != "waiting for workers":
+            self._no_worker_since = now
+        elif now - self._no_worker_since > NO_WORKER_SECONDS:
+            self._no_worker_since = math.inf
+            command = worker_command(self._network, self._name, self._run.settings.task.task)
+            log.warning("no worker is there: the run waits for one; on any host: %s", command,
+                        extra={"facts": {"event": "no worker", "command": command}})  # fmt: skip
+
+
+def _warn_of_expiry(credentials: Credentials) -> None:
+    """Warn in the join file's last week: links break when a certificate expires."""
+    if (left := credentials.time_left(datetime.now(UTC))) < EXPIRY_WARNING:
+        facts = {"event": "expiry", "seconds": left.total_seconds()}
+        log.warning("this coordinator's join file: %s; issue another and start it again with that",
+                    describe_time_left(left), extra={"facts": facts})  # fmt: skip
+
+
+def summary(status: Status) -> tuple[str, dict[str, Any]]:
+    """The status in one line, and as facts."""
+    best = status.confirmed or status.best
+    facts = {
+        "event": "summary", "state": status.state, "generation": status.generation.number,
+        "steps_per_second": status.throughput.steps_per_second, "best": None if best is None else best.mean,
+        "best_error": None if best is None else best.error, "workers": status.workers.present, "slots": status.slots,
+        "eta_seconds": estimate_eta(status).seconds,
+    }  # fmt: skip
+    return summarise_status(status), facts
+
+
+def worker_command(network: Network, run: str, task: str) -> str:
+    """The command that starts a worker of the run on any host; it names the `task` only if no package registers it.
+
+    With join files the worker's own names the addresses.
+    """
+    addresses = [_public_endpoint(each) for each in network.listen or network.connect]
+    where = ("--connect", *addresses) if network.credentials is None else ("--join", "FILE")
+    own = ("--task", task) if is_unregistered(task) else ()
+    return shlex.join(("dreamfleet", "worker", "--run", run, *where, *own))
+
+
+def _public_endpoint(endpoint: str) -> str:
+    """An endpoint as other hosts reach it: a wildcard address is replaced by this host's name."""
+    protocol, _, where = endpoint.partition("/")
+    host, _, port = where.rpartition(":")
+    return f"{protocol}/{socket.gethostname()}:{port}" if host in WILDCARD_HOSTS else endpoint

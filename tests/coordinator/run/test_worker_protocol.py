@@ -1,0 +1,84 @@
+"""Hellos, results and foreign messages; an exception while one result is handled leaves none half counted."""
+
+import pytest
+from dreamfleet.common.serialization.constraints import MAX_TEXT
+
+from dreamfleet.common.errors import InternalError
+from dreamfleet.common.protocol.messages import Result, ResultBatch
+from tests.coordinator.run.test_run import SETTINGS, B, Bench
+
+
+@pytest.fixture
+def bench(tmp_path, random_bundle):
+    made = Bench(tmp_path / "run", random_bundle.path, SETTINGS)
+    yield made
+    made.journal.close()
+
+
+def given_jobs(bench):
+    """Jobs, all given to one worker."""
+    bench.run.fleet.handle_departure(B, bench.now)
+    bench.now += 1
+    bench.run.tick(bench.now)
+    return [(send.identity, work.job) for send in bench.run.fleet.dispatch(bench.now) for work in send.content.work]
+
+
+def scored(job):
+    return Result(job.digest, 1.0, 10, 0.1, None, None)
+
+
+def send(bench, worker, *results):
+    batch = ResultBatch(run_uid=bench.run.uid, incarnation=1, fingerprint="f", results=results)
+    bench.worker_protocol.handle_results(worker, batch, bench.now)
+
+
+def test_an_exception_before_a_result_counts_loses_no_other_result(bench, monkeypatch):
+    (worker, first), (_, second) = given_jobs(bench)
+    judge = bench.run.fleet.handle_result
+
+    def stumble(identity, result, now):
+        if result.digest == first.digest:
+            raise ZeroDivisionError
+        return judge(identity, result, now)
+
+    monkeypatch.setattr(bench.run.fleet, "handle_result", stumble)
+    with pytest.raises(ZeroDivisionError):
+        send(bench, worker, scored(first), scored(second))
+    assert first.digest in bench.run.fleet.jobs, "its worker repeats it"
+    assert second.digest not in bench.run.fleet.jobs
+    monkeypatch.undo()
+    send(bench, worker, scored(first), scored(second))
+    assert bench.run.generation.complete
+
+
+def test_an_exception_while_a_result_is_counted_ends_the_incarnation_and_the_next_one_loses_nothing(bench, monkeypatch):
+    (worker, first), (_, second) = given_jobs(bench)
+
+    def stumble(*_):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(bench.run.generation, "record", stumble)
+    with pytest.raises(InternalError, match=r"ZeroDivisionError.*--resume"):
+        send(bench, worker, scored(first))
+    bench.restart()
+    send(bench, worker, scored(first), scored(second))
+    assert bench.run.generation.complete
+
+
+def test_a_malformed_hello_is_refused_and_a_hello_with_a_known_reason_admits_nobody(bench):
+    assert "not a hello" in bench.worker_protocol.answer_hello(None, None, bench.now).why
+    bench.run.fleet.remove_worker(B)
+    refused = bench.worker_protocol.answer_hello(bench.request(B), ("no " * 10_000, "wait"), bench.now)
+    assert (refused.accepted, refused.remedy, refused.spec) == (False, "wait", {})
+    assert len(refused.why) <= MAX_TEXT
+    assert B not in bench.run.fleet.members
+    welcome = bench.worker_protocol.answer_hello(bench.request(B), None, bench.now)
+    assert (welcome.accepted, welcome.numbering) == (True, bench.run.fleet.members[B].numbering)
+
+
+def test_a_message_for_another_run_is_dropped(bench):
+    (worker, job), _ = given_jobs(bench)
+    batch = ResultBatch(run_uid="0" * 32, incarnation=1, fingerprint="f", results=(scored(job),))
+    bench.worker_protocol.handle(worker, batch, bench.now)
+    assert bench.run.dropped == {"foreign run": 1}
+    assert job.digest in bench.run.fleet.jobs

@@ -1,0 +1,68 @@
+"""Control verbs, without a transport."""
+
+import pytest
+
+from dreamfleet.common.protocol import keys
+from dreamfleet.coordinator.service.control import DISBAND_TIMEOUT, Control
+from tests.coordinator.run.test_run import A, B, Bench
+
+AGAIN = "dreamfleet coordinator --resume night"
+
+
+class Controlled(Bench):
+    def begin(self):
+        super().begin()
+        self.stopped = False
+        self.control = Control(self.run, "night", 1.0, self.stop)
+
+    def stop(self):
+        self.stopped = True
+
+    def obey(self, verb):
+        return self.control.obey(keys.control("night", verb), AGAIN, self.now)
+
+
+@pytest.fixture
+def bench(tmp_path, random_bundle):
+    made = Controlled(tmp_path / "night", random_bundle.path)
+    yield made
+    made.journal.close()
+
+
+def test_a_known_verb_is_obeyed_and_one_that_ends_the_coordinator_names_the_command_that_continues(bench):
+    assert bench.obey("pause").accepted
+    assert (bench.run.paused, bench.obey("pause").again) == ("by hand", "")
+    assert bench.obey("resume").accepted
+    assert bench.run.paused is None
+    assert (bench.obey("stop").again, bench.stopped) == (AGAIN, True)
+
+
+def test_an_unknown_verb_and_one_for_several_runs_change_nothing(bench):
+    unknown, wild = bench.obey("halt"), bench.control.obey(keys.control("*", "stop"), AGAIN, bench.now)
+    assert not unknown.accepted
+    assert "'halt' is no control verb of this version; it knows: pause, resume" in unknown.why
+    assert (wild.accepted, wild.again, bench.stopped) == (False, "", False)
+    assert "by its own key" in wild.why
+
+
+def test_a_drained_run_stops_once_no_worker_holds_a_job(bench):
+    bench.run.fleet.dispatch(bench.now)
+    bench.obey("drain")
+    bench.control.advance(bench.now)
+    assert not bench.stopped
+    for name in (A, B):
+        bench.run.fleet.remove_worker(name)
+    bench.control.advance(bench.now)
+    assert bench.stopped
+
+
+def test_a_disbanded_run_asks_its_workers_to_leave_at_each_beat_until_they_have_or_too_long(bench):
+    bench.obey("disband")
+    assert [each.identity for each in bench.control.advance(bench.now)] == [A, B]
+    assert bench.control.advance(bench.now + 0.5) == []
+    (batch, _), _ = bench.control.advance(bench.now + 1.0), bench.run.fleet.handle_departure(A, bench.now)
+    assert bench.worker_protocol.job_batch(batch, leave=bench.control.disbanding).leave
+    assert [each.identity for each in bench.control.advance(bench.now + 2.0)] == [B]
+    assert not bench.stopped
+    bench.control.advance(bench.now + DISBAND_TIMEOUT + 1.0)
+    assert bench.stopped
