@@ -5,9 +5,9 @@ from __future__ import annotations
 from dreamfleet.common.protocol.host_classes import effective_class
 from dreamfleet.common.protocol.messages import HelloRequest
 from dreamfleet.common.runs.records import RunSettings
-from dreamfleet.coordinator.dispatch.admission import RefusedWorkers, class_mismatch, find_refusal
 from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.dispatch.member import Member
+from dreamfleet.coordinator.dispatch.refusals import RefusedWorkers, class_mismatch, find_refusal
 from dreamfleet.coordinator.storage.journal import FINGERPRINT, HOST_CLASS, Journal
 
 

@@ -195,14 +195,15 @@ def test_damaged_settings(tmp_path, watched):
 
 @pytest.mark.slow
 def test_damaged_task_options(watched):
-    from dreamfleet.coordinator.settings.config import RunConfig, _check_normalisation
+    from dreamfleet.coordinator.settings.config import RunConfig
+    from dreamfleet.coordinator.settings.task_options import check_normalisation
 
     whole = b'{"environment": {"a": 1}, "normal": {"mean": [0.5, 1.5], "deviation": [1.0, 2.0]}}'
     source = random.Random(4)
 
     def read(text):
-        RunConfig(task="gym:A-v0", task_options=text)._options()
-        _check_normalisation(text, 2)
+        RunConfig(task="gym:A-v0", task_options=text)._description_options()
+        check_normalisation(text, 2)
 
     for _ in range(COUNT):
         data = reworded(source, whole) if source.random() < 0.5 else mutate(source, whole, [whole])

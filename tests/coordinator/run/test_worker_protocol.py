@@ -1,10 +1,10 @@
 """Hellos, results and foreign messages; an exception while one result is handled leaves none half counted."""
 
 import pytest
-from dreamfleet.common.serialization.constraints import MAX_TEXT
 
 from dreamfleet.common.errors import InternalError
 from dreamfleet.common.protocol.messages import Result, ResultBatch
+from dreamfleet.common.serialization.validation import MAX_TEXT
 from tests.coordinator.run.test_run import SETTINGS, B, Bench
 
 

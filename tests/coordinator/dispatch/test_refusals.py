@@ -5,7 +5,7 @@ import pytest
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.protocol.host_classes import class_from_fingerprint
 from dreamfleet.common.protocol.keys import PROTOCOL_VERSION
-from dreamfleet.coordinator.dispatch.admission import MAX_REFUSED, RefusedWorkers, find_refusal
+from dreamfleet.coordinator.dispatch.refusals import MAX_REFUSED, RefusedWorkers, find_refusal
 from tests.support.samples import JSON
 
 HELLO = next(each for each in JSON.values() if type(each).__name__ == "HelloRequest")
