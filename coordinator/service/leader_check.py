@@ -78,7 +78,7 @@ class LeaderCheck:
 def rank(note: ClaimNote) -> tuple[int, float, str]:
     """Sort key: the lowest continues. The latest incarnation ranks first, then the longest serving, then by nonce.
 
-    The latest incarnation of a run is the one that was continued last, with all that the earlier ones held by then. The
-    order is total, so that exactly one coordinator continues.
+    The latest incarnation of a run is the one that was continued last, with all that the earlier ones held by then.
+    R25: the order is total, so exactly one coordinator of a name stays, whatever each has seen.
     """
     return -note.incarnation, note.began, note.nonce

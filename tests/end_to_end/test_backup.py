@@ -2,6 +2,7 @@
 
 import shutil
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -73,7 +74,7 @@ def test_what_cannot_be_a_copy_is_left_alone(processes, finished, tmp_path):
             (wrong / "test").mkdir(parents=True)
         elif wrong == other:
             assert back_up(processes, other)[0] == 0
-            with sqlite3.connect(other / "test" / JOURNAL) as journal:
+            with closing(sqlite3.connect(other / "test" / JOURNAL)) as journal, journal:
                 journal.execute("UPDATE run SET value = 'another' WHERE key = 'uid'")
         code, _, err = back_up(processes, wrong)
         assert (code, why in err) == (2, True), err

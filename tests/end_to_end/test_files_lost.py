@@ -4,6 +4,7 @@ import shutil
 import signal
 import sqlite3
 import subprocess
+from contextlib import closing
 
 import pytest
 
@@ -93,7 +94,7 @@ def test_a_journal_that_is_replaced_by_a_copy_is_rescued_and_the_copy_stays(proc
 def test_a_journal_that_others_read_is_no_reason_to_leave(processes, live):
     coordinator, folder = live
     for _ in range(5):
-        with sqlite3.connect(folder / "journal.sqlite") as reader:
+        with closing(sqlite3.connect(folder / "journal.sqlite")) as reader, reader:
             reader.execute("SELECT count(*) FROM result").fetchone()
             reader.execute("PRAGMA wal_checkpoint")
         reader.close()

@@ -4,6 +4,7 @@ import os
 import random
 import shutil
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -35,7 +36,7 @@ def look(folder):
 def test_a_killed_coordinators_open_transaction_is_rolled_back(folder, tmp_path):
     """Until it switches to its write-ahead log, a journal has a rollback journal, which a reader cannot roll back."""
     path = folder / "journal.sqlite"
-    with sqlite3.connect(path, isolation_level=None) as writer:
+    with closing(sqlite3.connect(path, isolation_level=None)) as writer, writer:
         writer.execute("PRAGMA journal_mode = DELETE")
         writer.execute("PRAGMA cache_size = 1")  # so that pages are written before the commit
         writer.execute("BEGIN")
@@ -47,8 +48,11 @@ def test_a_killed_coordinators_open_transaction_is_rolled_back(folder, tmp_path)
         writer.execute("ROLLBACK")
     writer.close()
     assert (killed / "journal.sqlite-journal").exists()
-    with pytest.raises(sqlite3.OperationalError, match="readonly"):
-        sqlite3.connect(f"file:{killed / 'journal.sqlite'}?mode=ro", uri=True).execute("SELECT * FROM run")
+    with (
+        closing(sqlite3.connect(f"file:{killed / 'journal.sqlite'}?mode=ro", uri=True)) as reader,
+        pytest.raises(sqlite3.OperationalError, match="readonly"),
+    ):
+        reader.execute("SELECT * FROM run")
     look(killed)
     with RunFolder(killed) as run, RunFolder(folder) as own:
         assert (run.uid, run.settings) == (own.uid, own.settings)
@@ -65,7 +69,7 @@ def test_damaged_pages(folder, watched):
 
 def loose(path):
     """The same rows in tables without type checks, as another program might have written them."""
-    with sqlite3.connect(path) as old:
+    with closing(sqlite3.connect(path)) as old, old:
         migrate(old, check_schema(old, path))
         names = [name for (name,) in old.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
         tables = {name: [each[1] for each in old.execute(f"PRAGMA table_info({name})")] for name in names}
@@ -140,7 +144,7 @@ def test_a_folder_name_with_uri_characters_is_read(folder):
 
 
 def test_a_confirmed_score_of_no_episodes_is_damaged(folder):
-    with sqlite3.connect(folder / "journal.sqlite") as journal:
+    with closing(sqlite3.connect(folder / "journal.sqlite")) as journal, journal:
         text = '{"generation": 1, "episodes": 0, "mean": 1.0, "std": 1.0, "closed": 9}'
         journal.execute("INSERT OR REPLACE INTO run VALUES ('confirmed', ?)", (text,))
     journal.close()

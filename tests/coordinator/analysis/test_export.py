@@ -6,6 +6,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -106,7 +107,7 @@ def test_the_receipt_says_what_a_paper_cites(runs, capsys):
 
 
 def test_the_receipt_of_a_schedule_lists_every_stage(runs, capsys):
-    with sqlite3.connect(runs / "reality" / "journal.sqlite") as journal:
+    with closing(sqlite3.connect(runs / "reality" / "journal.sqlite")) as journal, journal:
         (text,) = journal.execute("SELECT value FROM run WHERE key = 'settings'").fetchone()
         stages = [{"generations": 1}, {"horizon": 7, "episodes": 3}]
         text = json.dumps({**json.loads(text), "stages": stages})
@@ -123,7 +124,7 @@ def test_the_receipt_of_a_schedule_lists_every_stage(runs, capsys):
 
 
 def confirm(runs, text):
-    with sqlite3.connect(runs / "reality" / "journal.sqlite") as journal:
+    with closing(sqlite3.connect(runs / "reality" / "journal.sqlite")) as journal, journal:
         journal.execute("DELETE FROM run WHERE key = 'confirmed'")
         if text:
             journal.execute("INSERT INTO run VALUES ('confirmed', ?)", (text,))

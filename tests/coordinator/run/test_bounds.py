@@ -2,6 +2,7 @@
 
 import json
 import sqlite3
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -95,7 +96,7 @@ def test_excessive_generations_and_evaluations_of_an_older_coordinator_can_be_en
     while len(bench.run.history) < 1:
         deliver_all(bench, (1.0, 10, 0.1))
     bench.run.commit()
-    with sqlite3.connect(bench.path / "journal.sqlite") as connection:
+    with closing(sqlite3.connect(bench.path / "journal.sqlite")) as connection, connection:
         connection.execute("UPDATE generation SET mean = 9e999, std = NULL, best = 9e999, worst = -9e999, steps = ?",
                            (MAX_COUNT,))  # fmt: skip
         connection.execute("UPDATE evaluation SET mean = 9e999, std = NULL WHERE mean IS NOT NULL")

@@ -1,5 +1,6 @@
 import json
 import sqlite3
+from contextlib import closing
 
 import pytest
 
@@ -22,7 +23,7 @@ def test_a_fitness_that_differs_from_the_stored_one_is_reported_and_exits_1(proc
     replay = ("replay", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
     code, out, _ = processes.call(*replay)
     assert (code, out.count("same bits")) == (0, 2)
-    with sqlite3.connect(finished_run / JOURNAL) as connection:
+    with closing(sqlite3.connect(finished_run / JOURNAL)) as connection, connection:
         connection.execute("UPDATE result SET fitness = fitness + 1e-9 WHERE candidate = 1 AND episode = 1")
     connection.close()
     code, out, _ = processes.call(*replay)
@@ -33,7 +34,7 @@ def test_a_fitness_that_differs_from_the_stored_one_is_reported_and_exits_1(proc
 
 
 def test_results_of_another_host_class_are_counted_and_optionally_compared(processes, finished_run):
-    with sqlite3.connect(finished_run / JOURNAL) as connection:
+    with closing(sqlite3.connect(finished_run / JOURNAL)) as connection, connection:
         connection.execute("UPDATE result SET fitness = fitness + 0.5, host_class = 'there' WHERE episode = 1")
     connection.close()
     replay = ("replay", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
