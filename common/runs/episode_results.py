@@ -30,7 +30,7 @@ class EpisodeResults:
     >>> results = evaluate(find_controller("cartpole"), episodes=4, first_seed=1, jobs=1)
     >>> results.seeds
     (1, 2, 3, 4)
-    >>> results.least <= results.mean <= results.most
+    >>> results.worst <= results.mean <= results.best
     True
     """
 

@@ -59,7 +59,7 @@ class Optimiser(Protocol):
     It may have one thing more, which is shown: `axis_ratio`, a float, how many times longer the longest axis of its
     distribution is than the shortest.
 
-    >>> from dreamfleet.coordinator.optimisers.separable import Separable
+    >>> from dreamfleet.coordinator.optimisers.cmaes_library import Separable
     >>> optimiser: Optimiser = Separable(Search(mean=np.zeros(3), population=8, sigma0=0.5, seed=1))
     >>> for _ in range(100):
     ...     optimiser.tell(-np.square(optimiser.ask() - 1).sum(axis=1))

@@ -11,7 +11,7 @@ from dreamfleet.coordinator.dispatch.refusals import RefusedWorkers, class_misma
 from dreamfleet.coordinator.storage.journal import FINGERPRINT, HOST_CLASS, Journal
 
 
-class Admission:
+class WorkerAdmission:
     """Admits workers to a run's fleet and removes those of a foreign class; only a `strict` run has foreign classes."""
 
     def __init__(self, journal: Journal, settings: RunSettings, fleet: Fleet, *, strict: bool) -> None:

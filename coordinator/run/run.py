@@ -21,7 +21,7 @@ from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.jobs.work import Work
-from dreamfleet.coordinator.run.admission import Admission
+from dreamfleet.coordinator.run.admission import WorkerAdmission
 from dreamfleet.coordinator.run.background_jobs import BackgroundJobs
 from dreamfleet.coordinator.run.generations import Generations
 from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
@@ -48,7 +48,7 @@ class Run:
             self.fleet.notes.append(
                 f"{dropped} results of an older version are too large to count: their jobs are scored again"
             )
-        self.admission = Admission(journal, settings, self.fleet, strict=network.strict)
+        self.admission = WorkerAdmission(journal, settings, self.fleet, strict=network.strict)
         self._ending = self._stored_end_reason()  # the limit that is reached; only background jobs remain
         closed, evaluations = journal.read_closed()
         self.history = History(closed)
