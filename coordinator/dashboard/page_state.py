@@ -77,8 +77,8 @@ def _lost_sentence(look: RunSnapshot) -> str:
 
 
 def _eta(eta: Eta) -> dict[str, Any]:
-    bounds = [{"told": each.description, "share": round(each.share, 4)} for each in eta.bounds]
-    return {"told": eta.description, "bounds": bounds}
+    bounds = [{"text": each.description, "share": round(each.share, 4)} for each in eta.bounds]
+    return {"text": eta.description, "bounds": bounds}
 
 
 def _task(status: Status) -> str:

@@ -216,7 +216,7 @@ class _ViewProcess:
 
 def notice_event(state: str, text: str) -> bytes:
     """An event in a picture's place; `state` is `starting`, `waiting` or `ended`."""
-    return event("told", {"state": state, "text": truncate(text.strip(), LONGEST)})
+    return event("state", {"state": state, "text": truncate(text.strip(), LONGEST)})
 
 
 def _picture_event(picture: bytes, facts: Mapping[str, Any]) -> bytes:

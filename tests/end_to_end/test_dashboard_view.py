@@ -50,7 +50,7 @@ def children(process):
     return [int(each) for each in listed.split()]
 
 
-def say(page, text, part="view-told"):
+def say(page, text, part="view-text"):
     page.wait_for_function(
         "([part, text]) => document.querySelector(`[data-part=${part}]`)?.textContent.includes(text)", arg=[part, text],
         timeout=PATIENCE,

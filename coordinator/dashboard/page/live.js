@@ -44,9 +44,9 @@ export const drawCurves = (document) => {
   charts.search(page.search, curves);
   const last = curves.generation.length - 1;
   const every = curves.step > 1 ? `Every ${curves.step}th generation is drawn. ` : "";
-  const told = last < 0 ? "No generation is closed yet." : `${every}Generation ${curves.generation[last]}: mean ${number(curves.mean[last])}, best ${number(curves.best[last])}.`;
-  say(page["fitness-caption"], told);
-  page.fitness.setAttribute("aria-label", `Fitness by generation. ${told}`);
+  const text = last < 0 ? "No generation is closed yet." : `${every}Generation ${curves.generation[last]}: mean ${number(curves.mean[last])}, best ${number(curves.best[last])}.`;
+  say(page["fitness-caption"], text);
+  page.fitness.setAttribute("aria-label", `Fitness by generation. ${text}`);
   page.search.setAttribute("aria-label", `Step size by generation${last < 0 ? "" : `, now ${curves.sigma[last]}`}`);
 };
 
@@ -63,8 +63,8 @@ export const fillFrame = (frame, wanted) => {
   say(page.state, frame.lost ? `${frame.state} since ${clock(frame.lost)}` : frame.state);
   page.state.dataset.tone = TONES[frame.state] ?? "done";
   say(page.sentence, frame.sentence);
-  say(page.eta, frame.eta ? frame.eta.told : "");
-  fill(page.bounds, frame.eta ? frame.eta.bounds : [], () => bar(), (each, row) => setBar(each, row.share, row.told));
+  say(page.eta, frame.eta ? frame.eta.text : "");
+  fill(page.bounds, frame.eta ? frame.eta.bounds : [], () => bar(), (each, row) => setBar(each, row.share, row.text));
   say(page.task, frame.task);
   fill(page.tiles, frame.tiles, tile, (each, row) => {
     say(each.children[0], row.name);
@@ -135,9 +135,9 @@ const bar = () => {
   return whole;
 };
 
-const setBar = (element, share, told) => {
-  element.title = told;
-  element.setAttribute("aria-label", told);
+const setBar = (element, share, text) => {
+  element.title = text;
+  element.setAttribute("aria-label", text);
   element.setAttribute("aria-valuenow", String(Math.round(100 * share)));
   element.firstChild.style.width = `${100 * share}%`;
 };
@@ -158,14 +158,14 @@ const fillPopulation = ({ candidates, evaluation }) => {
   const finished = done.filter((each, index) => each >= wanted[index]).length;
   const rest = total > done.length ? `, the first ${done.length} are shown` : "";
   const open = total > 0;
-  say(page["population-told"], open ? `Generation ${generation}: ${finished} of ${total} candidates are scored${rest}.` : "No generation is open.");
+  say(page["population-text"], open ? `Generation ${generation}: ${finished} of ${total} candidates are scored${rest}.` : "No generation is open.");
   page.cells.style.setProperty("--cell", `${CELLS.find(([least]) => total > least)[1]}px`);
   fill(page.cells, done, () => make("div", "", { class: "cell" }), (cell, episodes, index) => {
     const value = fitness[index];
     const share = value === null ? 0 : high > low ? (value - low) / (high - low) : 1;
     const key = `${episodes}/${wanted[index]}/${value === null ? "" : share.toFixed(2)}`;
-    const told = `candidate ${generation}/${index}: ${episodes} of ${wanted[index]} episodes${value === null ? "" : `, fitness ${number(value)}`}`;
-    if (cell.told !== told) cell.title = cell.told = told;
+    const text = `candidate ${generation}/${index}: ${episodes} of ${wanted[index]} episodes${value === null ? "" : `, fitness ${number(value)}`}`;
+    if (cell.described !== text) cell.title = cell.described = text;
     if (cell.key === key) return;
     cell.key = key;
     cell.style.setProperty("--done", wanted[index] ? `${(100 * episodes) / wanted[index]}%` : "0%");

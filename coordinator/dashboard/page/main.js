@@ -48,9 +48,9 @@ const listen = () => {
   heard = Date.now();
   source = new EventSource(wanted ? `live?run=${encodeURIComponent(wanted)}` : "live");
   source.addEventListener("hello", (event) => {
-    const told = JSON.parse(event.data);
-    if (told.digest !== digest) location.reload(); // another version of the page is served now
-    view.offer(told.views);
+    const hello = JSON.parse(event.data);
+    if (hello.digest !== digest) location.reload(); // another version of the page is served now
+    view.offer(hello.views);
   });
   source.addEventListener("frame", (event) => take({ frame: JSON.parse(event.data) }));
   source.addEventListener("curves", (event) => take({ curves: JSON.parse(event.data) }));

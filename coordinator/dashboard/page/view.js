@@ -2,7 +2,7 @@
 
 import { facts, make, say } from "./dom.js";
 
-const MEASURED = 3000; // milliseconds over which a speed is told
+const MEASURED = 3000; // milliseconds over which a speed is measured
 const KINDS = { score: "a candidate", evaluate: "the mean, in reality", collect: "the mean, to be kept" };
 
 let page = null; // the parts, once they stand
@@ -101,7 +101,7 @@ const restart = () => {
   steps = [];
   page["view-picture"].hidden = true;
   facts(page["view-facts"], []);
-  tell("");
+  showText("");
   settle();
 };
 
@@ -116,14 +116,14 @@ export const settle = () => {
   say(page["view-pause"], paused ? "Watch" : "Pause");
   const wanted = run && seen && !paused && !over && !document.hidden;
   if (!wanted) close();
-  if (paused && !over) tell(page["view-picture"].hidden ? "Paused: nothing is drawn or sent." : "");
+  if (paused && !over) showText(page["view-picture"].hidden ? "Paused: nothing is drawn or sent." : "");
   if (!wanted || source) return;
   source = new EventSource(`view?run=${encodeURIComponent(run)}${whom && `&${whom}`}`);
   source.addEventListener("picture", (event) => draw(JSON.parse(event.data)));
-  source.addEventListener("told", (event) => {
+  source.addEventListener("state", (event) => {
     const { state, text } = JSON.parse(event.data);
     if (state === "ended") end(text);
-    else tell(text);
+    else showText(text);
   });
   source.onerror = () => end("The dashboard gives no live view: it was ended, or too many look at once.");
 };
@@ -131,24 +131,24 @@ export const settle = () => {
 const end = (text) => {
   close();
   over = true;
-  tell(text);
+  showText(text);
 };
 
-const tell = (text) => {
+const showText = (text) => {
   page["view-picture"].classList.toggle("stale", over);
   page["view-again"].hidden = !over;
-  say(page["view-told"], text);
+  say(page["view-text"], text);
 };
 
-const draw = ({ facts: told, jpeg }) => {
+const draw = ({ facts: named, jpeg }) => {
   const picture = page["view-picture"];
   picture.src = `data:image/jpeg;base64,${jpeg}`;
   if (picture.hidden) {
     picture.hidden = false;
     picture.alt = `${page["view-whom"].selectedOptions[0].textContent}: what it sees, beside what the world model decodes and the dream that goes on; the figures follow`;
-    tell("");
+    showText("");
   }
-  facts(page["view-facts"], rows(told));
+  facts(page["view-facts"], rows(named));
 };
 
 const rows = ({ worker, kind, generation, candidate, seed, step, score }) => {
