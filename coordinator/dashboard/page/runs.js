@@ -114,14 +114,14 @@ const runRow = (each, page) => {
     const kind = key === "run" ? "name" : key === "state" ? "says" : NUMBERS.has(key) ? "n" : "";
     const cell = make("td", "", { class: kind });
     if (key === "run" && !each.damaged) cell.append(make("a", each.run, { href: runLink(each.run) }));
-    else say(cell, tell(each, key));
+    else say(cell, describe(each, key));
     if (key !== "run" && key !== "state") cell.dataset.label = label;
     row.append(cell);
   }
   return row;
 };
 
-const tell = (each, key) => {
+const describe = (each, key) => {
   if (key === "created") return each.begun ?? "";
   const error = each[`${key}_error`];
   if (error) return `${number(each[key])} ± ${number(error)}`;
