@@ -113,7 +113,7 @@ class VectorPart:
 
 @dataclass(frozen=True)
 class Job:
-    """One candidate in one episode: the unit of dispatch."""
+    """One episode of a candidate, or of the mean (`evaluate`, `collect`): the unit of dispatch."""
 
     kind: Kind
     task: Word

@@ -171,7 +171,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
     def begin_generation(self, generation: int) -> None:
         """Forget the accepted jobs of generations before the last one.
 
-        R26: the memory of accepted jobs is bounded; an even later copy of a result is obsolete, not a duplicate.
+        R26: the memory of accepted jobs is bounded; a result that arrives after its job was forgotten is obsolete.
         """
         self._accepted = {digest: number for digest, number in self._accepted.items() if number >= generation - 1}
 

@@ -27,7 +27,7 @@ class Generation:
     """A table of scores, a row for each candidate and a column for each episode, and the digest of each place.
 
     With `racing` all candidates drive the first half of the episodes; after this barrier only the better half of the
-    candidates drives the second half. Of equals the one with the lower index goes on. `run_spec` is the run's
+    candidates drives the second half. Ties go to the lower index. `run_spec` is the run's
     specification, if `spec` differs from it: at a raised temperature or in a later stage. In a dream the first `driven`
     episodes are driven in the real world.
     """

@@ -31,7 +31,7 @@ def make_work(
     spec: TaskSpec, kind: Kind, generation: int, candidate: int, vector: bytes, seeds: Sequence[int],
     run_spec: TaskSpec | None = None, first: int = 0,
 ) -> list[Work]:  # fmt: skip
-    """One job for each seed, an episode each, numbered from `first` on.
+    """Make a job for each seed. A job is one episode; episodes are numbered from `first` on.
 
     `run_spec` is the run's specification if `spec` differs from it. A job names its temperature, horizon, patience and
     whether it is driven only if they differ from the run's. R1: the digest covers kind, parameters, seeds and

@@ -149,7 +149,7 @@ class Evolution:
         return origin
 
     def _to_parameters(self, coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The parameters `(..., dimension)` that what the optimiser knows of stands for."""
+        """The parameters `(..., dimension)` of the optimiser's coordinates."""
         space = self._config.space
         return coordinates if space is None else space.lift(self._origin, coordinates)
 

@@ -21,7 +21,7 @@ from dreamfleet.coordinator.storage.journal import Journal, StoredOpenGeneration
 
 
 class Generations:
-    """Opens and closes generations, one at a time; `evaluations` holds the finished ones by generation, and grows."""
+    """Opens and closes generations, one at a time. `evaluations` maps a generation to its finished evaluation."""
 
     def __init__(
         self, journal: Journal, settings: RunSettings, agenda: ScheduleState, history: History,

@@ -1,4 +1,4 @@
-"""The only writer of a run's journal: every result is on disk before it counts."""
+"""The only writer of a run's journal: a result is on disk before the worker gets its verdict."""
 
 from __future__ import annotations
 

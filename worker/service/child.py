@@ -91,6 +91,7 @@ def _score_groups(pipe: Connection[Any, Any], scorer: Scorer, steps: Any, abando
 
         def count(made: int) -> None:
             steps.value = made
+            # The parent names the abandoned group in one of two cells, by even and odd, so that the next group is safe.
             if abandoned[group % 2] == group:  # noqa: B023 - called within this round
                 raise AbandonedError
 
