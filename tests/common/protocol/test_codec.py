@@ -175,7 +175,7 @@ def test_a_million_damaged_messages_never_raise_are_all_counted_and_leave_nothin
     decode_all(1000, seed=2)
     tracemalloc.start()
     held = []
-    for count, seed in ((200_000, 3), (800_000, 4)):  # the interpreter's table of names grows once, by megabytes
+    for count, seed in ((200_000, 3), (400_000, 4), (400_000, 5)):
         inbox, good = decode_all(count, seed)
         assert sum(inbox.dropped.values()) + good == count
         assert len(inbox.dropped) < 20
@@ -183,7 +183,8 @@ def test_a_million_damaged_messages_never_raise_are_all_counted_and_leave_nothin
         gc.collect()
         held.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
-    assert held[1] - held[0] < 100_000
+    # The interpreter's table of names grows by megabytes, but once: a leak would grow in each part.
+    assert min(held[1] - held[0], held[2] - held[1]) < 100_000
 
 
 def test_half_a_surrogate_pair_is_malformed():
