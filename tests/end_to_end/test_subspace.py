@@ -119,5 +119,5 @@ def test_a_fork_goes_on_in_it_or_leaves_it_with_a_step_of_its_own(processes, beg
     (processes.folder / "fleet.toml").write_text('[run]\nsubspace = "gone.npz"\n')
     again = processes.start("coordinator", "--resume", "night", "--runs-dir", processes.runs, "--listen",
                             processes.endpoint, "--config", processes.folder / "fleet.toml")  # fmt: skip
-    again.wait_for("the settings name another subspace")
+    again.wait_for("the settings name another")
     again.end()

@@ -187,7 +187,7 @@ def rewritten(file, change=lambda about: about, network=None):
     ("change", "says"),
     [
         (lambda _about: [], "is not a JSON object"),
-        (lambda about: about | {"format": 9}, "of format 9; this version reads 1"),
+        (lambda about: about | {"format": 9}, "has format 9; this version reads 1"),
         (lambda about: about | {"network": "ab" * 32}, "is not the one in its manifest"),
         (lambda about: about | {"frame_skip": 0}, "out of range"),
         (lambda about: about | {"frame_skip": True}, "wrong type"),
