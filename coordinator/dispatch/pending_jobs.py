@@ -151,7 +151,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
 
     @property
     def queue_length(self) -> int:
-        """Candidates' jobs that wait for a worker."""
+        """Entries of the candidates' queue. Background jobs have another; an entry may outlive the state `QUEUED`."""
         return len(self._queue)
 
     def offer(self, work: Iterable[Work]) -> None:
