@@ -88,7 +88,7 @@ class RunLog:
         elif now - self._no_worker_since > NO_WORKER_SECONDS:
             self._no_worker_since = math.inf
             command = worker_command(self._network, self._name, self._run.settings.task.task)
-            log.warning("no worker is there: the run waits for one; on any host: %s", command,
+            log.warning("no worker is present: the run waits for one; on any host: %s", command,
                         extra={"facts": {"event": "no worker", "command": command}})  # fmt: skip
 
 

@@ -18,6 +18,8 @@ from tests.support.mutations import mutations
 from tests.support.processes import DEADLINE
 from tests.support.samples import JSON, MSGPACK
 
+KEYS = {"result": keys.result, "beat": keys.heartbeat, "upload": keys.upload}
+
 
 @pytest.mark.slow
 def test_a_coordinator_drops_and_counts_what_is_malformed_or_foreign(processes, random_bundle):
@@ -27,7 +29,7 @@ def test_a_coordinator_drops_and_counts_what_is_malformed_or_foreign(processes, 
     )  # fmt: skip
     with open_session(Network(connect=(processes.endpoint,))) as session:
         for kind in ("result", "beat", "upload"):
-            key = getattr(keys, kind)("test", "stranger/0badc0de")
+            key = KEYS[kind]("test", "stranger/0badc0de")
             for payload in (b"", b"\xc1\xff", bytes(MAX_MESSAGE + 1), encode(MSGPACK[kind]), encode(MSGPACK["view"])):
                 session.put(
                     key, payload, congestion_control=zenoh.CongestionControl.BLOCK
@@ -69,7 +71,7 @@ def flood(processes, random_bundle, *counts):
     with open_session(Network(connect=(processes.endpoint,))) as session:
         for seed, count in enumerate(counts):
             for number, payload in enumerate(mutations(count, seed)):
-                key = getattr(keys, kinds[number % 3])("test", "stranger/0badc0de")
+                key = KEYS[kinds[number % 3]]("test", "stranger/0badc0de")
                 session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
             sent += count
             while sum((dropped := processes.status()["dropped"]).values()) < sent:
@@ -162,7 +164,7 @@ def test_large_messages_fill_no_memory_and_the_run_goes_on(processes, random_bun
     before, most = resident(coordinator), 0
     with open_session(Network(connect=(processes.endpoint,))) as session:
         for number in range(40):
-            key = getattr(keys, ("result", "beat", "upload")[number % 3])("test", "stranger/0badc0de")
+            key = KEYS[("result", "beat", "upload")[number % 3]]("test", "stranger/0badc0de")
             session.put(key, bytes(40_000_000), congestion_control=zenoh.CongestionControl.BLOCK)
             most = max(most, resident(coordinator))
         coordinator.wait_for("generation", times=2)

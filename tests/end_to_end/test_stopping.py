@@ -78,5 +78,5 @@ def test_a_collection_keeps_its_episodes_and_counts_them(processes, tmp_path, nu
 
 def test_a_coordinator_that_waits_for_a_worker_says_so_once(processes, random_bundle):
     coordinator = processes.coordinator("--bundle", random_bundle.path, "--task", tasks.TOY)
-    coordinator.wait_for("no worker is there")
-    assert sum("no worker is there" in line for line in coordinator.lines) == 1
+    coordinator.wait_for("no worker is present")
+    assert sum("no worker is present" in line for line in coordinator.lines) == 1
