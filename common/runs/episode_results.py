@@ -27,7 +27,7 @@ class EpisodeResults:
     """The episodes of one controller, in the order of their seeds; at least one.
 
     >>> from dreamfleet import evaluate, find_controller
-    >>> results = evaluate(find_controller("cartpole"), episodes=4, first_seed=1, jobs=1)
+    >>> results = evaluate(find_controller("cartpole"), episodes=4, first_seed=1, jobs=1)  # a run of yours
     >>> results.seeds
     (1, 2, 3, 4)
     >>> results.worst <= results.mean <= results.best

@@ -65,7 +65,7 @@ class RunFolder:
     """A run's folder, read-only; close it, or use it in a `with`.
 
     >>> from dreamfleet import open_run
-    >>> with open_run("cartpole") as run:
+    >>> with open_run("cartpole") as run:  # begun by `dreamfleet coordinator --run cartpole --task gym:CartPole-v1`
     ...     generation = run.history()[0]
     ...     print(run.spec.task, generation.number, generation.worst <= generation.mean <= generation.best)
     gym:CartPole-v1 0 True

@@ -54,7 +54,7 @@ DRAIN = ControlVerb(
 STOP = ControlVerb(
     "stop",
     "leave now; the run can be continued",
-    "is left by its coordinator",
+    "is stopped",
     request_with_workers="disband",
     coordinator_leaves=True,
 )

@@ -35,6 +35,7 @@ from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import never_stop
 from dreamfleet.common.monitoring.client import Client
 from dreamfleet.common.monitoring.status_panel import RunPanel
+from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.records import best_evaluation
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import CONTROLLER
@@ -174,7 +175,7 @@ class Demo:
 
     def _evolve(self, demo_run: DemoRun) -> None:
         workers, logs, flags = self._config.workers or usable_cores(), self._runs_dir / demo_run.run, demo_run.flags
-        self._print(f"{demo_run.what}: a coordinator and {workers} workers on this machine")
+        self._print(f"{demo_run.what}: a coordinator and {plural(workers, 'worker')} on this machine")
         if demo_run.schedule:
             logs.mkdir(parents=True, exist_ok=True)
             (logs / SCHEDULE).write_text(demo_run.schedule)

@@ -64,7 +64,9 @@ class RunConfig:
     normalise: bool = option(
         False, "shift and scale the observations of gym:ENVIRONMENT by their statistics when the run begins"
     )
-    task_options: str | None = option(None, "the task's own options as `runs show` prints them, instead of these two")
+    task_options: str | None = option(
+        None, "the task's own options as `runs show` prints them, instead of --environment and --normalise"
+    )
     variant: tuple[str, ...] = option(
         (),
         "NAME=VALUE of how car-racing is driven: actions=discrete, pedals=half or one, pedal_shift=, decide_every=, "
@@ -250,7 +252,13 @@ class RunConfig:
 
     def _resolve_without_bundle(self) -> tuple[TaskSpec, ControllerShape, tuple[str, ...]]:
         if self.temperature is not None or self.collect_every or self.variant:
-            raise UsageError("--temperature, --collect-every and --variant are of tasks with a world model")
+            given = {
+                "--temperature": self.temperature is not None,
+                "--collect-every": self.collect_every,
+                "--variant": self.variant,
+            }
+            named = " and ".join(flag for flag, is_given in given.items() if is_given)
+            raise UsageError(f"{named}: only tasks with a world model take this; leave it out for {self.task}")
         description = describe_task(self.task, self._description_options())
         options = description.options if self.task_options is None else self.task_options
         shape = ControllerShape(description.observations, description.outputs, self._hidden)
@@ -358,7 +366,7 @@ class NetworkConfig:
     """Where the coordinator is reached, and how it treats its workers."""
 
     listen: tuple[str, ...] = option((), "listen here (default tcp/127.0.0.1:7447, unless --connect is given)")
-    connect: tuple[str, ...] = option((), "connect to these stand-alone routers, as well where --listen is given")
+    connect: tuple[str, ...] = option((), "connect to these stand-alone routers; with --listen, do both")
     beat: Annotated[float, Between(0.05, 60.0)] = option(1.0, "seconds between a worker's beats")
     evaluation_share: Annotated[float, Between(0.0, 0.9)] = option(
         0.25, "share of a busy fleet's time for evaluations, 0 to 0.9; 0: only idle slots"

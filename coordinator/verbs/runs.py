@@ -120,10 +120,12 @@ def show_run(args: argparse.Namespace) -> int:
 
 
 def _flatten_settings(settings: RunSettings) -> dict[str, object]:
-    """Settings by name, those of task and controller among them, without the stages."""
+    """Settings by name, with those of task and controller, without stages; heat only of older runs that have it."""
     flat: dict[str, object] = {}
     plain = asdict(settings)
     del plain["stages"]
+    if settings.heat == 1.0:
+        del plain["heat"]
     for name, value in plain.items():
         flat |= {name: value} if not isinstance(value, dict) else _prefix_names(name, value)
     return {name: None if value in (None, "", ()) else format_setting(value) for name, value in flat.items()}

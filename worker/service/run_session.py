@@ -18,6 +18,7 @@ import zenoh
 
 from dreamfleet.common.errors import RefusedError
 from dreamfleet.common.host.error_counter import ErrorCounter
+from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import CountingDecoder
 from dreamfleet.common.protocol.messages import MAX_LEASES, JobBatch, Result
@@ -95,7 +96,7 @@ class RunSession:
             session.liveliness().declare_token(keys.live_worker(run, self._link.identity)),
             self._frame_publisher,
         ]
-        log.info("joined run %s as %s, %d slots", run, self._link.identity, len(self._slots))
+        log.info("joined run %s as %s, %s", run, self._link.identity, plural(len(self._slots), "slot"))
         return declared
 
     def _main_loop(self) -> None:

@@ -46,7 +46,7 @@ def open_run(name: str, runs_dir: Path | str | None = None) -> run_folder.RunFol
     """A run's journal, read-only; close it or use it in a `with`. `JournalError` lists the existing runs.
 
     >>> from dreamfleet import open_run
-    >>> with open_run("cartpole") as run:
+    >>> with open_run("cartpole") as run:  # the name of a run of yours
     ...     print(run.spec.task, len(run.history()) > 0)
     gym:CartPole-v1 True
     """
@@ -97,7 +97,7 @@ def evaluate(
     script, because processes are spawned.
 
     >>> from dreamfleet import evaluate, find_controller
-    >>> results = evaluate(find_controller("cartpole"), episodes=3, jobs=1)
+    >>> results = evaluate(find_controller("cartpole"), episodes=3, jobs=1)  # the name of a run of yours
     >>> len(results.scores), results.steps > 0
     (3, True)
     """
