@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ from dreamfleet.common.errors import UsageError
 if TYPE_CHECKING:
     from dreamfleet.coordinator.settings.config import RunConfig
 
+log = logging.getLogger("dreamfleet.coordinator")
 SUMMARY = "start a new run from another one's mean, step size, temperature and stage; other settings may change"
 EXTRAS = ()
 
@@ -39,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.coordinator.verbs.coordinator import serve_new_run
 
     with open_run(args.runs_dir, args.source) as stored:
-        start, (_, sigma) = start_from_run(stored), latest_mean_and_sigma(stored)
+        start, (_, sigma), heat = start_from_run(stored), latest_mean_and_sigma(stored), stored.settings.heat
         scoring_params = scoring_params_of(stored, len(stored.history()))
         present = {
             **remaining_settings(stored.settings, scoring_params.stage),
@@ -49,6 +51,12 @@ def run(args: argparse.Namespace) -> int:
         settings = {**config_values(stored.settings, stored.bundle_path), **present}
         if not scoring_params.stage.whole:
             settings["loaded_subspace"] = stored_subspace(stored.fact(SUBSPACE_FACT), stored.settings, stored.path)
+    if heat != 1.0:
+        log.warning(
+            "run %s raised its temperature by --heat %g, which is gone: the fork keeps its temperature",
+            args.source,
+            heat,
+        )
     if {"environment", "normalise"} & args.given:
         settings.pop("task_options", None)  # described anew, and refused if that makes another world of it
     if "optimiser" in args.given and "optimiser_options" not in args.given:

@@ -21,7 +21,18 @@ from dreamfleet.worker.scoring.episode import EpisodeConfig, score
 from dreamfleet.worker.scoring.host_class_probe import HostClassProbe
 from dreamfleet.worker.scoring.rollout import Rollout
 from dreamfleet.worker.scoring.watched_policy import WatchedPolicy
-from dreamfleet.worker.tasks.api import Assignment, Batch, BatchedTask, Score, StepObserver, Task, WatchableBatch, World
+from dreamfleet.worker.tasks.api import (
+    FORMER_OBSERVER_NAMES,
+    Assignment,
+    Batch,
+    BatchedTask,
+    Score,
+    StepObserver,
+    Task,
+    WatchableBatch,
+    World,
+    accept_former_names,
+)
 from dreamfleet.worker.tasks.registry import find_task
 
 DRIVER_NAME = "controller"  # the driver's name in collected rollouts
@@ -42,7 +53,7 @@ class Scorer:
     """
 
     def __init__(self, spec: TaskSpec, bundle: Bundle | None = None) -> None:
-        self.observer: StepObserver | None = None  # may be set between jobs; `None` costs an episode nothing
+        self._observer: StepObserver | None = None
         task = find_task(spec.task)
         fitting = None if bundle is None else bundle.with_controllers(spec.controller, Variant.from_json(spec.options))
         assignment = Assignment(spec, fitting)
@@ -58,6 +69,16 @@ class Scorer:
         self._environment = task.make_environment(assignment)
         self._policy = task.make_policy(assignment)
         self._preprocessing = "" if bundle is None else bundle.manifest.preprocessing
+
+    @property
+    def observer(self) -> StepObserver | None:
+        """Who sees steps of the next jobs; `None`, which costs an episode nothing. May be set between jobs."""
+        return self._observer
+
+    @observer.setter
+    def observer(self, observer: StepObserver | None) -> None:
+        accept_former_names(observer, FORMER_OBSERVER_NAMES)
+        self._observer = observer
 
     def score(
         self, kind: Kind, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None,

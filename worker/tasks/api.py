@@ -39,17 +39,24 @@ FORMER_NAMES = {
     "make_shown": "make_watched_environment",
     "width": "batch_size",
 }
+FORMER_OBSERVER_NAMES = {"due": "is_due", "see": "observe"}
 FORMER_WORLD_FIELDS = {"stray": "off_course", "stray_cost": "off_course_cost"}
 
 
-def accept_former_names(*owners: Any) -> None:
-    """Give each class or instance that defines a name of `FORMER_NAMES` its counterpart too, in both directions."""
-    for owner in owners:
-        own = dict(getattr(owner, "__dict__", {}))
-        for pair in FORMER_NAMES.items():
-            for given, other in (pair, pair[::-1]):
-                if given in own and other not in own:
-                    setattr(owner, other, own[given])
+def accept_former_names(instance: Any, names: Mapping[str, str] = FORMER_NAMES) -> None:
+    """Give an instance and its classes, where they define one of `names`, its counterpart too, in both directions."""
+    for owner in (instance, *type(instance).__mro__):
+        add_former_names(owner, names)
+
+
+def add_former_names(owner: Any, names: Mapping[str, str] = FORMER_NAMES) -> None:
+    """Give one class or instance the counterparts of what it defines itself."""
+    own = dict(getattr(owner, "__dict__", {}))
+    for pair in names.items():
+        for given, other in (pair, pair[::-1]):
+            if given in own and other not in own:
+                # A frozen dataclass refuses `setattr`.
+                (setattr if isinstance(owner, type) else object.__setattr__)(owner, other, own[given])
 
 
 class Policy(Protocol):
@@ -171,8 +178,17 @@ class DreamReward:
     source: Literal["label", "survival"] = "label"
 
 
+class _FormerFields(type):
+    """The type of `World` and its subclasses, which are built by former names of fields too."""
+
+    def __call__(cls, *values: Any, **fields: Any) -> Any:
+        """Build one; `dataclasses.replace` passes a field by both names, and then the former one is the new value."""
+        former = {present: fields.pop(name) for name, present in FORMER_WORLD_FIELDS.items() if name in fields}
+        return super().__call__(*values, **{**fields, **former})
+
+
 @dataclass(frozen=True)
-class World:
+class World(metaclass=_FormerFields):
     """What the rest of the system must know of a world.
 
     `off_course` and `off_course_cost` may also be given and read by their former names `stray` and `stray_cost`.
@@ -198,17 +214,6 @@ class World:
 
     stray = property(lambda self: self.off_course)
     stray_cost = property(lambda self: self.off_course_cost)
-
-
-_init_world = World.__init__
-
-
-def _init_world_by_former_names(self: World, *values: Any, **fields: Any) -> None:
-    former = {present: fields.pop(name) for name, present in FORMER_WORLD_FIELDS.items() if name in fields}
-    _init_world(self, *values, **{**fields, **former})  # `dataclasses.replace` passes both; the former one is new
-
-
-World.__init__ = _init_world_by_former_names  # type: ignore[method-assign]
 
 
 @dataclass(frozen=True)
@@ -286,7 +291,8 @@ class Task:
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
-        accept_former_names(*cls.__mro__)
+        for each in cls.__mro__:
+            add_former_names(each)
 
     def world_of(self, assignment: Assignment) -> World:  # noqa: ARG002 - other tasks' worlds depend on the assignment
         """The world that is scored in."""

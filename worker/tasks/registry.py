@@ -41,7 +41,7 @@ def known_tasks() -> tuple[str, ...]:
 def find_task(name: str) -> Task:
     """A task by name; `UsageError` lists the registered ones, or says what this one lacks."""
     task = load_task(name)
-    accept_former_names(task, *type(task).__mro__)
+    accept_former_names(task)
     if missing := list(_find_problems(task)):
         raise UsageError(f"task {name!r} is incomplete: {'; '.join(missing)}; docs/tasks.md shows a whole one")
     found: Task = task

@@ -1,11 +1,13 @@
 """Tasks of other packages that still use the contract's former names."""
 
+import dataclasses
 from dataclasses import replace
 
 import gymnasium
 import numpy as np
 import pytest
 
+from dreamfleet.common.artifacts.actions import Discrete
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.scoring.scorer import Scorer
@@ -103,3 +105,36 @@ def test_a_world_takes_and_gives_its_former_fields():
     assert world == World(Toy.world.actions, off_course="off_road", off_course_cost=2.0)
     assert (world.stray, world.stray_cost) == ("off_road", 2.0)
     assert replace(world, stray_cost=3.0) == replace(world, off_course_cost=3.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class FrozenFormer(Toy):
+    width: int = 4
+
+
+def test_a_frozen_task_is_found_by_its_former_names():
+    assert found(FrozenFormer).batch_size == 4
+
+
+def test_an_observer_of_former_names_observes():
+    class Steps(list):
+        def due(self):
+            return True
+
+        def see(self, episode, look):
+            self.append(look().step)
+
+    scorer = Scorer(TaskSpec("gym:CartPole-v1", "", horizon=3, patience=0, controller=ControllerShape(4, 2)))
+    scorer.observer = Steps()
+    scorer.score("score", np.zeros(10, np.float32), seed=1)
+    assert scorer.observer == [0, 1, 2]
+
+
+def test_a_subclass_of_world_takes_former_fields():
+    @dataclasses.dataclass(frozen=True)
+    class Marked(World):
+        mark: int = 0
+
+    world = Marked(Discrete(2), stray="off", stray_cost=1.0, mark=3)
+    assert (world.off_course, world.stray_cost, world.mark) == ("off", 1.0, 3)
+    assert dataclasses.replace(world, stray_cost=2.0).off_course_cost == 2.0
