@@ -97,7 +97,7 @@ def test_what_can_be_scored_in_is_listed(processes):
         (("--task", "gym:Nothing-v0"), "makes no environment 'Nothing-v0'"),
         (("--task", "gym:CartPole-v1", "--environment", "wings"), "write KEY=VALUE"),
         (("--task", "gym:CartPole-v1", "--environment", "wings=2"), "takes no such arguments"),
-        (("--task", "gym:CartPole-v1", "--temperature", "1.5"), "of tasks with a world model"),
+        (("--task", "gym:CartPole-v1", "--temperature", "1.5"), "only tasks with a world model"),
         (("--task", "gym:CartPole-v1", "--task-options", "[1]"), "must be a JSON object"),
         (("--task", "car-racing", "--bundle", "none"), "needs a world model"),
         (("--normalise",), "without a world model"),
