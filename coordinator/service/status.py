@@ -57,7 +57,7 @@ def encode_part(snapshot: Snapshot, part: str, parameters: Parameters) -> bytes:
 
 
 def encode_status(snapshot: Snapshot) -> bytes:
-    """The whole status; the lists show fewer rows if the rest is unusually long."""
+    """The status with the first rows of each list; fewer rows if the rest is unusually long."""
     share = 1.0
     while True:
         payload = encode_json(_with_heads(snapshot, share))
