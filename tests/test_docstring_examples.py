@@ -21,7 +21,7 @@ CONTRACTS = [
     each
     for api in (optimisers_api, tasks_api)
     for each in vars(api).values()
-    if isinstance(each, type) and each.__module__ == api.__name__ and not each.__name__.startswith("_")
+    if isinstance(each, type) and each.__module__ == api.__name__
 ]
 
 

@@ -1,8 +1,4 @@
-"""Zenoh queries that collect the replies of all responders.
-
-By default Zenoh sends a query to one responder if that claims to be complete, and keeps only the last of several
-replies for a key: so anyone who reaches the port could answer in a coordinator's place.
-"""
+"""Zenoh queries that collect replies: the last one for each key, or every responder's."""
 
 from __future__ import annotations
 
@@ -24,7 +20,9 @@ def query_every_responder(
 ) -> Iterator[tuple[str, bytes]]:  # fmt: skip
     """Yield every good reply that comes within `timeout` seconds: the responder's Zenoh ID and its payload.
 
-    No reply replaces another one. The ID is as the responder claims. The query's `payload` is JSON.
+    By default Zenoh may ask only one responder, and keeps the last of several replies for a key. Then anyone who
+    reaches the port could answer in a coordinator's place. Here no reply replaces another one. The ID is as the
+    responder claims. The query's `payload` is JSON.
     """
     all_replies = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
     for reply in _replies(session, selectors, timeout, payload, stopped, **all_replies):
@@ -35,7 +33,7 @@ def query_all(
     session: zenoh.Session, selectors: Iterable[str], timeout: float, payload: bytes | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> list[bytes]:  # fmt: skip
-    """The payloads of all good replies within `timeout` seconds, or until `stopped`, unordered.
+    """The payloads of the good replies within `timeout` seconds, or until `stopped`: one for each key, unordered.
 
     All queries run concurrently. Their `payload` is JSON.
     """

@@ -111,7 +111,8 @@ class Watcher:
         except ConnectionFailedError:
             return {}
         named = {str(document.get("run")): document for document in found}
-        return {name: named[name] for name in sorted(named)[:MOST_RUNS] if self._only in (None, name)}
+        wanted = [name for name in sorted(named) if self._only in (None, name)]
+        return {name: named[name] for name in wanted[:MOST_RUNS]}
 
     def _update_run(self, name: str, document: dict[str, Any], now: float) -> None:
         assert self._client is not None

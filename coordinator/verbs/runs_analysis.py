@@ -67,7 +67,7 @@ def compare_runs(args: argparse.Namespace) -> int:
         print(_format_budget(sides, each))
     if found:
         print(f"\n{SAME_SEEDS}")
-        print("\n".join(f"{each['of']}: {each['run']} less {each['against']}: {each['told']}" for each in found))
+        print("\n".join(f"{each['of']}: {each['run']} less {each['against']}: {each['text']}" for each in found))
     return 0
 
 
@@ -122,7 +122,7 @@ def _run_differences(sides: Sequence[ComparedRun], equal: Sequence[EqualBudget])
         found = difference(one, other)
         figures = {**asdict(found), "clear": found.is_significant} if isinstance(found, PairedDifference) else {}
         text = found.description if isinstance(found, PairedDifference) else found
-        return {"of": of, "run": side.name, "against": sides[0].name, **figures, "told": text}
+        return {"of": of, "run": side.name, "against": sides[0].name, **figures, "text": text}
 
     for number, side in enumerate(sides[1:], 1):
         for each in equal:

@@ -22,7 +22,6 @@ from dreamfleet.worker.scoring.host_class_probe import HostClassProbe
 from dreamfleet.worker.scoring.rollout import Rollout
 from dreamfleet.worker.scoring.watched_policy import WatchedPolicy
 from dreamfleet.worker.tasks.api import (
-    FORMER_OBSERVER_NAMES,
     Assignment,
     Batch,
     BatchedTask,
@@ -31,8 +30,8 @@ from dreamfleet.worker.tasks.api import (
     Task,
     WatchableBatch,
     World,
-    accept_former_names,
 )
+from dreamfleet.worker.tasks.former_names import FORMER_OBSERVER_NAMES, accept_former_names
 from dreamfleet.worker.tasks.registry import find_task
 
 DRIVER_NAME = "controller"  # the driver's name in collected rollouts

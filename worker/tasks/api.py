@@ -21,6 +21,7 @@ from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.errors import BundleError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import Description
+from dreamfleet.worker.tasks.former_names import FormerFields, accept_former_names, add_former_names
 from dreamfleet.worker.tasks.policy import Driver, FlatPolicy
 
 __all__ = [
@@ -31,32 +32,6 @@ __all__ = [
 ]  # fmt: skip
 
 ENVIRONMENT_LIMIT = 10**6  # steps: the environment's own limit ends an episode
-
-
-# Tasks of other packages may still use the former names on the left.
-FORMER_NAMES = {
-    "make_judge": "make_evaluation_environment",
-    "make_shown": "make_watched_environment",
-    "width": "batch_size",
-}
-FORMER_OBSERVER_NAMES = {"due": "is_due", "see": "observe"}
-FORMER_WORLD_FIELDS = {"stray": "off_course", "stray_cost": "off_course_cost"}
-
-
-def accept_former_names(instance: Any, names: Mapping[str, str] = FORMER_NAMES) -> None:
-    """Give an instance and its classes, where they define one of `names`, its counterpart too, in both directions."""
-    for owner in (instance, *type(instance).__mro__):
-        add_former_names(owner, names)
-
-
-def add_former_names(owner: Any, names: Mapping[str, str] = FORMER_NAMES) -> None:
-    """Give one class or instance the counterparts of what it defines itself."""
-    own = dict(getattr(owner, "__dict__", {}))
-    for pair in names.items():
-        for given, other in (pair, pair[::-1]):
-            if given in own and other not in own:
-                # A frozen dataclass refuses `setattr`.
-                (setattr if isinstance(owner, type) else object.__setattr__)(owner, other, own[given])
 
 
 class Policy(Protocol):
@@ -178,17 +153,8 @@ class DreamReward:
     source: Literal["label", "survival"] = "label"
 
 
-class _FormerFields(type):
-    """The type of `World` and its subclasses, which are built by former names of fields too."""
-
-    def __call__(cls, *values: Any, **fields: Any) -> Any:
-        """Build one; `dataclasses.replace` passes a field by both names, and then the former one is the new value."""
-        former = {present: fields.pop(name) for name, present in FORMER_WORLD_FIELDS.items() if name in fields}
-        return super().__call__(*values, **{**fields, **former})
-
-
 @dataclass(frozen=True)
-class World(metaclass=_FormerFields):
+class World(metaclass=FormerFields):
     """What the rest of the system must know of a world.
 
     `off_course` and `off_course_cost` may also be given and read by their former names `stray` and `stray_cost`.

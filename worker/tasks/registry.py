@@ -13,7 +13,8 @@ from dreamfleet.common.artifacts.actions import Continuous, Discrete
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import RefusedError, UsageError
 from dreamfleet.common.protocol.tasks import family_of, load_task, registered_tasks
-from dreamfleet.worker.tasks.api import Task, World, accept_former_names
+from dreamfleet.worker.tasks.api import Task, World
+from dreamfleet.worker.tasks.former_names import accept_former_names
 
 REQUIRED_METHODS = ("make_environment", "make_evaluation_environment", "make_policy", "world_of")
 

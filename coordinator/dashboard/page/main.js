@@ -1,4 +1,4 @@
-// Which page is shown, the stream of live pictures, and the theme.
+// Which page is shown, the stream of the runs' states, and the theme.
 
 import * as charts from "./charts.js";
 import { say } from "./dom.js";

@@ -30,3 +30,13 @@ def test_lanes_are_kept_while_polling_is_suspended(tmp_path, monkeypatch):
         now[0] += 3 * STRETCH
         assert lane()[-4:] == seen + 2 * UNKNOWN + seen
         watcher.suspend()
+
+
+def test_a_run_by_name_is_followed_among_more_runs_than_the_page_holds(tmp_path, monkeypatch):
+    monkeypatch.setattr(live_runs, "MOST_RUNS", 1)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    watcher = live_runs.Watcher(Network(connect=(endpoint,)), "night", tmp_path)
+    with serving(endpoint, snapshot(4), snapshot(4, name="day")):
+        while watcher.poll().find("night") is None:
+            pass  # a busy host may answer late
+        assert watcher.poll().find("day") is None
