@@ -60,12 +60,13 @@ class GenerationStatus:
     number: Count
     episodes_done: Count
     episodes: Count  # known so far: with racing, half of them are decided later
-    seconds: Seconds  # since it was opened
+    seconds: Seconds  # in which it could be scored: not paused, and with a worker
     sigma: float  # the optimiser's step size
     temperature: float | None  # of the dream; `None` if the task has none
     stage: StageStatus | None = field(default=None, metadata=OPTIONAL)  # `None` without a schedule
     # Ratio of the longest to the shortest axis of the search distribution; `None` if the optimiser does not report it.
     axis_ratio: float | None = field(default=None, metadata=OPTIONAL)
+    failed: Count = field(default=0, metadata=OPTIONAL)  # candidates that failed, those drawn anew included
 
 
 @dataclass(frozen=True)
@@ -233,6 +234,9 @@ class Status:
     # When the coordinator's join file expires, in seconds since 1970; `None` without one.
     expires: float | None = field(default=None, metadata=OPTIONAL)
 
+    failed: Count = field(default=0, metadata=OPTIONAL)  # candidates of closed generations that failed
+    # Since the run began, by the wall clock: pauses, and time without coordinator or workers, included.
+    elapsed: Seconds | None = field(default=None, metadata=OPTIONAL)
     ending: bool = field(default=False, metadata=OPTIONAL)  # a limit is reached: only evaluations are left
     # Episodes of evaluations and of the confirmation until the run's end.
     closing: Count = field(default=0, metadata=OPTIONAL)

@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, Literal
 
 from dreamfleet.common.artifacts.controller import ControllerShape
@@ -21,6 +21,7 @@ MAX_STAGES = 32  # of a schedule; statuses contain them too
 PopulationSize = Annotated[int, Between(2, 10**5)]
 EpisodesPerCandidate = Annotated[int, Between(1, 10**4)]
 ConfirmationEpisodes = Annotated[int, Between(0, 10**4)]  # fresh tracks; 0: no confirmation
+OnFailure = Literal["worst", "redraw", "pause"]
 EpisodeCount = Annotated[int, Between(1, 2**63 - 1)]  # at least 1: a standard error divides by it
 
 
@@ -96,6 +97,8 @@ class RunSettings:
     # Share of a candidate's episodes in a dream task that are scored in reality: its first ones.
     driven: Share = field(default=0.0, metadata=OPTIONAL)
     subspace: str = field(default="", metadata=OPTIONAL)  # SHA-256; empty: search all parameters
+    # What becomes of a candidate whose episode fails everywhere: it ranks last, it is drawn anew, or the run pauses.
+    on_failure: OnFailure = field(default="pause", metadata=OPTIONAL)
     # A schedule. The settings above are its first stage's, which changes none. The last stage has no end.
     stages: Annotated[tuple[StageSettings, ...], Length(0, MAX_STAGES)] = field(default=(), metadata=OPTIONAL)
 
@@ -130,12 +133,27 @@ class StoredResult:
 
 
 @dataclass(frozen=True)
+class StoredFailure:
+    """An episode that failed in each independent attempt, so that it has no score."""
+
+    kind: str
+    generation: int
+    candidate: int
+    episode: int
+    seed: int
+    error: str  # of the last attempt
+    workers: str  # where it was tried, comma-separated
+    attempts: int
+    happened: float  # seconds since 1970
+
+
+@dataclass(frozen=True)
 class StoredCandidate:
-    """One candidate: its fitness as the optimiser received it, and the effort of its accepted results."""
+    """One candidate: its fitness, and the effort of its accepted results."""
 
     generation: int
     number: int
-    fitness: float | None  # `None` while its generation is open
+    fitness: float | None  # `None` while its generation is open, or if it failed
     episodes: int  # accepted results
     steps: int
     seconds: float  # slot time
@@ -153,6 +171,7 @@ class StoredGeneration:
     sigma: float
     steps: int
     seconds: float
+    failed: Count = field(default=0, metadata=OPTIONAL)  # candidates that failed; the statistics leave them out
 
 
 @dataclass(frozen=True)
@@ -163,6 +182,12 @@ class StoredEvaluation:
     episodes: EpisodeCount
     mean: float
     std: float
+    failed: Count = field(default=0, metadata=OPTIONAL)  # further episodes, which have no score
+
+    @property
+    def rank(self) -> tuple[int, float]:
+        """The greater, the better: a mean over the episodes that are easy enough not to fail would flatter."""
+        return -self.failed, self.mean
 
     @property
     def error(self) -> float:
@@ -187,6 +212,7 @@ class StoredConfirmation:
     mean: float
     std: float  # of the sample: `episodes - 1` in the denominator
     closed: int  # generations closed before the choice, whose evaluated means it considered
+    failed: Count = field(default=0, metadata=OPTIONAL)  # further episodes, which have no score
 
     @property
     def error(self) -> float:
@@ -199,7 +225,7 @@ class StoredConfirmation:
 
     def to_json(self) -> str:
         """The text in the journal."""
-        return json.dumps(asdict(self), allow_nan=False)
+        return json.dumps(to_dict(self), allow_nan=False)
 
     @classmethod
     def from_json(cls, text: str) -> StoredConfirmation:
@@ -211,8 +237,8 @@ class StoredConfirmation:
 
 
 def best_evaluation(evaluations: Iterable[StoredEvaluation]) -> StoredEvaluation | None:
-    """The evaluation of the highest mean, the first of equal ones; `None` if there are none."""
-    return max(evaluations, key=lambda each: each.mean, default=None)
+    """The evaluation of the highest rank, the first of equal ones; `None` if there are none."""
+    return max(evaluations, key=lambda each: each.rank, default=None)
 
 
 def expand_task_options(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -230,6 +256,7 @@ def describe_score(found: StoredEvaluation | StoredConfirmation | None) -> str:
     if found is None:
         return "the last mean; it was not evaluated"
     score = f"generation {found.generation}'s mean scored {format_mean(found)}"
+    score += f" ({plural(found.failed, 'more episode')} failed)" if found.failed else ""
     score += " (standard error)" if found.episodes > 1 else ""
     if isinstance(found, StoredConfirmation):
         seeds = plural(found.episodes, "fresh validation seed")

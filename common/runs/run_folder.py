@@ -33,6 +33,7 @@ from dreamfleet.common.runs.records import (
     StoredCandidate,
     StoredConfirmation,
     StoredEvaluation,
+    StoredFailure,
     StoredGeneration,
     StoredResult,
     best_evaluation,
@@ -76,6 +77,8 @@ class RunFolder:
         self.name = path.name
         self._journal = JournalReader(path / JOURNAL)
         self._class_column = "host_class" if self._journal.version >= schema.HOST_CLASS_VERSION else "''"
+        self._has_failures = self._journal.version >= schema.FAILURE_VERSION
+        self._failed_column = "failed" if self._has_failures else "0"
 
     def __enter__(self) -> RunFolder:
         return self
@@ -169,7 +172,7 @@ class RunFolder:
         return self._vector(row[0], "an evaluated mean")
 
     def fitness(self, generation: int, number: int) -> float | None:
-        """A candidate's fitness as the optimiser received it; `None` while its generation is open."""
+        """A candidate's fitness; `None` while its generation is open, or if it failed."""
         query = "SELECT fitness FROM candidate WHERE generation = ? AND number = ?"
         rows = self._journal.rows("F", query, generation, number)
         return rows[0][0] if rows else None
@@ -203,13 +206,14 @@ class RunFolder:
     def history(self) -> list[StoredGeneration]:
         """Every closed generation, oldest first."""
         query = (
-            "SELECT number, mean, std, best, worst, sigma, steps, seconds FROM generation WHERE closed IS NOT NULL "
-            "ORDER BY number"
+            f"SELECT number, mean, std, best, worst, sigma, steps, seconds, {self._failed_column} FROM generation "  # noqa: S608
+            "WHERE closed IS NOT NULL ORDER BY number"
         )
         found = []
-        for number, mean, std, best, worst, sigma, steps, seconds in self._journal.rows("iFFFFfiF", query):
+        for number, mean, std, best, worst, sigma, steps, seconds, failed in self._journal.rows("iFFFFfiFi", query):
             fitness = to_finite(mean), to_finite(std), to_finite(best), to_finite(worst)  # not finite in old journals
-            found.append(StoredGeneration(number, *fitness, to_finite(sigma), clamp_count(steps), to_finite(seconds)))
+            effort = clamp_count(steps), to_finite(seconds)
+            found.append(StoredGeneration(number, *fitness, to_finite(sigma), *effort, clamp_count(failed)))
         return found
 
     def quartiles(self, generations: Iterable[int]) -> dict[int, tuple[float, float]]:
@@ -225,12 +229,25 @@ class RunFolder:
 
     def evaluations(self) -> list[StoredEvaluation]:
         """Every finished evaluation of a mean, oldest first."""
-        query = "SELECT generation, episodes, mean, std FROM evaluation WHERE mean IS NOT NULL ORDER BY generation"
-        rows = self._journal.rows("iiFF", query)
-        if any(episodes < 1 for _, episodes, _, _ in rows):
+        query = (
+            f"SELECT generation, episodes, mean, std, {self._failed_column} FROM evaluation WHERE mean IS NOT NULL "  # noqa: S608
+            "ORDER BY generation"
+        )
+        rows = self._journal.rows("iiFFi", query)
+        if any(not 0 <= failed < episodes for _, episodes, _, _, failed in rows):
             raise self._journal.damage_error("an evaluation is of no episodes")
-        return [StoredEvaluation(generation, episodes, to_finite(mean), to_finite(std))
-                for generation, episodes, mean, std in rows]  # fmt: skip
+        return [StoredEvaluation(generation, episodes - failed, to_finite(mean), to_finite(std), failed)
+                for generation, episodes, mean, std, failed in rows]  # fmt: skip
+
+    def failures(self) -> list[StoredFailure]:
+        """Every episode that has no score because it failed everywhere, oldest first."""
+        if not self._has_failures:
+            return []
+        query = (
+            "SELECT kind, generation, candidate, episode, seed, error, workers, attempts, happened FROM failure "
+            "ORDER BY happened, generation, candidate, episode"
+        )
+        return [StoredFailure(*row) for row in self._journal.rows("siiiissif", query)]
 
     def confirmation(self) -> StoredConfirmation | None:
         """The confirmed score of the reported mean; `None` if that mean is not confirmed."""

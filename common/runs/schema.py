@@ -35,9 +35,23 @@ MIGRATIONS = (
     ) STRICT;
     """,
     "ALTER TABLE result ADD COLUMN host_class TEXT NOT NULL DEFAULT '';",
+    """
+    CREATE TABLE failure (
+        digest BLOB PRIMARY KEY, kind TEXT NOT NULL, generation INTEGER NOT NULL, candidate INTEGER NOT NULL,
+        episode INTEGER NOT NULL, seed INTEGER NOT NULL, error TEXT NOT NULL, workers TEXT NOT NULL,
+        attempts INTEGER NOT NULL, incarnation INTEGER NOT NULL, happened REAL NOT NULL
+    ) STRICT, WITHOUT ROWID;
+    CREATE TABLE redraw (
+        generation INTEGER NOT NULL, round INTEGER NOT NULL, candidate INTEGER NOT NULL, vector BLOB NOT NULL,
+        PRIMARY KEY (generation, round, candidate)
+    ) STRICT, WITHOUT ROWID;
+    ALTER TABLE generation ADD COLUMN failed INTEGER NOT NULL DEFAULT 0;
+    ALTER TABLE evaluation ADD COLUMN failed INTEGER NOT NULL DEFAULT 0;
+    """,
 )
 """Entry i migrates a journal from version i to i + 1. Append only."""
 VERSION = len(MIGRATIONS)
+FAILURE_VERSION = 4  # the first version with failures that are facts of the journal
 HOST_CLASS_VERSION = 3  # the first version whose results have a host class; empty: derive it from the fingerprint
 
 

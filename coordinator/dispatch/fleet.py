@@ -7,14 +7,15 @@ result, and a job that heartbeats do not list is given again.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import count
 
 from dreamfleet.common.monitoring.status import EventKind
 from dreamfleet.common.printable import plural
-from dreamfleet.common.protocol.messages import MAX_SLOTS, Heartbeat, Kind, Result, Verdict, VerdictWord
+from dreamfleet.common.protocol.messages import MAX_SLOTS, Heartbeat, Result, Verdict, VerdictWord
 from dreamfleet.coordinator.dispatch.event_log import EventLog
+from dreamfleet.coordinator.dispatch.failures import JobFailure
 from dreamfleet.coordinator.dispatch.host_stats import HostRecords
 from dreamfleet.coordinator.dispatch.member import DispatchGroup, Lease, LostWorkers, Member, MemberState, SentBatch
 from dreamfleet.coordinator.dispatch.packing import BatchContent, OutgoingBatch, pack
@@ -53,14 +54,21 @@ class Fleet:
         self.dropped: Counter[str] = Counter()  # results and reports that were not accepted, by reason
         self.event_log = EventLog()
         self.notes: list[str] = []  # lines for a log; its writer clears them
+        self.working_classes: set[str] = set()  # of hosts that scored jobs of this run
         self.drain_background = False  # only evaluations and kept rollouts are left to wait for
         self.paused = False
         self.single_job = False  # a slot scores one job at a time, even of a task whose slots score several at once
 
-    def cancel_kind(self, kind: Kind) -> None:
-        """Withdraw all jobs of a kind; results that still come are obsolete."""
-        for digest in self.jobs.digests_of_kind(kind):
-            self._cancel(digest, self.jobs.remove(digest))
+    def withdraw(self, digests: Iterable[bytes]) -> None:
+        """Want these jobs no more; results that still come are obsolete."""
+        for digest in digests:
+            if digest in self.jobs:
+                self._cancel(digest, self.jobs.remove(digest))
+
+    def find_lasting_failures(self) -> list[JobFailure]:
+        """The wanted jobs that fail wherever they are scored."""
+        hosts = {name.partition("/")[0] for name, member in self.members.items() if member.takes_jobs}
+        return self.jobs.find_lasting_failures(self.working_classes, hosts)
 
     def add_worker(self, identity: str, slots: int, fingerprint: str, now: float) -> int:
         """Welcome a worker as a guest; return the numbering of its batches.
@@ -197,6 +205,7 @@ class Fleet:
         gap = now - self._last_tick if self._last_tick is not None else 0.0
         self._last_tick = self._now = now
         self.lost.expire(now)
+        self.jobs.enqueue_due(now)
         for member in list(self.members.values()):
             if gap > CLOCK_GAP:
                 member.shift_clock(gap)
@@ -236,6 +245,11 @@ class Fleet:
             member.last_sent = now if batches else member.last_sent
             sends += batches
         return sends
+
+    @property
+    def takes_jobs(self) -> bool:
+        """Whether any worker can be given jobs."""
+        return any(member.takes_jobs for member in self.members.values())
 
     @property
     def lease_count(self) -> int:
@@ -301,9 +315,10 @@ class Fleet:
             self.dropped["result of a job that was not given"] += 1
             return "refused", None
         if result.fitness is None:
-            self.jobs.record_failure(identity, result)
+            member = self.members.get(identity)
+            self.jobs.record_failure(identity, result, self._now, "" if member is None else member.host_class)
             self.counts["errors"] += 1
-            if member := self.members.get(identity):
+            if member is not None:
                 self._drop_lease(member, result.digest)
             return "refused", None
         pending = self.jobs.accept(result)

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import heapq
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from enum import Enum, auto
 
-from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol.messages import TAG_BYTES, Kind, Result
 from dreamfleet.coordinator.dispatch.deficit_round_robin import DeficitCounter
+from dreamfleet.coordinator.dispatch.failures import Attempt, JobFailure, is_lasting, pause_before_retry
 from dreamfleet.coordinator.jobs.work import Work
 
-MAX_FAILED = 16  # workers of which a job's failures are remembered; two pause the run
+MAX_FAILED = 64  # failed attempts of a job that are remembered
 MAX_ATTEMPTS = 3  # of a failing job on one worker, where there is no other
 MAX_HOLDERS = 2  # workers that a job is leased to at a time
-LONGEST_ERROR = 300  # characters of a worker's error that are shown
-MAX_NAMED = 4  # workers that a failure names
 
 
 class JobState(Enum):
@@ -26,35 +23,6 @@ class JobState(Enum):
     QUEUED = auto()
     LEASED = auto()  # to one worker
     COPIED = auto()  # leased to two workers
-
-
-@dataclass(frozen=True)
-class JobFailure:
-    """A wanted job that failed on some workers: the last error of each, and how often it failed there."""
-
-    work: Work
-    errors: dict[str, str]  # worker -> error
-    attempts: dict[str, int]  # worker -> how often
-
-    @property
-    def subject(self) -> str:
-        """What the job scores, in words."""
-        job = self.work.job
-        words = {
-            "score": f"candidate {job.generation}/{job.candidate}",
-            "evaluate": f"the evaluation of generation {job.generation}'s mean",
-            "collect": f"a kept rollout of generation {job.generation}'s mean",
-        }
-        return f"{words[job.kind]}, seed {', '.join(map(str, job.seeds))},"
-
-    def __str__(self) -> str:
-        """One sentence for people: what failed, on which workers, how often, and why."""
-        names = list(self.errors)
-        number = "two" if len(names) == 2 else str(len(names))
-        where = "on one worker" if len(names) == 1 else f"on {number} workers"
-        parts = [f"{name} ({_times(self.attempts[name])}): {shorten(self.errors[name])}" for name in names[:MAX_NAMED]]
-        more = [f"and {len(names) - MAX_NAMED} more"] if len(names) > MAX_NAMED else []
-        return f"{self.subject} failed {where}: {'; '.join(parts + more)}"
 
 
 @dataclass
@@ -67,8 +35,8 @@ class PendingJob:
     holders: set[str] = field(default_factory=set)  # workers that have a lease
     given_to: set[str] = field(default_factory=set)  # workers that hold it or held it
     overrun_by: set[str] = field(default_factory=set)  # workers that reported more steps than it can have
-    failed: dict[str, str] = field(default_factory=dict)  # worker -> error
-    attempts: Counter[str] = field(default_factory=Counter)  # worker -> how often it failed there
+    attempts: list[Attempt] = field(default_factory=list)  # the failed ones
+    retry_at: float = 0.0  # seconds of the monotonic clock before which it is not tried again
 
     @property
     def state(self) -> JobState:
@@ -88,12 +56,12 @@ class PendingJob:
 
         R8: a job that failed is given to another worker.
         """
-        return self.failed.keys() | self.overrun_by
+        return {each.worker for each in self.attempts} | self.overrun_by
 
     @property
     def failure(self) -> JobFailure:
         """Its failures so far."""
-        return JobFailure(self.work, dict(self.failed), dict(self.attempts))
+        return JobFailure(self.work, tuple(self.attempts))
 
 
 @dataclass(frozen=True)
@@ -117,6 +85,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         self._next_order = 0
         self._background_held = 0  # background jobs with a holder
         self._failing: dict[bytes, PendingJob] = {}  # wanted jobs that failed somewhere
+        self._waiting: set[bytes] = set()  # failing jobs before their next attempt
         self._accepted: dict[bytes, int] = {}  # digest -> generation, of this generation and the last
 
     def __getitem__(self, digest: bytes) -> PendingJob:
@@ -180,10 +149,12 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         return [digest for digest, pending in self._pending.items() if pending.work.job.kind == kind]
 
     def enqueue(self, digest: bytes) -> None:
-        """Put a wanted job into its queue, in order of offer."""
+        """Put a wanted job into its queue: in order of offer, or behind the others if it failed; it may wait before."""
         pending = self._pending[digest]
         self._share.release(digest)
-        if not pending.in_queue:
+        if pending.retry_at:
+            self._waiting.add(digest)
+        elif not pending.in_queue:
             pending.in_queue = True
             heapq.heappush(self._background_queue if pending.is_background else self._queue, (pending.order, digest))
 
@@ -221,15 +192,28 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         self._background_held -= pending.is_background and not pending.holders
         return not pending.holders
 
-    def record_failure(self, worker: str, result: Result) -> None:
+    def record_failure(self, worker: str, result: Result, now: float, host_class: str = "") -> None:
         """Note the error that a worker sent for a wanted job.
 
-        R8: an error is no fitness; it only decides who is given the job next, and whether the run pauses.
+        R8: an error is no fitness; it decides who is given the job next and when, and whether the job has failed.
         """
         pending = self._failing[result.digest] = self._pending[result.digest]
-        if worker in pending.failed or len(pending.failed) < MAX_FAILED:
-            pending.attempts[worker] += 1
-            pending.failed[worker] = result.error or "no fitness and no reason"
+        pending.attempts.append(Attempt(worker, host_class, result.error or "no fitness and no reason"))
+        del pending.attempts[:-MAX_FAILED]
+        pending.order, self._next_order = self._next_order, self._next_order + 1
+        if pause := pause_before_retry(len(pending.attempts)):
+            pending.retry_at = now + pause
+
+    def enqueue_due(self, now: float) -> None:
+        """Put failing jobs whose next attempt is due into their queues."""
+        for digest in [each for each in self._waiting if self._pending[each].retry_at <= now]:
+            self._release(digest)
+
+    def _release(self, digest: bytes) -> None:
+        self._waiting.discard(digest)
+        self._pending[digest].retry_at = 0.0
+        if self._pending[digest].state is JobState.QUEUED:
+            self.enqueue(digest)
 
     def record_overrun(self, digest: bytes, worker: str) -> None:
         """Note that a worker reported more steps of this job than it can have."""
@@ -251,6 +235,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         """Want a job no more; the returned job still names its holders."""
         pending = self._pending.pop(digest)
         self._failing.pop(digest, None)
+        self._waiting.discard(digest)
         self._tags.pop(digest[:TAG_BYTES], None)
         self._share.release(digest)
         self._background_held -= pending.is_background and bool(pending.holders)
@@ -261,21 +246,41 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         """Wanted jobs that failed somewhere."""
         return [pending.failure for pending in self._failing.values()]
 
-    def find_pausing_failure(self) -> JobFailure | None:
+    def find_lasting_failures(self, working: Collection[str], hosts: Collection[str]) -> list[JobFailure]:
+        """The jobs that fail wherever they are scored; `working` are classes of hosts that scored jobs of this run.
+
+        `hosts` are the names of all hosts that take jobs.
+        """
+        found = []
+        for pending in self._failing.values():
+            untried = bool(set(hosts) - {each.host for each in pending.attempts})
+            if is_lasting(pending.attempts, working, untried):
+                found.append(pending.failure)
+        return found
+
+    def find_pausing_failure(self, working: Collection[str] | None = None) -> JobFailure | None:
         """A job that failed so often that the run must pause; `None` if there is none.
 
-        R8: two workers, or three attempts on the only one, show that the job itself is at fault.
+        R8: two workers, or three attempts on the only one, show that the job itself or every host is at fault. With
+        `working`, `find_lasting_failures` judges where such a host has tried, and the run does not pause while a job
+        that never failed is open: it may show that a class works.
         """
+        if working is not None and len(self._failing) < len(self._pending):
+            return None
         for pending in self._failing.values():
-            if len(pending.failed) > 1 or any(count >= MAX_ATTEMPTS for count in pending.attempts.values()):
+            if working is not None and any(each.host_class in working for each in pending.attempts):
+                continue
+            workers = {each.worker for each in pending.attempts}
+            if len(workers) > 1 or len(pending.attempts) >= MAX_ATTEMPTS:
                 return pending.failure
         return None
 
     def clear_failures(self) -> None:
         """Forget all failures, so that each job may be tried anew."""
-        for pending in self._failing.values():
-            pending.failed.clear()
+        for digest, pending in self._failing.items():
             pending.attempts.clear()
+            if pending.retry_at:
+                self._release(digest)
         self._failing.clear()
 
     def _next_queue(
@@ -293,12 +298,3 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         if self._background_queue and (drain_background or (idle and self._background_held < limit)):
             return self._background_queue, False
         return None
-
-
-def shorten(error: str, longest: int = LONGEST_ERROR) -> str:
-    """An error's text, cut to what a line can hold."""
-    return truncate(error, longest)  # it came over the wire
-
-
-def _times(count: int) -> str:
-    return "once" if count == 1 else f"{count} times"

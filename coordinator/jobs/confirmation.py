@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import fsum
+from math import fsum, isnan
 
 import numpy as np
 
@@ -24,23 +24,29 @@ from dreamfleet.coordinator.jobs.work import Work, make_work
 
 FINALISTS = 4
 FindScores = Callable[[list[bytes]], Mapping[bytes, float]]
-"""Finds the known scores of jobs, by digest."""
+"""Finds the known scores of jobs, by digest; NaN for an episode that failed for good."""
 
 
 @dataclass(frozen=True)
 class Finalist:
-    """The distribution's mean after `generation`, as float32 bytes, and its mean score on `episodes` tracks so far."""
+    """The distribution's mean after `generation`, as float32 bytes, and its mean score on `episodes` tracks so far.
+
+    On `failed` further tracks its episode failed for good.
+    """
 
     generation: int
     vector: bytes
     episodes: int
     mean: float
+    failed: int = 0
 
     def with_scores(self, scores: Sequence[float]) -> Finalist:
-        """This finalist with a round's scores added."""
-        episodes = self.episodes + len(scores)
-        mean = fsum((self.mean * self.episodes, *scores)) / episodes
-        return Finalist(self.generation, self.vector, episodes, mean)
+        """This finalist with a round's scores added, NaN for an episode that failed."""
+        found = [score for score in scores if not isnan(score)]
+        episodes = self.episodes + len(found)
+        mean = fsum((self.mean * self.episodes, *found)) / episodes
+        failed = self.failed + len(scores) - len(found)
+        return Finalist(self.generation, self.vector, episodes, mean, failed)
 
 
 class Confirmation:
@@ -51,6 +57,7 @@ class Confirmation:
 
     def __init__(self, spec: TaskSpec, episodes: int, finalists: Sequence[Finalist], closed: int) -> None:
         self.outcome: StoredConfirmation | None = None  # at the end
+        self.failed = False  # each of the last episodes failed: there is no score to report
         self._spec = spec
         self._episodes = episodes
         self._closed = closed
@@ -89,15 +96,19 @@ class Confirmation:
     def advance(self, known: FindScores) -> list[Work]:
         """Close a complete round and open the next one; return its missing jobs, none once there is an outcome."""
         missing: list[Work] = []
-        while self.outcome is None and not missing:
+        while not self._is_over and not missing:
             if self._digests:
                 self._close()
-            if self.outcome is None:
+            if not self._is_over:
                 missing = self._open(known)
         return missing
 
+    @property
+    def _is_over(self) -> bool:
+        return self.outcome is not None or self.failed
+
     def record(self, digest: bytes, score: float) -> None:
-        """Record one accepted score."""
+        """Record one score, NaN for an episode that failed for good."""
         if digest in self._digests:
             self._scores[digest] = score
 
@@ -120,15 +131,18 @@ class Confirmation:
         scores = np.array([self._scores[digest] for digest in self._digests]).reshape(len(self._remaining), -1)
         self._digests, self._scores = [], {}
         if len(self._remaining) == 1:
-            self.outcome = self._outcome(scores[0])
+            found = scores[0][np.isfinite(scores[0])]
+            self.failed = not len(found)
+            self.outcome = None if self.failed else self._outcome(found, scores.size - len(found))
             return
         judged = [each.with_scores(row.tolist()) for each, row in zip(self._remaining, scores, strict=True)]
-        judged.sort(key=lambda each: (-each.mean, each.generation))
+        judged.sort(key=lambda each: (each.failed, -each.mean, each.generation))
         self._remaining = judged[: _better_half(judged)]
 
-    def _outcome(self, scores: np.ndarray[tuple[int], np.dtype[np.float64]]) -> StoredConfirmation:
+    def _outcome(self, scores: np.ndarray[tuple[int], np.dtype[np.float64]], failed: int) -> StoredConfirmation:
         std = float(scores.std(ddof=1)) if len(scores) > 1 else 0.0
-        return StoredConfirmation(self._remaining[0].generation, len(scores), float(scores.mean()), std, self._closed)
+        last = self._remaining[0].generation
+        return StoredConfirmation(last, len(scores), float(scores.mean()), std, self._closed, failed)
 
 
 def total_episodes(finalists: int, episodes: int) -> int:

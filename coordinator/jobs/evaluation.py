@@ -39,6 +39,15 @@ class OpenEvaluation:
     scores: dict[bytes, float]
 
 
+@dataclass(frozen=True)
+class FinishedEvaluation:
+    """A closed evaluation: its vector, how many episodes failed for good, and its score if any did not."""
+
+    vector: bytes
+    failed: int
+    found: StoredEvaluation | None
+
+
 class Evaluations:
     """A run's evaluations: the open and the finished ones, by generation."""
 
@@ -61,7 +70,7 @@ class Evaluations:
         del self._bests[place:]
         for row in self.rows[place:]:
             best = self._bests[-1] if self._bests else row
-            self._bests.append(row if row.mean > best.mean else best)
+            self._bests.append(row if row.rank > best.rank else best)
 
     def open(self, evaluation: Evaluation, spec: TaskSpec, known: Mapping[bytes, float]) -> list[Work]:
         """Open an evaluation with the scores that are known already; return its missing jobs."""
@@ -73,7 +82,7 @@ class Evaluations:
         return [each for each in work if each.job.digest not in scores and each.job.digest not in wanted]
 
     def record(self, digest: bytes, score: float) -> list[int]:
-        """Record one accepted score; return the generations whose evaluations it belongs to.
+        """Record one score, NaN for an episode that failed for good; return the generations of its evaluations.
 
         A run that has converged evaluates the same mean again: the jobs are the same, and each score counts for all.
         """
@@ -82,16 +91,20 @@ class Evaluations:
             self._open[generation].scores[digest] = score
         return waiting
 
-    def finish(self, generation: int) -> tuple[StoredEvaluation, bytes] | None:
-        """Close an evaluation whose scores are complete: its result and its vector; `None` while some are missing."""
+    def finish(self, generation: int) -> FinishedEvaluation | None:
+        """Close an evaluation whose scores are complete; `None` while some are missing."""
         each = self._open[generation]
         if len(each.scores) < len(each.digests):
             return None
-        scores = np.array([each.scores[digest] for digest in each.digests])
-        finished = StoredEvaluation(generation, len(scores), float(scores.mean()), float(scores.std()))
-        self.add(finished)
+        every = np.array([each.scores[digest] for digest in each.digests])
+        scores = every[np.isfinite(every)]
+        failed = len(every) - len(scores)
         del self._open[generation]
-        return finished, each.evaluation.vector
+        if not len(scores):
+            return FinishedEvaluation(each.evaluation.vector, failed, None)
+        found = StoredEvaluation(generation, len(scores), float(scores.mean()), float(scores.std()), failed)
+        self.add(found)
+        return FinishedEvaluation(each.evaluation.vector, failed, found)
 
     def is_open(self, generation: int) -> bool:
         """Whether the evaluation of this generation's mean is open."""
@@ -115,7 +128,7 @@ class Evaluations:
 
     @property
     def best(self) -> StoredEvaluation | None:
-        """The finished evaluation with the highest mean; of equals the earliest."""
+        """The finished evaluation of the highest rank; of equals the earliest."""
         return self._bests[-1] if self._bests else None
 
     def have_fallen_behind(self, count: int) -> bool:

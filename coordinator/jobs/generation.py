@@ -29,7 +29,8 @@ class Generation:
     With `racing` all candidates drive the first half of the episodes; after this barrier only the better half of the
     candidates drives the second half. Ties go to the lower index. `run_spec` is the run's
     specification, if `spec` differs from it: at a raised temperature or in a later stage. In a dream the first `driven`
-    episodes are driven in the real world.
+    episodes are driven in the real world. R8: a candidate of which an episode failed for good has no fitness, needs no
+    more episodes, and ranks last.
     """
 
     def __init__(
@@ -56,24 +57,54 @@ class Generation:
         self._first = -(-len(seeds) // 2) if racing else len(seeds)
         self._wanted = np.zeros(self._scores.shape, dtype=bool)
         self._wanted[:, : self._first] = True
-        self.steps = 0
+        self._steps = np.zeros(self._scores.shape, dtype=np.int64)  # a result's steps stand in the first of its places
+        self._failed = np.zeros(len(vectors), dtype=bool)
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of its results, without those of failed candidates.
+
+        How many episodes of a failed candidate were scored before the failure depends on the fleet.
+        """
+        return sum(self._steps[~self._failed].ravel().tolist())
+
+    @property
+    def population(self) -> int:
+        """How many candidates it has."""
+        return len(self._failed)
+
+    @property
+    def failed(self) -> list[int]:
+        """The candidates that failed."""
+        return [int(each) for each in np.flatnonzero(self._failed)]
+
+    @property
+    def all_failed(self) -> bool:
+        """Whether no candidate is left."""
+        return bool(self._failed.all())
 
     @property
     def missing(self) -> list[Work]:
         """Wanted jobs without a result, each digest once, candidate by candidate."""
         first = {work.job.digest: work for work in reversed(self.work)}
-        open_places = self._wanted & np.isnan(self._scores)
+        open_places = self._open_places
         return [first[digest] for digest, places in self._places.items() if any(open_places[each] for each in places)]
 
     @property
+    def unwanted(self) -> list[bytes]:
+        """Digests of jobs that only failed candidates would need."""
+        failed = self._failed
+        return [digest for digest, places in self._places.items() if all(failed[row] for row, _ in places)]
+
+    @property
     def done(self) -> int:
-        """Episodes scored."""
-        return int(np.isfinite(self._scores).sum())
+        """Episodes scored, without those of failed candidates."""
+        return int(np.isfinite(self._scores[~self._failed]).sum())
 
     @property
     def total(self) -> int:
         """Episodes wanted, as far as that is known."""
-        return int((self._wanted | np.isfinite(self._scores)).sum())
+        return int((self._wanted | np.isfinite(self._scores))[~self._failed].sum())
 
     @property
     def complete(self) -> bool:
@@ -81,25 +112,30 @@ class Generation:
         return self.done == self.total
 
     def record(self, digest: bytes, fitness: float, steps: int) -> bool:
-        """Record one accepted result of this generation; return whether it opened the second half.
+        """Record a result of this generation, NaN for an episode that failed for good; whether others are wanted now.
 
-        R27: the digest names the place that a result fills, so the order of arrival does not matter.
+        R27: the digest names the place that a result fills, so the order of arrival does not matter. A candidate that
+        was drawn anew since has no place for it.
         """
-        for place in self._places[digest]:
+        for number, place in enumerate(self._places.get(digest, ())):
+            if np.isnan(fitness):
+                self._failed[place[0]] = True
             self._scores[place] = fitness
-        self.steps += steps
+            self._steps[place] = 0 if number else steps
         return self._open_second_half()
 
     def fitness(self) -> NDArray[np.float64]:
-        """The fitness of each candidate, `(population,)`: the mean of its own episodes.
+        """The fitness of each candidate, `(population,)`: the mean of its own episodes, NaN where one failed.
 
         R27: a mean is taken over a whole row, so any order of results gives the same bits.
         """
-        return np.asarray(np.nanmean(self._scores, axis=1))
+        fitness = np.full(len(self._scores), np.nan)
+        fitness[~self._failed] = np.nanmean(self._scores[~self._failed], axis=1)
+        return fitness
 
     def candidate_scores(self) -> CandidateScores:
         """The scores of all candidates so far."""
-        scored = np.isfinite(self._scores)
+        scored = np.isfinite(self._scores) & ~self._failed[:, None]
         done = scored.sum(axis=1)
         with np.errstate(over="ignore"):  # of a generation that an older version closed
             totals = np.where(scored, self._scores, 0.0).sum(axis=1)
@@ -107,12 +143,19 @@ class Generation:
             to_finite(total / count) if count else None
             for total, count in zip(totals.tolist(), done.tolist(), strict=True)
         ]
-        return CandidateScores(self.number, done.tolist(), (self._wanted | scored).sum(axis=1).tolist(), means)
+        wanted = (self._wanted & ~self._failed[:, None]) | scored
+        return CandidateScores(self.number, done.tolist(), wanted.sum(axis=1).tolist(), means)
+
+    @property
+    def _open_places(self) -> NDArray[np.bool_]:
+        """The places whose results are wanted and missing."""
+        return np.asarray(self._wanted & np.isnan(self._scores) & ~self._failed[:, None])
 
     def _open_second_half(self) -> bool:
-        first = self._scores[:, : self._first]
-        if self._first == self._scores.shape[1] or self._wanted[:, self._first :].any() or np.isnan(first).any():
+        is_raced = self._first < self._scores.shape[1]
+        if not is_raced or self._wanted[:, self._first :].any() or self._open_places.any():
             return False
+        first = np.where(self._failed[:, None], -np.inf, self._scores[:, : self._first])
         better = np.argsort(-first.mean(axis=1), kind="stable")[: -(-len(first) // 2)]
         self._wanted[better, self._first :] = True
-        return True
+        return bool(self._open_places.any())

@@ -13,7 +13,8 @@ class History:
 
     def __init__(self, rows: Iterable[StoredGeneration] = ()) -> None:
         self.steps = 0  # environment steps of all generations
-        self.seconds = 0.0
+        self.seconds = 0.0  # in which they could be scored
+        self.failed = 0  # candidates
         self._rows: list[StoredGeneration] = []
         for row in rows:
             self.append(row)
@@ -22,6 +23,7 @@ class History:
         """Add the generation that was just closed."""
         self._rows.append(row)
         self.steps = clamp_count(self.steps + row.steps)
+        self.failed = clamp_count(self.failed + row.failed)
         self.seconds = to_finite(self.seconds + row.seconds)
 
     def __len__(self) -> int:

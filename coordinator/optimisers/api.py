@@ -6,7 +6,7 @@ name it as `module:attribute`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol
 
@@ -86,6 +86,13 @@ class Optimiser(Protocol):
 
     def tell(self, fitness: NDArray[np.float64]) -> None:
         """Learn from the population asked for: `fitness` `(population,)` in its order, finite, larger is better."""
+
+    def redraw(self, indices: Sequence[int]) -> NDArray[np.float64]:
+        """Replace candidates of the last `ask`, which failed, by new ones `(len(indices), dimension)`.
+
+        Only `--on-failure redraw` needs this method. `tell` then refers to the new ones. A candidate that is not drawn
+        at random stays as it is. The numbers must follow from the state and the calls since, not from `prepare`.
+        """
 
     def prepare(self) -> None:
         """Work ahead while workers are busy, if there is anything to do; called any number of times, changes no bit."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import Any, ClassVar
 
@@ -60,8 +60,18 @@ class CmaesOptimiser(ABC):
 
     def ask(self) -> NDArray[np.float64]:
         """Sample the next population `(population, dimension)`."""
-        self._asked = [self._strategy.ask() for _ in range(self._search.population)]
+        self._asked = self._draw(self._search.population)
         return np.stack(self._asked)
+
+    def redraw(self, indices: Sequence[int]) -> NDArray[np.float64]:
+        """Sample these candidates again."""
+        drawn = self._draw(len(indices))
+        for index, candidate in zip(indices, drawn, strict=True):
+            self._asked[index] = candidate
+        return np.stack(drawn)
+
+    def _draw(self, count: int) -> list[NDArray[np.float64]]:
+        return [self._strategy.ask() for _ in range(count)]
 
     def tell(self, fitness: NDArray[np.float64]) -> None:
         """Update the distribution; equal fitness keeps the order of the candidates."""
@@ -136,17 +146,16 @@ class RateAdapted(CmaesOptimiser):
         "mean", "sigma", "C", "p_sigma", "pc", "g", "Emean", "ESigma", "Vmean", "VSigma", "eta_mean", "eta_Sigma",
     )  # fmt: skip
 
-    def ask(self) -> NDArray[np.float64]:
-        """Sample the next population `(population, dimension)` (equations 38 to 40 of Hansen 2016).
+    def _draw(self, count: int) -> list[NDArray[np.float64]]:
+        """Sample candidates (equations 38 to 40 of Hansen 2016).
 
         The library's own `ask` multiplies B with D as two full matrices anew for each candidate; these are its bits.
         """
         strategy = self._strategy
         eigenvectors, roots = strategy._eigen_decomposition()
         axes = np.ascontiguousarray(eigenvectors * roots)
-        normals = (strategy._rng.randn(self._search.dimension) for _ in range(self._search.population))
-        self._asked = [strategy._mean + strategy._sigma * axes.dot(z) for z in normals]
-        return np.stack(self._asked)
+        normals = (strategy._rng.randn(self._search.dimension) for _ in range(count))
+        return [strategy._mean + strategy._sigma * axes.dot(z) for z in normals]
 
     def _build(self, search: Search) -> Any:
         if search.population < 4:

@@ -98,9 +98,28 @@ class Evolution:
 
     def ask(self) -> NDArray[np.float64]:
         """The next population `(population, dimension)`; `DreamfleetError` if the optimiser breaks its contract."""
-        asked = np.asarray(self._optimiser.ask(), dtype=np.float64)
+        self._is_open = True
+        return self._check(self._optimiser.ask(), self._config.population)
+
+    def redraw(self, indices: Sequence[int]) -> NDArray[np.float64]:
+        """Replace these candidates of the open population; the new ones `(len(indices), dimension)`.
+
+        An optimiser may keep a candidate that it did not draw at random.
+        """
+        return self._check(self._optimiser.redraw(indices), len(indices))
+
+    def check_redraws(self) -> None:
+        """`UsageError` if the optimiser cannot draw single candidates anew."""
+        if not callable(getattr(self._optimiser, "redraw", None)):
+            raise UsageError(
+                f"optimiser {self._config.optimiser!r} cannot draw single candidates anew: say --on-failure worst"
+            )
+
+    def _check(self, drawn: object, count: int) -> NDArray[np.float64]:
+        """The parameters `(count, dimension)` of what the optimiser drew."""
+        asked = np.asarray(drawn, dtype=np.float64)
         space = self._config.space
-        wanted = self._config.population, self._config.dimension if space is None else space.dimension
+        wanted = count, self._config.dimension if space is None else space.dimension
         if asked.shape != wanted:
             raise DreamfleetError(f"optimiser {self._config.optimiser!r} asked for {asked.shape} numbers, not {wanted}")
         asked = self._to_parameters(asked)
@@ -111,7 +130,6 @@ class Evolution:
                 f"optimiser {self._config.optimiser!r} asked for what no single-precision number can hold, at "
                 f"step size {self.sigma:g}: it cannot go on; fork the run with another --sigma0 or --optimiser"
             )
-        self._is_open = True
         return asked
 
     def tell(self, fitness: NDArray[np.float64]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import Any, ClassVar
 from warnings import catch_warnings, filterwarnings
@@ -70,6 +70,14 @@ class Pycma:
         """Sample the next population `(population, dimension)` (equations 38 to 40)."""
         self._asked = [np.asarray(x, dtype=np.float64) for x in self._strategy.ask()]
         return np.stack(self._asked)
+
+    def redraw(self, indices: Sequence[int]) -> NDArray[np.float64]:
+        """Sample these candidates again (equations 38 to 40), except the two along the last step."""
+        kept = 2 if self._strategy.mean_shift_samples and self._strategy.countiter > 1 else 0
+        for index in indices:
+            if index >= kept:
+                self._asked[index] = np.asarray(self._strategy.ask(1)[0], dtype=np.float64)
+        return np.stack([self._asked[index] for index in indices])
 
     def tell(self, fitness: NDArray[np.float64]) -> None:
         """Update mean, step size and covariance (equations 41 to 47)."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from dreamfleet.common.protocol.messages import Result
+from dreamfleet.common.protocol.messages import Job
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation
 from dreamfleet.common.runs.run_folder import CONFIRMED
 from dreamfleet.common.runs.run_paths import CONTROLLER
@@ -103,16 +103,15 @@ class BackgroundJobs:
             work += self._collect(collection)
         return work
 
-    def count(self, work: Work, result: Result) -> None:
-        """Count an accepted, journalled result."""
-        if work.job.kind == "collect":
-            self.rollout_collections.finish(result.digest)
+    def count(self, job: Job, fitness: float) -> None:
+        """Count an accepted, journalled result; `fitness` is NaN for an episode that failed for good."""
+        if job.kind == "collect":
+            self.rollout_collections.finish(job.digest)
             return
-        assert result.fitness is not None
-        for generation in self.evaluations.record(result.digest, result.fitness):
+        for generation in self.evaluations.record(job.digest, fitness):
             self._finish(generation)
         if self._confirmation is not None:
-            self._confirmation.record(result.digest, result.fitness)
+            self._confirmation.record(job.digest, fitness)
 
     def confirm(self) -> list[Work]:
         """The next jobs that confirm the reported mean; call it when a limit is reached and nothing is in progress.
@@ -128,6 +127,8 @@ class BackgroundJobs:
                 return []
             self._confirmation = Confirmation(self._settings.task, episodes, finalists, closed)
         work = self._confirmation.advance(self._journal.fitness_of)
+        if self._confirmation.failed:
+            return []
         if (outcome := self._confirmation.outcome) is not None:
             self._journal.set_fact(CONFIRMED, outcome.to_json())
             self._confirmation, self._confirmed = None, outcome
@@ -144,10 +145,9 @@ class BackgroundJobs:
         found = self.evaluations.finish(generation)
         if found is None:
             return
-        finished, vector = found
-        self._journal.finish_evaluation(generation, finished.mean, finished.std)
-        if self.evaluations.best is finished:
-            self.report.set_judged(finished, vector, self._history.steps)
+        self._journal.finish_evaluation(generation, found.found, found.failed)
+        if found.found is not None and self.evaluations.best is found.found:
+            self.report.set_judged(found.found, found.vector, self._history.steps)
 
     def _collect(self, collection: RolloutCollection) -> list[Work]:
         known = self._journal.results_of("collect", collection.generation)

@@ -19,6 +19,8 @@ from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConf
 from dreamfleet.coordinator.settings.start import SUBSPACE_FACT, stored_start_mean, stored_subspace
 from dreamfleet.coordinator.storage.journal import Journal, StoredOpenGeneration
 
+MAX_REDRAWS = 3  # rounds in a generation; who fails after them ranks last
+
 
 class Generations:
     """Opens and closes generations, one at a time. `evaluations` maps a generation to its finished evaluation."""
@@ -30,6 +32,9 @@ class Generations:
         self.history = history
         self.scoring_params: ScoringParams  # of the open generation
         self.last: CandidateScores | None = None  # of the last closed generation
+        self.redrawn = 0  # candidates of the open generation that were drawn anew
+        self.seconds = 0.0  # for which the restored generation could be scored before
+        self._rounds = 0  # in which candidates were drawn anew
         self._journal = journal
         self._settings = settings
         self._agenda = agenda
@@ -67,7 +72,13 @@ class Generations:
         if self.scoring_params.stage.search > 1:
             self._strategy = self._search(self.scoring_params.stage, self._strategy.mean)
         self._strategy.restore(stored.state)
-        vectors = tuple(vector_bytes(x) for x in self._strategy.ask())
+        population = self._strategy.ask()
+        for indices in stored.redrawn:
+            population[list(indices)] = self._strategy.redraw(indices)
+        self.seconds = stored.seconds
+        self.redrawn = sum(map(len, stored.redrawn))
+        self._rounds = len(stored.redrawn)
+        vectors = tuple(vector_bytes(x) for x in population)
         if vectors != stored.vectors:
             raise JournalError(
                 f"generation {stored.number} cannot be continued: the strategy asks for another population than the "
@@ -88,26 +99,51 @@ class Generations:
             training_seed(self._settings.seed, number, episode) for episode in range(scoring_params.stage.episodes)
         ]
         self._journal.open_generation(number, state, sigma, seeds, vectors)
+        self.redrawn = self._rounds = 0
         return self._generation(number, vectors, seeds, scoring_params)
 
     def close(self, generation: Generation, seconds: float) -> StoredGeneration:
-        """Give the strategy the generation's fitness and journal the generation, which took `seconds`."""
+        """Give the strategy the generation's fitness and journal the generation, which took `seconds`.
+
+        R8: failed candidates rank last. Their fitness for the strategy is the next number below the worst.
+        """
         fitness = generation.fitness()
+        found = fitness[np.isfinite(fitness)]
         closed = StoredGeneration(
             number=generation.number,
-            mean=float(fitness.mean()),
-            std=float(fitness.std()),
-            best=float(fitness.max()),
-            worst=float(fitness.min()),
+            mean=float(found.mean()),
+            std=float(found.std()),
+            best=float(found.max()),
+            worst=float(found.min()),
             sigma=self._strategy.sigma,
             steps=generation.steps,
             seconds=seconds,
+            failed=len(generation.failed) + self.redrawn,
         )
-        self._strategy.tell(fitness)
+        self._strategy.tell(np.where(np.isfinite(fitness), fitness, np.nextafter(found.min(), -np.inf)))
         self._journal.close_generation(closed, fitness)
         self.history.append(closed)
         self.last = generation.candidate_scores()
         return closed
+
+    def redraw(self, generation: Generation) -> Generation | None:
+        """Draw the failed candidates anew; `None` if none failed, or if that was tried often enough.
+
+        Call it when all others are scored: then the draw does not depend on the order of arrival.
+        """
+        if not (indices := generation.failed) or self._rounds >= MAX_REDRAWS:
+            return None
+        vectors = [vector_bytes(x) for x in self._strategy.redraw(indices)]
+        self._journal.redraw(generation.number, indices, vectors)
+        self._rounds += 1
+        self.redrawn += len(indices)
+        return self.reload(generation.number)
+
+    def reload(self, number: int) -> Generation:
+        """The open generation as the journal has it."""
+        stored = self._journal.generation(number)
+        assert stored is not None  # the open generation is never deleted
+        return self._recall(stored, self.scoring_params)
 
     def _terms(self, number: int) -> ScoringParams:
         return self._agenda.scoring_params(number, self.history.rows, self._evaluations)

@@ -9,14 +9,18 @@ from __future__ import annotations
 import json
 from collections import Counter
 from dataclasses import asdict
+from datetime import UTC, datetime
+from math import nan
 
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.host_classes import HostClasses
-from dreamfleet.common.protocol.messages import Result
+from dreamfleet.common.protocol.messages import Job, Result
+from dreamfleet.common.protocol.result_bounds import MAX_SECONDS
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_folder import ENDING
 from dreamfleet.common.runs.scoring_params import ScheduleState
 from dreamfleet.common.runs.stages import longest_horizon
+from dreamfleet.coordinator.dispatch.failures import JobFailure, shorten
 from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.jobs.history import History
@@ -24,6 +28,7 @@ from dreamfleet.coordinator.jobs.work import Work
 from dreamfleet.coordinator.run.admission import WorkerAdmission
 from dreamfleet.coordinator.run.background_jobs import BackgroundJobs
 from dreamfleet.coordinator.run.generations import Generations
+from dreamfleet.coordinator.run.work_clock import WorkClock
 from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 
@@ -56,8 +61,11 @@ class Run:
         self.background_jobs = BackgroundJobs(journal, settings, self.uid, self.history, evaluations, self._agenda)
         evaluated = self.background_jobs.evaluations.finished
         self.generations = Generations(journal, settings, self._agenda, self.history, evaluated)
-        self.opened_at = now
+        self.failure_limit = network.failure_limit
+        self._forgiven = 0  # candidates of the open generation that were drawn anew before the last `resume`
         self.generation = self.generations.begin()
+        self.work_clock = WorkClock(now, self.generations.seconds)  # of the open generation
+        self.fleet.working_classes.update(each.host_class for each in self.classes.largest)
         if self.incarnation > 1:  # the last incarnation may have sent the next generation's jobs before it was durable
             self.fleet.jobs.previous_epoch_until = self.generation.number + 1
         self._begin(now)
@@ -78,6 +86,15 @@ class Run:
         return self._ending is not None
 
     @property
+    def elapsed(self) -> float | None:
+        """Wall-clock seconds since the run began; `None` if a clock was set so that they cannot be right."""
+        try:
+            seconds = (datetime.now(UTC) - datetime.fromisoformat(self.created)).total_seconds()
+        except (ValueError, TypeError):  # an old or damaged journal
+            return None
+        return round(seconds, 1) if 0 <= seconds <= MAX_SECONDS else None
+
+    @property
     def classes(self) -> HostClasses:
         """The host classes of the accepted results."""
         return self._journal.classes
@@ -94,7 +111,7 @@ class Run:
             return "ended"
         if self.paused is not None:
             return "paused"
-        if not any(member.takes_jobs for member in self.fleet.members.values()):
+        if not self.fleet.takes_jobs:
             return "waiting for workers"
         return "evaluating" if self.fleet.drain_background else "running"
 
@@ -102,36 +119,46 @@ class Run:
         """Journal an accepted result, then count it for the generation or the background job that wants it."""
         self._journal.add_result(work.job, result, worker, fingerprint, self.incarnation, host_class)
         self.admission.adopt_class(host_class, fingerprint)
+        self.fleet.working_classes.add(host_class)
         assert result.fitness is not None
-        if work.job.kind != "score":
-            self.background_jobs.count(work, result)
-        elif self.generation.record(result.digest, result.fitness, result.steps):  # it wants other jobs now
+        self._count(work.job, result.fitness, result.steps)
+
+    def _count(self, job: Job, fitness: float, steps: int) -> None:
+        """Count a result that is in the journal; `fitness` is NaN for an episode that failed for good."""
+        if job.kind != "score":
+            self.background_jobs.count(job, fitness)
+        elif self.generation.record(job.digest, fitness, steps):  # it wants other jobs now
             self.fleet.jobs.offer(self.generation.missing)
 
     def tick(self, now: float) -> None:
-        """Let time pass: departed workers, silent workers, stalled uploads."""
+        """Let time pass: departed workers, silent workers, stalled uploads, and the generation's own time."""
         self.fleet.tick(now)
+        self.work_clock.tick(now, is_working=self.paused is None and self.fleet.takes_jobs)
         self.background_jobs.rollout_collections.uploads.tick(now)
 
     def advance(self, now: float) -> bool:
         """Close the complete generation and open the next one; whether a generation was opened."""
         closed = len(self.history)
+        self._settle_failures()
         while self.ended is None and self.paused is None and self.generation.complete and not self._is_waiting:
-            self._close(now)
-        failure = self.fleet.jobs.find_pausing_failure()
-        if failure is not None and self.paused is None:
-            self.pause(f"{failure}; `dreamfleet resume` tries it again")
+            if self._redraws and (redrawn := self.generations.redraw(self.generation)) is not None:
+                self._replace_generation(redrawn)
+            else:
+                self._close(now)
         self.fleet.drain_background = self._is_waiting
         self._finish()
         return len(self.history) > closed
 
     def commit(self) -> None:
         """Make everything so far durable, then write the reported controller if it is due."""
+        if self._journal.has_writes:
+            self._journal.set_seconds(self.generation.number, self.work_clock.seconds)
         self._journal.commit()
         self.background_jobs.report.save()
 
     def leave(self) -> None:
         """Make everything durable and write the reported controller before the coordinator exits."""
+        self._journal.set_seconds(self.generation.number, self.work_clock.seconds)
         self._journal.commit()
         self.background_jobs.report.save(at_once=True)
 
@@ -152,6 +179,47 @@ class Run:
         self.paused = None
         self.fleet.paused = False
         self.fleet.jobs.clear_failures()
+        self._forgiven = self.generations.redrawn
+        if self.generation.failed:
+            self._journal.drop_failures(self.generation.number)
+            self._replace_generation(self.generations.reload(self.generation.number))
+
+    def _settle_failures(self) -> None:
+        """Make lasting failures facts of the run (R8), and pause it where too many candidates or all hosts fail."""
+        working = None if self.settings.on_failure == "pause" else self.fleet.working_classes
+        if working is not None:
+            for lasting in self.fleet.find_lasting_failures():
+                self._record_failure(lasting)
+        if self.paused is not None:
+            return
+        generation, failed = self.generation, len(self.generation.failed) + self.generations.redrawn - self._forgiven
+        if generation.all_failed or failed > self.failure_limit * generation.population:
+            self.pause(
+                f"{failed} of {plural(generation.population, 'candidate')} failed in generation {generation.number}; "
+                "`dreamfleet resume` tries them again, and --failure-limit 1 at the next start lets the run go on"
+            )
+        elif (failure := self.fleet.jobs.find_pausing_failure(working)) is not None:
+            self.pause(f"{failure}; `dreamfleet resume` tries it again")
+
+    def _record_failure(self, failure: JobFailure) -> None:
+        """Journal that a job's episode fails wherever it is scored; it is wanted no more."""
+        job = failure.work.job
+        self.fleet.withdraw([job.digest])
+        self._journal.add_failure(job, shorten(failure.history[-1].error), list(failure.attempts), len(failure.history))
+        self.fleet.notes.append(f"{failure}; it has failed for good")
+        self._count(job, nan, 0)
+        if job.kind == "score":
+            self.fleet.withdraw(self.generation.unwanted)
+
+    def _replace_generation(self, generation: Generation) -> None:
+        """Score the open generation as it is now."""
+        self.generation = generation
+        self.fleet.jobs.offer(generation.missing)
+
+    @property
+    def _redraws(self) -> bool:
+        """Whether failed candidates are drawn anew."""
+        return self.settings.on_failure == "redraw"
 
     def take_notes(self) -> list[str]:
         """What happened since the last call, for the log."""
@@ -189,7 +257,7 @@ class Run:
                 self.commit()
 
     def _close(self, now: float) -> None:
-        closed = self.generations.close(self.generation, now - self.opened_at)
+        closed = self.generations.close(self.generation, self.work_clock.seconds)
         self._unpublished.append(closed)
         mean = self.generations.mean
         # Opened even if the run ends here: a later incarnation with wider limits continues from it.
@@ -197,10 +265,11 @@ class Run:
         reason = self._stop_reason(generation)
         self.fleet.jobs.offer(self.background_jobs.schedule(closed.number, mean, now, last=reason is not None))
         self._note_stage_changes(generation)
-        self.generation, self.opened_at = generation, now
+        self.generation, self._forgiven = generation, 0
+        self.work_clock.restart()
         self._prepare_fleet(generation)
         if reason:
-            self.fleet.cancel_kind("score")
+            self.fleet.withdraw(self.fleet.jobs.digests_of_kind("score"))
             self._begin_ending(reason)
         else:
             self.fleet.jobs.offer(generation.missing)
@@ -234,7 +303,7 @@ class Run:
         if limits.steps and self.history.steps >= limits.steps:
             return f"{self.history.steps} environment steps"
         if limits.minutes and self.history.seconds >= 60 * limits.minutes:
-            return plural(limits.minutes, "minute")
+            return f"{plural(limits.minutes, 'minute')} in which it could work"
         best = evaluations.best
         if limits.target is not None and best is not None and best.mean >= limits.target:
             return f"the mean of generation {best.generation} reached {best.mean:.1f}"

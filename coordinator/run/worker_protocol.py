@@ -26,8 +26,8 @@ from dreamfleet.common.protocol.messages import (
 from dreamfleet.common.protocol.result_bounds import LONGEST_EPISODE, max_steps, rejection_reason
 from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.common.serialization.validation import MAX_TEXT
+from dreamfleet.coordinator.dispatch.failures import LONGEST_ERROR
 from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
-from dreamfleet.coordinator.dispatch.pending_jobs import LONGEST_ERROR
 from dreamfleet.coordinator.jobs.work import Work
 from dreamfleet.coordinator.run.run import Run
 

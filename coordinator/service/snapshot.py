@@ -26,9 +26,9 @@ from dreamfleet.common.monitoring.status import (
 from dreamfleet.common.protocol.result_bounds import MAX_SECONDS, clamp_count
 from dreamfleet.common.runs.records import StoredEvaluation
 from dreamfleet.coordinator.dispatch.event_log import EventLogView
+from dreamfleet.coordinator.dispatch.failures import JobFailure, shorten
 from dreamfleet.coordinator.dispatch.host_stats import HostStats
 from dreamfleet.coordinator.dispatch.member import Member
-from dreamfleet.coordinator.dispatch.pending_jobs import JobFailure, shorten
 from dreamfleet.coordinator.jobs.generation import CandidateScores
 from dreamfleet.coordinator.jobs.history import HistoryView
 from dreamfleet.coordinator.run.report import ReportedMean
@@ -76,7 +76,7 @@ def take_snapshot(
     members = list(run.fleet.members.values())
     lost = [member for worker, member in run.fleet.lost.items() if worker not in run.fleet.members]
     return Snapshot(
-        status=_status(run, name, candidate_scores, members, len(lost), dropped, uptime, now, expires),
+        status=_status(run, name, candidate_scores, members, len(lost), dropped, uptime, expires),
         workers=tuple(_worker(member, now) for member in (*members, *lost)),
         history=run.history.view(),
         evaluations=background_jobs.evaluations.rows,
@@ -90,7 +90,7 @@ def take_snapshot(
 
 def _status(
     run: Run, name: str, candidate_scores: CandidateScores, members: Sequence[Member], lost: int,
-    dropped: Mapping[str, int], uptime: float, now: float, expires: float | None,
+    dropped: Mapping[str, int], uptime: float, expires: float | None,
 ) -> Status:  # fmt: skip
     present = [member for member in members if member.is_reachable]
     evaluations, failures, last = run.background_jobs.evaluations, run.fleet.jobs.failures, run.generations.last
@@ -105,7 +105,7 @@ def _status(
         settings=run.settings,
         limits=asdict(run.limits),
         uptime=round(uptime, 1),
-        generation=_open_generation(run, now),
+        generation=_open_generation(run),
         generations=len(run.history),
         last=run.history.last,
         recent=(),
@@ -129,6 +129,8 @@ def _status(
         confirmed=run.confirmed,
         confirming=EpisodeProgress(*run.background_jobs.confirming),
         ending=run.ending,
+        failed=run.history.failed,
+        elapsed=run.elapsed,
         closing=0 if run.ended is not None else run.background_jobs.episodes_until_end(ending=run.ending),
         strict=run.admission.strict,
         classes=run.classes,
@@ -136,17 +138,18 @@ def _status(
     )
 
 
-def _open_generation(run: Run, now: float) -> GenerationStatus:
+def _open_generation(run: Run) -> GenerationStatus:
     axis_ratio = run.generations.axis_ratio
     return GenerationStatus(
         number=run.generation.number,
         episodes_done=run.generation.done,
         episodes=run.generation.total,
-        seconds=round(max(now - run.opened_at, 0.0), 1),
+        seconds=min(round(run.work_clock.seconds, 1), MAX_SECONDS),
         sigma=run.generations.sigma,
         temperature=run.generation.spec.temperature,
         stage=_stage(run),
         axis_ratio=None if axis_ratio is None else round(axis_ratio, 3),
+        failed=len(run.generation.failed) + run.generations.redrawn,
     )
 
 

@@ -26,6 +26,7 @@ from dreamfleet.common.runs.records import (
     STAGE_FIELDS,
     ConfirmationEpisodes,
     EpisodesPerCandidate,
+    OnFailure,
     PopulationSize,
     RunSettings,
     StageSettings,
@@ -116,6 +117,10 @@ class RunConfig:
         "share of a candidate's episodes, 0 to 1, that is driven in the world that the others dream of; 1: all, as in "
         "a schedule whose first stage dreams",
     )
+    on_failure: OnFailure = frozen_option(
+        RunSettings, "worst", "a candidate whose episode fails in two independent attempts: ranks last (worst), is "
+        "drawn anew (redraw), or pauses the run (pause)",
+    )  # fmt: skip
     seed: Count = frozen_option(RunSettings, 1, "makes the run: population and training seeds follow from it")
     evaluate_every: Interval = frozen_option(
         RunSettings, 25, "drive the mean in reality every so many generations; 0: never"
@@ -338,7 +343,11 @@ def _try_optimiser(settings: RunSettings, stage: Stage, subspace: Subspace | Non
         EvolutionConfig,
     )
 
-    Evolution(EvolutionConfig.of(settings, stage, subspace))
+    evolution = Evolution(EvolutionConfig.of(settings, stage, subspace))
+    if settings.on_failure == "redraw":
+        if stage.racing:
+            raise UsageError("--on-failure redraw cannot be combined with --racing: a late candidate has no first half")
+        evolution.check_redraws()
 
 
 @dataclass(frozen=True)
@@ -371,6 +380,9 @@ class NetworkConfig:
     evaluation_share: Annotated[float, Between(0.0, 0.9)] = option(
         0.25, "share of a busy fleet's time for evaluations, 0 to 0.9; 0: only idle slots"
     )  # the search needs the rest
+    failure_limit: Annotated[float, Between(0.0, 1.0)] = option(
+        0.5, "pause when more than this share of a generation's candidates failed, 0 to 1"
+    )
     strict: bool = option(
         False,
         "take results only of hosts that compute the same bits as the first one that scored, so that the run ends with "

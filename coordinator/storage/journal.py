@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from math import nan
 from pathlib import Path
 from time import time
 from typing import Any
@@ -55,7 +56,9 @@ class StoredOpenGeneration:
     number: int
     state: bytes
     seeds: tuple[int, ...]
-    vectors: tuple[bytes, ...]  # float32, as they travel
+    vectors: tuple[bytes, ...]  # float32, as they travel; the latest ones of candidates that were drawn anew
+    redrawn: tuple[tuple[int, ...], ...] = ()  # candidates, by round
+    seconds: float = 0.0  # for which it could be scored so far
 
 
 class Journal:
@@ -164,6 +167,11 @@ class Journal:
         if own:  # else somebody wrote there since the last commit, which `is_overwritten` looks into
             self._stamp = file_stamp(self.path)
 
+    @property
+    def has_writes(self) -> bool:
+        """Whether something waits for the next commit."""
+        return bool(self._writes) or self._connection.in_transaction
+
     def fact(self, key: str) -> str | None:
         """One of the run's facts, such as `uid` or `fingerprint`."""
         row = self._read_row("SELECT value FROM run WHERE key = ?", key)
@@ -233,13 +241,44 @@ class Journal:
         """Write the fitness that updates the strategy, and the generation's statistics."""
         self._write_all(
             "UPDATE candidate SET fitness = ? WHERE generation = ? AND number = ?",
-            [(float(value), closed.number, index) for index, value in enumerate(fitness)],
+            [(float(value), closed.number, index) for index, value in enumerate(fitness)],  # SQLite has NULL for NaN
         )
         self._write(
-            "UPDATE generation SET closed = ?, mean = ?, std = ?, best = ?, worst = ?, steps = ?, seconds = ? "
-            "WHERE number = ?",
-            time(), closed.mean, closed.std, closed.best, closed.worst, closed.steps, closed.seconds, closed.number,
+            "UPDATE generation SET closed = ?, mean = ?, std = ?, best = ?, worst = ?, steps = ?, seconds = ?, "
+            "failed = ? WHERE number = ?",
+            time(), closed.mean, closed.std, closed.best, closed.worst, closed.steps, closed.seconds, closed.failed,
+            closed.number,
         )  # fmt: skip
+
+    def set_seconds(self, generation: int, seconds: float) -> None:
+        """Write for how long the open generation could be scored so far."""
+        self._write("UPDATE generation SET seconds = ? WHERE number = ?", seconds, generation)
+
+    def redraw(self, generation: int, indices: Sequence[int], vectors: Sequence[bytes]) -> None:
+        """Write the new vectors of candidates that failed; the old ones are kept by round."""
+        (rounds,) = self._read_row("SELECT count(DISTINCT round) FROM redraw WHERE generation = ?", generation)
+        self._write_all(
+            "INSERT INTO redraw (generation, round, candidate, vector) "
+            "SELECT generation, ?, number, vector FROM candidate WHERE generation = ? AND number = ?",
+            [(rounds, generation, index) for index in indices],
+        )
+        self._write_all(
+            "UPDATE candidate SET vector = ? WHERE generation = ? AND number = ?",
+            [(vector, generation, index) for vector, index in zip(vectors, indices, strict=True)],
+        )
+
+    def add_failure(self, job: Job, error: str, workers: Sequence[str], attempts: int) -> None:
+        """Write that a job's episode failed for good."""
+        self._write(
+            "INSERT INTO failure (digest, kind, generation, candidate, episode, seed, error, workers, attempts, "
+            "incarnation, happened) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            job.digest, job.kind, job.generation, job.candidate, job.episode, job.seeds[0], error, ",".join(workers),
+            attempts, self._incarnation, time(),
+        )  # fmt: skip
+
+    def drop_failures(self, generation: int) -> None:
+        """Forget the failures of a generation's candidates, so that they are scored again."""
+        self._write("DELETE FROM failure WHERE kind = 'score' AND generation = ?", generation)
 
     def add_result(
         self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int, host_class: str = ""
@@ -289,9 +328,11 @@ class Journal:
             evaluation.generation, evaluation.vector, evaluation.episodes,
         )  # fmt: skip
 
-    def finish_evaluation(self, generation: int, mean: float, std: float) -> None:
-        """Write what an evaluation gave."""
-        self._write("UPDATE evaluation SET mean = ?, std = ? WHERE generation = ?", mean, std, generation)
+    def finish_evaluation(self, generation: int, found: StoredEvaluation | None, failed: int) -> None:
+        """Write what an evaluation gave: `None` if each of its episodes `failed`."""
+        mean, std = (None, None) if found is None else (found.mean, found.std)
+        query = "UPDATE evaluation SET mean = ?, std = ?, failed = ? WHERE generation = ?"
+        self._write(query, mean, std, failed, generation)
 
     def schedule_collection(self, collection: RolloutCollection) -> None:
         """Write that drives of a generation's mean are to be kept."""
@@ -313,15 +354,20 @@ class Journal:
     def generation(self, number: int) -> StoredOpenGeneration | None:
         """One of the last two generations, with the population that was sampled; `None` if its state is deleted."""
         row = self._read_row(
-            "SELECT state, seeds FROM generation JOIN strategy ON number = generation WHERE number = ?", number
+            "SELECT state, seeds, seconds FROM generation JOIN strategy ON number = generation WHERE number = ?", number
         )
         if row is None:
             return None
         vectors = self._read("SELECT vector FROM candidate WHERE generation = ? ORDER BY number", number)
+        rounds: dict[int, list[int]] = {}
+        query = "SELECT round, candidate FROM redraw WHERE generation = ? ORDER BY round, candidate"
+        for each, candidate in self._read(query, number):
+            rounds.setdefault(each, []).append(candidate)
         try:
             return StoredOpenGeneration(
-                number, row[0], tuple(json.loads(row[1])), tuple(vector for (vector,) in vectors)
-            )
+                number, row[0], tuple(json.loads(row[1])), tuple(vector for (vector,) in vectors),
+                tuple(map(tuple, rounds.values())), to_finite(row[2] or 0.0),
+            )  # fmt: skip
         except (ValueError, TypeError) as error:
             raise JournalError(f"{self.path} is damaged: {error}; restore it from a copy") from error
 
@@ -331,32 +377,43 @@ class Journal:
             return folder.history(), folder.evaluations()
 
     def results_of(self, kind: str, generation: int) -> dict[bytes, tuple[float, int]]:
-        """Fitness and steps of a generation's accepted results, by digest."""
+        """Fitness and steps of a generation's accepted results, by digest; NaN for what failed for good."""
         query = "SELECT digest, fitness, steps FROM result WHERE kind = ? AND generation = ?"
-        return {digest: (to_finite(fitness), steps) for digest, fitness, steps in self._read(query, kind, generation)}
+        found = {digest: (to_finite(fitness), steps) for digest, fitness, steps in self._read(query, kind, generation)}
+        query = "SELECT digest FROM failure WHERE kind = ? AND generation = ?"
+        return found | {digest: (nan, 0) for (digest,) in self._read(query, kind, generation)}
 
     def fitness_of(self, digests: Sequence[bytes]) -> dict[bytes, float]:
-        """Fitness of those of these jobs that have an accepted result, whichever generation asked for it."""
+        """Fitness of those of these jobs that have an accepted result, whichever generation asked for it.
+
+        NaN for those that failed for good.
+        """
         found: dict[bytes, float] = {}
         for start in range(0, len(digests), MOST_VARIABLES):
             some = digests[start : start + MOST_VARIABLES]
             marks = ", ".join("?" * len(some))
             found.update(self._read(f"SELECT digest, fitness FROM result WHERE digest IN ({marks})", *some))  # noqa: S608
+            failed = self._read(f"SELECT digest FROM failure WHERE digest IN ({marks})", *some)  # noqa: S608
+            found.update((digest, nan) for (digest,) in failed)
         return found
 
     def pending_evaluations(self) -> list[Evaluation]:
         """Evaluations that were scheduled and not finished, oldest first."""
-        query = "SELECT generation, vector, episodes FROM evaluation WHERE mean IS NULL ORDER BY generation"
+        query = (
+            "SELECT generation, vector, episodes FROM evaluation WHERE mean IS NULL AND failed < episodes "
+            "ORDER BY generation"
+        )
         return [Evaluation(*row) for row in self._read(query)]
 
     def finalists(self, count: int) -> list[Finalist]:
         """The best evaluated means, best first; of generations with one mean and of equals the earliest."""
         query = (
-            "SELECT min(generation), vector, episodes, mean FROM evaluation WHERE mean IS NOT NULL GROUP BY vector "
-            "ORDER BY mean DESC, 1 LIMIT ?"
+            "SELECT min(generation), vector, episodes - failed, mean, failed FROM evaluation WHERE mean IS NOT NULL "
+            "GROUP BY vector ORDER BY failed, mean DESC, 1 LIMIT ?"
         )
         rows = self._read(query, count)
-        return [Finalist(generation, vector, episodes, to_finite(mean)) for generation, vector, episodes, mean in rows]
+        return [Finalist(generation, vector, episodes, to_finite(mean), failed)
+                for generation, vector, episodes, mean, failed in rows]  # fmt: skip
 
     def evaluated_vector(self, generation: int) -> bytes:
         """The mean after a generation that was scheduled to be evaluated."""
