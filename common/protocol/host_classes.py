@@ -49,7 +49,7 @@ class HostClasses:
             sizes[host_class] += results
         largest = tuple(
             HostClassShare(host_class, results, _fingerprints(counted, host_class))
-            for host_class, results in sizes.most_common(MAX_LISTED)
+            for host_class, results in sorted(sizes.items(), key=lambda each: (-each[1], each[0]))[:MAX_LISTED]
         )
         return cls(len(sizes), largest, sum(sizes.values()))
 

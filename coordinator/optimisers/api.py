@@ -6,7 +6,7 @@ name it as `module:attribute`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol
 
@@ -56,8 +56,10 @@ class Optimiser(Protocol):
     `requirement` is what pip installs to get these very bits, such as "cma==4.5.0". A state names it, and is continued
     by the same one alone. `options` says which options there are, and what each takes.
 
-    It may have one thing more, which is shown: `axis_ratio`, a float, how many times longer the longest axis of its
-    distribution is than the shortest.
+    Two more attributes are optional. `axis_ratio`, a float, is shown: how many times longer the longest axis of the
+    distribution is than the shortest. `redraw(indices)` is needed by `--on-failure redraw`: it replaces candidates of
+    the last `ask`, which failed, and returns the new ones `(len(indices), dimension)`. `tell` then refers to these. A
+    candidate that was not drawn at random may stay as it is. The result must not depend on `prepare`.
 
     >>> from dreamfleet.coordinator.optimisers.cmaes_library import Separable
     >>> optimiser: Optimiser = Separable(Search(mean=np.zeros(3), population=8, sigma0=0.5, seed=1))
@@ -86,13 +88,6 @@ class Optimiser(Protocol):
 
     def tell(self, fitness: NDArray[np.float64]) -> None:
         """Learn from the population asked for: `fitness` `(population,)` in its order, finite, larger is better."""
-
-    def redraw(self, indices: Sequence[int]) -> NDArray[np.float64]:
-        """Replace candidates of the last `ask`, which failed, by new ones `(len(indices), dimension)`.
-
-        Only `--on-failure redraw` needs this method. `tell` then refers to the new ones. A candidate that is not drawn
-        at random stays as it is. The numbers must follow from the state and the calls since, not from `prepare`.
-        """
 
     def prepare(self) -> None:
         """Work ahead while workers are busy, if there is anything to do; called any number of times, changes no bit."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,7 +106,7 @@ class Evolution:
 
         An optimiser may keep a candidate that it did not draw at random.
         """
-        return self._check(self._optimiser.redraw(indices), len(indices))
+        return self._check(cast(Any, self._optimiser).redraw(indices), len(indices))
 
     def check_redraws(self) -> None:
         """`UsageError` if the optimiser cannot draw single candidates anew."""

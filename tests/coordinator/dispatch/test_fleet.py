@@ -240,6 +240,7 @@ def test_an_error_is_no_fitness_and_another_worker_tries():
 def test_the_only_worker_tries_a_failed_job_again_but_not_for_ever():
     fleet = fleet_of(A, jobs=1)
     for attempt in range(3):
+        fleet.tick(attempt)  # the third attempt waits for a second
         assert fleet.jobs.find_pausing_failure() is None
         (digest,) = digests(fleet.dispatch(attempt), A)
         fleet.handle_result(A, result(digest, error="boom"), attempt)

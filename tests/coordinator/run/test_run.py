@@ -251,6 +251,9 @@ def test_a_pause_on_the_only_worker_names_one_worker_and_three_failures(bench):
     bench.run.tick(bench.now)
     digest = None
     while bench.run.paused is None:
+        bench.now += 1
+        bench.run.tick(bench.now)
+        bench.handle_heartbeat(A)
         for send in bench.run.fleet.dispatch(bench.now):
             digest = digest or (send.content.work[0].job.digest if send.content.work else None)
         fail(bench, A, digest, "boom")

@@ -6,7 +6,7 @@ import pytest
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.protocol.messages import Result
-from dreamfleet.common.runs.records import RunSettings, StoredGeneration
+from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.coordinator.jobs.confirmation import Finalist
@@ -84,7 +84,7 @@ def test_incarnations_count(journal):
 def test_evaluations_are_kept_until_finished(journal):
     journal.schedule_evaluation(Evaluation(4, VECTORS[0], 2))
     assert journal.pending_evaluations() == [Evaluation(4, VECTORS[0], 2)]
-    journal.finish_evaluation(4, 800.0, 10.0)
+    journal.finish_evaluation(4, StoredEvaluation(4, 2, 800.0, 10.0), 0)
     assert journal.pending_evaluations() == []
     assert journal.evaluated_vector(4) == VECTORS[0]
 
@@ -93,7 +93,7 @@ def test_finalists_are_the_best_means_each_once(journal):
     vectors = [bytes([each]) * 8 for each in range(4)]
     for generation, vector, mean in ((1, 0, 5.0), (2, 1, 7.0), (3, 1, 7.0), (4, 2, 7.0), (5, 3, 6.0)):
         journal.schedule_evaluation(Evaluation(generation, vectors[vector], 2))
-        journal.finish_evaluation(generation, mean, 1.0)
+        journal.finish_evaluation(generation, StoredEvaluation(generation, 2, mean, 1.0), 0)
     assert [each.generation for each in journal.finalists(3)] == [2, 4, 5]
     assert journal.finalists(1) == [Finalist(2, vectors[1], 2, 7.0)]
 
