@@ -70,10 +70,12 @@ def _progress(status: Status) -> Iterator[Metric]:
     states = [({"state": each}, float(each == status.state)) for each in STATES]
     yield Metric("dreamfleet_state", "gauge", "1 for the state that the run is in.", states)
     yield _gauge("generation", "The open generation's number.", opened.number)
-    yield _gauge("generation_seconds", "Seconds since it was opened.", opened.seconds)
+    yield _gauge("generation_seconds", "Seconds in which it could be scored.", opened.seconds)
     yield _gauge("generation_episodes_done", "Its episodes that are scored.", opened.episodes_done)
     yield _gauge("generation_episodes", "Its episodes known so far.", opened.episodes)
     yield _counter("generations_closed_total", "Generations that were closed.", status.generations)
+    failed = status.failed + opened.failed
+    yield _counter("failed_candidates_total", "Candidates of which an episode failed everywhere.", failed)
     yield _counter("environment_steps_total", "Environment steps of candidates.", spent.environment_steps)
     yield _gauge("steps_per_second", "Environment steps a second of the present workers.", spent.steps_per_second)
     eta = estimate_eta(status)

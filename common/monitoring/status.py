@@ -128,7 +128,7 @@ class WorkerStatus:
 
 EventKind = Literal[
     "joined", "back", "silent", "lost", "left", "given", "seen", "sent again", "recalled", "copied", "reissued",
-    "accepted", "duplicate", "obsolete", "refused",
+    "accepted", "duplicate", "obsolete", "refused", "failed",
 ]  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from rich.console import Console, ConsoleOptions, Group, RenderResult
 from rich.panel import Panel
 from rich.text import Text
 
-from dreamfleet.common.monitoring.eta import describe_state, estimate_eta
+from dreamfleet.common.monitoring.eta import describe_state, estimate_eta, format_duration
 from dreamfleet.common.monitoring.status import (
     EpisodeProgress,
     FailureStatus,
@@ -166,6 +166,11 @@ def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
     yield 3, "throughput", f"{rate:,.0f} steps/s, {steps:,} in all"
     resent = f", {plural(waste.resent_batches, 'batch', 'batches')} sent again" if waste.resent_batches else ""
     yield 4, "waste", f"{waste.share:.1%}, {plural(waste.reissued, 'job')} issued again{resent}"
+    if failed := status.failed + status.generation.failed:
+        yield 2, "failed", f"{plural(failed, 'candidate')}, {status.generation.failed} of this generation"
+    if status.throughput.seconds is not None and status.elapsed is not None:
+        worked = status.throughput.seconds + status.generation.seconds
+        yield 6, "time", f"{format_duration(worked)} of work in {format_duration(status.elapsed)}"
     if status.classes.total:
         yield 4 if status.classes.mixed else 7, "hosts", status.classes.description
     if status.expires is not None:
@@ -230,7 +235,7 @@ def _describe_reported(status: Status) -> str:
 
 def _describe_failure(failure: FailureStatus) -> str:
     worker, error = next(iter(failure.errors.items()), ("a worker", "no reason was given"))
-    return f"candidate {failure.candidate} failed on {worker}: {error}; another worker will try"
+    return f"candidate {failure.candidate} failed on {worker}: {error}; it is tried again"
 
 
 def _progress_lines(status: Status, width: int) -> Iterator[Text]:

@@ -66,6 +66,7 @@ class RunProvenance:
     seeds: dict[str, tuple[int, ...]] | None = field(default=None, metadata=OPTIONAL)
     subspace: str | None = field(default=None, metadata=OPTIONAL)  # `Subspace.text`
     classes: HostClasses | None = field(default=None, metadata=OPTIONAL)  # of all results
+    failed: Count = field(default=0, metadata=OPTIONAL)  # candidates that failed
 
     @property
     def total(self) -> Effort:

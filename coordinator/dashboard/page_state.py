@@ -163,6 +163,11 @@ def _search(status: Status) -> Facts:
         facts.append(("axis ratio", f"{open_one.axis_ratio:,.4g}"))
     if open_one.temperature is not None:
         facts.append(("temperature", f"{open_one.temperature:g}"))
+    if status.throughput.seconds is not None and status.elapsed is not None:
+        worked = status.throughput.seconds + open_one.seconds
+        facts.append(("time", f"{format_duration(worked)} of work in {format_duration(status.elapsed)}"))
+    if failed := status.failed + open_one.failed:
+        facts.append(("failed candidates", f"{failed:,}, {open_one.failed} of this generation"))
     if status.last is not None:
         facts.append(("spread of the last generation", f"{status.last.std:,.1f} (standard deviation)"))
     return facts

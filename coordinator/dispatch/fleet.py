@@ -65,6 +65,12 @@ class Fleet:
             if digest in self.jobs:
                 self._cancel(digest, self.jobs.remove(digest))
 
+    def give_up(self, failure: JobFailure) -> None:
+        """Withdraw a job whose episode fails wherever it is scored."""
+        digest = failure.work.job.digest
+        self.event_log.add(self._now, "failed", failure.history[-1].worker, digest)
+        self.withdraw([digest])
+
     def find_lasting_failures(self) -> list[JobFailure]:
         """The wanted jobs that fail wherever they are scored."""
         hosts = {name.partition("/")[0] for name, member in self.members.items() if member.takes_jobs}

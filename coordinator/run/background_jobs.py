@@ -31,8 +31,9 @@ class BackgroundJobs:
         self.evaluations = Evaluations(evaluations)
         self.rollout_collections = RolloutCollections(folder)
         self.report = ControllerWriter(
-            folder / CONTROLLER, run_uid, settings, lambda: build_provenance(journal, settings, len(history))
-        )
+            folder / CONTROLLER, run_uid, settings,
+            lambda: build_provenance(journal, settings, len(history), history.failed),
+        )  # fmt: skip
         self._journal = journal
         self._settings = settings
         self._history = history

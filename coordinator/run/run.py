@@ -204,7 +204,7 @@ class Run:
     def _record_failure(self, failure: JobFailure) -> None:
         """Journal that a job's episode fails wherever it is scored; it is wanted no more."""
         job = failure.work.job
-        self.fleet.withdraw([job.digest])
+        self.fleet.give_up(failure)
         self._journal.add_failure(job, shorten(failure.history[-1].error), list(failure.attempts), len(failure.history))
         self.fleet.notes.append(f"{failure}; it has failed for good")
         self._count(job, nan, 0)

@@ -55,7 +55,8 @@ class RunLog:
     def report_closed(self, generations: Iterable[StoredGeneration]) -> None:
         """Log these closed generations, and the evaluations that have finished since the last call."""
         for closed in generations:
-            log.info("generation %d: mean %.1f, best %.1f", closed.number, closed.mean, closed.best,
+            failed = f", {closed.failed} failed" if closed.failed else ""
+            log.info("generation %d: mean %.1f, best %.1f%s", closed.number, closed.mean, closed.best, failed,
                      extra={"facts": {"event": "generation", **asdict(closed)}})  # fmt: skip
         evaluations = self._run.background_jobs.evaluations
         if len(evaluations) > self._evaluations_logged:

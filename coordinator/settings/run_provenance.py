@@ -15,11 +15,14 @@ from dreamfleet.coordinator.storage.journal import Journal
 DECIDING_PACKAGES = ("dreamfleet", "numpy", "cma", "cmaes")  # packages whose versions decide what is asked for
 
 
-def build_provenance(journal: Journal, settings: RunSettings, generations: int) -> RunProvenance:
-    """The receipt of a run that has closed so many generations. It costs the same however long the run is."""
+def build_provenance(journal: Journal, settings: RunSettings, generations: int, failed: int) -> RunProvenance:
+    """The receipt of a run that has closed so many generations, in which so many candidates `failed`.
+
+    It costs the same however long the run is.
+    """
     return RunProvenance(
         generations, journal.effort, _start(journal), journal.fingerprint(), journal.classes.mixed, versions(),
-        validation_seed_ranges(settings), journal.fact(SUBSPACE_FACT), journal.classes,
+        validation_seed_ranges(settings), journal.fact(SUBSPACE_FACT), journal.classes, failed,
     )  # fmt: skip
 
 

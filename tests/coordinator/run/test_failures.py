@@ -1,0 +1,220 @@
+"""Candidates whose episodes fail wherever they are scored."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.protocol.messages import Result
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.coordinator.settings.config import LimitsConfig
+from tests.coordinator.run.test_run import SETTINGS as TWO
+from tests.coordinator.run.test_run import A, B, Bench
+
+SETTINGS = replace(TWO, population=6, episodes=2, collect_every=0, on_failure="worst")
+GENERATIONS = 3
+
+
+class Failing(Bench):
+    """A bench whose episodes fail where `fails(job)`; everything else scores by its digest."""
+
+    host_class = "0123456789abcdef"
+
+    def __init__(self, *args, fails, host_errors=(), **kwargs):
+        self.fails, self.host_errors = fails, list(host_errors)
+        self.hosts = [A, B]
+        super().__init__(*args, generations=GENERATIONS, **kwargs)
+
+    def begin(self):
+        super().begin()
+        for name in self.hosts:
+            self.handle_heartbeat(name, host_class=self.host_class)
+
+    def answer_one(self, name, job):
+        if self.host_errors:
+            result = Result(job.digest, None, 0, 0.1, self.host_errors.pop(), None)
+        elif self.fails(job):
+            result = Result(job.digest, None, 3, 0.1, f"ValueError: at {id(job):#x} on {name}", None)
+        else:
+            result = Result(job.digest, int.from_bytes(job.digest[:3]) / 1e6, 10, 0.1, None, None)
+        self.deliver(name, result)
+
+    def serve(self, turns=400, stop=lambda run: False):
+        for _ in range(turns):
+            if self.run.ended or self.run.paused or stop(self.run):
+                return
+            self.now += 1.0
+            self.run.tick(self.now)
+            for name in self.hosts:
+                self.handle_heartbeat(name, host_class=self.host_class)
+            for send in self.run.fleet.dispatch(self.now):
+                for work in send.content.work:
+                    self.answer_one(send.identity, work.job)
+        raise AssertionError("the run does not end")
+
+    def story(self):
+        """What a run computed, without times."""
+        self.journal.commit()
+        with RunFolder(self.path) as folder:
+            rows = [replace(each, seconds=0.0) for each in folder.history()]
+            candidates = [(each.generation, each.number, each.fitness) for each in folder.candidates()]
+            vectors = [folder.candidate(*each[:2]).tobytes() for each in candidates]
+            return rows, candidates, vectors, folder.evaluations(), folder.confirmation()
+
+
+def by_vector(share):
+    """An episode fails by its parameters and its seed."""
+    return lambda job: job.kind == "score" and (job.vector[0] + job.seeds[0]) % 256 < share * 256
+
+
+def finished(path, bundle, settings=SETTINGS, **options):
+    bench = Failing(path / "night", bundle.path, settings, **options)
+    bench.serve()
+    return bench
+
+
+@pytest.fixture
+def failing(tmp_path, random_bundle):
+    made = []
+
+    def build(name, **options):
+        made.append(finished(tmp_path / name, random_bundle, **options))
+        return made[-1]
+
+    yield build
+    for each in made:
+        each.journal.close()
+
+
+def test_a_failed_candidate_ranks_last_and_the_run_ends(failing):
+    bench = failing("one", fails=by_vector(0.15))
+    rows, candidates, *_ = bench.story()
+    assert bench.run.ended
+    assert len(rows) == GENERATIONS
+    failed = [each for each in candidates if each[0] < GENERATIONS and each[2] is None]
+    assert 0 < len(failed) == sum(each.failed for each in rows)
+    with RunFolder(bench.path) as folder:
+        facts = folder.failures()
+    assert {(each.generation, each.candidate) for each in facts} == {each[:2] for each in failed}
+    assert all(each.attempts == 2 and set(each.workers.split(",")) == {A, B} for each in facts)
+    assert all(row.worst <= row.mean <= row.best for row in rows)
+
+
+@pytest.mark.parametrize("on_failure", ["worst", "redraw"])
+def test_the_bits_are_the_same_on_any_fleet_and_through_restarts(failing, tmp_path, random_bundle, on_failure):
+    settings = replace(SETTINGS, on_failure=on_failure, evaluate_every=1, evaluation_episodes=3, confirm_episodes=4)
+
+    def fails(job):
+        return (job.vector[0] + job.seeds[0]) % 256 < 40
+
+    whole = failing("whole", settings=settings, fails=fails).story()
+    assert sum(each.failed for each in whole[0])
+    lone = Failing(tmp_path / "lone" / "night", random_bundle.path, settings, fails=fails)
+    lone.hosts = [A]
+    lone.run.fleet.handle_departure(B, lone.now)
+    lone.serve()
+    assert lone.story() == whole
+    killed = Failing(tmp_path / "killed" / "night", random_bundle.path, settings, fails=fails)
+    while not killed.run.ended:
+        killed.serve(stop=lambda run: run.fleet.counts["accepted"] + run.fleet.counts["errors"] > 12)
+        if not killed.run.ended:
+            killed.restart()
+    assert killed.story() == whole
+    lone.journal.close()
+    killed.journal.close()
+
+
+def test_a_candidate_that_is_drawn_anew_is_another_and_the_old_one_stays_in_the_journal(failing):
+    fails = by_vector(0.15)
+    kept, drawn = (
+        failing(each, settings=replace(SETTINGS, on_failure=each), fails=fails) for each in ("worst", "redraw")
+    )
+    with RunFolder(kept.path) as before, RunFolder(drawn.path) as after:
+        failures = [each for each in before.failures() if each.generation == 0]
+        assert failures
+        for each in failures:
+            assert not np.array_equal(before.candidate(0, each.candidate), after.candidate(0, each.candidate))
+        assert after.history()[0].failed >= len(failures)
+    (old,) = drawn.journal._connection.execute("SELECT count(*) FROM redraw WHERE generation = 0").fetchone()
+    assert old >= len(failures)
+
+
+def test_a_run_whose_every_episode_fails_pauses_and_resume_tries_again(tmp_path, random_bundle):
+    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: True)
+    bench.serve()
+    assert "failed on two workers" in bench.run.paused
+    bench.fails = lambda job: False
+    bench.run.resume()
+    bench.serve()
+    assert bench.run.ended
+    assert sum(each.failed for each in bench.run.history.rows) == 0
+    bench.journal.close()
+
+
+def test_more_failures_than_the_limit_pause_the_run_and_resume_scores_these_candidates_again(tmp_path, random_bundle):
+    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate > 1)
+    bench.serve()
+    assert bench.run.paused.startswith("4 of 6 candidates failed in generation 0")
+    bench.fails = lambda job: job.candidate > 3
+    bench.run.resume()
+    bench.serve()
+    assert bench.run.ended
+    assert [each.failed for each in bench.run.history.rows] == [2, 2, 2]
+    bench.journal.close()
+
+
+def test_a_shortage_of_the_host_is_no_failure_of_the_candidate(failing):
+    whole = failing("whole", fails=lambda job: False).story()
+    short = failing("short", fails=lambda job: False, host_errors=["host: killed by SIGKILL"] * 9)
+    assert short.story() == whole
+    assert short.run.fleet.counts["errors"] == 9
+
+
+def test_an_evaluation_counts_its_scored_episodes_and_one_without_any_ends(failing):
+    settings = replace(SETTINGS, evaluate_every=1, evaluation_episodes=3, confirm_episodes=4)
+    partly = failing("partly", settings=settings, fails=lambda job: job.kind == "evaluate" and job.episode % 3 == 0)
+    _, _, _, evaluations, confirmed = partly.story()
+    assert [(each.episodes, each.failed) for each in evaluations] == [(2, 1)] * GENERATIONS
+    assert confirmed.episodes + confirmed.failed == 4
+    assert confirmed.failed
+    none = failing("none", settings=settings, fails=lambda job: job.kind == "evaluate")
+    assert none.run.ended
+    assert none.story()[3:] == ([], None)
+
+
+def test_racing_goes_on_without_the_failed_ones(failing):
+    racing = replace(SETTINGS, racing=True, episodes=4)
+    bench = failing("race", settings=racing, fails=by_vector(0.1))
+    rows = bench.story()[0]
+    assert len(rows) == GENERATIONS
+    assert sum(each.failed for each in rows)
+
+
+def test_time_without_workers_or_paused_is_no_time_of_the_run(tmp_path, random_bundle):
+    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: False)
+    bench.run.limits = LimitsConfig(minutes=1.0)
+    bench.run.pause("by a test")
+    for _ in range(100):
+        bench.now += 1.0
+        bench.run.tick(bench.now)
+        bench.run.commit()
+    assert bench.run.work_clock.seconds == 0.0
+    bench.run.resume()
+    for name in (A, B):
+        bench.handle_heartbeat(name, host_class=bench.host_class)
+    bench.now += 1.0
+    bench.run.tick(bench.now)
+    assert bench.run.work_clock.seconds == 1.0
+    bench.hosts = []
+    for name in (A, B):
+        bench.run.fleet.handle_departure(name, bench.now)
+    for _ in range(100):
+        bench.now += 1.0
+        bench.run.tick(bench.now)
+    assert bench.run.work_clock.seconds <= 2.0
+    bench.run.leave()
+    bench.hosts = [A, B]
+    spent = bench.run.work_clock.seconds
+    bench.restart()
+    assert bench.run.work_clock.seconds == pytest.approx(spent), "the open generation's time outlives its coordinator"
+    bench.journal.close()
