@@ -256,12 +256,13 @@ def describe_score(found: StoredEvaluation | StoredConfirmation | None) -> str:
     if found is None:
         return "the last mean; it was not evaluated"
     score = f"generation {found.generation}'s mean scored {format_mean(found)}"
-    score += f" ({plural(found.failed, 'more episode')} failed)" if found.failed else ""
     score += " (standard error)" if found.episodes > 1 else ""
+    failed = f"; {plural(found.failed, 'more episode')} failed" if found.failed else ""
     if isinstance(found, StoredConfirmation):
         seeds = plural(found.episodes, "fresh validation seed")
-        return f"{score} on {seeds}; confirmed: they took no part in its choice"
-    return f"{score} on {plural(found.episodes, 'validation seed')}; provisional: it is the best of all looks so far"
+        return f"{score} on {seeds}{failed}; confirmed: they took no part in its choice"
+    seeds = plural(found.episodes, "validation seed")
+    return f"{score} on {seeds}{failed}; provisional: it is the best of all looks so far"
 
 
 def format_mean(found: StoredEvaluation | StoredConfirmation) -> str:
