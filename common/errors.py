@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from errno import EDQUOT, ENOSPC
+
 
 class DreamfleetError(Exception):
     """Base of expected failures; the command line prints the text as one line and exits with `exit_code`.
@@ -42,6 +44,16 @@ class DatasetError(DreamfleetError):
 
 class JournalError(DreamfleetError):
     """A run's journal is missing, damaged, locked, not writable, or not a journal."""
+
+
+class DiskFullError(JournalError):
+    """The disk of a run is full; what was not written can be written once there is room."""
+
+
+def write_error(path: object, error: OSError) -> JournalError:
+    """The error for a file of a run that cannot be written."""
+    kind = DiskFullError if error.errno in (ENOSPC, EDQUOT) else JournalError
+    return kind(f"cannot write {path}: {error.strerror}; make room and continue the run")
 
 
 class InternalError(DreamfleetError):

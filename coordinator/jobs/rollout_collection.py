@@ -6,7 +6,7 @@ from collections.abc import Container
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dreamfleet.common.errors import JournalError
+from dreamfleet.common.errors import write_error
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.protocol.messages import Job, Result, TaskSpec
 from dreamfleet.common.runs.run_paths import rollout_path
@@ -80,4 +80,4 @@ class RolloutCollections:
             with atomic_write(path) as file:
                 file.write(data)
         except OSError as error:
-            raise JournalError(f"cannot write {path}: {error.strerror}; make room and continue the run") from error
+            raise write_error(path, error) from error

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.errors import JournalError
+from dreamfleet.common.errors import write_error
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation
 from dreamfleet.common.runs.run_provenance import RECEIPT, RunProvenance
 from dreamfleet.common.serialization.optional_fields import to_dict
@@ -109,9 +109,7 @@ class ControllerWriter:
         try:
             replace(controller, provenance=provenance).save(self._path)
         except OSError as error:
-            raise JournalError(
-                f"cannot write {self._path}: {error.strerror}; make room and continue the run"
-            ) from error
+            raise write_error(self._path, error) from error
         self._saved, self._due = self.current, False
 
     @property

@@ -12,6 +12,7 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from math import nan
 
+from dreamfleet.common.errors import DiskFullError
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.messages import Job, Result
@@ -32,6 +33,8 @@ from dreamfleet.coordinator.run.work_clock import WorkClock
 from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 
+DISK_RETRY = 2.0  # seconds until a full disk is tried again
+
 
 class Run:
     """One incarnation of a run, new or continued; `network` says how it treats its workers."""
@@ -44,6 +47,9 @@ class Run:
         self.fleet = Fleet(network.beat, network.evaluation_share)
         self.ended: str | None = None
         self.paused: str | None = None
+        self.stalled: str | None = None  # why the journal cannot be written now
+        self._retry_at = 0.0  # when it is tried again
+        self._now = now
         self.uid = journal.fact("uid") or ""
         self.created = journal.fact("created") or ""  # ISO 8601, UTC
         self.incarnation = journal.begin_incarnation()
@@ -109,7 +115,7 @@ class Run:
         """The state in a word, as the status shows it."""
         if self.ended is not None:
             return "ended"
-        if self.paused is not None:
+        if self.paused is not None or self.stalled is not None:
             return "paused"
         if not self.fleet.takes_jobs:
             return "waiting for workers"
@@ -132,13 +138,16 @@ class Run:
 
     def tick(self, now: float) -> None:
         """Let time pass: departed workers, silent workers, stalled uploads, and the generation's own time."""
+        self._now = now
         self.fleet.tick(now)
-        self.work_clock.tick(now, is_working=self.paused is None and self.fleet.takes_jobs)
+        self.work_clock.tick(now, is_working=not self.fleet.paused and self.fleet.takes_jobs)
         self.background_jobs.rollout_collections.uploads.tick(now)
 
     def advance(self, now: float) -> bool:
         """Close the complete generation and open the next one; whether a generation was opened."""
         closed = len(self.history)
+        if self.stalled is not None:
+            return False
         self._settle_failures()
         while self.ended is None and self.paused is None and self.generation.complete and not self._is_waiting:
             if self._redraws and (redrawn := self.generations.redraw(self.generation)) is not None:
@@ -149,12 +158,32 @@ class Run:
         self._finish()
         return len(self.history) > closed
 
-    def commit(self) -> None:
-        """Make everything so far durable, then write the reported controller if it is due."""
-        if self._journal.has_writes:
+    def commit(self) -> bool:
+        """Make everything so far durable, then write the reported controller if it is due; whether that succeeded.
+
+        On a full disk the run waits: it gives out no jobs and closes no generation until a later call succeeds.
+        """
+        if self.stalled is None and self._journal.has_writes:
             self._journal.set_seconds(self.generation.number, self.work_clock.seconds)
-        self._journal.commit()
-        self.background_jobs.report.save()
+        elif self.stalled is not None and self._now < self._retry_at:
+            return False
+        try:
+            self._journal.commit()
+            self.background_jobs.report.save()
+        except DiskFullError as error:
+            self.wait_for_room(error)
+            return False
+        if self.stalled is not None:
+            self.stalled, self.fleet.paused = None, self.paused is not None
+            self.fleet.notes.append("there is room on the disk again: the run goes on")
+        return True
+
+    def wait_for_room(self, error: DiskFullError) -> None:
+        """Give out no jobs until what could not be written is written."""
+        if self.stalled is None:
+            self.fleet.notes.append(f"paused: {error}")
+        self.stalled, self.fleet.paused = str(error), True
+        self._retry_at = self._now + DISK_RETRY
 
     def leave(self) -> None:
         """Make everything durable and write the reported controller before the coordinator exits."""
@@ -177,7 +206,7 @@ class Run:
         if self.paused is not None:
             self.fleet.notes.append("resumed")
         self.paused = None
-        self.fleet.paused = False
+        self.fleet.paused = self.stalled is not None
         self.fleet.jobs.clear_failures()
         self._forgiven = self.generations.redrawn
         if self.generation.failed:

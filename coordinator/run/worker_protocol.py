@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 
-from dreamfleet.common.errors import DreamfleetError, InternalError
+from dreamfleet.common.errors import DiskFullError, DreamfleetError, InternalError
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol import keys
@@ -152,7 +152,7 @@ class WorkerProtocol:
         bounded = fail_if_excessive(reported, kind, horizon or self._horizon)
         result: Result | None = bounded
         if kind == "collect":
-            result = self._collections.receive(worker, bounded, self._fleet.find_job_for_result(worker, bounded))
+            result = self._receive_rollout(worker, bounded)
         if result is None:
             self._fleet.defer_verdict(worker, reported.digest, now)
             return
@@ -160,6 +160,14 @@ class WorkerProtocol:
         if accepted is not None:
             self._run.record_result(accepted, result, worker, fingerprint, host_class)
         self._collections.uploads.forget(reported.digest)
+
+    def _receive_rollout(self, worker: str, result: Result) -> Result | None:
+        """The result of a kept rollout with its file saved; `None` while the file is on its way or the disk is full."""
+        try:
+            return self._collections.receive(worker, result, self._fleet.find_job_for_result(worker, result))
+        except DiskFullError as error:  # the worker sends both again
+            self._run.wait_for_room(error)
+            return None
 
     def _most_steps(self, job: Job) -> int:
         """The most steps that a job can report while it runs."""

@@ -125,14 +125,14 @@ class Service:
 
     def _loop(self, session: zenoh.Session) -> None:
         snapshot_at = monotonic()
-        while not self._stopping and self._run.ended is None:
+        while not self._stopping and (self._run.ended is None or self._run.stalled is not None):
             self._drain_events()
             now = monotonic()
             self._run.tick(now)
             if self._run.advance(now):  # the new generation's jobs need not wait for the disk
                 self._put(session, self._run.fleet.dispatch(now, durable=False))
-            self._run.commit()
-            self._put(session, self._run.fleet.dispatch(now))
+            durable = self._run.commit()
+            self._put(session, self._run.fleet.dispatch(now, durable=durable))
             self._run.prepare()
             # A new state is in the snapshot before it is announced: a client that hears of it and asks must see it.
             if now - snapshot_at >= SNAPSHOT_INTERVAL or self._run.state != self._snapshot.status.state:

@@ -101,7 +101,7 @@ def _status(
         incarnation=run.incarnation,
         package=_package(),
         state=run.state,
-        why=run.paused or run.ended or "",
+        why=run.paused or run.stalled or run.ended or "",
         settings=run.settings,
         limits=asdict(run.limits),
         uptime=round(uptime, 1),

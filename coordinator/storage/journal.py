@@ -8,7 +8,7 @@ import shutil
 import sqlite3
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from math import nan
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.errors import JournalError
+from dreamfleet.common.errors import DiskFullError, JournalError
 from dreamfleet.common.files.atomic_write import atomic_write, fsync_path, reporting_unwritable_folder
 from dreamfleet.common.protocol.host_classes import HostClasses, class_from_fingerprint, count_results
 from dreamfleet.common.protocol.messages import Job, Result
@@ -72,12 +72,14 @@ class Journal:
         self._effort: Effort | None = None  # of every result, once somebody asked
         self._counted: Counter[tuple[str, str]] | None = None  # results by class and fingerprint, likewise
         self._writes: list[tuple[str, list[tuple[Any, ...]]]] = []  # a statement, and a row for each time it runs
+        self._uncommitted: list[tuple[str, list[tuple[Any, ...]]]] = []  # those that ran since the last commit
         with journal_errors(path):
             self._connection = sqlite3.connect(path, timeout=5)
             try:
                 schema.migrate(self._connection, schema.check_schema(self._connection, path))
                 self._connection.execute("PRAGMA journal_mode = WAL")
                 self._connection.execute("PRAGMA synchronous = FULL")
+                self._connection.execute("PRAGMA cache_spill = OFF")  # only a commit can find the disk full
             except BaseException:
                 self._connection.close()
                 raise
@@ -159,11 +161,18 @@ class Journal:
             )
 
     def commit(self) -> None:
-        """Make everything written so far durable."""
-        self._flush()
+        """Make everything written so far durable; after `DiskFullError` it may be called again."""
         own = self._stamp in (None, file_stamp(self.path))
-        with journal_errors(self.path):
-            self._connection.commit()
+        try:
+            self._flush()
+            with journal_errors(self.path):
+                self._connection.commit()
+        except DiskFullError:
+            with suppress(sqlite3.Error):
+                self._connection.rollback()
+            self._writes, self._uncommitted = [*self._uncommitted, *self._writes], []
+            raise
+        self._uncommitted = []
         if own:  # else somebody wrote there since the last commit, which `is_overwritten` looks into
             self._stamp = file_stamp(self.path)
 
@@ -431,6 +440,7 @@ class Journal:
 
     def _flush(self) -> None:
         writes, self._writes = self._writes, []
+        self._uncommitted += writes
         with journal_errors(self.path):
             for statement, rows in writes:
                 self._connection.executemany(statement, rows)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from dreamfleet.common.errors import DreamfleetError, JournalError
+from dreamfleet.common.errors import DiskFullError, DreamfleetError, JournalError
 
 
 def check_database(connection: sqlite3.Connection) -> tuple[str, int | None]:
@@ -48,6 +48,8 @@ def journal_errors(path: Path) -> Iterator[None]:
     except DreamfleetError:
         raise
     except sqlite3.OperationalError as error:
+        if getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_FULL:
+            raise DiskFullError(f"cannot write {path}: {error}; make room, and the run goes on") from error
         raise JournalError(f"cannot write {path}: {error}; nothing counted that was not written before") from error
     except sqlite3.IntegrityError as error:
         raise JournalError(
