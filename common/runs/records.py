@@ -133,6 +133,15 @@ class StoredResult:
 
 
 @dataclass(frozen=True)
+class StoredEvent:
+    """Something that happened to a run, as its coordinator noted it."""
+
+    happened: float  # seconds since 1970, by the coordinator's wall clock
+    incarnation: int
+    text: str
+
+
+@dataclass(frozen=True)
 class StoredFailure:
     """An episode that failed in each independent attempt, so that it has no score."""
 

@@ -33,6 +33,7 @@ from dreamfleet.common.runs.records import (
     StoredCandidate,
     StoredConfirmation,
     StoredEvaluation,
+    StoredEvent,
     StoredFailure,
     StoredGeneration,
     StoredResult,
@@ -238,6 +239,13 @@ class RunFolder:
             raise self._journal.damage_error("an evaluation is of no episodes")
         return [StoredEvaluation(generation, episodes - failed, to_finite(mean), to_finite(std), failed)
                 for generation, episodes, mean, std, failed in rows]  # fmt: skip
+
+    def events(self) -> list[StoredEvent]:
+        """What happened to the run, oldest first: workers that came and went, pauses, failures, lives."""
+        if not self._has_failures:
+            return []
+        query = "SELECT happened, incarnation, text FROM event ORDER BY number"
+        return [StoredEvent(*row) for row in self._journal.rows("fis", query)]
 
     def failures(self) -> list[StoredFailure]:
         """Every episode that has no score because it failed everywhere, oldest first."""

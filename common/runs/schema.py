@@ -45,6 +45,9 @@ MIGRATIONS = (
         generation INTEGER NOT NULL, round INTEGER NOT NULL, candidate INTEGER NOT NULL, vector BLOB NOT NULL,
         PRIMARY KEY (generation, round, candidate)
     ) STRICT, WITHOUT ROWID;
+    CREATE TABLE event (
+        number INTEGER PRIMARY KEY, happened REAL NOT NULL, incarnation INTEGER NOT NULL, text TEXT NOT NULL
+    ) STRICT;
     ALTER TABLE generation ADD COLUMN failed INTEGER NOT NULL DEFAULT 0;
     ALTER TABLE evaluation ADD COLUMN failed INTEGER NOT NULL DEFAULT 0;
     """,

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import count
+from typing import Literal
 
 from dreamfleet.common.monitoring.status import EventKind
 from dreamfleet.common.printable import plural
@@ -118,7 +119,7 @@ class Fleet:
             return
         self._mark_heard(member, now)
         if member.is_guest:  # R26: only now is it logged, as strangers could fill the log with names
-            self.event_log.add(now, "back" if identity in self.lost else "joined", identity)
+            self._note_arrival(identity, now, "back" if identity in self.lost else "joined")
             self.lost.remove(identity)
         beat = self._check_numbering(member, beat)
         if self.single_job:
@@ -363,8 +364,12 @@ class Fleet:
     def _mark_heard(self, member: Member, now: float) -> None:
         member.last_heard = now
         if member.silent and not member.is_guest:  # a guest's silence was not logged either
-            self.event_log.add(now, "back", member.identity)
+            self._note_arrival(member.identity, now, "back")
         member.silent = False
+
+    def _note_arrival(self, identity: str, now: float, what: Literal["joined", "back"]) -> None:
+        self.event_log.add(now, what, identity)
+        self.notes.append(f"worker {identity} {'joined' if what == 'joined' else 'is back'}")
 
     def _release_lost(self, member: Member, now: float, what: str) -> None:
         """Release and log a worker that is gone or silent; its host's record counts a loss of jobs."""

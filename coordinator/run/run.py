@@ -53,6 +53,8 @@ class Run:
         self.uid = journal.fact("uid") or ""
         self.created = journal.fact("created") or ""  # ISO 8601, UTC
         self.incarnation = journal.begin_incarnation()
+        journal.add_event(f"incarnation {self.incarnation} begins")
+        self._notes: list[str] = []  # that are in the journal and not in the log
         self._journal = journal
         self._unpublished: list[StoredGeneration] = []
         if dropped := journal.drop_excessive(longest_horizon(settings)):
@@ -187,6 +189,8 @@ class Run:
 
     def leave(self) -> None:
         """Make everything durable and write the reported controller before the coordinator exits."""
+        self._journal_notes()
+        self._journal.add_event("the coordinator leaves")
         self._journal.set_seconds(self.generation.number, self.work_clock.seconds)
         self._journal.commit()
         self.background_jobs.report.save(at_once=True)
@@ -251,9 +255,16 @@ class Run:
         return self.settings.on_failure == "redraw"
 
     def take_notes(self) -> list[str]:
-        """What happened since the last call, for the log."""
-        notes, self.fleet.notes = self.fleet.notes, []
+        """What happened since the last call, for the log; the journal keeps it too."""
+        self._journal_notes()
+        notes, self._notes = self._notes, []
         return notes
+
+    def _journal_notes(self) -> None:
+        for note in self.fleet.notes:
+            self._journal.add_event(note)
+        self._notes += self.fleet.notes
+        self.fleet.notes = []
 
     def take_closed(self) -> list[StoredGeneration]:
         """Generations closed since the last call."""
@@ -363,4 +374,6 @@ class Run:
     def _end(self) -> None:
         self.ended = self._ending or "stopped"
         self._journal.end(self.ended)
+        self._journal_notes()
+        self._journal.add_event(f"ended: {self.ended}")
         self.background_jobs.report.finish()

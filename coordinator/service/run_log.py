@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from dataclasses import asdict
 from datetime import UTC, datetime
 from itertools import islice
+from time import time
 from typing import Any
 
 from dreamfleet.common.monitoring.eta import estimate_eta, summarise_status
@@ -25,6 +26,7 @@ log = logging.getLogger(__name__)
 WILDCARD_HOSTS = ("0.0.0.0", "[::]")  # noqa: S104 - compared with addresses, never listened on
 SUMMARY_INTERVAL = 60.0  # seconds from one summary line to the next
 DAY = 86_400.0  # seconds from one warning that the join file expires to the next
+CLOCK_STEP = 5.0  # seconds by which a wall clock that is not set stays true
 NO_WORKER_SECONDS = 5.0  # seconds without a worker before the log says so
 
 
@@ -39,6 +41,7 @@ class RunLog:
         self._summary_at = now
         self._no_worker_since = now
         self._expiry_at = 0.0
+        self._clock_offset = time() - now
 
     def begin(self) -> None:
         """The run is served from now on."""
@@ -74,6 +77,7 @@ class RunLog:
     def check(self, snapshot: Snapshot, now: float) -> None:
         """Log what is due: a warning that no worker is present, the minute's summary, the join file's expiry."""
         self._warn_if_no_worker(now)
+        self._note_clock(now)
         if now - self._summary_at >= SUMMARY_INTERVAL:
             self._summary_at = now
             text, facts = summary(snapshot.full_status())
@@ -81,6 +85,13 @@ class RunLog:
             if self._network.credentials is not None and now >= self._expiry_at:
                 self._expiry_at = now + DAY
                 _warn_of_expiry(self._network.credentials)
+
+    def _note_clock(self, now: float) -> None:
+        """Note that the wall clock moved against the monotonic one, by which all deadlines are kept."""
+        offset = time() - now
+        if abs(moved := offset - self._clock_offset) > CLOCK_STEP:
+            self._run.fleet.notes.append(f"the wall clock moved by {moved:+,.0f} s: it was set, or this host slept")
+            self._clock_offset = offset
 
     def _warn_if_no_worker(self, now: float) -> None:
         """Warn once per spell without workers: a run that stands still should not be silent."""

@@ -45,6 +45,7 @@ from dreamfleet.coordinator.storage.journal_file import (
 
 sqlite3.register_adapter(Checkpoint, Checkpoint.packed)  # when it is written, not while workers wait
 
+MAX_EVENTS = 10_000  # R26: strangers and failing hosts cause some
 MOST_VARIABLES = 500  # of one SQL statement
 FINGERPRINT, HOST_CLASS = "fingerprint", "host_class"  # the facts' names
 
@@ -284,6 +285,11 @@ class Journal:
             job.digest, job.kind, job.generation, job.candidate, job.episode, job.seeds[0], error, ",".join(workers),
             attempts, self._incarnation, time(),
         )  # fmt: skip
+
+    def add_event(self, text: str) -> None:
+        """Write what happened to the run, for people; the last `MAX_EVENTS` are kept."""
+        self._write("INSERT INTO event (happened, incarnation, text) VALUES (?, ?, ?)", time(), self._incarnation, text)
+        self._write("DELETE FROM event WHERE number <= (SELECT max(number) FROM event) - ?", MAX_EVENTS)
 
     def drop_failures(self, generation: int) -> None:
         """Forget the failures of a generation's candidates, so that they are scored again."""

@@ -429,7 +429,7 @@ def test_guests_without_a_heartbeat_are_few_and_soon_forgotten():
         fleet.handle_heartbeat(A, beat(), float(now))
         fleet.tick(float(now))
     assert set(fleet.members) == {A}
-    assert not fleet.notes, "strangers cannot fill the log with names"
+    assert fleet.notes == [f"worker {A} joined"], "strangers cannot fill the log with names"
 
 
 def test_a_member_is_forgotten_only_after_a_long_silence():
