@@ -6,7 +6,7 @@ SUPPLY := .venv-supply
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 SOURCES := pyproject.toml constraints.txt $(wildcard worker/car_racing/native/*)
 
-.PHONY: demo test test-newest slow setup check wheel long box2d-py simulate chaos sanitize bundle worker-size stranger reproduce \
+.PHONY: demo test test-newest slow setup check wheel long box2d-py simulate chaos weekend sanitize bundle worker-size stranger reproduce \
   reproduce-evolution lock audit sbom structure clean
 
 demo: $(VENV)/.demo  ## evolve a controller here, judge it, plot it, record it
@@ -58,6 +58,9 @@ box2d-py: $(VENV)/bin/python  ## the same library from its source archive instea
 
 simulate: $(VENV)/.dev  ## SCHEDULES seeded schedules of faults against the pure parts, by a virtual clock: 100,000 take ten minutes
 	$(BIN)/python -m tests.simulation --schedules $(or $(SCHEDULES),100000) --seed $(or $(SEED),1) --jobs $(or $(JOBS),2)
+
+weekend: $(VENV)/.dev  ## about MINUTES of a run that nobody watches, under outages, kills, clock steps and a full disk
+	$(BIN)/python -m tests.chaos.weekend --minutes $(or $(MINUTES),60) --seed $(or $(SEED),1) $(ARGS)
 
 chaos: $(VENV)/.dev  ## a fleet under FAULTS seeded faults gives the bits of one that nobody disturbs
 	$(BIN)/python -m tests.chaos.chaos --faults $(or $(FAULTS),200) --seed $(or $(SEED),7) $(ARGS)
