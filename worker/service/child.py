@@ -41,22 +41,41 @@ def serve_jobs(
     never imported.
     """
     exit_with_parent(parent)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group; the worker handles it
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    os.setsid()  # the worker ends the whole session, and Ctrl-C reaches only the worker
+    _outlive_stop_signals()
+    os.register_at_fork(after_in_child=pipe.close)  # a copy would hide this process's end from the worker
     with suppress(OSError, AttributeError, ValueError, RuntimeError):  # without a stderr a crash leaves no traceback
         faulthandler.enable()
     make_stderr_nonblocking()  # inherited from the worker, whose reader may be suspended
     make_stdout_nonblocking()
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     scorer = _make_scorer(pipe, spec, bundle, allowed_tasks)
-    pipe.send(ChildReady(scorer.drawn_by, scorer.host_class))
     _score_groups(pipe, scorer, steps, abandoned, is_watched)
+
+
+def _outlive_stop_signals() -> None:
+    """Do nothing on SIGINT and SIGTERM, which a service manager sends to all processes of a worker that it stops.
+
+    Processes that the simulator starts handle them as usual, so handlers are installed: ignored and blocked signals
+    would be inherited.
+    """
+    stop_signals = (signal.SIGINT, signal.SIGTERM)
+
+    def restore() -> None:
+        for number in stop_signals:
+            signal.signal(number, signal.SIG_DFL)
+
+    os.register_at_fork(after_in_child=restore)
+    for number in stop_signals:
+        signal.signal(number, lambda *_: None)
+        signal.siginterrupt(number, False)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, stop_signals)
 
 
 def _make_scorer(
     pipe: Connection[Any, Any], spec: TaskSpec, bundle: Path | None, allowed_tasks: tuple[str, ...]
 ) -> Scorer:
-    """Load the task and the world model; on an error send it as a `ScoringFailure` and exit."""
+    """Load the task and the world model and send `ChildReady`; on an error send a `ScoringFailure` and exit."""
     from dreamfleet.common.artifacts.bundle import Bundle
     from dreamfleet.worker.scoring.scorer import Scorer
     from dreamfleet.worker.service.failure_log import ScoringFailure
@@ -64,14 +83,16 @@ def _make_scorer(
 
     try:
         check_task_allowed(spec.task, allowed_tasks)
-        if bundle is None:
-            return Scorer(spec)
-        opened = Bundle.open(bundle, spec.bundle)
-        check_world_allowed(opened, allowed_tasks)
-        return Scorer(spec, opened)
-    except Exception as error:
+        opened = None
+        if bundle is not None:
+            opened = Bundle.open(bundle, spec.bundle)
+            check_world_allowed(opened, allowed_tasks)
+        scorer = Scorer(spec, opened)
+        pipe.send(ChildReady(scorer.drawn_by, scorer.host_class))
+        return scorer
+    except BaseException as error:  # a simulator may raise `SystemExit`
         pipe.send(ScoringFailure.of(error))
-        raise SystemExit(1) from error
+        raise SystemExit(1) from None
 
 
 def _score_groups(pipe: Connection[Any, Any], scorer: Scorer, steps: Any, abandoned: Any, is_watched: Any) -> None:
