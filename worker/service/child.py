@@ -10,10 +10,12 @@ import os
 import signal
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking, make_stdout_nonblocking
 from dreamfleet.common.host.parent_death import exit_with_parent
+from dreamfleet.common.host.stop_signals import SIGNALS
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -59,17 +61,22 @@ def _outlive_stop_signals() -> None:
     Processes that the simulator starts handle them as usual, so handlers are installed: ignored and blocked signals
     would be inherited.
     """
-    stop_signals = (signal.SIGINT, signal.SIGTERM)
 
     def restore() -> None:
-        for number in stop_signals:
+        for number in SIGNALS:
             signal.signal(number, signal.SIG_DFL)
+        unblock()
 
-    os.register_at_fork(after_in_child=restore)
-    for number in stop_signals:
+    def unblock() -> None:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+
+    # Blocked around a fork, so that a signal for the new process waits until that handles it.
+    block = partial(signal.pthread_sigmask, signal.SIG_BLOCK, SIGNALS)
+    os.register_at_fork(before=block, after_in_parent=unblock, after_in_child=restore)
+    for number in SIGNALS:
         signal.signal(number, lambda *_: None)
         signal.siginterrupt(number, False)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, stop_signals)
+    unblock()
 
 
 def _make_scorer(

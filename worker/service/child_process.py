@@ -91,14 +91,15 @@ class ChildProcess:
         """Its exit status, or the negative number of the signal that ended it; `None` while it runs."""
         return self._process.exitcode
 
-    def send(self, group: int, work: Sequence[JobWithVector]) -> None:
-        """Send a group of jobs. If the child is gone, the reader notices; one that does not read is killed."""
+    def send(self, group: int, work: Sequence[JobWithVector]) -> bool:
+        """Send a group of jobs; return whether the child reads. If it is gone, the reader notices."""
         try:
             self._pipe.send((group, work))
         except BlockingIOError:
-            self.kill()
+            return False
         except OSError:
             pass
+        return True
 
     def abandon_group(self, group: int) -> None:
         """End a group at its next step. Both of two consecutive groups can be abandoned at the same time."""

@@ -139,7 +139,8 @@ class Slot:
         self._groups.append(group)
         if len(self._groups) == 1:
             self._reset_progress()
-        self._child.send(group.number, group.work)
+        if not self._child.send(group.number, group.work):
+            self._kill("it read no job")
 
     def show(self, wanted: bool) -> None:
         """Start sending frames with the next group, also after the child is replaced; or stop."""
@@ -221,7 +222,11 @@ class Slot:
 
     def _kill_after(self, limit: float, quiet: float, why: str) -> None:
         """Kill a child that has been quiet for longer than `limit` seconds; 0: never."""
-        if quiet > limit > 0 and self._child is not None and not self._kill_reason:
+        if quiet > limit > 0:
+            self._kill(why)
+
+    def _kill(self, why: str) -> None:
+        if self._child is not None and not self._kill_reason:
             self._kill_reason = why
             self._child.kill()
             self._given_up_at = monotonic() + EXIT_GRACE
