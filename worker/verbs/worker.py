@@ -7,7 +7,7 @@ import argparse
 from dreamfleet.common.cli.config import add_flags, load
 from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
 from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking
-from dreamfleet.common.host.resource_limits import raise_open_file_limit
+from dreamfleet.common.host.resource_limits import check_room_for_session, raise_open_file_limit
 from dreamfleet.common.host.stop_signals import END_LIMIT, call_on_signals, end_within
 from dreamfleet.worker.service.config import WorkerConfig
 
@@ -26,8 +26,9 @@ def run(args: argparse.Namespace) -> int:
     """Serve until stopped; the first Ctrl-C drains, the second leaves at once."""
     from dreamfleet.worker.service.worker import Worker
 
-    make_stderr_nonblocking()
     raise_open_file_limit()
+    check_room_for_session()  # before anything else starts a thread
+    make_stderr_nonblocking()
     config = load(WorkerConfig, "worker", **args.sources)
     worker = Worker(config, resolve_network(args, "worker", "coordinator"), tuple(args.task))
     call_on_signals(worker.stop)

@@ -216,4 +216,3 @@ def test_many_children_that_cannot_end_do_not_delay_the_end_of_a_pool(random_bun
     for kill in kills:
         kill()
     assert taken < 4.5
-
