@@ -87,14 +87,10 @@ def kill_descendants(mark: str, sessions: Set[int]) -> None:
 def _find(mark: bytes, sessions: Set[int]) -> Iterator[int]:
     """The process ids of running descendants."""
     own = os.getpid()
-    names: list[str] = []
-    with suppress(OSError):
-        names = os.listdir("/proc")
-    for name in names:
+    for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):  # it has ended, or is another user's
-            if not name.isdigit() or (pid := int(name)) == own:
+            if (pid := int(process.name)) == own:
                 continue
-            process = Path("/proc", name)
             if os.getsid(pid) in sessions:
                 state = (process / "stat").read_bytes().rpartition(b") ")[2][:1]
                 if state not in b"ZX":  # a zombie has ended

@@ -79,7 +79,8 @@ def check_room_for_session() -> None:
         raise DreamfleetError(
             f"this process may open only {soft} files, too few for a network session: raise the limit (ulimit -n 1024)"
         )
-    done, threads = threading.Event(), [threading.Thread(target=lambda: done.wait()) for _ in range(SESSION_THREADS)]
+    done = threading.Event()
+    threads = [threading.Thread(target=done.wait) for _ in range(SESSION_THREADS)]
     try:
         for each in threads:
             each.start()
@@ -98,7 +99,7 @@ def check_room_for_session() -> None:
 def _open_files() -> int:
     """The number of descriptors in use; 0 if unknown."""
     try:
-        return len(os.listdir("/dev/fd"))
+        return sum(1 for _ in Path("/dev/fd").iterdir())
     except OSError as error:
         return WANTED_FILES if error.errno in (errno.EMFILE, errno.ENFILE) else 0
 

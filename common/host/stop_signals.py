@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -108,3 +109,27 @@ def end_within(seconds: float, code: int) -> None:
 
     signal.alarm(round(seconds) + 1)  # the kernel ends the process, should Python be unable to run even a thread
     threading.Thread(target=end, name="end", daemon=True).start()
+
+
+def outlive_stop_signals() -> None:
+    """Do nothing on SIGINT and SIGTERM, which a service manager sends to all processes of a service.
+
+    Processes that the simulator starts handle them as usual, so handlers are installed: ignored and blocked signals
+    would be inherited.
+    """
+
+    def restore() -> None:
+        for number in SIGNALS:
+            signal.signal(number, signal.SIG_DFL)
+        unblock()
+
+    def unblock() -> None:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+
+    # Blocked around a fork, so that a signal for the new process waits until that handles it.
+    block = partial(signal.pthread_sigmask, signal.SIG_BLOCK, SIGNALS)
+    os.register_at_fork(before=block, after_in_parent=unblock, after_in_child=restore)
+    for number in SIGNALS:
+        signal.signal(number, lambda *_: None)
+        signal.siginterrupt(number, False)
+    unblock()

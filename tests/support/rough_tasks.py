@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 from tests.support.tasks import Toy, ToyEnvironment
@@ -51,10 +52,8 @@ def segfault():
 def hold_copies():
     """Copies of all descriptors, which a forked process then holds too."""
     for descriptor in range(3, 64):
-        try:
+        with suppress(OSError):
             os.dup(descriptor)
-        except OSError:
-            pass
 
 
 def linger():
@@ -64,7 +63,7 @@ def linger():
 
 
 def wait_for_one_left():
-    while not os.listdir(os.environ[FOLDER]):
+    while not any(Path(os.environ[FOLDER]).iterdir()):
         time.sleep(0.01)
 
 
@@ -133,10 +132,8 @@ class Rubbish(Rough):
 
     def misbehave(self):
         for descriptor in range(3, 64):
-            try:
+            with suppress(OSError):
                 os.write(descriptor, b"\x00\x00\x00\x7frubbish")
-            except OSError:
-                pass
         os.kill(os.getpid(), signal.SIGSTOP)
 
 
@@ -144,7 +141,7 @@ class Twice(Rough):
     """Two processes go on with the episode."""
 
     def misbehave(self):
-        if not os.listdir(os.environ[FOLDER]):
+        if not any(Path(os.environ[FOLDER]).iterdir()):
             Path(os.environ[FOLDER], "0").touch()
             os.fork()
 

@@ -7,15 +7,13 @@ from __future__ import annotations
 
 import faulthandler
 import os
-import signal
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking, make_stdout_nonblocking
 from dreamfleet.common.host.parent_death import exit_with_parent
-from dreamfleet.common.host.stop_signals import SIGNALS
+from dreamfleet.common.host.stop_signals import outlive_stop_signals
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -44,7 +42,7 @@ def serve_jobs(
     """
     exit_with_parent(parent)
     os.setsid()  # the worker ends the whole session, and Ctrl-C reaches only the worker
-    _outlive_stop_signals()
+    outlive_stop_signals()
     os.register_at_fork(after_in_child=pipe.close)  # a copy would hide this process's end from the worker
     with suppress(OSError, AttributeError, ValueError, RuntimeError):  # without a stderr a crash leaves no traceback
         faulthandler.enable()
@@ -53,30 +51,6 @@ def serve_jobs(
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     scorer = _make_scorer(pipe, spec, bundle, allowed_tasks)
     _score_groups(pipe, scorer, steps, abandoned, is_watched)
-
-
-def _outlive_stop_signals() -> None:
-    """Do nothing on SIGINT and SIGTERM, which a service manager sends to all processes of a worker that it stops.
-
-    Processes that the simulator starts handle them as usual, so handlers are installed: ignored and blocked signals
-    would be inherited.
-    """
-
-    def restore() -> None:
-        for number in SIGNALS:
-            signal.signal(number, signal.SIG_DFL)
-        unblock()
-
-    def unblock() -> None:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
-
-    # Blocked around a fork, so that a signal for the new process waits until that handles it.
-    block = partial(signal.pthread_sigmask, signal.SIG_BLOCK, SIGNALS)
-    os.register_at_fork(before=block, after_in_parent=unblock, after_in_child=restore)
-    for number in SIGNALS:
-        signal.signal(number, lambda *_: None)
-        signal.siginterrupt(number, False)
-    unblock()
 
 
 def _make_scorer(

@@ -71,5 +71,5 @@ def _text(error: BaseException) -> str:
     try:
         lines = str(error)[: 10 * MAX_TEXT].strip().splitlines()
         return one_line(lines[0]) if lines else ""
-    except BaseException as another:  # noqa: BLE001 - also `SystemExit`
+    except BaseException as another:  # also `SystemExit`
         return f"its message cannot be read ({type(another).__name__})"

@@ -3,6 +3,7 @@
 import os
 import queue
 import signal
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from time import monotonic, sleep
@@ -59,10 +60,8 @@ def left(tmp_path, monkeypatch):
     yield folder
     for each in folder.iterdir():
         if int(each.name):
-            try:
+            with suppress(ProcessLookupError):
                 os.kill(int(each.name), signal.SIGKILL)
-            except ProcessLookupError:
-                pass
 
 
 @pytest.fixture
@@ -199,8 +198,7 @@ def test_whatever_is_raised_as_a_slot_starts_is_one_clear_error(harness, monkeyp
     monkeypatch.setenv(rough_tasks.ERROR, error)
     slot = harness(rough_tasks.Raising)
     with pytest.raises(DreamfleetError, match=rf"a slot cannot start: {error}: "):
-        while True:
-            slot.take()
+        slot.wait_ready()
 
 
 def test_many_children_that_cannot_end_do_not_delay_the_end_of_a_pool(random_bundle, monkeypatch):

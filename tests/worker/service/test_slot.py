@@ -26,7 +26,6 @@ from tests.support.bundles import write_random_bundle
 from tests.support.processes import DEADLINE, environment
 from tests.support.samples import VECTOR, job
 
-
 OUT_OF_MEMORY = "host: killed by SIGKILL, as the kernel does when memory is short"
 
 
