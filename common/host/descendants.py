@@ -115,6 +115,8 @@ def _tell_guard(*sessions: int) -> None:
 
 def main() -> None:
     """Be the guard: read sessions until the process that writes them ends, then end the descendants."""
+    for number in (signal.SIGINT, signal.SIGTERM):  # a service manager sends it to all processes of a service
+        signal.signal(number, signal.SIG_IGN)
     sessions: set[int] = set()
     for line in sys.stdin:
         session = int(line)

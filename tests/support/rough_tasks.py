@@ -182,6 +182,13 @@ class Parallel(Rough):
             process.join()
 
 
+class Hungry(Rough):
+    """Takes memory without an end, some slowly enough for a test to look."""
+
+    def misbehave(self):
+        self.held = [bytearray(os.urandom(1) * (16 << 20)) for _ in range(4096)]
+
+
 class Mute(Exception):  # noqa: N818
     def __str__(self):
         raise SystemExit(7)
