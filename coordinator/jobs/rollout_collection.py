@@ -80,4 +80,4 @@ class RolloutCollections:
             with atomic_write(path) as file:
                 file.write(data)
         except OSError as error:
-            raise JournalError(f"cannot write {path}: {error.strerror}; make room and continue the run") from error
+            raise JournalError(f"cannot write {path}: {error.strerror}; make room") from error

@@ -109,9 +109,7 @@ class ControllerWriter:
         try:
             replace(controller, provenance=provenance).save(self._path)
         except OSError as error:
-            raise JournalError(
-                f"cannot write {self._path}: {error.strerror}; make room and continue the run"
-            ) from error
+            raise JournalError(f"cannot write {self._path}: {error.strerror}; make room") from error
         self._saved, self._due = self.current, False
 
     @property

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 
@@ -88,3 +89,23 @@ def test_a_disk_that_fills_while_a_drive_is_written_keeps_whole_drives_only(proc
         for path in run.rollouts():
             with np.load(path) as drive:
                 assert len(drive["picture"]) == len(drive["action"])
+
+
+@pytest.mark.slow
+def test_a_disk_without_inodes_is_one_line_with_the_command_that_goes_on(processes, random_bundle, small_disk):
+    flags = ("--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 1, "--evaluate-every", 0, "--generations", 12)
+    processes.runs = small_disk
+    full = processes.coordinator("--bundle", random_bundle.path, *flags, name="small")
+    processes.worker("--task", tasks.SLOW_TOY, "--exit-when-done")
+    full.wait_for("generation 0: mean")
+    used = sum(1 for _ in small_disk.rglob("*")) + 1
+    subprocess.run(["mount", "-o", f"remount,nr_inodes={used}", small_disk], check=True)
+    code, _ = full.finish()
+    assert code == 1
+    assert "No space left on device; make room; it goes on with: " in full.lines[-1]
+    assert not any("Traceback" in line for line in full.lines)
+    subprocess.run(["mount", "-o", "remount,nr_inodes=1000", small_disk], check=True)
+    again = processes.start("coordinator", *shlex.split(full.lines[-1].split(" coordinator ", 1)[1]))
+    assert again.finish()[0] == 0
+    with open_run(small_disk, "small") as run:
+        assert len(run.history()) == 12
