@@ -53,7 +53,7 @@ class DiskFullError(JournalError):
 def write_error(path: object, error: OSError) -> JournalError:
     """The error for a file of a run that cannot be written."""
     kind = DiskFullError if error.errno in (ENOSPC, EDQUOT) else JournalError
-    return kind(f"cannot write {path}: {error.strerror}; make room and continue the run")
+    return kind(f"cannot write {path}: {error.strerror}; make room")
 
 
 class InternalError(DreamfleetError):

@@ -22,6 +22,7 @@ from dreamfleet.common.errors import DreamfleetError
 
 KEPT_LINES = 10_000  # the last lines of each stream that are kept, at least
 PATIENCE = 3.0  # seconds to wait after each SIGTERM
+KILL_LIMIT = 30.0  # seconds to wait after SIGKILL: a process in a system call that does not return does not end
 
 
 def command(*words: object) -> list[str]:
@@ -144,7 +145,7 @@ class VerbProcess:
                 _wait(self.popen, patience)
         if self.popen.poll() is None:
             os.killpg(self.popen.pid, signal.SIGKILL)
-        self.popen.wait()
+        _wait(self.popen, KILL_LIMIT)
         self._join()
 
     def _add_line(self, line: str) -> None:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import resource
+import threading
 from contextlib import suppress
 from pathlib import Path
+
+from dreamfleet.common.errors import DreamfleetError
 
 _CGROUPS, _OWN_CGROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
@@ -62,6 +66,42 @@ def connection_budget() -> int:
     """The number of connections that leaves `RESERVED_FILES` under the limit of open files."""
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     return max((WANTED_FILES if soft == resource.RLIM_INFINITY else soft) - RESERVED_FILES, 8)
+
+
+SESSION_FILES = 24  # a network session opens some ten, and its first connections
+SESSION_THREADS = 16
+
+
+def check_room_for_session() -> None:
+    """`DreamfleetError` if no network session fits: Zenoh would crash where a descriptor or a thread is lacking."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft != resource.RLIM_INFINITY and soft - _open_files() < SESSION_FILES:
+        raise DreamfleetError(
+            f"this process may open only {soft} files, too few for a network session: raise the limit (ulimit -n 1024)"
+        )
+    done = threading.Event()
+    threads = [threading.Thread(target=done.wait) for _ in range(SESSION_THREADS)]
+    try:
+        for each in threads:
+            each.start()
+    except RuntimeError as error:
+        raise DreamfleetError(
+            "this user may start too few threads for a network session: end other processes, or raise the limit "
+            "(ulimit -u)"
+        ) from error
+    finally:
+        done.set()
+        for each in threads:
+            if each.ident is not None:
+                each.join()
+
+
+def _open_files() -> int:
+    """The number of descriptors in use; 0 if unknown."""
+    try:
+        return sum(1 for _ in Path("/dev/fd").iterdir())
+    except OSError as error:
+        return WANTED_FILES if error.errno in (errno.EMFILE, errno.ENFILE) else 0
 
 
 _SETTINGS = ("OPENBLAS_", "GOTO_", "BLIS_", "MKL_", "OMP_", "KMP_", "GOMP_", "DNNL_", "ONEDNN_", "ATEN_", "NPY_")

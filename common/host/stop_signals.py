@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+END_LIMIT = 4.0  # seconds that an orderly end may take after the second signal
 Stop = Callable[[], bool]
 """Returns whether to stop at the next point where that is safe."""
 
@@ -70,3 +75,61 @@ def signals_deferred() -> Iterator[None]:
             signal.signal(number, handler)
     for received in waiting:
         signal.raise_signal(received)
+
+
+def call_on_signals(stop: Callable[[], None]) -> None:
+    """Call `stop` in a thread at each Ctrl-C or SIGTERM; the second ends this process within `END_LIMIT` seconds.
+
+    The main thread may be blocked in native code, where Python handles no signal, so it has no part in this.
+    """
+    heard, sent = socket.socketpair()
+    sent.setblocking(False)
+    for number in SIGNALS:
+        signal.signal(number, lambda *_: None)
+    signal.set_wakeup_fd(sent.detach(), warn_on_full_buffer=False)
+
+    def listen() -> None:
+        received = 0
+        while received < 2:
+            if heard.recv(1)[0] in SIGNALS:
+                received += 1
+                if received == 2:
+                    end_within(END_LIMIT, 1)
+                stop()
+
+    threading.Thread(target=listen, name="signals", daemon=True).start()
+
+
+def end_within(seconds: float, code: int) -> None:
+    """Let this process end with this exit code in so many seconds, if it has not ended before."""
+
+    def end() -> None:
+        time.sleep(seconds)
+        os._exit(code)
+
+    signal.alarm(round(seconds) + 1)  # the kernel ends the process, should Python be unable to run even a thread
+    threading.Thread(target=end, name="end", daemon=True).start()
+
+
+def outlive_stop_signals() -> None:
+    """Do nothing on SIGINT and SIGTERM, which a service manager sends to all processes of a service.
+
+    Processes that the simulator starts handle them as usual, so handlers are installed: ignored and blocked signals
+    would be inherited.
+    """
+
+    def restore() -> None:
+        for number in SIGNALS:
+            signal.signal(number, signal.SIG_DFL)
+        unblock()
+
+    def unblock() -> None:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+
+    # Blocked around a fork, so that a signal for the new process waits until that handles it.
+    block = partial(signal.pthread_sigmask, signal.SIG_BLOCK, SIGNALS)
+    os.register_at_fork(before=block, after_in_parent=unblock, after_in_child=restore)
+    for number in SIGNALS:
+        signal.signal(number, lambda *_: None)
+        signal.siginterrupt(number, False)
+    unblock()

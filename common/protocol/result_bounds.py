@@ -23,13 +23,14 @@ def max_steps(horizon: int) -> int:
 
 
 def rejection_reason(fitness: float, steps: int, seconds: float, horizon: int) -> str | None:
-    """Why a result must be rejected; `None` if it is valid."""
+    """Why a result must be rejected, a cause without numbers and a colon first; `None` if it is valid."""
     if not abs(fitness) <= LARGEST_FITNESS:  # false of NaN too
-        return f"the episode gave the fitness {fitness:g}, which must lie within ±{LARGEST_FITNESS:g}: scale the reward"
+        limits = f"within ±{LARGEST_FITNESS:g}"
+        return f"fitness out of bounds: the episode gave {fitness:g}, which must lie {limits}: scale the reward"
     if not 0 <= steps <= max_steps(horizon):
-        return f"the episode has {steps:.6g} steps, more than the allowed {horizon}"
+        return f"too many steps: the episode has {steps:.6g} steps, more than the allowed {horizon}"
     if not 0 <= seconds <= MAX_SECONDS:
-        return f"the episode took {seconds:g} seconds, which is impossible"
+        return f"impossible time: the episode took {seconds:g} seconds"
     return None
 
 

@@ -20,7 +20,7 @@ from typing import Any
 import zenoh
 
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, HandshakeRejectedError
-from dreamfleet.common.host.resource_limits import connection_budget
+from dreamfleet.common.host.resource_limits import check_room_for_session, connection_budget
 from dreamfleet.common.security.access_rules import access_control_config
 from dreamfleet.common.security.connection_limiter import limit_connections
 from dreamfleet.common.security.credentials import SEATS, Credentials, derive_password, identity
@@ -48,6 +48,7 @@ def open_session(network: Network, *, timeout: float | None = CONNECT_TIMEOUT) -
     found first, and callers that want to wait longer call again. A router without `timeout` opens at once and links
     to others as they become reachable.
     """
+    check_room_for_session()
     with _password_file(network) as dictionary:
         if network.listen or len(network.connect) < 2:
             session = _open_or_explain(network, lambda: _open_zenoh(zenoh_config(network, timeout, dictionary)))

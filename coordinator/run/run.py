@@ -183,8 +183,8 @@ class Run:
     def wait_for_room(self, error: DiskFullError) -> None:
         """Give out no jobs until what could not be written is written."""
         if self.stalled is None:
-            self.fleet.notes.append(f"paused: {error}")
-        self.stalled, self.fleet.paused = str(error), True
+            self.fleet.notes.append(f"paused: {error}, and the run goes on by itself")
+        self.stalled, self.fleet.paused = f"{error}, and the run goes on by itself", True
         self._retry_at = self._now + DISK_RETRY
 
     def leave(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
@@ -82,6 +83,10 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
         on_stoppable(service.stop)
         try:
             return service.serve(lambda: Run(journal, settings, request.limits, request.network, monotonic()))
+        except JournalError as error:
+            if not isinstance(error.__cause__, (OSError, sqlite3.OperationalError)):
+                raise
+            raise JournalError(f"{error}; it goes on with: {request.resume_command()}") from error
         except ConnectionFailedError as error:
             if request.config is None:
                 raise

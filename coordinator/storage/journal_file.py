@@ -49,7 +49,7 @@ def journal_errors(path: Path) -> Iterator[None]:
         raise
     except sqlite3.OperationalError as error:
         if getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_FULL:
-            raise DiskFullError(f"cannot write {path}: {error}; make room, and the run goes on") from error
+            raise DiskFullError(f"cannot write {path}: {error}; make room") from error
         raise JournalError(f"cannot write {path}: {error}; nothing counted that was not written before") from error
     except sqlite3.IntegrityError as error:
         raise JournalError(

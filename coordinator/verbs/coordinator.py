@@ -16,7 +16,7 @@ from dreamfleet.common.cli.global_config import load_credentials
 from dreamfleet.common.cli.output import print_answer
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking
-from dreamfleet.common.host.resource_limits import raise_open_file_limit
+from dreamfleet.common.host.resource_limits import check_room_for_session, raise_open_file_limit
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE, LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.settings.presets import find_preset
@@ -105,8 +105,9 @@ def serve_request(
     """Serve until the run ends and report how; `on_ended` adds to the report of a run that ended."""
     from dreamfleet.coordinator.service.main import serve_run
 
-    make_stderr_nonblocking()
     raise_open_file_limit()
+    check_room_for_session()  # before anything else starts a thread
+    make_stderr_nonblocking()
     run = serve_run(request, _stop_on_signals)
     _restore_signals()  # its last word may wait for a reader of stdout
     outcome = ExitReport(code=LEFT_OPEN) if run.ended is None else on_ended()

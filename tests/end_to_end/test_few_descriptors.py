@@ -1,5 +1,8 @@
 """Hosts that allow a process few open files."""
 
+import os
+import shutil
+
 import pytest
 
 from dreamfleet.common.errors import DreamfleetError
@@ -41,3 +44,56 @@ def test_strangers_cannot_take_a_coordinators_last_descriptor(processes, random_
     assert (processes.runs / "test" / "controller.npz").exists()
     for each in strangers:
         each.close()
+
+
+@pytest.mark.parametrize("files", [10, 16])
+@pytest.mark.parametrize("verb", ["worker", "status", "coordinator", "router"])
+def test_a_limit_that_fits_no_session_is_one_line(processes, random_bundle, files, verb):
+    words = {
+        "worker": ("--connect", processes.endpoint),
+        "status": ("--connect", processes.endpoint),
+        "router": ("--listen", processes.endpoint),
+        "coordinator": (
+            "--listen", processes.endpoint, "--run", "test", "--runs-dir", processes.runs, "--task", tasks.TOY,
+            "--bundle", random_bundle.path,
+        ),
+    }[verb]  # fmt: skip
+    process = processes.start(verb, *words, inside=at_most(files))
+    assert process.finish()[0] == 1
+    said = "".join(process.lines)
+    assert "ulimit -n" in process.lines[-1]
+    assert "panicked" not in said
+    assert "Traceback" not in said
+
+
+@pytest.mark.skipif(os.geteuid() != 0 or not shutil.which("setpriv"), reason="needs another user, without processes")
+@pytest.mark.parametrize(
+    ("verb", "processes_allowed"), [("worker", 2), ("worker", 8), ("worker", 24), ("coordinator", 16)]
+)
+def test_a_user_with_few_processes_gets_one_line_and_no_traceback(processes, random_bundle, processes_allowed, verb):
+    able = "+dac_override,+dac_read_search"  # to read this interpreter and write its own run
+    other = (
+        "setpriv", "--reuid=54321", "--clear-groups", f"--inh-caps={able}", f"--ambient-caps={able}",
+        "bash", "-c", f'ulimit -u {processes_allowed}; exec "$@"', "-",
+    )  # fmt: skip
+    told = ("--run", "test", "--task", tasks.TOY)
+    words = {
+        "worker": ("--connect", processes.endpoint, "--slots", 8, *told),
+        "coordinator": (
+            "--listen",
+            processes.endpoint,
+            *told,
+            "--runs-dir",
+            processes.runs,
+            "--bundle",
+            random_bundle.path,
+        ),
+    }[verb]
+    if verb == "worker":  # where it can join, it lacks room for its slots
+        processes.coordinator("--bundle", random_bundle.path, "--task", tasks.TOY)
+    process = processes.start(verb, *words, inside=other)
+    code, said = process.finish()[0], "".join(process.lines)
+    assert code == 1, said
+    assert "ulimit -u" in process.lines[-1]
+    assert "panicked" not in said
+    assert "Traceback" not in said

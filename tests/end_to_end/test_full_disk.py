@@ -95,3 +95,20 @@ def test_a_disk_that_fills_while_a_drive_is_written_keeps_every_drive_whole(proc
         for path in run.rollouts():
             with np.load(path) as drive:
                 assert len(drive["picture"]) == len(drive["action"])
+
+
+@pytest.mark.slow
+def test_a_run_on_a_disk_without_inodes_waits_and_goes_on_by_itself(processes, random_bundle, small_disk):
+    flags = ("--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 1, "--evaluate-every", 0, "--generations", 12)
+    processes.runs = small_disk
+    full = processes.coordinator("--bundle", random_bundle.path, *flags, name="small")
+    processes.worker("--task", tasks.SLOW_TOY)
+    full.wait_for("generation 0: mean")
+    used = sum(1 for _ in small_disk.rglob("*")) + 1
+    subprocess.run(["mount", "-o", f"remount,nr_inodes={used}", small_disk], check=True)
+    full.wait_for("No space left on device")
+    subprocess.run(["mount", "-o", "remount,nr_inodes=1000", small_disk], check=True)
+    full.wait_for("the run goes on")
+    assert full.finish()[0] == 0
+    with open_run(small_disk, "small") as run:
+        assert len(run.history()) == 12

@@ -120,7 +120,7 @@ class BenchRun:
             yield
         finally:
             process.kill()
-            process.join()
+            process.join(5)
 
     def finish(self) -> None:
         """Wait until the run ends; `DreamfleetError` if it fails or takes too long."""

@@ -136,7 +136,7 @@ class Scorer:
         """
         steps = getattr(self._task, "probe_steps", Task.probe_steps)
         found, size = HostClassProbe(), self._assignment.controller.size
-        with suppress(Exception):  # the first job will report the same error
+        with suppress(BaseException):  # `SystemExit` too: the first job will report the same error
             if steps > 0:
                 found.add_episode(self._environment, self._policy, size, steps)
                 if self._batch_for is not None:
@@ -193,7 +193,7 @@ class Scorer:
     @cached_property
     def _watched_environment(self) -> gymnasium.Env[Any, Any] | None:
         """The task's environment for watched episodes; `None` if there is none or it cannot be made."""
-        with suppress(Exception):
+        with suppress(BaseException):
             return self._task.make_watched_environment(self._assignment)
         return None
 

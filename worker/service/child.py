@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import faulthandler
 import os
-import signal
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking, make_stdout_nonblocking
 from dreamfleet.common.host.parent_death import exit_with_parent
+from dreamfleet.common.host.stop_signals import outlive_stop_signals
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -41,22 +41,22 @@ def serve_jobs(
     never imported.
     """
     exit_with_parent(parent)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group; the worker handles it
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    os.setsid()  # the worker ends the whole session, and Ctrl-C reaches only the worker
+    outlive_stop_signals()
+    os.register_at_fork(after_in_child=pipe.close)  # a copy would hide this process's end from the worker
     with suppress(OSError, AttributeError, ValueError, RuntimeError):  # without a stderr a crash leaves no traceback
         faulthandler.enable()
     make_stderr_nonblocking()  # inherited from the worker, whose reader may be suspended
     make_stdout_nonblocking()
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     scorer = _make_scorer(pipe, spec, bundle, allowed_tasks)
-    pipe.send(ChildReady(scorer.drawn_by, scorer.host_class))
     _score_groups(pipe, scorer, steps, abandoned, is_watched)
 
 
 def _make_scorer(
     pipe: Connection[Any, Any], spec: TaskSpec, bundle: Path | None, allowed_tasks: tuple[str, ...]
 ) -> Scorer:
-    """Load the task and the world model; on an error send it as a `ScoringFailure` and exit."""
+    """Load the task and the world model and send `ChildReady`; on an error send a `ScoringFailure` and exit."""
     from dreamfleet.common.artifacts.bundle import Bundle
     from dreamfleet.worker.scoring.scorer import Scorer
     from dreamfleet.worker.service.failure_log import ScoringFailure
@@ -64,14 +64,16 @@ def _make_scorer(
 
     try:
         check_task_allowed(spec.task, allowed_tasks)
-        if bundle is None:
-            return Scorer(spec)
-        opened = Bundle.open(bundle, spec.bundle)
-        check_world_allowed(opened, allowed_tasks)
-        return Scorer(spec, opened)
-    except Exception as error:
+        opened = None
+        if bundle is not None:
+            opened = Bundle.open(bundle, spec.bundle)
+            check_world_allowed(opened, allowed_tasks)
+        scorer = Scorer(spec, opened)
+        pipe.send(ChildReady(scorer.drawn_by, scorer.host_class))
+        return scorer
+    except BaseException as error:  # a simulator may raise `SystemExit`
         pipe.send(ScoringFailure.of(error))
-        raise SystemExit(1) from error
+        raise SystemExit(1) from None
 
 
 def _score_groups(pipe: Connection[Any, Any], scorer: Scorer, steps: Any, abandoned: Any, is_watched: Any) -> None:

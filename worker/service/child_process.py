@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import socket
+import struct
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -11,6 +14,7 @@ from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
 
+from dreamfleet.common.host.descendants import Descendants
 from dreamfleet.common.host.parent_death import signals_blocked
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.protocol.messages import TaskSpec
@@ -19,7 +23,9 @@ from dreamfleet.worker.service.failure_log import ScoringFailure
 from dreamfleet.worker.service.frame_sampler import SampledFrame
 from dreamfleet.worker.service.job_group import GroupDone, JobWithVector
 
-EXIT_GRACE = 2.0  # seconds that a child may take to exit after it closed its pipe
+log = logging.getLogger(__name__)
+EXIT_GRACE = 2.0  # seconds that a child may take to exit after it closed its pipe, or after it was killed
+SEND_LIMIT = 5  # seconds that a child may leave its full pipe unread: it was suspended, for example
 
 ChildMessage = ChildReady | SampledFrame | GroupDone | ScoringFailure | None
 """What a child sends; the reader adds `None` when the pipe is closed."""
@@ -43,20 +49,23 @@ class ChildProcess:
         )  # numbers of the groups to abandon: an even and an odd one
         self._is_watched: Any = context.Value("B", 0, lock=False)
         self._pipe, theirs = context.Pipe()
+        self._limit_sending()
         self._process = context.Process(
             target=serve_jobs,
             args=(theirs, self._steps, self._abandoned, self._is_watched, spec, bundle, allowed_tasks, os.getpid()),
-            daemon=True,
+            daemon=False,  # a simulator may start processes with `multiprocessing`, which daemons may not
         )
-        with signals_blocked():
+        self._descendants = Descendants()
+        with signals_blocked(), self._descendants.starting():
             self._process.start()
+        self._descendants.add_session(self.pid)
         theirs.close()
         self._reader = threading.Thread(target=self._read, args=(on_message,), daemon=True)
         try:
             self._reader.start()
         except RuntimeError:  # the thread cannot start, so nothing would read the child's messages
-            self._process.kill()
-            self._process.join()
+            self.kill()
+            self.wait_for_exit()
             raise
 
     @property
@@ -77,10 +86,20 @@ class ChildProcess:
         except (OSError, ValueError, IndexError):
             return 0
 
-    def send(self, group: int, work: Sequence[JobWithVector]) -> None:
-        """Send a group of jobs. If the child is gone, the reader notices."""
-        with suppress(OSError):
+    @property
+    def exit_status(self) -> int | None:
+        """Its exit status, or the negative number of the signal that ended it; `None` while it runs."""
+        return self._process.exitcode
+
+    def send(self, group: int, work: Sequence[JobWithVector]) -> bool:
+        """Send a group of jobs; return whether the child reads. If it is gone, the reader notices."""
+        try:
             self._pipe.send((group, work))
+        except BlockingIOError:
+            return False
+        except OSError:
+            pass
+        return True
 
     def abandon_group(self, group: int) -> None:
         """End a group at its next step. Both of two consecutive groups can be abandoned at the same time."""
@@ -91,27 +110,37 @@ class ChildProcess:
         self._is_watched.value = wanted
 
     def kill(self) -> None:
-        """Kill the child; the reader then reports `None`."""
+        """Kill the child and its descendants, which may hold its pipe open; the reader then reports `None`."""
         self._process.kill()
+        self._descendants.kill()
 
-    def wait_for_exit(self) -> bool:
-        """Wait up to `EXIT_GRACE` seconds for the child to exit; return whether it has."""
-        until = monotonic() + EXIT_GRACE
+    def wait_for_exit(self, seconds: float = EXIT_GRACE) -> bool:
+        """Wait up to `seconds` for the child to exit; return whether it has."""
+        until = monotonic() + seconds
         while self._process.is_alive() and monotonic() < until:  # a timed `join` can block on a silent child
             sleep(0.005)
         return not self._process.is_alive()
 
-    def close(self) -> str:
-        """Kill the child if it is alive, and close its pipe; return the signal that ended it, or an empty text."""
-        self._process.kill()
-        self._process.join()
-        self._reader.join()  # before the pipe is closed, because another pipe may get its descriptor
-        self._pipe.close()
-        code = self._process.exitcode or 0
-        return f"signal {-code}" if code < 0 else ""
+    def close(self, seconds: float = EXIT_GRACE) -> None:
+        """Kill the child if it is alive, and close its pipe; wait up to `seconds` for each, then leave them behind."""
+        self.kill()
+        if not self.wait_for_exit(seconds):
+            log.warning("process %d was killed and does not end: its host blocks it; left behind", self.pid)
+        self._descendants.forget()
+        self._reader.join(seconds)
+        if not self._reader.is_alive():  # else another pipe may get its descriptor while it still reads
+            self._pipe.close()
+
+    def _limit_sending(self) -> None:
+        """Let a write to a full pipe fail after `SEND_LIMIT` seconds: the worker's one thread must never block."""
+        with socket.socket(fileno=os.dup(self._pipe.fileno())) as ours:
+            ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", SEND_LIMIT, 0))
 
     def _read(self, on_message: Callable[[ChildMessage], None]) -> None:
-        with suppress(EOFError, OSError):
+        with suppress(Exception):  # the pipe is closed, or one of its processes wrote rubbish into it
             while True:
-                on_message(self._pipe.recv())
+                message = self._pipe.recv()
+                if not isinstance(message, ChildMessage):
+                    break
+                on_message(message)
         on_message(None)

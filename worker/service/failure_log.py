@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from dreamfleet.common.protocol.messages import Job
+from dreamfleet.worker.service.failure_cause import describe_exception, encodable
 
 MAX_TRACE = 8000  # characters of a traceback that are kept, from its end, where the cause stands
 MAX_KINDS = 100  # kinds of failures that are logged at most
@@ -25,14 +26,16 @@ class ScoringFailure:
     trace: str
 
     @classmethod
-    def of(cls, error: Exception) -> ScoringFailure:
+    def of(cls, error: BaseException) -> ScoringFailure:
         """From a caught exception."""
-        lines = str(error).strip().splitlines()
-        places = traceback.extract_tb(error.__traceback__)
+        try:
+            places = traceback.extract_tb(error.__traceback__)
+            trace = "".join(traceback.format_exception(error)).rstrip()
+        except Exception:  # a simulator's exceptions may fail in every way
+            places, trace = traceback.StackSummary(), "its traceback cannot be formatted"
         place = f"{places[-1].filename}:{places[-1].lineno}" if places else "nowhere"
-        name, first = type(error).__name__, lines[0] if lines else ""
-        trace = "".join(traceback.format_exception(error)).rstrip()
-        return cls(_encodable(f"{name}: {first}"[:500]), f"{name} at {place}", _encodable(trace[-MAX_TRACE:]))
+        kind = encodable(f"{type(error).__name__} at {place}")
+        return cls(describe_exception(error), kind, encodable(trace[-MAX_TRACE:]))
 
 
 class FailureLog:
@@ -56,11 +59,6 @@ class FailureLog:
             f"task {task}: {failure.text} ({_describe_jobs(jobs)}); later failures from this line are not logged\n"
             f"{failure.trace}"
         )
-
-
-def _encodable(text: str) -> str:
-    """Replace half surrogate pairs, as in names of files, which UTF-8 cannot encode."""
-    return text.encode(errors="replace").decode()
 
 
 def _describe_jobs(jobs: Sequence[Job]) -> str:

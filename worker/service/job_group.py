@@ -64,8 +64,8 @@ class AbandonedError(Exception):
 def score_group(scorer: Scorer, group: int, work: Sequence[JobWithVector], count: Callable[[int], None]) -> GroupDone:
     """Score a group and return one result a job.
 
-    R8: an exception of the task becomes an error of these jobs, because a wrong fitness would mislead the search. The
-    slot lives on.
+    R8: an exception of the task, also `SystemExit`, becomes an error of these jobs, because a wrong fitness would
+    mislead the search. The slot lives on.
     `count` gets the number of steps so far, over all jobs; it may raise `AbandonedError` to end the group.
     """
     started, made = perf_counter(), 0
@@ -83,7 +83,7 @@ def score_group(scorer: Scorer, group: int, work: Sequence[JobWithVector], count
         return GroupDone(group, _results(work, scores, spent, upload, spec.horizon), upload)
     except AbandonedError:
         return GroupDone(group, ())
-    except Exception as error:
+    except BaseException as error:
         failure = ScoringFailure.of(error)
         each = clamp_count(made // len(work)), (perf_counter() - started) / len(work), failure.text
         return GroupDone(group, tuple(Result(job.digest, None, *each, None) for job, _ in work), failure=failure)

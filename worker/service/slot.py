@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import queue
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -15,7 +16,8 @@ from dreamfleet.common.errors import BundleError, DreamfleetError
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol.messages import Job, Result, TaskSpec
 from dreamfleet.worker.service.child import ChildReady
-from dreamfleet.worker.service.child_process import ChildMessage, ChildProcess
+from dreamfleet.worker.service.child_process import EXIT_GRACE, ChildMessage, ChildProcess
+from dreamfleet.worker.service.failure_cause import describe_crash, describe_exit
 from dreamfleet.worker.service.failure_log import ScoringFailure
 from dreamfleet.worker.service.frame_sampler import SampledFrame
 from dreamfleet.worker.service.job_group import GroupDone, JobGroup, JobWithVector
@@ -27,6 +29,7 @@ START_RETRY_DELAY = 2.0  # seconds until the next try, where the host had no res
 REMEDY = "give it fewer --slots, or this host more room (ulimit -n, ulimit -u, memory, the disk of temporary files)"
 MAX_START_DELAY = 30.0  # the longest pause before a new child, where children end one after another without a result
 START_LIMIT = 120.0  # seconds that a child may take to load task and world model; doubled with each failed start
+LOOK_INTERVAL = 0.5  # seconds between two looks whether the child still runs
 SHORT_GROUP = 0.25  # seconds; after a group that was shorter, a second group is queued in the child
 MAX_PIPELINED_BYTES = 64 * 1024  # bytes of vectors that a pipe accepts while its child is busy
 
@@ -87,6 +90,8 @@ class Slot:
         self._start_at = 0.0
         self._child: ChildProcess | None = None  # `None` until `_start_at`
         self._kill_reason, self._last_error = "", ""
+        self._looked_at = 0.0
+        self._given_up_at = math.inf  # when a child that was killed or has exited counts as gone in any case
         self._sent = 0  # groups sent to this child
         self._is_watched = False
         self._start()
@@ -134,7 +139,8 @@ class Slot:
         self._groups.append(group)
         if len(self._groups) == 1:
             self._reset_progress()
-        self._child.send(group.number, group.work)
+        if not self._child.send(group.number, group.work):
+            self._kill("it read no job")
 
     def show(self, wanted: bool) -> None:
         """Start sending frames with the next group, also after the child is replaced; or stop."""
@@ -169,6 +175,7 @@ class Slot:
             limit = max(job.stall for job in self.running)
             self._kill_after(limit, now - since, f"no step for {limit:g} s")
         self._progress = (self.steps, since)
+        self._check_exit(now)
 
     def abandon(self, digest: bytes) -> None:
         """Mark a job as unwanted.
@@ -190,18 +197,25 @@ class Slot:
             self._failed_starts = 0
             self._reset_progress()
         elif isinstance(event.message, GroupDone):
-            return self._finish_group(event.message)
+            running = self._groups[0].number if self._groups else None  # a forked copy of the child may answer again
+            return self._finish_group(event.message) if event.message.group == running else ()
         elif isinstance(event.message, ScoringFailure):
             self._last_error = event.message.text
         elif not isinstance(event.message, SampledFrame):
             return self._replace_child()
         return ()
 
-    def stop(self) -> None:
-        """Kill the child."""
+    def kill(self) -> None:
+        """Kill the child, without waiting for its end; the slot is of no use then."""
         self._child_number += 1
         if self._child is not None:
-            self._child.close()
+            self._child.kill()
+
+    def stop(self, seconds: float = EXIT_GRACE) -> None:
+        """Kill the child, and wait up to about `seconds` for its end."""
+        self._child_number += 1
+        if self._child is not None:
+            self._child.close(seconds)
 
     def _reset_progress(self) -> None:
         self._progress = (0, monotonic())
@@ -209,9 +223,24 @@ class Slot:
     def _kill_after(self, limit: float, quiet: float, why: str) -> None:
         """Kill a child that has been quiet for longer than `limit` seconds; 0: never."""
         if quiet > limit > 0:
+            self._kill(why)
+
+    def _kill(self, why: str) -> None:
+        if self._child is not None and not self._kill_reason:
             self._kill_reason = why
-            if self._child is not None:
-                self._child.kill()
+            self._child.kill()
+            self._given_up_at = monotonic() + EXIT_GRACE
+
+    def _check_exit(self, now: float) -> None:
+        """Report a child as gone whose reader does not: a process that it left behind holds its pipe, for example."""
+        if self._child is None or 0 <= now - self._looked_at < LOOK_INTERVAL:
+            return
+        self._looked_at = now
+        if self._given_up_at == math.inf and self._child.exit_status is not None:
+            self._child.kill()  # what it left behind, so that the reader hears the pipe's end after the last message
+            self._given_up_at = monotonic() + EXIT_GRACE
+        elif monotonic() > self._given_up_at:
+            self._events.put(("slot", SlotEvent(self.number, self._child_number, None)))
 
     def _finish_group(self, done: GroupDone) -> tuple[Result, ...]:
         group = self._groups.popleft()
@@ -234,19 +263,18 @@ class Slot:
         R8: a crash is an error of these jobs, which other workers then try, and never a fitness.
         """
         assert self._child is not None  # it has just sent its last event
-        if not self._child.wait_for_exit():
-            self._kill_reason = self._kill_reason or self._last_error
-        steps = self.steps
-        ended_by = self._child.close()
-        reason = self._kill_reason or ended_by or self._last_error
+        if self._given_up_at == math.inf:
+            self._child.wait_for_exit()
+        steps, status = self.steps, self._child.exit_status
+        self._child.close(LOOK_INTERVAL)
+        ended_by = "it closed its pipe and ran on" if status is None else self._last_error or describe_exit(status)
+        reason = self._kill_reason or ended_by
         if not self.ready:
             self._count_failed_start(reason)
         lost = self._groups.popleft().jobs if self.ready and self._groups else []  # before it was ready it ran nothing
         log.warning("slot %d ended (%s)%s; starting another", self.number, reason, _describe_lost_jobs(lost))
         self._start_after_pause()
-        return tuple(
-            Result(job.digest, None, steps // len(lost), 0.0, f"slot crashed ({reason})", None) for job in lost
-        )
+        return tuple(Result(job.digest, None, steps // len(lost), 0.0, describe_crash(reason), None) for job in lost)
 
     def _count_failed_start(self, reason: str) -> None:
         self._failed_starts += 1
@@ -266,12 +294,13 @@ class Slot:
         self.ready = self._groups_are_short = False
         self._child_number += 1
         self._child = None
+        self._given_up_at = math.inf
         self._start_at = monotonic() + pause
 
     def _start(self) -> None:
         """Start a child and send it the groups that waited for the last one."""
         self._clear_child(0.0)
-        self._kill_reason, self._last_error = "", "the child ended"
+        self._kill_reason, self._last_error = "", ""
         self._sent = 0
         number, child_number, events = self.number, self._child_number, self._events
         try:

@@ -6,12 +6,14 @@ import logging
 import queue
 from collections.abc import Callable
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 from dreamfleet.common.protocol.messages import MAX_LEASES, TAG_BYTES, Job, Result, RunningJob, TaskSpec
 from dreamfleet.common.protocol.result_bounds import clamp_count
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.child import ChildReady
+from dreamfleet.worker.service.child_process import EXIT_GRACE
 from dreamfleet.worker.service.failure_log import FailureLog
 from dreamfleet.worker.service.frame_sampler import SampledFrame
 from dreamfleet.worker.service.job_group import JobWithVector
@@ -155,9 +157,12 @@ class SlotPool:
             self.abandon(job.digest)
 
     def stop(self) -> None:
-        """Kill all children."""
+        """Kill all children; wait at most about `EXIT_GRACE` seconds for their end."""
         for slot in self._slots:
-            slot.stop()
+            slot.kill()
+        until = monotonic() + EXIT_GRACE
+        for slot in self._slots:
+            slot.stop(max(0.0, until - monotonic()))
 
     def _switch_shown_slot(self) -> None:
         """Let the first slot that scores send frames instead of one that idles."""

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import os
-import signal
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from functools import cache
-from multiprocessing import get_context
 from time import perf_counter
 from typing import ClassVar
 
@@ -16,7 +13,9 @@ from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.host.parent_death import exit_with_parent
+from dreamfleet.common.host.process_pool import map_in_processes
 from dreamfleet.common.host.resource_limits import pin_thread_pools
+from dreamfleet.common.host.stop_signals import outlive_stop_signals
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
 from dreamfleet.common.runs.evaluation_report import EvaluationReport
 from dreamfleet.worker.scoring.agents import Agent
@@ -32,19 +31,13 @@ def evaluate(agent: Agent, seeds: tuple[int, ...], jobs: int) -> Iterator[Episod
         yield from map(evaluator.drive, seeds)
         evaluator.close()
         return
-    pool = ProcessPoolExecutor(
-        min(jobs, len(seeds)), get_context("spawn"), _ProcessEvaluator.start, (agent, os.getpid())
-    )
     try:
-        for each in as_completed([pool.submit(_ProcessEvaluator.drive, seed) for seed in seeds]):
-            yield each.result()
+        yield from map_in_processes(jobs, _ProcessEvaluator.start, (agent, os.getpid()), _ProcessEvaluator.drive, seeds)
     except BrokenProcessPool as error:
         raise DreamfleetError(
             'a driving process has crashed; in your own script call this under `if __name__ == "__main__":` or with '
             "jobs=1; otherwise `dreamfleet doctor` looks for the cause"
         ) from error
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 def run_evaluation(
@@ -72,7 +65,7 @@ class _ProcessEvaluator:
         """Initialise the process, which ends with its parent."""
         exit_with_parent(parent)
         os.environ["SDL_VIDEODRIVER"] = "dummy"
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C reaches the whole process group: end without a traceback
+        outlive_stop_signals()  # Ctrl-C reaches the whole process group; the parent ends this process
         cls.agent = agent
 
     @classmethod

@@ -101,16 +101,21 @@ def _compare(args: argparse.Namespace) -> int:
 
 def measure_on_one_thread(measure: Callable[..., dict[str, Any]], bundle_name: str, *more: object) -> dict[str, Any]:
     """The figures of `measure(bundle, *more)`, called in a child process whose libraries use one thread."""
+    from concurrent.futures import ProcessPoolExecutor
+    from concurrent.futures.process import BrokenProcessPool
     from multiprocessing import get_context
 
     from dreamfleet.common.artifacts.bundle_store import find_bundle
+    from dreamfleet.common.errors import DreamfleetError
 
     bundle: Bundle = find_bundle(bundle_name)
     _pin_libraries()
     # A child: numpy's library reads its thread count once, when loaded, and this process has loaded it.
-    with get_context("spawn").Pool(1) as pool:
-        figures: dict[str, Any] = pool.apply(measure, (bundle, *more))
-    return figures
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        try:
+            return pool.submit(measure, bundle, *more).result()
+        except BrokenProcessPool as error:
+            raise DreamfleetError("the process that measured has crashed; is memory short?") from error
 
 
 def _pin_libraries() -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import signal
 
 from dreamfleet.common.cli.config import add_flags, load
 from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
 from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking
-from dreamfleet.common.host.resource_limits import raise_open_file_limit
+from dreamfleet.common.host.resource_limits import check_room_for_session, raise_open_file_limit
+from dreamfleet.common.host.stop_signals import END_LIMIT, call_on_signals, end_within
 from dreamfleet.worker.service.config import WorkerConfig
 
 SUMMARY = "score candidates for a run; it needs no files and no display, and may start before its coordinator"
@@ -26,11 +26,14 @@ def run(args: argparse.Namespace) -> int:
     """Serve until stopped; the first Ctrl-C drains, the second leaves at once."""
     from dreamfleet.worker.service.worker import Worker
 
-    make_stderr_nonblocking()
     raise_open_file_limit()
+    check_room_for_session()  # before anything else starts a thread
+    make_stderr_nonblocking()
     config = load(WorkerConfig, "worker", **args.sources)
     worker = Worker(config, resolve_network(args, "worker", "coordinator"), tuple(args.task))
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: worker.stop())
-    worker.serve()
+    call_on_signals(worker.stop)
+    try:
+        worker.serve()
+    finally:
+        end_within(END_LIMIT, 1)  # at its exit, the interpreter would wait without a limit for a child that cannot end
     return 0

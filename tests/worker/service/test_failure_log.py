@@ -53,6 +53,6 @@ def test_the_log_is_bounded():
 
 def test_an_error_that_cannot_be_encoded_is_replaced():
     failure = raised(OSError("no file \udcff\nsecond line"))
-    assert failure.text.encode() == b"OSError: no file ?"
+    assert failure.text == r"OSError: no file \udcff"
     assert failure.trace.encode()
     assert raised(RuntimeError("")).text == "RuntimeError: "

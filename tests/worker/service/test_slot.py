@@ -26,6 +26,8 @@ from tests.support.bundles import write_random_bundle
 from tests.support.processes import DEADLINE, environment
 from tests.support.samples import VECTOR, job
 
+OUT_OF_MEMORY = "host: killed by SIGKILL, as the kernel does when memory is short"
+
 
 @cache
 def hash_of(bundle):
@@ -141,14 +143,14 @@ def test_a_crash_costs_one_job_and_another_child_takes_its_place(harness):
     slot = harness(tasks.CRASHING)
     for _ in range(2):
         result = slot.score()
-        assert (result.fitness, result.error) == (None, f"slot crashed (signal {signal.SIGSEGV.value})")
+        assert (result.fitness, result.error) == (None, "slot crashed (killed by SIGSEGV)")
 
 
 def test_a_child_that_lives_but_closed_its_pipe_is_replaced(harness):
     slot = harness(tasks.SILENT)
     slot.wait_ready()
     pid = slot.slot.pid
-    assert slot.score().error == "slot crashed (the child ended)"
+    assert slot.score().error == "slot crashed (it closed its pipe and ran on)"
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
 
@@ -166,7 +168,7 @@ def test_a_killed_child_is_replaced_alone(harness):
     slot.wait_ready()
     slot.slot.submit([(job(0, spec=slot.spec), VECTOR)])
     os.kill(slot.slot.pid, signal.SIGKILL)
-    assert "signal 9" in slot.result().error
+    assert slot.result().error == OUT_OF_MEMORY
     assert slot.score().fitness is not None
 
 
@@ -327,7 +329,7 @@ def test_a_child_that_ends_as_it_starts_blames_no_job(harness):
     for number in (0, 1):
         slot.slot.submit([(job(number, spec=slot.spec), VECTOR)])
     os.kill(slot.slot.pid, signal.SIGKILL)
-    assert slot.result().error == "slot crashed (signal 9)"
+    assert slot.result().error == OUT_OF_MEMORY
     os.kill(slot.slot.pid, signal.SIGKILL)  # the next child, which is starting and has the second job
     scored = slot.result()
     assert scored.digest == job(1, spec=slot.spec).digest

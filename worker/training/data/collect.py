@@ -5,9 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Generator, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +16,10 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.bundle import hash_file
 from dreamfleet.common.errors import DatasetError, DreamfleetError
 from dreamfleet.common.files.atomic_write import atomic_write
-from dreamfleet.common.host.parent_death import exit_with_parent, signals_blocked
+from dreamfleet.common.host.parent_death import exit_with_parent
+from dreamfleet.common.host.process_pool import map_in_processes
 from dreamfleet.common.host.resource_limits import pin_thread_pools
+from dreamfleet.common.host.stop_signals import outlive_stop_signals
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.scoring.rollout import Rollout, write_episode
 from dreamfleet.worker.scoring.scorer import DRIVER_NAME
@@ -61,20 +61,16 @@ def collect(folder: Path, config: CollectConfig, jobs: int, pilots: Sequence[Pil
     if not numbers:
         return
     pin_thread_pools()
-    pool = ProcessPoolExecutor(min(jobs, len(numbers)), get_context("spawn"), _start_process, (os.getpid(),))
+    tasks = [(folder, config, number, tuple(pilots)) for number in numbers]
     try:
-        with signals_blocked():
-            rollouts = [pool.submit(_collect_one, (folder, config, number, tuple(pilots))) for number in numbers]
-        for each in as_completed(rollouts):
-            yield each.result()
+        yield from map_in_processes(jobs, _start_process, (os.getpid(),), _collect_one, tasks)
     except BrokenProcessPool as error:
         raise DreamfleetError("a process that drove has crashed; `dreamfleet doctor` looks for the cause") from error
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 def _start_process(parent: int) -> None:
     exit_with_parent(parent)
+    outlive_stop_signals()  # Ctrl-C reaches the whole process group; the parent lets this episode finish
     os.environ["SDL_VIDEODRIVER"] = "dummy"
 
 

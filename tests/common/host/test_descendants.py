@@ -1,0 +1,113 @@
+"""What child processes leave behind ends with them, and with the process that started them."""
+
+import os
+import select
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from time import monotonic, sleep
+
+import pytest
+
+from dreamfleet.common.host.descendants import Descendants
+from tests.support.processes import DEADLINE, environment
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="Linux")
+
+# A process that leaves its parent and session, ignores SIGTERM, and writes its id.
+DAEMON = (
+    "import os, signal, sys, time\n"
+    "if os.fork() == 0:\n"
+    "    os.setsid()\n"
+    "    if os.fork() == 0:\n"
+    "        signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+    "        print(os.getpid(), flush=True)\n"
+    "        time.sleep(600)\n"
+    "    os._exit(0)\n"
+    "os.wait()\n"
+)
+
+
+def ends(pidfd):
+    return bool(select.select([pidfd], [], [], DEADLINE)[0])
+
+
+def start_daemon(where, **more):
+    with where.starting():
+        child = subprocess.Popen([sys.executable, "-S", "-c", DAEMON], stdout=subprocess.PIPE, text=True, **more)
+    pid = int(child.stdout.readline())
+    child.wait()
+    child.stdout.close()
+    return os.pidfd_open(pid)
+
+
+def test_a_daemon_ends_and_another_childs_does_not():
+    ours, others = Descendants(), Descendants()
+    ends_now, lives = start_daemon(ours), start_daemon(others)
+    ours.kill()
+    assert ends(ends_now)
+    signal.pidfd_send_signal(lives, 0)
+    others.kill()
+    assert ends(lives)
+
+
+def test_a_process_of_the_session_without_the_mark_ends():
+    ours = Descendants()
+    with ours.starting():
+        child = subprocess.Popen(
+            ["/bin/sh", "-c", "env -i /bin/sleep 600 & echo $!; wait"], stdout=subprocess.PIPE, text=True,
+            start_new_session=True,
+        )  # fmt: skip
+    ours.add_session(child.pid)
+    pid = int(child.stdout.readline())
+    until = monotonic() + DEADLINE
+    while b"sleep" not in Path(f"/proc/{pid}/cmdline").read_bytes() and monotonic() < until:
+        sleep(0.01)
+    pidfd = os.pidfd_open(pid)
+    ours.kill()
+    assert ends(pidfd)
+    child.wait()
+    child.stdout.close()
+    ours.forget()
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_daemons_end_with_the_process_that_started_their_parent(tmp_path, number):
+    script = (
+        "import subprocess, sys, time\n"
+        "from dreamfleet.common.host.descendants import Descendants\n"
+        "with Descendants().starting():\n"
+        f"    subprocess.Popen([sys.executable, '-S', '-c', {DAEMON!r}])\n"
+        "time.sleep(600)\n"
+    )
+    parent = subprocess.Popen(
+        [sys.executable, "-c", script], env=environment(tmp_path), stdout=subprocess.PIPE, text=True
+    )
+    pidfd = os.pidfd_open(int(parent.stdout.readline()))
+    parent.send_signal(number)
+    parent.wait()
+    assert ends(pidfd)
+    parent.stdout.close()
+
+
+def test_a_guard_that_was_killed_is_replaced(tmp_path):
+    script = (
+        "import subprocess, sys, time\n"
+        "from dreamfleet.common.host import descendants\n"
+        "with descendants.Descendants().starting():\n"
+        "    pass\n"
+        "descendants._guard.kill()\n"
+        "descendants._guard.wait()\n"
+        "with descendants.Descendants().starting():\n"
+        f"    subprocess.Popen([sys.executable, '-S', '-c', {DAEMON!r}])\n"
+        "time.sleep(600)\n"
+    )
+    parent = subprocess.Popen(
+        [sys.executable, "-c", script], env=environment(tmp_path), stdout=subprocess.PIPE, text=True
+    )
+    pidfd = os.pidfd_open(int(parent.stdout.readline()))
+    parent.kill()
+    parent.wait()
+    assert ends(pidfd)
+    parent.stdout.close()

@@ -1,0 +1,235 @@
+"""Tasks whose environments leave processes behind, end their process, or raise what nobody expects."""
+
+import ctypes
+import errno
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+
+from tests.support.tasks import Toy, ToyEnvironment
+
+MODULE = "tests.support.rough_tasks"
+FOLDER = "DREAMFLEET_TEST_LEFT"  # where processes that are left behind write their ids
+SLEEP = (
+    "import os, pathlib, signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); "
+    f"pathlib.Path(os.environ.get('{FOLDER}', '/nowhere'), str(os.getpid())).touch(); time.sleep(600)"
+)
+
+
+def name_of(task):
+    return f"{MODULE}:{task.__name__}"
+
+
+class Rough(Toy):
+    """An episode's first step calls `misbehave`."""
+
+    probe_steps = 0
+
+    def make_environment(self, assignment):
+        return RoughEnvironment(self.misbehave)
+
+
+class RoughEnvironment(ToyEnvironment):
+    def __init__(self, misbehave):
+        super().__init__()
+        self._misbehave = misbehave
+
+    def step(self, action):
+        self._misbehave()
+        return super().step(action)
+
+
+def segfault():
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def hold_copies():
+    """Copies of all descriptors, which a forked process then holds too."""
+    for descriptor in range(3, 64):
+        with suppress(OSError):
+            os.dup(descriptor)
+
+
+def linger():
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    Path(os.environ[FOLDER], str(os.getpid())).touch()
+    time.sleep(600)
+
+
+def wait_for_one_left():
+    while not any(Path(os.environ[FOLDER]).iterdir()):
+        time.sleep(0.01)
+
+
+class Forking(Rough):
+    """A forked process holds copies of the pipe; then the child crashes."""
+
+    def misbehave(self):
+        hold_copies()
+        if os.fork() == 0:
+            linger()
+        wait_for_one_left()
+        segfault()
+
+
+class ForkingBySystemCall(Rough):
+    """As a simulator in C does it, so Python's hooks do not run."""
+
+    def misbehave(self):
+        if ctypes.PyDLL(None).fork() == 0:
+            linger()
+        wait_for_one_left()
+        segfault()
+
+
+class Daemonizing(Rough):
+    """The forked process leaves the session and its parent."""
+
+    def misbehave(self):
+        hold_copies()
+        if os.fork() == 0:
+            os.setsid()
+            if os.fork() == 0:
+                linger()
+            os._exit(0)
+        wait_for_one_left()
+        segfault()
+
+
+class Executing(Rough):
+    """Starts a program with an environment of its own in a process group of its own."""
+
+    def misbehave(self):
+        subprocess.Popen(
+            [sys.executable, "-S", "-c", SLEEP],
+            env={FOLDER: os.environ[FOLDER]},
+            process_group=0,
+            close_fds=False,
+        )
+        wait_for_one_left()
+        segfault()
+
+
+class ForkingAndHanging(Rough):
+    """A daemon is left behind, and the child runs on."""
+
+    def misbehave(self):
+        if os.fork() == 0:
+            os.setsid()
+            linger()
+        wait_for_one_left()
+        time.sleep(600)
+
+
+class Rubbish(Rough):
+    """Begins a message on each of its descriptors that never ends, and stops itself."""
+
+    def misbehave(self):
+        for descriptor in range(3, 64):
+            with suppress(OSError):
+                os.write(descriptor, b"\x00\x00\x00\x7frubbish")
+        os.kill(os.getpid(), signal.SIGSTOP)
+
+
+class Twice(Rough):
+    """Two processes go on with the episode."""
+
+    def misbehave(self):
+        if not any(Path(os.environ[FOLDER]).iterdir()):
+            Path(os.environ[FOLDER], "0").touch()
+            os.fork()
+
+
+class Exiting(Rough):
+    def misbehave(self):
+        threading.Thread(target=time.sleep, args=(600,)).start()
+        os._exit(0)
+
+
+class ExitingWithStatus(Rough):
+    def misbehave(self):
+        os._exit(3)
+
+
+class Deaf(Rough):
+    """Takes no notice of signals, and hangs."""
+
+    def misbehave(self):
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, lambda *_: None)
+        time.sleep(600)
+
+
+class Parallel(Rough):
+    """Has a process of `multiprocessing` compute, and ends it with SIGTERM, as gymnasium's `AsyncVectorEnv` does."""
+
+    begun = False
+
+    def misbehave(self):
+        if self.begun:
+            return
+        self.begun = True
+        for method in ("fork", "spawn"):
+            process = multiprocessing.get_context(method).Process(target=time.sleep, args=(600,), daemon=True)
+            process.start()
+            process.terminate()
+            process.join()
+
+
+class Hungry(Rough):
+    """Takes memory without an end, some slowly enough for a test to look."""
+
+    def misbehave(self):
+        self.held = [bytearray(os.urandom(1) * (16 << 20)) for _ in range(4096)]
+
+
+class Mute(Exception):  # noqa: N818
+    def __str__(self):
+        raise SystemExit(7)
+
+    __repr__ = __str__
+
+
+ERRORS = {
+    "SystemExit": lambda: SystemExit(3),
+    "KeyboardInterrupt": KeyboardInterrupt,
+    "GeneratorExit": GeneratorExit,
+    "Mute": Mute,
+    "ValueError": lambda: ValueError("\udc80\0é" + "x" * 10_000_000),
+    "MemoryError": MemoryError,
+    "OSError": lambda: OSError(errno.ENOSPC, "No space left on device"),
+}
+PLACE, ERROR = "DREAMFLEET_TEST_PLACE", "DREAMFLEET_TEST_ERROR"
+
+
+class Raising(Toy):
+    """Raises the error `ERROR` at `PLACE`: in make, reset, step or begin."""
+
+    def make_environment(self, assignment):
+        raise_at("make")
+        return RaisingEnvironment()
+
+    def make_policy(self, assignment):
+        raise_at("policy")
+        return super().make_policy(assignment)
+
+
+class RaisingEnvironment(ToyEnvironment):
+    def reset(self, **more):
+        raise_at("reset")
+        return super().reset(**more)
+
+    def step(self, action):
+        raise_at("step")
+        return super().step(action)
+
+
+def raise_at(place):
+    if os.environ.get(PLACE) == place:
+        raise ERRORS[os.environ[ERROR]]()

@@ -1,0 +1,216 @@
+"""Slots whose environments fork, crash, hang, or raise what nobody expects."""
+
+import os
+import queue
+import signal
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from time import monotonic, sleep
+
+import pytest
+
+from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.worker.service.slot import Slot
+from dreamfleet.worker.service.slot_pool import SlotPool
+from tests.support import rough_tasks, tasks
+from tests.support.processes import DEADLINE
+from tests.support.samples import VECTOR, job
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="Linux")
+
+
+class Harness:
+    def __init__(self, task, bundle):
+        self.spec = TaskSpec(task=task, bundle=bundle.sha256, horizon=100, patience=0)
+        self.events = queue.SimpleQueue()
+        self.slot = Slot(0, self.spec, bundle.path, self.events, (task,))
+
+    def take(self, ahead=0.0):
+        """What the slot's next event brings; the worker looks at its slots every moment, here `ahead` of its time."""
+        until = monotonic() + DEADLINE
+        while monotonic() < until:
+            self.slot.check(monotonic() + ahead, 0.0)
+            try:
+                return self.slot.handle(self.events.get(timeout=0.05)[1])
+            except queue.Empty:
+                continue
+        raise AssertionError("no event")
+
+    def wait_ready(self):
+        while not self.slot.ready:
+            self.take()
+
+    def score(self, number=0, stall=0.0, vector=VECTOR):
+        self.wait_ready()
+        made = job(number, spec=self.spec)
+        self.slot.submit([(replace(made, stall=stall) if stall else made, vector)])
+        while not (results := self.take()):
+            pass
+        return results[0]
+
+
+@pytest.fixture
+def left(tmp_path, monkeypatch):
+    """The ids of the processes that the environment leaves behind."""
+    folder = tmp_path / "left"
+    folder.mkdir()
+    monkeypatch.setenv(rough_tasks.FOLDER, str(folder))
+    yield folder
+    for each in folder.iterdir():
+        if int(each.name):
+            with suppress(ProcessLookupError):
+                os.kill(int(each.name), signal.SIGKILL)
+
+
+@pytest.fixture
+def harness(random_bundle):
+    made = []
+
+    def make(task):
+        made.append(Harness(task if isinstance(task, str) else rough_tasks.name_of(task), random_bundle))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.slot.stop()
+
+
+def wait_gone(folder):
+    until = monotonic() + DEADLINE
+    for each in folder.iterdir():
+        while runs(int(each.name)):
+            assert monotonic() < until, f"process {each.name} still runs"
+            sleep(0.01)
+
+
+def runs(pid):
+    try:
+        return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.parametrize(
+    "task",
+    [rough_tasks.Forking, rough_tasks.ForkingBySystemCall, rough_tasks.Daemonizing, rough_tasks.Executing],
+)
+def test_a_crash_is_noticed_although_another_process_holds_the_pipe_and_that_ends_too(harness, left, task):
+    slot = harness(task)
+    assert slot.score().error == "slot crashed (killed by SIGSEGV)"
+    assert len(list(left.iterdir())) == 1
+    wait_gone(left)
+    slot.wait_ready()
+
+
+def test_what_a_hung_child_left_behind_ends_with_it(harness, left):
+    slot = harness(rough_tasks.ForkingAndHanging)
+    assert slot.score(stall=1.0).error == "slot crashed (no step for 1 s)"
+    wait_gone(left)
+
+
+def test_what_a_child_left_behind_ends_with_a_stopped_slot(harness, left):
+    slot = harness(rough_tasks.ForkingAndHanging)
+    slot.wait_ready()
+    slot.slot.submit([(job(0, spec=slot.spec), VECTOR)])
+    while not list(left.iterdir()):
+        sleep(0.01)
+    slot.slot.stop()
+    wait_gone(left)
+
+
+@pytest.mark.parametrize(
+    ("task", "error"),
+    [
+        (rough_tasks.Exiting, "slot crashed (exit status 0)"),
+        (rough_tasks.ExitingWithStatus, "slot crashed (exit status 3)"),
+        (rough_tasks.Deaf, "slot crashed (no step for 1 s)"),
+        (rough_tasks.Rubbish, "slot crashed (no step for 1 s)"),
+    ],
+)
+def test_a_childs_end_is_its_jobs_error(harness, task, error):
+    slot = harness(task)
+    assert slot.score(stall=1.0).error == error
+    slot.wait_ready()
+
+
+def test_a_copy_of_the_child_does_not_answer(harness, left):
+    slot = harness(rough_tasks.Twice)
+    for number in range(3):
+        assert slot.score(number).fitness is not None
+
+
+def test_an_environment_may_start_and_end_processes_of_its_own(harness):
+    assert harness(rough_tasks.Parallel).score(stall=60.0).fitness is not None
+
+
+def test_a_suspended_child_with_a_full_pipe_does_not_block_its_worker(harness, monkeypatch):
+    monkeypatch.setattr("dreamfleet.worker.service.child_process.SEND_LIMIT", 1)
+    slot = harness(tasks.TOY)
+    slot.wait_ready()
+    os.kill(slot.slot.pid, signal.SIGSTOP)
+    assert slot.score(vector=bytes(4 << 20)).error == "slot crashed (it read no job)"
+    slot.wait_ready()
+
+
+def test_a_child_that_cannot_end_is_left_behind(harness, monkeypatch):
+    slot = harness(rough_tasks.Deaf)
+    slot.wait_ready()
+    monkeypatch.setattr(slot.slot._child, "kill", lambda: None)  # as one in a system call that does not return
+    pid = slot.slot.pid
+    assert slot.score(stall=1.0).error == "slot crashed (no step for 1 s)"
+    assert runs(pid)
+    os.kill(pid, signal.SIGKILL)
+    slot.wait_ready()
+
+
+@pytest.mark.parametrize("place", ["reset", "step"])
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        ("SystemExit", "SystemExit: 3"),
+        ("KeyboardInterrupt", "KeyboardInterrupt: "),
+        ("GeneratorExit", "GeneratorExit: "),
+        ("Mute", "Mute: its message cannot be read (SystemExit)"),
+        ("ValueError", r"ValueError: \udc80\x00éxxx"),
+        ("MemoryError", "host: MemoryError: "),
+        ("OSError", "host: OSError: [Errno 28] No space left on device"),
+    ],
+)
+def test_whatever_an_environment_raises_is_the_jobs_error(harness, monkeypatch, place, error, text):
+    monkeypatch.setenv(rough_tasks.PLACE, place)
+    monkeypatch.setenv(rough_tasks.ERROR, error)
+    slot = harness(rough_tasks.Raising)
+    slot.wait_ready()
+    pid = slot.slot.pid
+    result = slot.score()
+    assert result.error.startswith(text)
+    assert len(result.error) <= 500
+    assert "\n" not in result.error
+    assert slot.slot.pid == pid
+
+
+@pytest.mark.parametrize("place", ["make", "policy"])
+@pytest.mark.parametrize("error", ["SystemExit", "KeyboardInterrupt", "Mute"])
+def test_whatever_is_raised_as_a_slot_starts_is_one_clear_error(harness, monkeypatch, place, error):
+    monkeypatch.setenv(rough_tasks.PLACE, place)
+    monkeypatch.setenv(rough_tasks.ERROR, error)
+    slot = harness(rough_tasks.Raising)
+    with pytest.raises(DreamfleetError, match=rf"a slot cannot start: {error}: "):
+        slot.wait_ready()
+
+
+def test_many_children_that_cannot_end_do_not_delay_the_end_of_a_pool(random_bundle, monkeypatch):
+    spec = TaskSpec(task=tasks.TOY, bundle=random_bundle.sha256, horizon=1, patience=0)
+    pool = SlotPool(3, spec, random_bundle.path, queue.SimpleQueue(), (tasks.TOY,), 0)
+    kills = []
+    for slot in pool._slots:
+        kills.append(slot._child.kill)
+        monkeypatch.setattr(slot._child, "kill", lambda: None)
+    began = monotonic()
+    pool.stop()
+    taken = monotonic() - began
+    for kill in kills:
+        kill()
+    assert taken < 4.5
