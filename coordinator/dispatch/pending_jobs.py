@@ -69,6 +69,8 @@ class PendingJob:
     overrun_by: set[str] = field(default_factory=set)  # workers that reported more steps than it can have
     failed: dict[str, str] = field(default_factory=dict)  # worker -> error
     attempts: Counter[str] = field(default_factory=Counter)  # worker -> how often it failed there
+    # Worker that lost its lease -> environment steps it had made; `None`: it had finished.
+    lost_steps: dict[str, int | None] = field(default_factory=dict)
 
     @property
     def state(self) -> JobState:
@@ -89,6 +91,11 @@ class PendingJob:
         R8: a job that failed is given to another worker.
         """
         return self.failed.keys() | self.overrun_by
+
+    def steps_lost_to(self, scorer: str, steps: int) -> int:
+        """What former holders had done of the job that `scorer` has now scored in `steps`."""
+        gone = self.lost_steps.keys() - self.holders - {scorer}
+        return sum(min(steps if (made := self.lost_steps[each]) is None else made, steps) for each in gone)
 
     @property
     def failure(self) -> JobFailure:

@@ -9,7 +9,7 @@ import faulthandler
 import os
 import signal
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking, make_stdout_nonblocking
@@ -58,6 +58,7 @@ def _make_scorer(
 ) -> Scorer:
     """Load the task and the world model; on an error send it as a `ScoringFailure` and exit."""
     from dreamfleet.common.artifacts.bundle import Bundle
+    from dreamfleet.common.errors import DreamfleetError
     from dreamfleet.worker.scoring.scorer import Scorer
     from dreamfleet.worker.service.failure_log import ScoringFailure
     from dreamfleet.worker.tasks.registry import check_task_allowed, check_world_allowed
@@ -70,7 +71,9 @@ def _make_scorer(
         check_world_allowed(opened, allowed_tasks)
         return Scorer(spec, opened)
     except Exception as error:
-        pipe.send(ScoringFailure.of(error))
+        failure = ScoringFailure.of(error)
+        # An expected error says all in its text.
+        pipe.send(replace(failure, trace="") if isinstance(error, DreamfleetError) else failure)
         raise SystemExit(1) from error
 
 

@@ -55,7 +55,7 @@ class FailureLog:
         return (
             f"task {task}: {failure.text} ({_describe_jobs(jobs)}); later failures from this line are not logged\n"
             f"{failure.trace}"
-        )
+        ).rstrip()
 
 
 def _encodable(text: str) -> str:
