@@ -88,6 +88,7 @@ def summarise_status(status: Status) -> str:
     score = "nothing evaluated yet" if best is None else f"best mean {format_mean(best)}"
     workers, slots = plural(status.workers.present, "worker"), plural(status.slots, "slot")
     lost = f", {status.workers.lost} lost" if status.workers.lost else ""
+    lost += f", {status.workers.left} left" if status.workers.left else ""
     return (
         f"{status.state}, generation {opened.number} ({opened.episodes_done}/{opened.episodes} episodes), {score}, "
         f"{status.throughput.steps_per_second:,.0f} steps/s, {workers} with {slots}{lost}, "
@@ -223,7 +224,9 @@ def _describe_waiting(status: Status) -> str:
     known = status.workers.known
     if not known and not status.throughput.environment_steps:
         return "waiting for workers: none has joined yet"
-    return f"waiting for workers: none{f' of {known}' if known else ''} is present"
+    left = sorted((each for each in status.worker_list if each.reason), key=lambda each: each.heard)
+    last = f"; {left[0].worker} left {format_duration(left[0].heard)} ago: {left[0].reason}" if left else ""
+    return f"waiting for workers: none{f' of {known}' if known else ''} is present{last}"
 
 
 def _format_episodes(part: EpisodeProgress) -> str:

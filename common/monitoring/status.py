@@ -108,7 +108,7 @@ class WorkerStatus:
     """A worker as the coordinator knows it."""
 
     worker: Word
-    state: Word  # present, silent or lost
+    state: Word  # present, silent, lost or left
     slots: Count
     leases: Count
     finished: Count
@@ -124,6 +124,7 @@ class WorkerStatus:
     round_trip: float | None = field(default=None, metadata=OPTIONAL)
     resent: Count = field(default=0, metadata=OPTIONAL)  # batches
     host_class: HostClass = field(default="", metadata=OPTIONAL)  # empty: not known yet
+    reason: Text = field(default="", metadata=OPTIONAL)  # why it left
 
 
 EventKind = Literal[
@@ -140,6 +141,7 @@ class Event:
     what: EventKind
     worker: Word
     job: Annotated[str, Length(0, 128)]  # kind generation/candidate/episode; empty if of no known job
+    why: Text = field(default="", metadata=OPTIONAL)  # a worker left, or was refused
 
 
 @dataclass(frozen=True)
@@ -147,9 +149,10 @@ class WorkerCount:
     """Numbers of workers."""
 
     present: Count
-    known: Count  # lost ones included
+    known: Count  # those that were lost, or left, in the last minutes included
     # Lost in the last minutes and not back; `None` from older coordinators.
     lost: Count | None = field(default=None, metadata=OPTIONAL)
+    left: Count = field(default=0, metadata=OPTIONAL)  # likewise, and they said why
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ In a narrow terminal columns are left out in `DROP_ORDER`, in a low one the rows
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from math import ceil
@@ -74,12 +75,17 @@ def find_slowest(workers: Sequence[WorkerStatus]) -> WorkerStatus | None:
 
 
 def _priority(each: WorkerStatus, slowest: WorkerStatus | None) -> tuple[bool, bool, float]:
-    """Sort key: lost and silent workers first, then the slowest ones."""
+    """Sort key: workers that are not present first, then the slowest ones."""
     return each.state == "present", each is not slowest, -(each.job_seconds or 0.0)
 
 
 def _row_height(each: WorkerStatus, width: int) -> int:
-    return max(1, ceil(cell_len(printable(each.worker)) / max(width, 1)))
+    return max(1, ceil(cell_len(printable(each.worker)) / max(width, 1))) + len(_reason_lines(each, width))
+
+
+def _reason_lines(each: WorkerStatus, width: int) -> list[str]:
+    """Why a worker left, beneath its row."""
+    return [f"  {line}"[:width] for line in textwrap.wrap(printable(each.reason), max(width - COLUMN_GAP, 1))]
 
 
 def _build_table(
@@ -101,6 +107,7 @@ def _build_table(
         style = "red" if each.state != "present" else "yellow" if each is slowest else ""
         line = (" " * COLUMN_GAP).join(_pad(name, cells[name][row], widths[name]) for name in kept)
         found += [Text(part, style=style) for part in chop_cells(line.rstrip(), width)]
+        found += [Text(part, style=style) for part in _reason_lines(each, width)]
     return found
 
 

@@ -36,6 +36,7 @@ Horizon = Annotated[int, Between(1, 10**6)]  # maximum steps of an episode that 
 Share = Annotated[float, Between(0.0, 1.0)]
 Patience = Annotated[int, Between(0, 10**6)]  # steps without reward after which a scored episode ends; 0: never
 Packages = Annotated[tuple[Word, ...], Length(0, 64)]
+Reason = Annotated[str, Length(0, 400)]  # why a worker leaves; empty: it stays, or does not say
 HostClass = Annotated[str, Length(0, 32)]  # see `host_classes`; empty: not known yet
 Kind = Literal["score", "evaluate", "collect"]
 VerdictWord = Literal["accepted", "duplicate", "obsolete", "refused"]
@@ -167,6 +168,8 @@ class JobBatch(Message):
     cancels: tuple[Digest, ...]
     verdicts: tuple[Verdict, ...]
     leave: bool = field(default=False, metadata=OPTIONAL)  # the run is over: the worker exits
+    # The run has ended. Only workers whose hello said `leaves_with_run` read it, and they exit.
+    ended: bool = field(default=False, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True)
@@ -219,6 +222,7 @@ class Heartbeat(Message):
     steps_per_second: Annotated[float, Between(0.0, 1e9)]
     drawn_by: Word  # renderer of the slots' pictures: native, gymnasium, or - if the task does not say
     host_class: HostClass | None = field(default=None, metadata=OPTIONAL)
+    reason: Reason = field(default="", metadata=OPTIONAL)  # the worker leaves, and this is its last heartbeat
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,6 +293,7 @@ class HelloRequest:
     slots: Count
     packages: Packages = field(default=NUMERIC_PACKAGES, metadata=OPTIONAL)  # whose versions the fingerprint names
     host_class: HostClass | None = field(default=None, metadata=OPTIONAL)
+    leaves_with_run: bool = field(default=False, metadata=OPTIONAL)  # it reads `JobBatch.ended`, and then exits
 
 
 @dataclass(frozen=True)
@@ -312,6 +317,7 @@ class HelloReply:
     packages: Packages = field(default=NUMERIC_PACKAGES, metadata=OPTIONAL)  # whose versions the fingerprint names
     numbering: Count = field(default=0, metadata=OPTIONAL)  # of the following batches; it increases
     classes: bool = field(default=False, metadata=OPTIONAL)  # whether this coordinator reads `host_class`
+    reasons: bool = field(default=False, metadata=OPTIONAL)  # whether it reads `Heartbeat.reason`
 
 
 @dataclass(frozen=True, kw_only=True)

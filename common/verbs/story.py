@@ -60,7 +60,8 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps([vars(each) for each in events]))
         return 0
-    print_rows([{"seconds ago": f"{each.ago:.2f}", "what": each.what, "job": each.job or None, "worker": each.worker}
+    print_rows([{"seconds ago": f"{each.ago:.2f}", "what": each.what, "job": each.job or None, "worker": each.worker,
+                 **({"why": each.why or None} if any(one.why for one in events) else {})}
                 for each in events], right=("seconds ago",))  # fmt: skip
     if not events:
         print("nothing of that is kept: it is too long ago, or not yet", file=sys.stderr)

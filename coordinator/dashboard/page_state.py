@@ -204,9 +204,10 @@ def _problems(status: Status) -> list[str]:
 def _fleet(status: Status, link: str) -> str:
     counts = status.workers
     lost = counts.lost or 0
-    silent = counts.known - counts.present - lost
+    silent = counts.known - counts.present - lost - counts.left
     text = f"{counts.present} present, {plural(status.slots, 'slot')}"
-    text += "".join(f", {count} {state}" for count, state in ((silent, "silent"), (lost, "lost")) if count > 0)
+    text += "".join(f", {count} {state}" for count, state in ((silent, "silent"), (lost, "lost"), (counts.left, "left"))
+                    if count > 0)  # fmt: skip
     text = text if link == LIVE else f"at the last: {text}"
     return f"{text}; {status.classes.description}" if status.classes.total else text
 
@@ -218,6 +219,7 @@ def _workers(look: RunSnapshot, link: str) -> dict[str, list[Any]]:
     return {
         "worker": [printable(each.worker) for each in rows],
         "state": [printable(each.state) if link == LIVE else NONE for each in rows],
+        "reason": [printable(each.reason) for each in rows],
         "slots": [each.slots for each in rows],
         "leases": [each.leases if link == LIVE else None for each in rows],
         "finished": [each.finished for each in rows],

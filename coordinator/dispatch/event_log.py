@@ -23,6 +23,7 @@ class FleetEvent(NamedTuple):
     what: EventKind
     worker: str
     job: tuple[str, int, int, int] | None
+    why: str = ""
 
 
 class EventLogView:
@@ -60,12 +61,12 @@ class EventLog:
         self._names[job.digest] = (job.kind, job.generation, job.candidate, job.episode)
         self.add(now, "given", worker, job.digest)
 
-    def add(self, now: float, what: EventKind, worker: str, digest: bytes | None = None) -> None:
-        """Record an event of a worker, or of a job that it holds."""
+    def add(self, now: float, what: EventKind, worker: str, digest: bytes | None = None, why: str = "") -> None:
+        """Record an event of a worker, or of a job that it holds, and the reason if there is one."""
         if len(self._blocks[-1]) >= BLOCK:
             self._blocks.append([])
         job = None if digest is None else self._names.get(digest)
-        self._blocks[-1].append(FleetEvent(now, what, worker, job))
+        self._blocks[-1].append(FleetEvent(now, what, worker, job, why))
 
     def view(self) -> EventLogView:
         """The log as it is now, for other threads."""

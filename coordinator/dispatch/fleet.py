@@ -13,12 +13,12 @@ from itertools import count
 from typing import Literal
 
 from dreamfleet.common.monitoring.status import EventKind
-from dreamfleet.common.printable import plural
+from dreamfleet.common.printable import one_line, plural
 from dreamfleet.common.protocol.messages import MAX_SLOTS, Heartbeat, Result, Verdict, VerdictWord
 from dreamfleet.coordinator.dispatch.event_log import EventLog
 from dreamfleet.coordinator.dispatch.failures import JobFailure
 from dreamfleet.coordinator.dispatch.host_stats import HostRecords
-from dreamfleet.coordinator.dispatch.member import DispatchGroup, Lease, LostWorkers, Member, MemberState, SentBatch
+from dreamfleet.coordinator.dispatch.member import DepartedWorkers, DispatchGroup, Lease, Member, MemberState, SentBatch
 from dreamfleet.coordinator.dispatch.packing import BatchContent, OutgoingBatch, pack
 from dreamfleet.coordinator.dispatch.pending_jobs import JobState, PendingJob, PendingJobs
 from dreamfleet.coordinator.dispatch.speculative_execution import Move, SpeculativeExecution
@@ -48,7 +48,7 @@ class Fleet:
         self._last_tick: float | None = None
         self._now = 0.0  # of the event that is being handled
         self._hosts = HostRecords()
-        self.lost = LostWorkers()
+        self.departed = DepartedWorkers()
         self.jobs = PendingJobs(evaluation_share)
         self.members: dict[str, Member] = {}
         self.counts: Counter[str] = Counter()
@@ -103,6 +103,21 @@ class Fleet:
         if (member := self.members.get(identity)) and member.gone_since is None:
             member.gone_since = now
 
+    def handle_farewell(self, identity: str, why: str, now: float) -> None:
+        """Note that a worker leaves, and why.
+
+        R24: the reason is for people, who see it in status, log and story. A worker that fails before it could score
+        says it in its first heartbeat.
+        """
+        if member := self.members.get(identity):
+            member.farewell = one_line(why)
+            self.handle_departure(identity, now)
+
+    def note_refusal(self, identity: str, note: str, why: str) -> None:
+        """Log that a worker was refused; the caller bounds how many are (R26)."""
+        self.notes.append(note)
+        self.event_log.add(self._now, "left", identity, why=f"refused: {why}")
+
     def remove_worker(self, identity: str) -> None:
         """Forget a worker: others get its jobs. If it is alive it gets no answer, and so says hello again (R22)."""
         if member := self.members.pop(identity, None):
@@ -119,8 +134,8 @@ class Fleet:
             return
         self._mark_heard(member, now)
         if member.is_guest:  # R26: only now is it logged, as strangers could fill the log with names
-            self._note_arrival(identity, now, "back" if identity in self.lost else "joined")
-            self.lost.remove(identity)
+            self._note_arrival(identity, now, "back" if identity in self.departed else "joined")
+            self.departed.remove(identity)
         beat = self._check_numbering(member, beat)
         if self.single_job:
             beat = replace(beat, capacity=min(beat.capacity, beat.slots))
@@ -128,8 +143,9 @@ class Fleet:
             for work in sent.content.work:
                 self.event_log.add(now, "seen", identity, work.job.digest)
         running = {self.jobs.digest_of_tag(run.tag): run.steps for run in beat.running}
-        listed = {self.jobs.digest_of_tag(tag) for tag in (*beat.queued, *beat.unacked)} | running.keys()
-        for digest in member.update_leases(listed, running, now):
+        finished = {self.jobs.digest_of_tag(tag) for tag in beat.unacked}
+        listed = {self.jobs.digest_of_tag(tag) for tag in beat.queued} | finished | running.keys()
+        for digest in member.update_leases(listed, running, finished, now):
             self._drop_lease(member, digest)
         held = DispatchGroup(now, len(member.leases), only_scoring=False)
         for found in listed - member.leases.keys():
@@ -211,16 +227,16 @@ class Fleet:
         """
         gap = now - self._last_tick if self._last_tick is not None else 0.0
         self._last_tick = self._now = now
-        self.lost.expire(now)
+        self.departed.expire(now)
         self.jobs.enqueue_due(now)
         for member in list(self.members.values()):
             if gap > CLOCK_GAP:
                 member.shift_clock(gap)
             if member.gone_since is not None:
                 if now - max(member.gone_since, member.last_heard) >= DEPARTURE_GRACE:
-                    self._release_lost(member, now, "is gone without a word" if member.capacity else "left")
+                    self._release_lost(member, now, member.departure)
                     self.remove_worker(member.identity)
-                    self.lost.add(member)
+                    self.departed.add(member)
             elif now - member.last_heard > (GUEST_TIMEOUT if member.is_guest else FORGET_AFTER):
                 self.remove_worker(member.identity)
             elif not member.silent and now - member.last_heard > SILENT_AFTER * self._interval:
@@ -327,8 +343,10 @@ class Fleet:
             self.counts["errors"] += 1
             if member is not None:
                 self._drop_lease(member, result.digest)
+                self.jobs[result.digest].lost_steps.pop(identity, None)  # the result's own steps count
             return "refused", None
         pending = self.jobs.accept(result)
+        self.counts["discarded_steps"] += pending.steps_lost_to(identity, result.steps)
         pending.holders.discard(identity)
         self._cancel(result.digest, pending)
         return "accepted", pending.work
@@ -377,8 +395,8 @@ class Fleet:
             return  # it has no jobs, and a stranger can invent names without end
         freed = f"{plural(len(member.leases), 'job')} {'is' if len(member.leases) == 1 else 'are'} free again"
         self.notes.append(f"worker {member.identity} {what}: {freed}")
-        gone: EventKind = "lost" if member.capacity else "left"
-        self.event_log.add(now, "silent" if member.gone_since is None else gone, member.identity)
+        gone: EventKind = "lost" if member.is_lost else "left"
+        self.event_log.add(now, "silent" if member.gone_since is None else gone, member.identity, why=member.farewell)
         if member.leases:
             (self._hosts.get(member.identity) or member.host_stats).record_loss(now - member.joined_at)
         self._release_leases(member)
@@ -409,7 +427,9 @@ class Fleet:
 
         R3: when the last lease of a wanted job ends, the job goes back into the queue.
         """
-        member.leases.pop(digest, None)
+        lease, pending = member.leases.pop(digest, None), self.jobs.get(digest)
+        if lease is not None and pending is not None and (lease.steps or lease.finished):
+            pending.lost_steps[member.identity] = None if lease.finished else lease.steps
         if self.jobs.remove_holder(digest, member.identity):
             self.counts["reissued"] += 1
             self.event_log.add(self._now, "reissued", member.identity, digest)

@@ -14,12 +14,12 @@ from dreamfleet.coordinator.dispatch.packing import BatchContent
 TRIAL_SECONDS = 60.0  # after which a trial copy without a result is forgotten
 MAX_BACKOFF = 4  # doublings of the pause before a batch is sent again
 ABSENT_HEARTBEATS = 2  # in a row that confirm a job's batch and do not list the job: its lease ends
-LOST_TIMEOUT = 600.0  # seconds for which a lost worker is listed, unless its host is back
-MAX_LOST = 256  # lost workers that are listed, the latest ones
+DEPARTED_TIMEOUT = 600.0  # seconds for which a departed worker is listed, unless its host is back
+MAX_DEPARTED = 256  # departed workers that are listed, the latest ones
 
 
 class MemberState(Enum):
-    """A member's state; a lost worker is no member any more (`LostWorkers`)."""
+    """A member's state; one that departed is no member any more (`DepartedWorkers`)."""
 
     GUEST = auto()  # welcomed, no heartbeat yet: anybody can say hello
     PRESENT = auto()
@@ -47,6 +47,7 @@ class Lease:
     absent_heartbeats: int = 0  # in a row that confirm the batch and do not list the job
     steps: int | None = None  # environment steps so far, once a heartbeat has shown the job running
     steps_seen_at: float = 0.0  # when the last heartbeat came
+    finished: bool = False  # the last heartbeat listed its result, which has not come
     upload_pending_since: float | None = None  # when its result first came, while its upload is still on the way
 
 
@@ -72,7 +73,9 @@ class Member:
     joined_at: float = 0.0
     host_stats: HostStats = field(default_factory=HostStats)
     capacity: int = 0  # slots that take jobs; 0, and so no credit, before the first heartbeat and once it drains
-    gone_since: float | None = None  # when its token vanished
+    leaves_with_run: bool = False  # it reads that the run has ended, and then exits
+    gone_since: float | None = None  # when its token vanished, or it said farewell
+    farewell: str = ""  # why it leaves, as it said itself
     silent: bool = False
     is_guest: bool = True  # until its first heartbeat
     number: int = 0  # of the last batch in its numbering
@@ -100,6 +103,16 @@ class Member:
         if self.is_guest:
             return MemberState.GUEST
         return MemberState.SILENT if self.silent else MemberState.PRESENT
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether it is gone, and neither drained nor said why it leaves."""
+        return self.gone_since is not None and self.capacity > 0 and not self.farewell
+
+    @property
+    def departure(self) -> str:
+        """How it went, for the log."""
+        return "is gone without a word" if self.is_lost else f"left ({self.farewell})" if self.farewell else "left"
 
     @property
     def is_reachable(self) -> bool:
@@ -158,7 +171,9 @@ class Member:
             self.last_delivery = now
         return arrived
 
-    def update_leases(self, listed: Set[bytes | None], running: Mapping[bytes | None, int], now: float) -> list[bytes]:
+    def update_leases(
+        self, listed: Set[bytes | None], running: Mapping[bytes | None, int], finished: Set[bytes | None], now: float
+    ) -> list[bytes]:
         """Note which jobs the last heartbeat listed and how far they are; return the digests whose leases end.
 
         R20: a lease ends when two heartbeats that confirm its batch do not list the job, so another worker gets it
@@ -168,6 +183,7 @@ class Member:
             present = digest in listed or lease.batch > self.confirmed
             lease.absent_heartbeats = 0 if present else lease.absent_heartbeats + 1
             lease.steps, lease.steps_seen_at = running.get(digest), now
+            lease.finished = digest in finished
         return [digest for digest, lease in self.leases.items() if lease.absent_heartbeats >= ABSENT_HEARTBEATS]
 
     def take_overdue_batches(self, now: float, patience: float) -> Iterator[tuple[int, SentBatch]]:
@@ -258,14 +274,14 @@ class Member:
             group.given_at += gap
 
 
-class LostWorkers(dict[str, Member]):
-    """Workers that vanished without leaving, by identity, the latest last: listed in the status, no members."""
+class DepartedWorkers(dict[str, Member]):
+    """Workers that were lost, or said why they leave, by identity, the latest last: in the status, but no members."""
 
     def add(self, member: Member) -> None:
-        """List a worker whose token vanished, unless it was draining: then it left in order."""
-        if not member.is_guest and member.capacity:
+        """List a worker that is gone, unless it had drained and gave no reason, as older ones do."""
+        if not member.is_guest and (member.capacity or member.farewell):
             self[member.identity] = member
-            if len(self) > MAX_LOST:  # R26: the list is bounded
+            if len(self) > MAX_DEPARTED:  # R26: the list is bounded
                 del self[next(iter(self))]
 
     def remove(self, identity: str) -> None:
@@ -276,5 +292,5 @@ class LostWorkers(dict[str, Member]):
 
     def expire(self, now: float) -> None:
         """Unlist the workers that were not heard for too long."""
-        for name in [name for name, each in self.items() if now - each.last_heard > LOST_TIMEOUT]:
+        for name in [name for name, each in self.items() if now - each.last_heard > DEPARTED_TIMEOUT]:
             del self[name]

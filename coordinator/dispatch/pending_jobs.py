@@ -37,6 +37,8 @@ class PendingJob:
     overrun_by: set[str] = field(default_factory=set)  # workers that reported more steps than it can have
     attempts: list[Attempt] = field(default_factory=list)  # the failed ones
     retry_at: float = 0.0  # seconds of the monotonic clock before which it is not tried again
+    # Worker that lost its lease -> environment steps it had made; `None`: it had finished.
+    lost_steps: dict[str, int | None] = field(default_factory=dict)
 
     @property
     def state(self) -> JobState:
@@ -57,6 +59,11 @@ class PendingJob:
         R8: a job that failed is given to another worker.
         """
         return {each.worker for each in self.attempts} | self.overrun_by
+
+    def steps_lost_to(self, scorer: str, steps: int) -> int:
+        """What former holders had done of the job that `scorer` has now scored in `steps`."""
+        gone = self.lost_steps.keys() - self.holders - {scorer}
+        return sum(min(steps if (made := self.lost_steps[each]) is None else made, steps) for each in gone)
 
     @property
     def failure(self) -> JobFailure:

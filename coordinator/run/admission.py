@@ -30,7 +30,7 @@ class WorkerAdmission:
         found = find_refusal(request, settings.task.task, admitted, settings.packages)
         final = request.packages == settings.packages  # otherwise the worker says hello again with these packages
         if found is not None and final and self.refused_workers.add(request.worker, found[0]):
-            self._fleet.notes.append(f"refused worker {request.worker}: {found[0]}")
+            self._fleet.note_refusal(request.worker, f"refused worker {request.worker}: {found[0]}", found[0])
         return found
 
     def admit(self, request: HelloRequest, now: float) -> int:
@@ -40,6 +40,7 @@ class WorkerAdmission:
         numbering = self._fleet.add_worker(request.worker, request.slots, request.fingerprint, now)
         if (member := self._fleet.members[request.worker]) is not known:
             member.host_class = self.class_of(request.host_class, request.fingerprint)
+            member.leaves_with_run = request.leaves_with_run
         return numbering
 
     def update_class(self, worker: str, host_class: str | None) -> None:
@@ -93,4 +94,4 @@ class WorkerAdmission:
         why, _ = class_mismatch(self.host_class, host_class, fingerprint)
         self._fleet.remove_worker(worker)
         if self.refused_workers.add(worker, why):
-            self._fleet.notes.append(f"worker {worker} must go: {why}")
+            self._fleet.note_refusal(worker, f"worker {worker} must go: {why}", why)

@@ -74,6 +74,7 @@ class WorkerProtocol:
             packages=self._run.settings.packages,
             numbering=numbering,
             classes=True,
+            reasons=True,
         )
 
     def handle(self, worker: str, message: WorkerMessage, now: float) -> None:
@@ -90,6 +91,8 @@ class WorkerProtocol:
     def handle_heartbeat(self, worker: str, beat: Heartbeat, now: float) -> None:
         """Reconcile what a worker holds, and its class, before it gets more work."""
         self._fleet.handle_heartbeat(worker, beat, now)
+        if beat.reason:
+            self._fleet.handle_farewell(worker, beat.reason, now)
         self._admission.update_class(worker, beat.host_class)
         for running in beat.running:
             digest = self._fleet.jobs.digest_of_tag(running.tag)
@@ -128,8 +131,8 @@ class WorkerProtocol:
         else:
             uploads.add(worker, part, now)
 
-    def job_batch(self, batch: OutgoingBatch, *, leave: bool = False) -> JobBatch:
-        """The message for a batch; with `leave` it asks the worker to leave the run."""
+    def job_batch(self, batch: OutgoingBatch, *, leave: bool = False, ended: bool = False) -> JobBatch:
+        """The message for a batch; with `leave` it asks the worker to leave the run, with `ended` it says why."""
         content = batch.content
         return JobBatch(
             run_uid=self._run.uid,
@@ -142,6 +145,7 @@ class WorkerProtocol:
             cancels=tuple(content.cancels),
             verdicts=tuple(content.verdicts),
             leave=leave,
+            ended=ended,
         )
 
     def _handle_result(

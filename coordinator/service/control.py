@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.messages import ControlReply
 from dreamfleet.common.serialization.validation import MAX_TEXT
+from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.packing import BatchContent, OutgoingBatch
 from dreamfleet.coordinator.run.run import Run
 
@@ -71,8 +72,13 @@ class Control:
             self._stop()
         elif now - self._leave_sent_at >= self._beat:
             self._leave_sent_at = now
-            return [OutgoingBatch(each.identity, each.numbering, 0, BatchContent()) for each in present]
+            return _empty_batches(present)
         return []
+
+    def last_batches(self) -> list[OutgoingBatch]:
+        """Empty batches that say that the run has ended, for those present that then exit."""
+        return _empty_batches(each for each in self._run.fleet.members.values()
+                              if each.leaves_with_run and each.gone_since is None)  # fmt: skip
 
     def _resume(self) -> None:
         self._draining = False
@@ -85,3 +91,7 @@ class Control:
     def _disband(self) -> None:
         self._run.pause("ending with its workers")
         self._disbanding_since = self._now
+
+
+def _empty_batches(members: Iterable[Member]) -> list[OutgoingBatch]:
+    return [OutgoingBatch(each.identity, each.numbering, 0, BatchContent()) for each in members]

@@ -9,7 +9,7 @@ import logging
 import queue
 import secrets
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from time import monotonic
 from typing import Any
 
@@ -52,6 +52,7 @@ TICK = 0.05  # seconds: the longest that a lost worker waits to be noticed
 MOST_EVENTS_PER_COMMIT = 256  # events that share one commit at most
 LINGER = 0.005  # seconds that a commit waits for more events to share it
 SNAPSHOT_INTERVAL = 0.2
+END_GRACE = 2.0  # seconds that workers may take to leave a run that has ended
 _WORKER_MESSAGES: dict[str, type[WorkerMessage]] = {"result": ResultBatch, "beat": Heartbeat, "upload": UploadPart}
 
 
@@ -152,9 +153,26 @@ class Service:
         self._file_watch.check(monotonic(), at_once=True)
         self._run.leave()
         self._snapshot = self._take_snapshot().as_left()
+        if self._run.ended is not None:
+            self._dismiss_workers(session)
         for each in declared:
             each.undeclare()
         session.put(keys.event_status(self._name), encode_status(self._snapshot), encoding="application/json")
+
+    def _dismiss_workers(self, session: zenoh.Session) -> None:
+        """Tell the workers that leave with the run that it has ended, and wait briefly until they are gone.
+
+        R24: without this word such a worker would wait for another life of the coordinator.
+        """
+        until = monotonic() + END_GRACE
+        self._put(session, self._control.last_batches(), ended=True)
+        with suppress(queue.Empty):
+            while self._control.last_batches():
+                kind, event = self._events.get(timeout=max(until - monotonic(), 0.0))
+                if kind in ("token", "beat"):
+                    self._handle(kind, event)
+                elif isinstance(event, zenoh.Query):
+                    event.drop()  # type: ignore[no-untyped-call]
 
     def _enqueue(self, kind: str) -> Any:
         """A callback that only enqueues; if the queue is full, the event is dropped, a query without an answer."""
@@ -166,10 +184,10 @@ class Service:
 
         return zenoh.handlers.Callback(enqueue, indirect=False)
 
-    def _put(self, session: zenoh.Session, batches: list[OutgoingBatch]) -> None:
+    def _put(self, session: zenoh.Session, batches: list[OutgoingBatch], *, ended: bool = False) -> None:
         for batch in batches:
             try:
-                message = encode(self._protocol.job_batch(batch, leave=self._control.disbanding))
+                message = encode(self._protocol.job_batch(batch, leave=self._control.disbanding, ended=ended))
             except MalformedError as error:  # caused by what this worker reported
                 self._error_counter.record("batch", error, batch.identity)
                 self._run.fleet.remove_worker(batch.identity)

@@ -74,10 +74,10 @@ def take_snapshot(
     """
     background_jobs, candidate_scores = run.background_jobs, run.generation.candidate_scores()
     members = list(run.fleet.members.values())
-    lost = [member for worker, member in run.fleet.lost.items() if worker not in run.fleet.members]
+    departed = [member for worker, member in run.fleet.departed.items() if worker not in run.fleet.members]
     return Snapshot(
-        status=_status(run, name, candidate_scores, members, len(lost), dropped, uptime, expires),
-        workers=tuple(_worker(member, now) for member in (*members, *lost)),
+        status=_status(run, name, candidate_scores, members, departed, dropped, uptime, expires),
+        workers=tuple(_worker(member, now) for member in (*members, *departed)),
         history=run.history.view(),
         evaluations=background_jobs.evaluations.rows,
         candidate_scores=candidate_scores,
@@ -89,10 +89,11 @@ def take_snapshot(
 
 
 def _status(
-    run: Run, name: str, candidate_scores: CandidateScores, members: Sequence[Member], lost: int,
+    run: Run, name: str, candidate_scores: CandidateScores, members: Sequence[Member], departed: Sequence[Member],
     dropped: Mapping[str, int], uptime: float, expires: float | None,
 ) -> Status:  # fmt: skip
     present = [member for member in members if member.is_reachable]
+    lost = sum(member.is_lost for member in departed)
     evaluations, failures, last = run.background_jobs.evaluations, run.fleet.jobs.failures, run.generations.last
     return Status(
         schema=STATUS_SCHEMA_VERSION,
@@ -116,7 +117,7 @@ def _status(
         evaluations=len(evaluations),
         evaluating=EpisodeProgress(*evaluations.progress),
         collecting=EpisodeProgress(*run.background_jobs.rollout_collections.progress),
-        workers=WorkerCount(len(present), len(members) + lost, lost),
+        workers=WorkerCount(len(present), len(members) + len(departed), lost, len(departed) - lost),
         worker_list=(),
         slots=sum(member.slots for member in present),
         fingerprint=run.admission.fingerprint,
@@ -227,7 +228,7 @@ def _failure(failure: JobFailure) -> FailureStatus:
 def _worker(member: Member, now: float) -> WorkerStatus:
     return WorkerStatus(
         worker=member.identity,
-        state="lost" if member.gone_since is not None else "silent" if member.silent else "present",
+        state=_worker_state(member),
         slots=member.slots,
         leases=len(member.leases),
         finished=member.finished,
@@ -240,7 +241,14 @@ def _worker(member: Member, now: float) -> WorkerStatus:
         round_trip=_rounded(member.host_stats.round_trip),
         resent=member.resent,
         host_class=member.host_class,
+        reason=member.farewell,
     )
+
+
+def _worker_state(member: Member) -> str:
+    if member.farewell:
+        return "left"
+    return "lost" if member.gone_since is not None else "silent" if member.silent else "present"
 
 
 def _rounded(seconds: float | None) -> float | None:

@@ -119,7 +119,7 @@ def _story(snapshot: Snapshot, parameters: Parameters) -> dict[str, Any]:
 
 def _event(each: FleetEvent, now: float) -> Event:
     job = "" if each.job is None else "{} {}/{}/{}".format(*each.job)
-    return Event(round(now - each.at, 3), each.what, each.worker, job)
+    return Event(round(now - each.at, 3), each.what, each.worker, job, each.why)
 
 
 def _best(snapshot: Snapshot, offset: int) -> dict[str, Any]:

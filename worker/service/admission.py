@@ -38,6 +38,7 @@ class Admission:
     packages: tuple[str, ...] = NUMERIC_PACKAGES  # the run's fingerprint consists of their versions
     numbering: int = 0  # R12: of the batches that follow; older ones cannot pass for current ones
     classes: bool = False  # whether the coordinator supports host classes
+    reasons: bool = False  # whether the coordinator reads why a worker leaves
 
 
 def request_admission(
@@ -115,7 +116,7 @@ def find_run_with_fewest_slots(session: zenoh.Session, excluded: Collection[str]
     return min(found)[1] if found else None
 
 
-def make_request(worker: str, tasks: tuple[str, ...], slots: int) -> HelloRequest:
+def make_request(worker: str, tasks: tuple[str, ...], slots: int, *, leaves_with_run: bool = False) -> HelloRequest:
     """The hello request of a worker."""
     return HelloRequest(
         protocol_min=keys.PROTOCOL_VERSION,
@@ -125,6 +126,7 @@ def make_request(worker: str, tasks: tuple[str, ...], slots: int) -> HelloReques
         tasks=tasks,
         fingerprint=fingerprint(),
         slots=slots,
+        leaves_with_run=leaves_with_run,
     )
 
 
@@ -140,5 +142,5 @@ def _read_admission(reply: HelloReply) -> Admission:
         ) from error
     return Admission(
         keys.check_run_name(reply.run), reply.run_uid, reply.incarnation, reply.nonce, spec, intervals, reply.packages,
-        reply.numbering, reply.classes,
+        reply.numbering, reply.classes, reply.reasons,
     )  # fmt: skip

@@ -8,7 +8,7 @@ from __future__ import annotations
 import faulthandler
 import os
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking, make_stdout_nonblocking
@@ -58,6 +58,7 @@ def _make_scorer(
 ) -> Scorer:
     """Load the task and the world model and send `ChildReady`; on an error send a `ScoringFailure` and exit."""
     from dreamfleet.common.artifacts.bundle import Bundle
+    from dreamfleet.common.errors import DreamfleetError
     from dreamfleet.worker.scoring.scorer import Scorer
     from dreamfleet.worker.service.failure_log import ScoringFailure
     from dreamfleet.worker.tasks.registry import check_task_allowed, check_world_allowed
@@ -72,7 +73,9 @@ def _make_scorer(
         pipe.send(ChildReady(scorer.drawn_by, scorer.host_class))
         return scorer
     except BaseException as error:  # a simulator may raise `SystemExit`
-        pipe.send(ScoringFailure.of(error))
+        failure = ScoringFailure.of(error)
+        # An expected error says all in its text.
+        pipe.send(replace(failure, trace="") if isinstance(error, DreamfleetError) else failure)
         raise SystemExit(1) from None
 
 

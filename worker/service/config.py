@@ -24,6 +24,9 @@ class WorkerConfig:
         2048, "MiB that a scoring process may hold; a larger one is replaced between jobs; 0: no limit"
     )
     exit_when_done: bool = option(False, "leave when the run has ended or refuses this worker")
+    coordinator_timeout: float = option(
+        600.0, "with --exit-when-done: seconds without a coordinator after which it leaves, and exits with 1"
+    )
 
     def __post_init__(self) -> None:
         if self.run is not None:
@@ -36,6 +39,6 @@ class WorkerConfig:
             raise UsageError("--any goes on to the next run, --exit-when-done leaves after one: give one of them")
         if not 0 <= self.slots <= MAX_LEASES:
             raise UsageError(f"--slots must be from 0 to {MAX_LEASES}, not {self.slots}")
-        for name in ("drain_timeout", "lifetime", "slot_memory"):
+        for name in ("drain_timeout", "lifetime", "slot_memory", "coordinator_timeout"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise UsageError(f"--{name.replace('_', '-')} must be a finite number, and not negative")

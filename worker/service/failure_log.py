@@ -58,7 +58,7 @@ class FailureLog:
         return (
             f"task {task}: {failure.text} ({_describe_jobs(jobs)}); later failures from this line are not logged\n"
             f"{failure.trace}"
-        )
+        ).rstrip()
 
 
 def _describe_jobs(jobs: Sequence[Job]) -> str:

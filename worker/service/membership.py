@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-COORDINATOR_GONE_AFTER = 5.0  # seconds without a coordinator after which a run counts as over
+NEXT_RUN_AFTER = 5.0  # seconds without a coordinator after which an idle worker of any run looks for another
+NEXT_RUN_PATIENCE = 60.0  # the same for one that has jobs or results of the run
 SILENT_BEATS = 5  # heartbeat intervals in which a coordinator that knows this worker would have answered
 UPLOAD_GRACE = 30.0  # seconds more while a rollout is being sent: the verdict comes only after it
 
@@ -20,7 +21,9 @@ class LeaveConditions:
 
     lifetime: float = 0.0  # seconds from its start until it drains; 0: never
     drain_timeout: float = 30.0  # seconds that draining may take
-    leaves_without_coordinator: bool = False  # whether it leaves a run whose coordinator is gone
+    leaves_with_run: bool = False  # whether it leaves when its run has ended
+    serves_any: bool = False  # whether it goes on to the next run, then and where the coordinator is gone
+    coordinator_timeout: float = math.inf  # seconds without a coordinator after which it gives its run up
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,7 @@ class Membership:
         """Record that a run welcomed this worker: its coordinator's life `nonce`, and the heartbeat interval `beat`."""
         self._beat = beat
         self._coordinators: set[str] = set()  # nonces of the coordinators in sight
-        self._run_has_ended = False
+        self._run_is_over = ""
         self._no_coordinator_since: float | None = now  # `None` while one is in sight
         self._next_hello_at = now
         self.rejoin(nonce, now)
@@ -76,9 +79,9 @@ class Membership:
         """Restart the silence: the coordinator sent something, or a slot did and the coordinator owes an answer."""
         self._silent_since = now
 
-    def end_run(self) -> None:
+    def end_run(self, why: str) -> None:
         """Record that the joined run is over and its workers leave."""
-        self._run_has_ended = True
+        self._run_is_over = why
 
     def add_coordinator(self, nonce: str) -> bool:
         """Record that a coordinator came into sight; return whether it is the joined one that is back."""
@@ -102,9 +105,13 @@ class Membership:
         return self._stop_requests > 0 or now >= self._ends_at
 
     @property
-    def leaves_without_coordinator(self) -> bool:
-        """Whether it leaves a run whose coordinator is gone."""
-        return self._conditions.leaves_without_coordinator
+    def plan_without_coordinator(self) -> str:
+        """What it does while its coordinator is out of sight, in words."""
+        if self._conditions.serves_any:
+            return f"goes on to the next run after {NEXT_RUN_AFTER:g} s, or {NEXT_RUN_PATIENCE:g} s with results"
+        if self._conditions.leaves_with_run:
+            return f"leaves too if it is not back within {self._conditions.coordinator_timeout:g} s"
+        return "waits for that run alone (--any: the next one)"
 
     @property
     def draining(self) -> bool:
@@ -121,20 +128,35 @@ class Membership:
         self._drain_until = now + self._conditions.drain_timeout
         return True
 
-    def is_over(self, now: float, busy: bool) -> bool:
-        """Whether to leave the run now; `busy` means that jobs run or results have no verdict.
+    def find_end(self, now: float, busy: bool) -> str:
+        """Why to leave the run now; empty: it stays. `busy` means that jobs run or results have no verdict.
 
-        R24: a draining worker leaves once all is delivered, or when its time is up.
+        R24: a draining worker leaves once all is delivered, or when its time is up. A run ends by its coordinator's
+        word; silence alone may be a cut link or a restart, so it needs long patience.
         """
-        if self._stop_requests > 1 or self._run_has_ended:
-            return True
+        if self._stop_requests > 1:
+            return "stopped by two signals, without draining"
+        if self._run_is_over:
+            return self._run_is_over
         if self._drain_until is not None:
-            return not busy or now > self._drain_until or self._coordinator_is_gone(now)
-        return self._conditions.leaves_without_coordinator and self._coordinator_is_gone(now)
+            if busy and now <= self._drain_until:
+                return ""
+            why = "drained after a signal" if self._stop_requests else "drained at the end of its lifetime"
+            return f"{why}, with jobs or results left when the time for that was up" if busy else why
+        if self.gives_up(now):
+            return f"its coordinator was out of sight for {self._conditions.coordinator_timeout:g} s"
+        if self._conditions.serves_any and self._is_alone(now, NEXT_RUN_PATIENCE if busy else NEXT_RUN_AFTER):
+            return "it goes on to another run"
+        return ""
 
-    def _coordinator_is_gone(self, now: float) -> bool:
-        """Whether no coordinator has been in sight for `COORDINATOR_GONE_AFTER` seconds."""
-        return self._no_coordinator_since is not None and now - self._no_coordinator_since > COORDINATOR_GONE_AFTER
+    def gives_up(self, now: float) -> bool:
+        """Whether the coordinator has been out of sight for so long that waiting for it makes no sense."""
+        alone = self._is_alone(now, self._conditions.coordinator_timeout)
+        return self._conditions.leaves_with_run and alone and not self.is_leaving(now)
+
+    def _is_alone(self, now: float, seconds: float) -> bool:
+        """Whether no coordinator has been in sight for longer than `seconds`."""
+        return self._no_coordinator_since is not None and now - self._no_coordinator_since > seconds
 
     def must_rejoin(self, now: float, load: WorkerLoad) -> bool:
         """Whether to say hello again.

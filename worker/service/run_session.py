@@ -16,7 +16,7 @@ from typing import Any
 
 import zenoh
 
-from dreamfleet.common.errors import RefusedError
+from dreamfleet.common.errors import ConnectionFailedError, RefusedError
 from dreamfleet.common.host.error_counter import ErrorCounter
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol import keys
@@ -25,9 +25,10 @@ from dreamfleet.common.protocol.messages import MAX_LEASES, JobBatch, Result
 from dreamfleet.common.transport.session import enqueue_into
 from dreamfleet.worker.service.admission import Admission
 from dreamfleet.worker.service.backlog import Backlog
+from dreamfleet.worker.service.farewell import describe_failure
 from dreamfleet.worker.service.frame_publisher import FramePublisher
 from dreamfleet.worker.service.frame_sampler import SampledFrame
-from dreamfleet.worker.service.membership import COORDINATOR_GONE_AFTER, Membership, WorkerLoad
+from dreamfleet.worker.service.membership import Membership, WorkerLoad
 from dreamfleet.worker.service.outbox import BURST_INTERVAL, Outbox, UploadQueue
 from dreamfleet.worker.service.sender import CoordinatorSender, StepRate
 from dreamfleet.worker.service.slot import SlotEvent
@@ -74,12 +75,22 @@ class RunSession:
         self._finished = self._steps_finished = 0
 
     def serve(self) -> None:
-        """Work until this worker stops or the run is over. Closes neither the slots nor the session."""
+        """Work until this worker stops or the run is over. Closes neither the slots nor the session.
+
+        `ConnectionFailedError` if it gave the run up because its coordinator was out of sight for too long.
+        """
         declared = self._startup()
         try:
-            self._main_loop()
-        finally:
-            self._shutdown(declared)
+            why = self._main_loop()
+        except BaseException as error:
+            self._shutdown(declared, describe_failure(error))
+            raise
+        self._shutdown(declared, why)
+        if self._membership.gives_up(monotonic()):
+            raise ConnectionFailedError(
+                f"left run {self._admission.run}: {why}{self._lost_results()}; start this worker again, or give it "
+                "more --coordinator-timeout"
+            )
 
     def _startup(self) -> list[Any]:
         run, session = self._admission.run, self._link.session
@@ -99,9 +110,10 @@ class RunSession:
         log.info("joined run %s as %s, %s", run, self._link.identity, plural(len(self._slots), "slot"))
         return declared
 
-    def _main_loop(self) -> None:
+    def _main_loop(self) -> str:
+        """Work; return why it ended."""
         now = monotonic()
-        while not self._membership.is_over(now, busy=self._slots.busy or len(self._outbox) > 0):
+        while not (why := self._membership.find_end(now, busy=self._slots.busy or len(self._outbox) > 0)):
             before = now
             self._wait()
             now = monotonic()
@@ -114,15 +126,21 @@ class RunSession:
             self._send(now)
             if self._membership.must_rejoin(now, self._load()):
                 self._rejoin(now)
+        return why
 
-    def _shutdown(self, declared: list[Any]) -> None:
-        # R24: a last heartbeat without capacity says that this worker left in order and was not killed.
-        self._send_heartbeat(monotonic(), capacity=0)
+    def _shutdown(self, declared: list[Any], why: str) -> None:
+        # R24: a last heartbeat without capacity says that this worker left in order and was not killed, and why.
+        self._send_heartbeat(monotonic(), capacity=0, reason=why)
         for each in declared:
             each.undeclare()
-        log.info(
-            "leaving run %s: %d jobs, %d environment steps", self._admission.run, self._finished, self._steps_finished
-        )
+        log.info("leaving run %s (%s): %d jobs, %d environment steps%s", self._admission.run, why, self._finished,
+                 self._steps_finished, self._lost_results())  # fmt: skip
+
+    def _lost_results(self) -> str:
+        """Which finished results go with this worker, in words."""
+        lost = len(self._outbox)
+        them = plural(lost, "finished result")
+        return f"; {them} that its coordinator has not taken {'is' if lost == 1 else 'are'} lost" if lost else ""
 
     def _wait(self) -> None:
         """Handle all waiting events; without any, wait for one until something must be sent."""
@@ -159,13 +177,8 @@ class RunSession:
         nonce = str(event.key_expr).rsplit("/", 1)[-1]
         if event.kind == zenoh.SampleKind.DELETE:
             self._membership.remove_coordinator(nonce, monotonic())
-            then = (
-                f"this worker leaves too if it is not back within {COORDINATOR_GONE_AFTER:g} s"
-                if self._membership.leaves_without_coordinator
-                else "this worker waits for that run alone (--any: the next one)"
-            )
-            log.info("the coordinator of run %s is out of sight: it left, or the connection was cut; %s",
-                     self._admission.run, then,
+            log.info("the coordinator of run %s is out of sight: it left, or the connection was cut; this worker %s",
+                     self._admission.run, self._membership.plan_without_coordinator,
                      extra={"facts": {"event": "coordinator gone", "run": self._admission.run}})  # fmt: skip
         elif self._membership.add_coordinator(nonce):  # joining another life is logged by `_rejoin`
             log.info("the coordinator of run %s is in sight again; this worker goes on", self._admission.run,
@@ -193,8 +206,8 @@ class RunSession:
             self._membership.suspect_forgotten()
             return
         self._membership.note_activity(monotonic())
-        if batch.leave:
-            self._membership.end_run()
+        if batch.leave or batch.ended:
+            self._membership.end_run("the run has ended" if batch.ended else "the run is over for its workers")
         for digest in batch.cancels:
             self._slots.abandon(digest)
         for job, why in self._backlog.add_batch(batch, self._slots.wanted_digests):
@@ -253,7 +266,7 @@ class RunSession:
         for part in self._uploads.due(now):
             self._sender.send_part(part)
 
-    def _send_heartbeat(self, now: float, capacity: int) -> None:
+    def _send_heartbeat(self, now: float, capacity: int, reason: str = "") -> None:
         self._sender.send_heartbeat(
             self._slots,
             numbering=self._backlog.numbering,
@@ -262,6 +275,7 @@ class RunSession:
             queued=self._backlog.queued,
             unacked=self._outbox.digests,
             rate=self._rate.update(now, self._steps_finished + self._slots.steps),
+            reason=reason,
         )
 
     def _load(self) -> WorkerLoad:

@@ -77,7 +77,7 @@ class CoordinatorSender:
 
     def send_heartbeat(
         self, slots: SlotPool, *, numbering: int, seen: int, capacity: int, queued: Sequence[bytes],
-        unacked: Sequence[bytes], rate: float,
+        unacked: Sequence[bytes], rate: float, reason: str = "",
     ) -> None:  # fmt: skip
         """Send a heartbeat: batches received up to `seen`, queued and running jobs, results without a verdict.
 
@@ -101,6 +101,29 @@ class CoordinatorSender:
             steps_per_second=min(rate, MAX_STEPS_PER_SECOND),
             drawn_by=slots.drawn_by,
             host_class=self._host_class(slots),
+            reason=reason if self._admission.reasons else "",
+        )
+        self._publish(keys.heartbeat(self._admission.run, self._identity), beat)
+
+    def send_farewell(self, slots: int, reason: str) -> None:
+        """Send the first and last heartbeat of a worker that fails before it can score (R24)."""
+        if not self._admission.reasons:
+            return
+        beat = Heartbeat(
+            run_uid=self._admission.run_uid,
+            incarnation=self._admission.incarnation,
+            nonce=self._admission.nonce,
+            numbering=self._admission.numbering,
+            seen=0,
+            capacity=0,
+            slots=slots,
+            queued=(),
+            running=(),
+            unacked=(),
+            load=os.getloadavg()[0],
+            steps_per_second=0.0,
+            drawn_by="-",
+            reason=reason,
         )
         self._publish(keys.heartbeat(self._admission.run, self._identity), beat)
 

@@ -7,7 +7,8 @@ import math
 import queue
 import random
 from collections import Counter
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
 from time import monotonic
@@ -32,9 +33,11 @@ from dreamfleet.common.transport.session import Network, open_session
 from dreamfleet.worker.service.admission import Admission, find_run_with_fewest_slots, make_request, request_admission
 from dreamfleet.worker.service.bundle_fetch import fetch_bundle
 from dreamfleet.worker.service.config import WorkerConfig
+from dreamfleet.worker.service.farewell import describe_failure
 from dreamfleet.worker.service.membership import LeaveConditions, Membership
 from dreamfleet.worker.service.refusal_backoff import SINGLE_RUN_DELAYS, RefusalBackoff
 from dreamfleet.worker.service.run_session import CoordinatorLink, RunSession
+from dreamfleet.worker.service.sender import CoordinatorSender
 from dreamfleet.worker.service.slot_pool import SlotPool
 from dreamfleet.worker.tasks.registry import check_world_allowed, find_task, known_tasks
 
@@ -56,10 +59,13 @@ class Worker:
         self._config = config
         self._network = network
         self._slot_count = config.slots or usable_cores()
-        self._hello = make_request(self.identity, (*known_tasks(), *tasks), self._slot_count)
+        self._hello = make_request(
+            self.identity, (*known_tasks(), *tasks), self._slot_count,
+            leaves_with_run=config.exit_when_done or config.any,
+        )  # fmt: skip
         lifetime = min(config.lifetime or math.inf, self._seconds_until_expiry)
         conditions = LeaveConditions(
-            lifetime, config.drain_timeout, leaves_without_coordinator=config.exit_when_done or config.any
+            lifetime, config.drain_timeout, config.exit_when_done, config.any, config.coordinator_timeout
         )
         self._membership = Membership(conditions, monotonic())
         self._refusals = RefusalBackoff() if config.any else RefusalBackoff(*SINGLE_RUN_DELAYS)
@@ -127,21 +133,35 @@ class Worker:
     def _serve_run(self, link: CoordinatorLink, admission: Admission) -> None:
         """Work for a run until it is over or this worker leaves."""
         bundle = None
-        if admission.spec.bundle and (bundle := self._fetch_bundle(link.session, admission)) is None:
-            return
+        with self._farewell(link.session, admission):
+            if admission.spec.bundle and (bundle := self._fetch_bundle(link.session, admission)) is None:
+                return
         # Each run has its own queue, so that late events of the last run are not taken for this one's.
         self._events = queue.SimpleQueue()
         with ExitStack() as stack:
-            memory, path = self._config.slot_memory << 20, bundle.path if bundle else None
-            if bundle is not None:
-                check_world_allowed(bundle, self._hello.tasks)
-            slots = SlotPool(
-                self._slot_count, admission.spec, path, self._events, self._hello.tasks, memory,
-                lambda: self._fetch_bundle(link.session, admission) if bundle else None,
-            )  # fmt: skip
+            with self._farewell(link.session, admission):
+                slots = self._open_slots(link.session, admission, bundle)
             stack.callback(slots.stop)
             self._refusals.forget(self._refusal_key(admission.run))
             RunSession(link, admission, self._membership, slots, self._events).serve()
+
+    def _open_slots(self, session: zenoh.Session, admission: Admission, bundle: Bundle | None) -> SlotPool:
+        if bundle is not None:
+            check_world_allowed(bundle, self._hello.tasks)
+        return SlotPool(
+            self._slot_count, admission.spec, bundle.path if bundle else None, self._events, self._hello.tasks,
+            self._config.slot_memory << 20, lambda: self._fetch_bundle(session, admission) if bundle else None,
+        )  # fmt: skip
+
+    @contextmanager
+    def _farewell(self, session: zenoh.Session, admission: Admission) -> Iterator[None]:
+        """Tell the coordinator why this worker fails before it can score."""
+        try:
+            yield
+        except Exception as error:
+            sender = CoordinatorSender(session, self.identity, admission)
+            sender.send_farewell(self._slot_count, describe_failure(error))
+            raise
 
     def _join(self, session: zenoh.Session) -> Admission | None:
         """A run that welcomed this worker; `None` if this worker stops first."""

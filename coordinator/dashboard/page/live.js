@@ -209,7 +209,7 @@ const fillWorkers = (frame) => {
     row.classList.toggle("same", host === before);
     before = host;
     say(row.name.firstChild, host);
-    say(row.name.lastChild, life);
+    say(row.name.lastChild, workers.reason[index] ? `${life} ${workers.reason[index]}` : life);
     if (row.lane !== workers.lane[index]) {
       row.lane = workers.lane[index];
       if (row.inSight) paintLane(row);

@@ -14,7 +14,7 @@ from dreamfleet.coordinator.dispatch.fleet import (
     SILENT_AFTER,
 )
 from dreamfleet.coordinator.dispatch.fleet import Fleet as _Fleet
-from dreamfleet.coordinator.dispatch.member import LOST_TIMEOUT, MAX_LOST
+from dreamfleet.coordinator.dispatch.member import DEPARTED_TIMEOUT, MAX_DEPARTED
 from dreamfleet.coordinator.dispatch.speculative_execution import LONGEST_HELD, LONGEST_HELD_TIMES, UPLOAD_SECONDS
 from dreamfleet.coordinator.jobs.work import make_work, vector_bytes
 from tests.support.samples import HEAD, SPEC
@@ -157,29 +157,29 @@ def test_a_worker_that_vanishes_without_leaving_is_listed_as_lost_until_it_is_ba
     vanish(A, 1.0)
     fleet.handle_heartbeat(B, beat(0), 2.0)  # it drains
     vanish(B, 2.0)
-    assert list(fleet.lost) == [A]
+    assert list(fleet.departed) == [A]
     assert [each.what for each in fleet.event_log.view().latest()][:2] == ["left", "lost"]
     fleet.add_worker(A, 1, "f", 3.0)
-    assert list(fleet.lost) == [A]  # anybody may say hello
+    assert list(fleet.departed) == [A]  # anybody may say hello
     fleet.handle_heartbeat(A, beat(), 3.0)
-    assert (fleet.lost, next(fleet.event_log.view().latest()).what) == ({}, "back")
+    assert (fleet.departed, next(fleet.event_log.view().latest()).what) == ({}, "back")
     vanish(A, 4.0)
     another_life = "a/00000009"
     fleet.add_worker(another_life, 1, "f", 5.0)
     fleet.handle_heartbeat(another_life, beat(), 5.0)
-    assert not fleet.lost
+    assert not fleet.departed
     vanish(another_life, 6.0)
-    fleet.tick(6.0 + LOST_TIMEOUT)
-    assert not fleet.lost
+    fleet.tick(6.0 + DEPARTED_TIMEOUT)
+    assert not fleet.departed
 
 
 def test_the_list_of_lost_workers_is_bounded():
-    fleet = fleet_of(*(f"h{number}/0" for number in range(MAX_LOST + 3)))
+    fleet = fleet_of(*(f"h{number}/0" for number in range(MAX_DEPARTED + 3)))
     for name in list(fleet.members):
         fleet.handle_departure(name, 1.0)
     fleet.tick(1.0 + 2 * DEPARTURE_GRACE)
-    assert len(fleet.lost) == MAX_LOST
-    assert "h0/0" not in fleet.lost
+    assert len(fleet.departed) == MAX_DEPARTED
+    assert "h0/0" not in fleet.departed
 
 
 def test_a_silent_workers_jobs_are_given_again_and_a_heartbeat_brings_it_back():
