@@ -10,16 +10,20 @@ from __future__ import annotations
 import argparse
 import difflib
 import errno
+import logging
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points, version
-from typing import NoReturn, Protocol
+from io import TextIOWrapper
+from pathlib import Path
+from typing import Any, NoReturn, Protocol
 
 from dreamfleet.common.errors import DreamfleetError, MissingExtraError, UsageError
 from dreamfleet.common.host.logs import configure_logging, report_failure
+from dreamfleet.common.host.stop_signals import interrupts
 
 GROUP = "dreamfleet.verbs"
 EXIT_INTERRUPTED = 130
@@ -60,7 +64,11 @@ class SimpleVerb:
 
 
 class Parser(argparse.ArgumentParser):
-    """A verb's parser; the error for an unknown flag suggests the nearest one."""
+    """A verb's parser: each error is one line, and the one for an unknown flag suggests the nearest."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise a `UsageError`; argparse would print all flags first."""
+        raise UsageError(f"{message}; `{self.prog} --help` lists the flags")
 
     def parse_all(self, words: Sequence[str]) -> argparse.Namespace:
         """Parse `words`; exits with an error on an unknown one."""
@@ -72,34 +80,67 @@ class Parser(argparse.ArgumentParser):
     def _refuse(self, unknown: Sequence[str]) -> NoReturn:
         flags = [word.split("=")[0] for word in unknown if word.startswith("--")]
         near = [each for flag in flags for each in difflib.get_close_matches(flag, self._option_string_actions, n=1)]
-        hint = f"; did you mean {', '.join(dict.fromkeys(near))}?" if near else ""
-        self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
+        if near:
+            raise UsageError(f"unrecognized arguments: {' '.join(unknown)}; did you mean {', '.join(dict.fromkeys(near))}?")
+        self.error(f"unrecognized arguments: {' '.join(unknown)}")
+
+    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
+        if action.option_strings and "--" in arg_strings:  # of `--flag=--`: Python 3.11 drops it and gives a list
+            raise argparse.ArgumentError(action, "expected a value, not --")
+        return super()._get_values(action, arg_strings)  # type: ignore[misc]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb; returns the exit code. An expected error becomes one line on stderr and a non-zero exit code."""
     _open_closed_streams()
+    _accept_all_text()
     configure_logging()
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         code = run_verb({point.name: point for point in entry_points(group=GROUP)}, words)
         sys.stdout.flush()
-        return code
-    except DreamfleetError as error:
+    except (KeyboardInterrupt, Exception) as error:
+        code = _report(error)
+    with suppress(OSError):
+        sys.stderr.flush()
+    return code
+
+
+def _report(error: BaseException) -> int:
+    """Report why a verb failed; returns the exit code. An error that nobody expected is raised again."""
+    if isinstance(error, DreamfleetError):
         report_failure(str(error))
         return error.exit_code
-    except KeyboardInterrupt:
+    if isinstance(error, KeyboardInterrupt) or interrupts.seen:
         report_failure("interrupted")
         return EXIT_INTERRUPTED
-    except BrokenPipeError:  # `dreamfleet runs list | head`
+    if isinstance(error, BrokenPipeError):  # `dreamfleet runs list | head`
         _discard_stdout()
         return 0
-    except OSError as error:
-        if error.errno != errno.ENOSPC or error.filename is not None:
-            raise
-        _discard_stdout()
-        report_failure("cannot write to stdout: no space left")
-        return 1
+    if not isinstance(error, OSError):
+        raise error
+    logging.getLogger("dreamfleet").debug("the error in full", exc_info=error)
+    _discard_stdout()
+    report_failure(_describe_system_error(error))
+    return 1
+
+
+def _describe_system_error(error: OSError) -> str:
+    """What the operating system refused, on which file."""
+    try:
+        Path.cwd()
+    except OSError:
+        return "the current folder is gone or closed to this user: change to another"
+    if error.filename is not None:
+        return f"{os.fspath(error.filename)}: {error.strerror}"
+    return "cannot write to stdout: no space left" if error.errno == errno.ENOSPC else str(error)
+
+
+def _accept_all_text() -> None:
+    """Write what a stream's encoding lacks as escape sequences: a terminal may take ASCII, a name be no UTF-8."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _open_closed_streams() -> None:
@@ -129,7 +170,8 @@ def run_verb(points: Mapping[str, EntryPoint], words: Sequence[str]) -> int:
 
     complete_arguments(args)
     try:
-        return verb.run(args)
+        with interrupts.on_ctrl_c():
+            return verb.run(args)
     except ModuleNotFoundError as error:
         if not verb.EXTRAS:
             raise

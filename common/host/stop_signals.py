@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import _thread
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,6 +20,38 @@ def never_stop() -> bool:
     return False
 
 
+class Interrupts:
+    """The handler that raises `KeyboardInterrupt`, and whether it did: an import may turn it into another error."""
+
+    def __init__(self) -> None:
+        self.seen = False
+
+    def raise_one(self, _number: int, _frame: Any) -> None:
+        """Handle a signal."""
+        self.seen = True
+        raise KeyboardInterrupt
+
+    @contextmanager
+    def on_ctrl_c(self) -> Iterator[None]:
+        """Handle Ctrl-C, unless it is ignored; one that hits a finaliser, where nobody catches it, is raised again."""
+        if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+            yield
+            return
+        self.seen = False
+        before, report = signal.signal(signal.SIGINT, self.raise_one), sys.unraisablehook
+        sys.unraisablehook = lambda lost: (
+            _thread.interrupt_main() if lost.exc_type is KeyboardInterrupt else report(lost)
+        )
+        try:
+            yield
+        finally:
+            sys.unraisablehook = report
+            signal.signal(signal.SIGINT, before)
+
+
+interrupts = Interrupts()
+
+
 @contextmanager
 def stop_on_signals() -> Iterator[Stop]:
     """Yield a `Stop` that is True after a first Ctrl-C or SIGTERM; a second one raises `KeyboardInterrupt`.
@@ -29,7 +63,7 @@ def stop_on_signals() -> Iterator[Stop]:
     def handle(_number: int, _frame: Any) -> None:
         nonlocal stopped
         if stopped:
-            raise KeyboardInterrupt
+            interrupts.raise_one(_number, _frame)
         stopped = True
 
     before = {number: signal.signal(number, handle) for number in SIGNALS}
@@ -47,7 +81,7 @@ def interrupted_by_signals() -> Iterator[None]:
     By default only Ctrl-C raises, and not in a script's background jobs, which shells start with SIGINT ignored. Main
     thread only.
     """
-    before = {number: signal.signal(number, signal.default_int_handler) for number in SIGNALS}
+    before = {number: signal.signal(number, interrupts.raise_one) for number in SIGNALS}
     try:
         yield
     finally:
