@@ -81,13 +81,15 @@ class Parser(argparse.ArgumentParser):
         flags = [word.split("=")[0] for word in unknown if word.startswith("--")]
         near = [each for flag in flags for each in difflib.get_close_matches(flag, self._option_string_actions, n=1)]
         if near:
-            raise UsageError(f"unrecognized arguments: {' '.join(unknown)}; did you mean {', '.join(dict.fromkeys(near))}?")
+            raise UsageError(
+                f"unrecognized arguments: {' '.join(unknown)}; did you mean {', '.join(dict.fromkeys(near))}?"
+            )
         self.error(f"unrecognized arguments: {' '.join(unknown)}")
 
     def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
         if action.option_strings and "--" in arg_strings:  # of `--flag=--`: Python 3.11 drops it and gives a list
             raise argparse.ArgumentError(action, "expected a value, not --")
-        return super()._get_values(action, arg_strings)  # type: ignore[misc]
+        return super()._get_values(action, arg_strings)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

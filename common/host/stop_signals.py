@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+RETRY = 0.01  # seconds until a Ctrl-C that nobody could catch is sent again
 Stop = Callable[[], bool]
 """Returns whether to stop at the next point where that is safe."""
 
@@ -34,14 +35,15 @@ class Interrupts:
     @contextmanager
     def on_ctrl_c(self) -> Iterator[None]:
         """Handle Ctrl-C, unless it is ignored; one that hits a finaliser, where nobody catches it, is raised again."""
-        if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        if (
+            threading.current_thread() is not threading.main_thread()
+            or signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+        ):
             yield
             return
         self.seen = False
         before, report = signal.signal(signal.SIGINT, self.raise_one), sys.unraisablehook
-        sys.unraisablehook = lambda lost: (
-            _thread.interrupt_main() if lost.exc_type is KeyboardInterrupt else report(lost)
-        )
+        sys.unraisablehook = lambda lost: _interrupt_soon() if lost.exc_type is KeyboardInterrupt else report(lost)
         try:
             yield
         finally:
@@ -50,6 +52,13 @@ class Interrupts:
 
 
 interrupts = Interrupts()
+
+
+def _interrupt_soon() -> None:
+    """Send Ctrl-C again once the main thread has left the finaliser."""
+    again = threading.Timer(RETRY, _thread.interrupt_main)
+    again.daemon = True
+    again.start()
 
 
 @contextmanager

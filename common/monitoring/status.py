@@ -18,6 +18,7 @@ from dreamfleet.common.serialization.validation import (
     Count,
     Length,
     MalformedError,
+    Moment,
     Seconds,
     Text,
     Word,
@@ -231,7 +232,7 @@ class Status:
     strict: bool = field(default=False, metadata=OPTIONAL)  # hosts of another class than the first result's are refused
     classes: HostClasses = field(default=HostClasses(), metadata=OPTIONAL)  # of the accepted results
     # When the coordinator's join file expires, in seconds since 1970; `None` without one.
-    expires: float | None = field(default=None, metadata=OPTIONAL)
+    expires: Moment | None = field(default=None, metadata=OPTIONAL)
 
     ending: bool = field(default=False, metadata=OPTIONAL)  # a limit is reached: only evaluations are left
     # Episodes of evaluations and of the confirmation until the run's end.
