@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import logging
 import sys
-from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Literal
 
@@ -48,5 +47,4 @@ def report_failure(text: str) -> None:
     if any(isinstance(handler.formatter, JsonFormatter) for handler in logging.getLogger().handlers):
         logging.getLogger("dreamfleet").error("%s", text)
     else:
-        with suppress(OSError):  # stderr may be full, or nobody reads it
-            print(f"dreamfleet: {text}", file=sys.stderr, flush=True)  # noqa: T201 - the command line's output
+        print(f"dreamfleet: {text}", file=sys.stderr)  # noqa: T201 - the command line's output

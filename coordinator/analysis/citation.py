@@ -54,10 +54,8 @@ def _rows(
         if run.duration_seconds is None
         else f" at {run.ended_at}, {format_duration(run.duration_seconds)} after it began"
     )
-    yield (
-        "run",
-        f"`{run.uid}`, begun {run.created or 'at an unknown time'}, {f'ended after {run.ended}{at}' if run.ended else 'open'}",
-    )
+    since, state = run.created or "at an unknown time", f"ended after {run.ended}{at}" if run.ended else "open"
+    yield "run", f"`{run.uid}`, begun {since}, {state}"
     yield "controller", f"SHA-256 `{controller.sha256}` of its parameters"
     yield "world model", f"SHA-256 `{spec.bundle}`" if spec.bundle else "none"
     yield "score", _score(run)

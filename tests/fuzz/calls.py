@@ -13,7 +13,8 @@ from tests.support.drives import write_drives
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 REPORT = Path(__file__).parents[2] / "docs" / "results" / "tiny.json"
-NETWORK = "--listen tcp/127.0.0.1:7400 --minutes 0.003"
+LISTEN = "--listen tcp/127.0.0.1:7400"
+NETWORK = f"{LISTEN} --minutes 0.003"
 RUN = "--task dream --bundle tiny --population 4 --episodes 1"
 # Words that a verb accepts, in a folder that `write_stage` made; a verb of a plug-in has none.
 VALID = {
@@ -26,23 +27,25 @@ VALID = {
     "coordinator": f"--run new {RUN} {NETWORK}", "dashboard": "--port 0", "demo": "--no-page --workers 1",
     "doctor": "", "down": "nowhere.invalid", "drain": "", "drive": "--steps 2", "encode": "--data data",
     "evaluate": "--controller tiny --episodes 1 --jobs 1", "fork": f"dream --run new {NETWORK}", "inspect": "tiny",
-    "iterate": f"--data data --rounds 1 {NETWORK.split(' --min', maxsplit=1)[0]}", "live": "--controller tiny --seconds 0.1",
+    "iterate": f"--data data --rounds 1 {LISTEN}", "live": "--controller tiny --seconds 0.1",
     "pause": "", "pipeline": "--data new --scale 0.001", "record": "--controller tiny --steps 2",
-    "refit": "tiny --to tiny --data data --out new.npz", "repeat": f"tiny --run new {NETWORK.split(' --min', maxsplit=1)[0]}",
+    "refit": "tiny --to tiny --data data --out new.npz", "repeat": f"tiny --run new {LISTEN}",
     "replay": "reality --candidate best", "reproduce": "report.json --episodes 1 --jobs 1", "resume": "",
-    "router": NETWORK.split(" --min", maxsplit=1)[0], "runs.archive": "dream", "runs.backup": "dream --to new",
+    "router": LISTEN, "runs.archive": "dream", "runs.backup": "dream --to new",
     "runs.compare": "dream reality", "runs.delete": "dream --yes", "runs.export": "dream --csv --out new",
     "runs.list": "", "runs.plot": "dream", "runs.receipt": "reality", "runs.show": "dream",
     "spawn": "nowhere.invalid", "status": "", "stop": "", "story": "", "subspace": "tiny --data data --out new.npz",
     "tasks": "", "train.mdnrnn": "--data data --updates 1", "train.vae": "--data data --updates 1 --batch 2",
     "unbundle": "tiny --data new", "up": "settings.toml", "worker": "--connect tcp/127.0.0.1:7400 --lifetime 0.01",
 }  # fmt: skip
+# No path of these leads out of the scratch folder, except to devices.
 VALUES = (
     "", "--", "-", "-1", "0", "1", "2", "0.5", "1e309", "1" + "0" * 400, "-1e-320", "nan", "inf", "-inf", "±ünï",
-    "\udcff\udc80", "a\nb\x1b[2J", "x" * 5000, "%s%(a)d{}", "[1", "a=b", "a=[[1e999]]", "none", "None", "true", " ", "..",
-    "../..", "/", "folder", "/dev/null", "/dev/full", "/dev/zero", "missing/path", "binary", "pipe", "other.npz",
-    "report.json", "w-issued.join", "tcp/127.0.0.1:1", "tcp/127.0.0.1:99999999", "tcp/[::1", "dream", "empty", "'", "3-1", "0/0", "0/99999",
-    "gym:CartPole-v1", "gym:", "1,2,,3", "18446744073709551616", "9223372036854775807", "-9223372036854775809",
+    "\udcff\udc80", "a\nb\x1b[2J", "x" * 5000, "%s%(a)d{}", "[1", "a=b", "a=[[1e999]]", "none", "None", "true",
+    " ", "..", "../..", "folder", "/dev/null", "/dev/full", "/dev/zero", "missing/path", "binary", "pipe", "other.npz",
+    "report.json", "w-issued.join", "tcp/127.0.0.1:1", "tcp/127.0.0.1:99999999", "tcp/[::1", "dream",
+    "empty", "'", "3-1", "0/0", "0/99999", "gym:CartPole-v1", "gym:", "1,2,,3", "18446744073709551616",
+    "9223372036854775807", "-9223372036854775809",
 )  # fmt: skip
 
 

@@ -22,7 +22,7 @@ SECOND_CTRL_C = 4.0  # seconds after the first
 MOST_MEMORY = 3_000_000  # kilobytes
 MOST_ADDRESSES = 16_000_000_000  # bytes
 MOST_LINES = 6  # of a usage error
-CLONE_NEWNET, SIOCSIFFLAGS, IFF_UP = 0x40000000, 0x8914, 1
+CLONE_NEWNET, SIOCSIFFLAGS, IFF_UP, PR_SET_PDEATHSIG = 0x40000000, 0x8914, 1, 1
 
 
 def preload():
@@ -105,6 +105,7 @@ def start(argv, folder, limit):
 
 def _isolate(folder):
     os.setsid()
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     os.chdir(folder / "work")
     for number, (name, flags) in enumerate(
         (

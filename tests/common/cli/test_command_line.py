@@ -9,6 +9,7 @@ import pytest
 
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.host.standard_streams import LAST_STREAM
 from tests.support.processes import DEADLINE
 
 BROKEN = EntryPoint("broken", "tests.no_such_module", command_line.GROUP)
@@ -111,4 +112,4 @@ def test_closed_streams_are_replaced(tmp_path):
     )
     command = ["bash", "-c", '"$@" <&- >&- 2>&-', "-", sys.executable, "-c", program]
     number = subprocess.run(command, cwd=tmp_path, check=False, timeout=DEADLINE).returncode
-    assert number > command_line.LAST_STREAM
+    assert number > LAST_STREAM
