@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import signal
 import sys
 import threading
@@ -56,7 +55,7 @@ interrupts = Interrupts()
 
 def _interrupt_soon() -> None:
     """Send Ctrl-C again once the main thread has left the finaliser."""
-    again = threading.Timer(RETRY, _thread.interrupt_main)
+    again = threading.Timer(RETRY, signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT))
     again.daemon = True
     again.start()
 

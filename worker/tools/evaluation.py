@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -15,7 +14,7 @@ from typing import ClassVar
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.host.packages import package_version
-from dreamfleet.common.host.parent_death import exit_with_parent
+from dreamfleet.common.host.parent_death import end_on_signals, exit_with_parent, signals_blocked
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
 from dreamfleet.common.runs.evaluation_report import EvaluationReport
@@ -36,7 +35,9 @@ def evaluate(agent: Agent, seeds: tuple[int, ...], jobs: int) -> Iterator[Episod
         min(jobs, len(seeds)), get_context("spawn"), _ProcessEvaluator.start, (agent, os.getpid())
     )
     try:
-        for each in as_completed([pool.submit(_ProcessEvaluator.drive, seed) for seed in seeds]):
+        with signals_blocked():
+            drives = [pool.submit(_ProcessEvaluator.drive, seed) for seed in seeds]
+        for each in as_completed(drives):
             yield each.result()
     except BrokenProcessPool as error:
         raise DreamfleetError(
@@ -72,7 +73,7 @@ class _ProcessEvaluator:
         """Initialise the process, which ends with its parent."""
         exit_with_parent(parent)
         os.environ["SDL_VIDEODRIVER"] = "dummy"
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C reaches the whole process group: end without a traceback
+        end_on_signals()  # Ctrl-C reaches the whole process group
         cls.agent = agent
 
     @classmethod

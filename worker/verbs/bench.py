@@ -104,11 +104,14 @@ def measure_on_one_thread(measure: Callable[..., dict[str, Any]], bundle_name: s
     from multiprocessing import get_context
 
     from dreamfleet.common.artifacts.bundle_store import find_bundle
+    from dreamfleet.common.host.parent_death import end_on_signals, signals_blocked
 
     bundle: Bundle = find_bundle(bundle_name)
     _pin_libraries()
     # A child: numpy's library reads its thread count once, when loaded, and this process has loaded it.
-    with get_context("spawn").Pool(1) as pool:
+    with signals_blocked():
+        one_process = get_context("spawn").Pool(1, end_on_signals)
+    with one_process as pool:
         figures: dict[str, Any] = pool.apply(measure, (bundle, *more))
     return figures
 
