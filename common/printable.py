@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Sequence
+
+KEPT_OF_HUGE_WORD = 100  # characters kept at each end
+_HUGE_WORD = re.compile(r"\S{1000,}")
 
 
 def printable(text: str) -> str:
@@ -20,6 +24,11 @@ def truncate(text: str, max_chars: int) -> str:
 def one_line(text: str) -> str:
     """The text on one line, printable: text from the network cannot start a line."""
     return printable(" ".join(text.split()))
+
+
+def shorten_words(text: str) -> str:
+    """The text with the middle of huge words left out, such as a name of 5,000 characters; its remedy stays."""
+    return _HUGE_WORD.sub(lambda word: f"{word[0][:KEPT_OF_HUGE_WORD]}...{word[0][-KEPT_OF_HUGE_WORD:]}", text)
 
 
 def plural(count: float, noun: str, nouns: str = "") -> str:

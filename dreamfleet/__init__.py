@@ -11,10 +11,10 @@ when it is first asked for, so that a coordinator needs no simulator and a reade
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
+TYPE_CHECKING = False  # `typing` takes milliseconds, in which Ctrl-C would still print a traceback
 if TYPE_CHECKING:
+    from typing import Any
+
     from dreamfleet.common.artifacts.actions import Continuous, Discrete
     from dreamfleet.common.artifacts.bundle import Bundle
     from dreamfleet.common.artifacts.bundle_store import find_bundle
@@ -85,6 +85,8 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
     module, _, original = _HOMES[name].partition(":")
     found = getattr(import_module(f"{__name__}.{module}"), original or name)
     globals()[name] = found

@@ -10,20 +10,21 @@ from __future__ import annotations
 import argparse
 import difflib
 import errno
-import os
+import logging
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points, version
-from typing import NoReturn, Protocol
+from pathlib import Path
+from typing import Any, NoReturn, Protocol
 
 from dreamfleet.common.errors import DreamfleetError, MissingExtraError, UsageError
 from dreamfleet.common.host.logs import configure_logging, report_failure
+from dreamfleet.common.host.standard_streams import discard_stdout, prepare_streams
+from dreamfleet.common.host.stop_signals import interrupts
 
 GROUP = "dreamfleet.verbs"
 EXIT_INTERRUPTED = 130
-LAST_STREAM = 2  # file descriptor of stderr
 DESCRIPTION = "Evolve World-Models controllers on whatever machines you have."
 EXIT_CODES = (
     "Exit codes: 0 done; 1 it failed, was refused, or the answer is no; 2 the command or a setting is wrong; 130 it "
@@ -60,7 +61,11 @@ class SimpleVerb:
 
 
 class Parser(argparse.ArgumentParser):
-    """A verb's parser; the error for an unknown flag suggests the nearest one."""
+    """A verb's parser: each error is one line, and the one for an unknown flag suggests the nearest."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise a `UsageError`; argparse would print all flags first."""
+        raise UsageError(f"{message}; `{self.prog} --help` lists the flags")
 
     def parse_all(self, words: Sequence[str]) -> argparse.Namespace:
         """Parse `words`; exits with an error on an unknown one."""
@@ -72,54 +77,62 @@ class Parser(argparse.ArgumentParser):
     def _refuse(self, unknown: Sequence[str]) -> NoReturn:
         flags = [word.split("=")[0] for word in unknown if word.startswith("--")]
         near = [each for flag in flags for each in difflib.get_close_matches(flag, self._option_string_actions, n=1)]
-        hint = f"; did you mean {', '.join(dict.fromkeys(near))}?" if near else ""
-        self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
+        if near:
+            raise UsageError(
+                f"unrecognized arguments: {' '.join(unknown)}; did you mean {', '.join(dict.fromkeys(near))}?"
+            )
+        self.error(f"unrecognized arguments: {' '.join(unknown)}")
+
+    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
+        if action.option_strings and "--" in arg_strings:  # of `--flag=--`: Python 3.11 drops it and gives a list
+            raise argparse.ArgumentError(action, "expected a value, not --")
+        if action.type is Path and "" in arg_strings:  # would be the current folder
+            raise argparse.ArgumentError(action, "expected a path, not an empty text")
+        return super()._get_values(action, arg_strings)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb; returns the exit code. An expected error becomes one line on stderr and a non-zero exit code."""
-    _open_closed_streams()
+    prepare_streams()
     configure_logging()
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         code = run_verb({point.name: point for point in entry_points(group=GROUP)}, words)
         sys.stdout.flush()
-        return code
-    except DreamfleetError as error:
+    except (KeyboardInterrupt, Exception) as error:
+        code = _report(error)
+    return code
+
+
+def _report(error: BaseException) -> int:
+    """Report why a verb failed; returns the exit code. An error that nobody expected is raised again."""
+    if isinstance(error, DreamfleetError):
         report_failure(str(error))
         return error.exit_code
-    except KeyboardInterrupt:
+    if isinstance(error, KeyboardInterrupt) or interrupts.seen:
         report_failure("interrupted")
         return EXIT_INTERRUPTED
-    except BrokenPipeError:  # `dreamfleet runs list | head`
-        _discard_stdout()
+    if isinstance(error, BrokenPipeError):  # `dreamfleet runs list | head`
+        discard_stdout()
         return 0
-    except OSError as error:
-        if error.errno != errno.ENOSPC or error.filename is not None:
-            raise
-        _discard_stdout()
-        report_failure("cannot write to stdout: no space left")
-        return 1
+    if not isinstance(error, OSError):
+        raise error
+    logging.getLogger("dreamfleet").debug("the error in full", exc_info=error)
+    discard_stdout()
+    report_failure(_describe_system_error(error))
+    return 1
 
 
-def _open_closed_streams() -> None:
-    """Open closed standard streams (`>&-`) on /dev/null; else the next opened file, such as a journal, gets output."""
-    while (number := os.open(os.devnull, os.O_RDWR)) <= LAST_STREAM:
-        os.set_inheritable(number, True)
-    os.close(number)
-    for number, name in enumerate(("stdin", "stdout", "stderr")):
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(number, "w" if number else "r", closefd=False))  # noqa: SIM115 - never closed
-
-
-def _discard_stdout() -> None:
-    """Drop stdout's buffer, which cannot be written; else the interpreter would try again at exit."""
-    with suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def _describe_system_error(error: OSError) -> str:
+    """What the operating system refused, on which file."""
+    if error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return "cannot write to stdout: no space left" if error.errno == errno.ENOSPC else str(error)
 
 
 def run_verb(points: Mapping[str, EntryPoint], words: Sequence[str]) -> int:
     """Run the verb that `words` begin with, with the rest as its arguments; without a verb, show help and exit."""
+    _check_current_folder()
     name = ".".join(words[:2]) if ".".join(words[:2]) in points else "".join(words[:1])
     if name not in points:
         _show_overview(points, words)
@@ -129,7 +142,8 @@ def run_verb(points: Mapping[str, EntryPoint], words: Sequence[str]) -> int:
 
     complete_arguments(args)
     try:
-        return verb.run(args)
+        with interrupts.on_ctrl_c():
+            return verb.run(args)
     except ModuleNotFoundError as error:
         if not verb.EXTRAS:
             raise
@@ -137,6 +151,14 @@ def run_verb(points: Mapping[str, EntryPoint], words: Sequence[str]) -> int:
         raise MissingExtraError(
             f"the package {error.name!r} is not installed; this needs: pip install 'dreamfleet[{wanted}]'"
         ) from error
+
+
+def _check_current_folder() -> None:
+    """`UsageError` if the current folder was deleted: relative paths lead nowhere, and torch ends the process."""
+    try:
+        Path.cwd()
+    except OSError as error:
+        raise UsageError("the current folder is gone or closed to this user: change to another") from error
 
 
 def build_parser(name: str, verb: Configurable) -> Parser:

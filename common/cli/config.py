@@ -104,10 +104,12 @@ def read_toml(
     if path is None:
         return {}
     try:
-        table = tomllib.loads(read_text(path, MAX_BYTES))
+        table = tomllib.loads(read_text(path, MAX_BYTES).removeprefix("\ufeff"))  # an editor may mark UTF-8
     except FileNotFoundError:
         raise UsageError(f"no configuration file at {path}") from None
-    except (OSError, ValueError, RecursionError) as error:  # a number of 5,000 digits is a plain ValueError
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read as TOML: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:  # a number of 5,000 digits is a plain ValueError
         raise UsageError(f"{path} cannot be read as TOML: {error}") from error
     known, keys, repeated = sorted(tables), sorted(top), sorted(arrays)
     for name, value in table.items():
@@ -145,7 +147,8 @@ def _from_environment(known: Mapping[str, Any], section: str, environment: Mappi
         if key not in known:
             names = [prefix + each.upper() for each in known]
             raise UsageError(f"unknown environment variable {variable}{suggestion(variable, names)}")
-        values[key] = _parse_text(known[key], text, variable)
+        if text or _takes_empty(known[key]):  # else as if unset
+            values[key] = _parse_text(known[key], text, variable)
     return values
 
 
@@ -156,7 +159,7 @@ def _convert_toml_value(hint: Any, value: Any, where: str) -> Any:
         return tuple(value)
     if base is float and type(value) in (int, float):
         return float(value)
-    if base is Path and isinstance(value, str):
+    if base is Path and isinstance(value, str) and value:
         return Path(value)
     if get_origin(base) is Literal and value in get_args(base):
         return value
@@ -182,6 +185,12 @@ def _parse_text(hint: Any, text: str, where: str) -> Any:
     if get_origin(base) is Literal and text in get_args(base):
         return text
     raise UsageError(f"{where} must be {_describe_type(base)}, not {text!r}")
+
+
+def _takes_empty(hint: Any) -> bool:
+    """Whether an empty variable is a value: an empty text, an empty list, no path."""
+    base = _without_none(hint)
+    return base is str or get_origin(base) is tuple or (base is Path and base is not hint)
 
 
 def _without_none(hint: Any) -> Any:

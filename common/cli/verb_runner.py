@@ -35,7 +35,7 @@ class InProcessRunner:
     """Runs verbs one after the other in this process. All commands are parsed before the first one runs."""
 
     def __init__(self, commands: Mapping[str, Sequence[str]]) -> None:
-        """`commands` by the names that their answers get; a wrong one ends this process as on the command line."""
+        """`commands` by the names that their answers get; `UsageError` for a wrong one."""
         self._parsed = {name: _parse(words) for name, words in commands.items()}
 
     def run_all(self) -> None:
@@ -78,7 +78,7 @@ class ProcessRunner:
         A wrong command is a `UsageError`, a stop a `StoppedError`, any other failure a `DreamfleetError`.
         """
         log.parent.mkdir(parents=True, exist_ok=True)
-        with log.open("w") as kept:
+        with log.open("w", encoding="utf-8", errors="backslashreplace") as kept:
 
             def forward_lines() -> None:
                 for line in child.new_lines():

@@ -23,8 +23,12 @@ def open_regular(path: Path, max_bytes: int = sys.maxsize) -> Iterator[BufferedR
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except ValueError as error:  # a NUL, or half a surrogate pair
         raise OSError(errno.EINVAL, "no file can have this name") from error
-    with open(number, "rb") as file:  # noqa: PTH123 - a descriptor
+    try:
         _check_regular_size(os.fstat(number), max_bytes)
+    except OSError:
+        os.close(number)
+        raise
+    with open(number, "rb") as file:  # noqa: PTH123 - a descriptor
         yield file
 
 

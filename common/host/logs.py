@@ -11,7 +11,7 @@ import sys
 from datetime import UTC, datetime
 from typing import Literal
 
-from dreamfleet.common.printable import PrintableFormatter, one_line
+from dreamfleet.common.printable import PrintableFormatter, one_line, shorten_words
 
 
 class JsonFormatter(logging.Formatter):
@@ -43,7 +43,8 @@ def set_log_format(log_format: Literal["text", "json", "auto"]) -> None:
 
 def report_failure(text: str) -> None:
     """Report why a verb fails: as a line on stderr, or as a log record if the log is JSON."""
+    text = shorten_words(one_line(text))
     if any(isinstance(handler.formatter, JsonFormatter) for handler in logging.getLogger().handlers):
         logging.getLogger("dreamfleet").error("%s", text)
     else:
-        print(f"dreamfleet: {one_line(text)}", file=sys.stderr)  # noqa: T201 - the command line's output
+        print(f"dreamfleet: {text}", file=sys.stderr)  # noqa: T201 - the command line's output

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 END_LIMIT = 4.0  # seconds that an orderly end may take after the second signal
+RETRY = 0.01  # seconds until a Ctrl-C that nobody could catch is sent again
 Stop = Callable[[], bool]
 """Returns whether to stop at the next point where that is safe."""
 
@@ -21,6 +23,46 @@ Stop = Callable[[], bool]
 def never_stop() -> bool:
     """A `Stop` that is always False."""
     return False
+
+
+class Interrupts:
+    """The handler that raises `KeyboardInterrupt`, and whether it did: an import may turn it into another error."""
+
+    def __init__(self) -> None:
+        self.seen = False
+
+    def raise_one(self, _number: int, _frame: Any) -> None:
+        """Handle a signal."""
+        self.seen = True
+        raise KeyboardInterrupt
+
+    @contextmanager
+    def on_ctrl_c(self) -> Iterator[None]:
+        """Handle Ctrl-C, unless it is ignored; one that hits a finaliser, where nobody catches it, is raised again."""
+        if (
+            threading.current_thread() is not threading.main_thread()
+            or signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+        ):
+            yield
+            return
+        self.seen = False
+        before, report = signal.signal(signal.SIGINT, self.raise_one), sys.unraisablehook
+        sys.unraisablehook = lambda lost: _interrupt_soon() if lost.exc_type is KeyboardInterrupt else report(lost)
+        try:
+            yield
+        finally:
+            sys.unraisablehook = report
+            signal.signal(signal.SIGINT, before)
+
+
+interrupts = Interrupts()
+
+
+def _interrupt_soon() -> None:
+    """Send Ctrl-C again once the main thread has left the finaliser."""
+    again = threading.Timer(RETRY, signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT))
+    again.daemon = True
+    again.start()
 
 
 @contextmanager
@@ -34,7 +76,7 @@ def stop_on_signals() -> Iterator[Stop]:
     def handle(_number: int, _frame: Any) -> None:
         nonlocal stopped
         if stopped:
-            raise KeyboardInterrupt
+            interrupts.raise_one(_number, _frame)
         stopped = True
 
     before = {number: signal.signal(number, handle) for number in SIGNALS}
@@ -52,7 +94,7 @@ def interrupted_by_signals() -> Iterator[None]:
     By default only Ctrl-C raises, and not in a script's background jobs, which shells start with SIGINT ignored. Main
     thread only.
     """
-    before = {number: signal.signal(number, signal.default_int_handler) for number in SIGNALS}
+    before = {number: signal.signal(number, interrupts.raise_one) for number in SIGNALS}
     try:
         yield
     finally:

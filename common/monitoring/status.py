@@ -18,6 +18,7 @@ from dreamfleet.common.serialization.validation import (
     Count,
     Length,
     MalformedError,
+    Moment,
     Seconds,
     Text,
     Word,
@@ -235,7 +236,7 @@ class Status:
     strict: bool = field(default=False, metadata=OPTIONAL)  # hosts of another class than the first result's are refused
     classes: HostClasses = field(default=HostClasses(), metadata=OPTIONAL)  # of the accepted results
     # When the coordinator's join file expires, in seconds since 1970; `None` without one.
-    expires: float | None = field(default=None, metadata=OPTIONAL)
+    expires: Moment | None = field(default=None, metadata=OPTIONAL)
 
     failed: Count = field(default=0, metadata=OPTIONAL)  # candidates of closed generations that failed
     # Since the run began, by the wall clock: pauses, and time without coordinator or workers, included.

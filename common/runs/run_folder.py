@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
-from datetime import datetime
 from difflib import SequenceMatcher
 from pathlib import Path
 from typing import Any
@@ -43,6 +42,7 @@ from dreamfleet.common.runs.run_lock import is_run_locked
 from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, rollout_path, run_paths
 from dreamfleet.common.runs.seeds import CHOOSING_OFFSET, CONFIRMING_OFFSET, VALIDATION
 from dreamfleet.common.runs.stages import begun_stages
+from dreamfleet.common.runs.times import elapsed_seconds
 
 MAX_LISTED_RUNS = 8  # in the error for an unknown run name
 # Names of facts in the journal.
@@ -138,10 +138,8 @@ class RunFolder:
 
     @property
     def duration_seconds(self) -> float | None:
-        """Seconds from the run's beginning to its end, pauses included; `None` where `ended_at` is."""
-        if (ended_at := self.ended_at) is None:
-            return None
-        return (datetime.fromisoformat(ended_at) - datetime.fromisoformat(self.created)).total_seconds()
+        """Seconds from the run's beginning to its end, pauses included; `None` if its clocks do not tell."""
+        return elapsed_seconds(self.created, self.ended_at or "")
 
     @property
     def classes(self) -> HostClasses:

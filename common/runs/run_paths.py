@@ -20,7 +20,7 @@ ROLLOUTS = "rollouts"
 
 def default_runs_dir() -> Path:
     """The folder of all runs: `$DREAMFLEET_RUNS_DIR`, else `runs` in the current folder."""
-    return Path(os.environ.get("DREAMFLEET_RUNS_DIR", "runs"))
+    return Path(os.environ.get("DREAMFLEET_RUNS_DIR") or "runs")
 
 
 def run_paths(runs_dir: Path) -> Iterator[Path]:

@@ -14,7 +14,7 @@ from dreamfleet.common.errors import AccessError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import read_regular
 from dreamfleet.common.security.credentials import Credentials, identity
-from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.serialization.validation import MalformedError, Moment, from_plain
 
 log = logging.getLogger(__name__)
 LEDGER_FILE = "issued.json"  # in the authority's folder
@@ -30,8 +30,8 @@ class IssuedJoinFile:
     seat: int
     name: str
     serial: str  # of the certificate, hexadecimal; empty without one
-    expires: float
-    revoked: float | None = None
+    expires: Moment
+    revoked: Moment | None = None
 
     @property
     def identity(self) -> str:

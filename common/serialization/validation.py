@@ -36,6 +36,7 @@ class Length:
 
 Count = Annotated[int, Between(0, 2**63 - 1)]
 Seconds = Annotated[float, Between(0.0, 1e9)]
+Moment = Annotated[float, Between(0.0, 253_402_300_799.0)]  # in seconds since 1970, to the year 9999
 Digest = Annotated[bytes, Length(32, 32)]
 Word = Annotated[str, Length(1, 128)]
 Text = Annotated[str, Length(0, MAX_TEXT)]

@@ -14,6 +14,7 @@ from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_provenance import RunProvenance, read_run_provenance, read_run_settings
 from dreamfleet.common.runs.seeds import TRAINING_FIRST
 from dreamfleet.common.runs.stages import begun_stages, describe_stages
+from dreamfleet.common.runs.times import parse_time
 from dreamfleet.common.serialization.optional_fields import to_dict
 
 
@@ -53,7 +54,8 @@ def _rows(
         if run.duration_seconds is None
         else f" at {run.ended_at}, {format_duration(run.duration_seconds)} after it began"
     )
-    yield "run", f"`{run.uid}`, begun {run.created}, {f'ended after {run.ended}{at}' if run.ended else 'open'}"
+    since, state = run.created or "at an unknown time", f"ended after {run.ended}{at}" if run.ended else "open"
+    yield "run", f"`{run.uid}`, begun {since}, {state}"
     yield "controller", f"SHA-256 `{controller.sha256}` of its parameters"
     yield "world model", f"SHA-256 `{spec.bundle}`" if spec.bundle else "none"
     yield "score", _score(run)
@@ -104,11 +106,11 @@ def _commands(run: RunFolder) -> dict[str, str]:
 
 
 def _bibtex(run: RunFolder, controller: Controller, receipt: RunProvenance) -> list[str]:
-    version = (receipt.versions or {}).get("dreamfleet", "")
+    version, begun = (receipt.versions or {}).get("dreamfleet", ""), parse_time(run.created)
     return [
         f"@misc{{dreamfleet-{run.name},",
         f"  title = {{Run {run.name} of dreamfleet {version}}},",
-        f"  year = {{{run.created[:4]}}},",
+        *([] if begun is None else [f"  year = {{{begun.year}}},"]),
         f"  note = {{run {run.uid}, controller SHA-256 {controller.sha256}, {receipt.generations} generations}}",
         "}",
     ]

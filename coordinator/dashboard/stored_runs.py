@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,7 @@ from dreamfleet.common.runs.records import (
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import resume_command, run_paths
 from dreamfleet.common.runs.stages import stages_of
+from dreamfleet.common.runs.times import format_time
 from dreamfleet.coordinator.dashboard.curves import Quartiles, RunData, cumulative_effort, curves, downsample
 from dreamfleet.coordinator.dashboard.page_state import NONE, Facts, describe_optimiser, format_score
 
@@ -100,7 +100,7 @@ def _run_row(path: Path) -> dict[str, Any]:
             return {
                 "run": printable(run.name),
                 "created": run.created,
-                "begun": format_created(run.created),
+                "begun": format_time(run.created),
                 "task": printable(run.spec.task),
                 "generations": len(history),
                 "mean": history[-1].mean if history else None,
@@ -121,13 +121,6 @@ def _resume_command(run: RunFolder) -> str:
     return printable(resume_command(run.path)) if run.state == "open" else ""
 
 
-def format_created(created: str) -> str:
-    """Format a start time for people, such as 2026-11-23 17:30 UTC."""
-    with suppress(ValueError):
-        return f"{datetime.fromisoformat(created).astimezone(UTC):%Y-%m-%d %H:%M} UTC"
-    return printable(created)
-
-
 def _world(run: RunFolder) -> str:
     """The task that gives the scores; for a dream, the task of its world model."""
     task = run.spec.task
@@ -141,7 +134,7 @@ def _facts(run: RunFolder, data: RunData, total: Effort) -> Facts:
     settings, best = data.settings, best_evaluation(data.evaluations)
     facts = [
         ("task", settings.task.task),
-        ("begun", format_created(run.created)),
+        ("begun", format_time(run.created)),
         ("generations", f"{len(data.history):,}"),
         ("population", f"{settings.population} candidates x {plural(settings.episodes, 'episode')}"),
         ("horizon", f"{settings.task.horizon:,} steps"),

@@ -36,6 +36,7 @@ from dreamfleet.common.host.stop_signals import never_stop
 from dreamfleet.common.monitoring.client import Client
 from dreamfleet.common.monitoring.status_panel import RunPanel
 from dreamfleet.common.printable import plural
+from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.runs.records import best_evaluation
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import CONTROLLER
@@ -178,7 +179,7 @@ class Demo:
         self._print(f"{demo_run.what}: a coordinator and {plural(workers, 'worker')} on this machine")
         if demo_run.schedule:
             logs.mkdir(parents=True, exist_ok=True)
-            (logs / SCHEDULE).write_text(demo_run.schedule)
+            (logs / SCHEDULE).write_text(demo_run.schedule, encoding="utf-8")
             flags = {**flags, "schedule": logs / SCHEDULE}
         words = model_commands.begin_run(
             demo_run.run, self._runs_dir, (self._endpoint,), *options(**flags), world_model=self._config.bundle,
@@ -262,7 +263,7 @@ def plan_runs(config: DemoConfig, name: str, runs_dir: Path) -> tuple[DemoRun, .
         "variant": OFFROAD_COST, **_evaluation_flags(*REAL_EVALUATIONS),
     }  # fmt: skip
     if config.dream_minutes:
-        dream = f"{name}-dream"
+        dream = check_run_name(f"{name}-dream")
         flags = {
             **search, "preset": "dream", "temperature": config.temperature, "sigma0": sigma0, "seed": config.seed,
             "minutes": config.dream_minutes, **_evaluation_flags(*DREAM_EVALUATIONS),

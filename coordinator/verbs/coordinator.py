@@ -175,6 +175,7 @@ def _report(
     from dreamfleet.common.monitoring.eta import format_duration
     from dreamfleet.common.runs.records import describe_score
     from dreamfleet.common.runs.run_paths import CONTROLLER
+    from dreamfleet.common.runs.times import elapsed_seconds
 
     again = request.resume_command()
     path = request.folder / CONTROLLER
@@ -194,9 +195,9 @@ def _report(
     else:
         where = f"; controller: {controller}" if controller else "; it has no controller yet"
         more = f"; it goes on with wider limits, such as: {again} --generations 0 --minutes 30" if nothing_new else ""
-        lasted = (datetime.now(UTC) - datetime.fromisoformat(run.created)).total_seconds()
-        ended = f"ended after {run.ended} (begun {format_duration(lasted)} ago)"
-        text = f"run {request.name} {ended}{score}{where}{outcome.text or more}"
+        lasted = elapsed_seconds(run.created, datetime.now(UTC).isoformat())
+        ago = "" if lasted is None else f" (begun {format_duration(lasted)} ago)"
+        text = f"run {request.name} ended after {run.ended}{ago}{score}{where}{outcome.text or more}"
     if run.ended is None and not args.json:
         print(text, file=sys.stderr)
     else:

@@ -10,6 +10,7 @@ from importlib.util import find_spec
 from dreamfleet.common.cli.config import add_flags, load
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.host.stop_signals import interrupted_by_signals
+from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.coordinator.experiments.demo import Demo, DemoConfig
 
 SUMMARY = "evolve a controller on this machine in minutes, judge it, plot it and record its drive"
@@ -31,6 +32,6 @@ def run(args: argparse.Namespace) -> int:
             raise ModuleNotFoundError(name=package)
     config = load(DemoConfig, "demo", **args.sources)
     os.environ["DREAMFLEET_JOIN"] = ""  # the demo stays on this host, even if its user is in a fleet
-    name = args.run_name or f"demo-{datetime.now():%m%d-%H%M%S}"
+    name = check_run_name(args.run_name or f"demo-{datetime.now():%m%d-%H%M%S}")
     Demo(config, name, args.runs_dir).play()
     return 0

@@ -15,6 +15,7 @@ from dreamfleet.common.cli.command_line import SimpleVerb
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.common.files.regular_files import is_folder, path_exists
 from dreamfleet.common.monitoring.eta import format_duration
 from dreamfleet.common.printable import format_setting
 from dreamfleet.common.runs.records import RunSettings, StoredGeneration, best_evaluation, describe_score
@@ -45,6 +46,8 @@ def configure_list(parser: argparse.ArgumentParser) -> None:
 
 def list_runs(args: argparse.Namespace) -> int:
     """Print one row per run; a run whose journal is damaged has the error as its state."""
+    if not is_folder(args.runs_dir) and ("runs_dir" in args.given or path_exists(args.runs_dir)):
+        raise UsageError(f"--runs-dir {args.runs_dir} is no folder: name the one that holds runs")
     runs_dir = args.runs_dir / ARCHIVE_FOLDER if args.archived else args.runs_dir
     rows = [_run_row(path) for path in run_paths(runs_dir)]
     if args.json:

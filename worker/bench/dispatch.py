@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.host.parent_death import end_on_signals, signals_blocked
 from dreamfleet.common.host.processes import VerbProcess
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.worker.bench.simulated_workers import run_simulated_workers
@@ -203,7 +204,9 @@ def peer_figures(peer: Peer) -> Figures:
 @contextmanager
 def pool_peer() -> Iterator[Mapper]:
     """The standard library's pool, one job per message."""
-    with get_context("spawn").Pool(SLOTS) as pool:
+    with signals_blocked():
+        processes = get_context("spawn").Pool(SLOTS, end_on_signals)
+    with processes as pool:
         yield lambda work, count: pool.map(work, range(count), chunksize=1)
 
 

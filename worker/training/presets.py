@@ -13,6 +13,8 @@ from dreamfleet.worker.worldmodel import mdnrnn_config, vae_config
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 
+LARGEST_SEED = 2**43  # of a training: times a million it is still a seed of torch
+
 
 def required(text: str) -> Any:
     """A field without a default, with the text that `--help` shows."""
@@ -41,8 +43,10 @@ class TrainConfig:
                 raise UsageError(f"--{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
         if self.keep_every < 0:
             raise UsageError(f"--keep-every must be at least 1, or 0 for none, not {self.keep_every}")
-        if not (self.rate > 0 and self.clip >= 0 and 0 < self.decay <= 1 and self.patience >= 0 and self.seed >= 0):
-            raise UsageError("--rate must be positive, --decay in (0, 1], --clip, --patience and --seed not negative")
+        if not (self.rate > 0 and self.clip >= 0 and 0 < self.decay <= 1 and self.patience >= 0):
+            raise UsageError("--rate must be positive, --decay in (0, 1], --clip and --patience not negative")
+        if not 0 <= self.seed <= LARGEST_SEED:
+            raise UsageError(f"--seed must be from 0 to {LARGEST_SEED}, not {self.seed}")
 
 
 @dataclass(frozen=True)

@@ -107,13 +107,16 @@ def measure_on_one_thread(measure: Callable[..., dict[str, Any]], bundle_name: s
 
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.common.errors import DreamfleetError
+    from dreamfleet.common.host.parent_death import end_on_signals, signals_blocked
 
     bundle: Bundle = find_bundle(bundle_name)
     _pin_libraries()
     # A child: numpy's library reads its thread count once, when loaded, and this process has loaded it.
-    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+    with ProcessPoolExecutor(1, get_context("spawn"), end_on_signals) as pool:
         try:
-            return pool.submit(measure, bundle, *more).result()
+            with signals_blocked():
+                measured = pool.submit(measure, bundle, *more)
+            return measured.result()
         except BrokenProcessPool as error:
             raise DreamfleetError("the process that measured has crashed; is memory short?") from error
 

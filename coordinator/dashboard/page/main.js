@@ -12,7 +12,7 @@ const digest = new URL(import.meta.url).pathname.split("/").at(-2);
 
 let source = null;
 let wanted = ""; // the live run that was asked for by name; empty: whichever there is
-let heard = Date.now();
+let heard = performance.now(); // not by the wall clock, which may be set
 let latest = null; // what is not painted yet: of several frames the last one alone is
 let painting = false;
 
@@ -33,7 +33,7 @@ const paint = () => {
 };
 
 const take = (part) => {
-  heard = Date.now();
+  heard = performance.now();
   silent.hidden = true;
   latest = { ...latest, ...part };
   if (!painting) {
@@ -45,7 +45,7 @@ const take = (part) => {
 const listen = () => {
   source?.close();
   latest = null;
-  heard = Date.now();
+  heard = performance.now();
   source = new EventSource(wanted ? `live?run=${encodeURIComponent(wanted)}` : "live");
   source.addEventListener("hello", (event) => {
     const hello = JSON.parse(event.data);
@@ -67,9 +67,10 @@ const hush = () => {
 };
 
 setInterval(() => {
-  if (!source || Date.now() - heard < SILENCE) return;
+  const silence = performance.now() - heard;
+  if (!source || silence < SILENCE) return;
   silent.hidden = false;
-  say(silent, `No word from the dashboard since ${new Date(heard).toLocaleTimeString("en-GB")}: it was ended, or the network is cut. The runs go on without it.`);
+  say(silent, `No word from the dashboard since ${new Date(Date.now() - silence).toLocaleTimeString("en-GB")}: it was ended, or the network is cut. The runs go on without it.`);
 }, 500);
 
 // Nobody is asked anything for a page that nobody sees.

@@ -161,7 +161,7 @@ const rows = ({ worker, kind, generation, candidate, seed, step, score }) => {
 // A worker's is the fleet's figure; what is driven for the page is timed here.
 const speed = (worker, step) => {
   if (worker) return rates.has(worker) ? `${rates.get(worker).toLocaleString("en")} steps/s` : null;
-  const now = Date.now();
+  const now = performance.now();
   if (!steps.length || step < steps.at(-1)[1]) steps = [];
   steps.push([now, step]);
   while (now - steps[0][0] > MEASURED) steps.shift();

@@ -1,16 +1,23 @@
 """The command line: finding and loading verbs, help, and errors for typing mistakes."""
 
+import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 
 import pytest
 
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.host.standard_streams import LAST_STREAM
+from tests.fuzz.calls import flags_with_values
 from tests.support.processes import DEADLINE
 
+RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
 BROKEN = EntryPoint("broken", "tests.no_such_module", command_line.GROUP)
 
 
@@ -25,14 +32,14 @@ def points(*more):
         (("coordinator", "--evaluate-evry=3"), "did you mean --evaluate-every?"),
         (("worker", "--conect", "tcp/a:1"), "did you mean --connect?"),
         (("train", "vae", "--data", "x", "--updats", "3"), "did you mean --updates?"),
-        (("status", "--xyzzy"), "unrecognized arguments: --xyzzy\n"),
+        (("status", "--xyzzy"), "unrecognized arguments: --xyzzy; `dreamfleet status --help` lists the flags\n"),
     ],
 )
 def test_the_error_for_an_unknown_flag_suggests_the_nearest(words, said, capsys):
-    with pytest.raises(SystemExit) as left:
-        command_line.main(words)
-    assert left.value.code == 2
-    assert said in capsys.readouterr().err
+    assert command_line.main(words) == UsageError.exit_code
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -111,4 +118,118 @@ def test_closed_streams_are_replaced(tmp_path):
     )
     command = ["bash", "-c", '"$@" <&- >&- 2>&-', "-", sys.executable, "-c", program]
     number = subprocess.run(command, cwd=tmp_path, check=False, timeout=DEADLINE).returncode
-    assert number > command_line.LAST_STREAM
+    assert number > LAST_STREAM
+
+
+@pytest.mark.parametrize("name", sorted(points()))
+def test_two_dashes_are_no_flags_value(name):
+    parser = command_line.build_parser(name, points()[name].load())
+    for flag in flags_with_values(parser):
+        with pytest.raises(UsageError, match=f"argument .*{flag}.*: expected (a value, not --|2 arg)"):
+            parser.parse_all([f"{flag}=--"])
+
+
+def test_an_empty_path_is_refused(capsys):
+    assert command_line.main(["runs", "list", "--runs-dir", ""]) == UsageError.exit_code
+    assert "argument --runs-dir: expected a path, not an empty text" in capsys.readouterr().err
+
+
+def test_a_missing_folder_of_runs_is_an_error_where_it_was_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert command_line.main(["runs", "list"]) == 0
+    for place in (tmp_path / "missing", Path("/dev/null")):
+        assert command_line.main(["runs", "list", "--runs-dir", str(place)]) == UsageError.exit_code
+        assert f"--runs-dir {place} is no folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["x" * 5000, "\udcff\udc80", "a\nb\x1b[2J", "a\0b"])
+def test_an_impossible_name_is_one_short_printable_line(name, tmp_path, capsys):
+    of_names = ("runs show", "coordinator --run", "worker --name", "", "runs", "coordinator --run r --task")
+    for words in ([*each.split(), name] for each in of_names):
+        folder = ["--runs-dir", str(tmp_path)] if "--task" in words else []
+        assert command_line.main([*words, *folder]) in (DreamfleetError.exit_code, UsageError.exit_code)
+        said = capsys.readouterr().err
+        assert said.removesuffix("\n").isprintable()
+        assert len(said) < 1500
+
+
+def run_program(*words, cwd=None, out=subprocess.PIPE, err=subprocess.PIPE, before=(), **environment):
+    command = [*before, sys.executable, "-P", "-m", "dreamfleet", *map(str, words)]
+    return subprocess.run(command, cwd=cwd, stdout=out, stderr=err, env={**os.environ, **environment}, check=False,
+                          timeout=DEADLINE)  # fmt: skip
+
+
+def test_a_stream_of_ascii_takes_every_text():
+    ascii_only = {"LC_ALL": "C", "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+    done = run_program("runs", "show", "dream", "--runs-dir", RUNS, **ascii_only)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert rb"\xb1" in done.stdout
+
+
+def test_a_full_disk_under_stderr_ends_no_verb(tmp_path):
+    with Path("/dev/full").open("wb") as full:
+        done = run_program("runs", "list", "--runs-dir", tmp_path, err=full)
+        assert done.returncode == 0
+        done = run_program("runs", "show", "dream", "--runs-dir", RUNS, out=full)
+    assert (done.returncode, done.stderr) == (1, b"dreamfleet: cannot write to stdout: no space left\n")
+
+
+def test_a_deleted_current_folder_is_one_line(tmp_path):
+    done = run_program(
+        "doctor", before=("sh", "-c", f'mkdir {tmp_path}/x; cd {tmp_path}/x; rmdir ../x; exec "$@"', "-")
+    )
+    said = b"dreamfleet: the current folder is gone or closed to this user: change to another\n"
+    assert (done.returncode, done.stderr) == (UsageError.exit_code, said)
+
+
+INTERRUPTED_AT_AN_IMPORT = """
+import os, signal, sys
+class Finder:
+    left = int(sys.argv.pop(1))
+    def find_spec(self, *_):
+        Finder.left -= 1
+        if not Finder.left:
+            os.kill(os.getpid(), signal.SIGINT)
+from dreamfleet.__main__ import main
+sys.meta_path.insert(0, Finder())
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("number", [1, 3, 10, 25, 40, 80, 120, 160, 200, 240])
+def test_ctrl_c_amid_an_import_leaves_no_traceback(number):
+    command = [sys.executable, "-c", INTERRUPTED_AT_AN_IMPORT, str(number), "runs", "show", "dream", "--runs-dir", RUNS]
+    done = subprocess.run(command, capture_output=True, check=False, timeout=DEADLINE)
+    assert done.stderr in (b"", b"dreamfleet: interrupted\n")
+    assert done.returncode in (0, -signal.SIGINT, command_line.EXIT_INTERRUPTED)  # a shell says 130 of both
+
+
+def test_an_import_that_turns_ctrl_c_into_another_error_is_still_interrupted(monkeypatch, capsys):
+    def run(_args):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt as error:
+            raise RuntimeError("Error calling __set_name__") from error
+
+    verb = command_line.SimpleVerb("odd", lambda parser: None, run)
+    monkeypatch.setattr(command_line, "load_verb", lambda _point: verb)
+    before = signal.getsignal(signal.SIGINT)
+    assert command_line.main(["tasks"]) == command_line.EXIT_INTERRUPTED
+    assert capsys.readouterr().err == "dreamfleet: interrupted\n"
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_ctrl_c_in_a_finaliser_is_not_lost(monkeypatch, capsys):
+    class Finalised:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    def run(_args):
+        item = Finalised()
+        del item
+        time.sleep(DEADLINE)
+        raise AssertionError("it slept on")
+
+    monkeypatch.setattr(command_line, "load_verb", lambda _: command_line.SimpleVerb("odd", lambda parser: None, run))
+    assert command_line.main(["tasks"]) == command_line.EXIT_INTERRUPTED
+    assert capsys.readouterr().err == "dreamfleet: interrupted\n"

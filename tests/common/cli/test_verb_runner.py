@@ -28,7 +28,7 @@ def test_verbs_in_this_process_answer_or_print(tmp_path, capsys):
 
 
 def test_a_wrong_command_is_refused_before_the_first_verb_runs():
-    with pytest.raises(SystemExit):
+    with pytest.raises(UsageError, match="unrecognized arguments: --xyzzy"):
         InProcessRunner({"right": ("runs", "list"), "wrong": ("runs", "list", "--xyzzy")})
 
 

@@ -83,7 +83,7 @@ def test_a_readable_expired_or_invalid_join_file_is_refused(join, tmp_path):
         read_join_file(join, datetime.now(UTC) + timedelta(days=31))
     with pytest.raises(AccessError, match="no join file at"):
         read_join_file(tmp_path / "nowhere")
-    with pytest.raises(AccessError, match="Is a directory"):
+    with pytest.raises(AccessError, match="it is a folder"):
         read_join_file(tmp_path)
     for mode in (0o640, 0o604):
         join.chmod(mode)

@@ -227,7 +227,7 @@ def test_what_cannot_be_is_refused_before_anything_is_driven(tmp_path, flags, sa
 
 
 def test_an_unknown_flag_of_a_stage_is_refused_before_anything_is_driven(tmp_path):
-    with pytest.raises(SystemExit):
+    with pytest.raises(UsageError, match="unrecognized arguments: --ghost"):
         call("--data", tmp_path / "data", "--mdnrnn-flags", "--ghost 1")
     assert not (tmp_path / "data").exists()
 
