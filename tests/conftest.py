@@ -55,3 +55,4 @@ def processes(tmp_path):
 def private_folders(tmp_path, monkeypatch):
     monkeypatch.setenv("DREAMFLEET_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("DREAMFLEET_RUNS_DIR", str(tmp_path / "runs"))
+    monkeypatch.setenv("DREAMFLEET_TRUST", "tests.support")  # its tasks are found by processes that tests start

@@ -18,6 +18,8 @@ from typing import Any, Literal
 from dreamfleet.common.cli.config import add_flags, load, option, read_toml
 from dreamfleet.common.errors import AccessError, UsageError
 from dreamfleet.common.host.logs import set_log_format
+from dreamfleet.common.host.trusted_modules import trust
+from dreamfleet.common.protocol.tasks import module_of
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, Credentials, describe_time_left, read_join_file
 from dreamfleet.common.transport.network import DEFAULT_ENDPOINT, Network, check_endpoint
 
@@ -43,6 +45,9 @@ class GlobalConfig:
         Path("access"), "folder of the fleet's certificate authority and its list of revoked files"
     )
     runs_dir: Path = option(Path("runs"), "where runs live")  # noqa: RUF009 - a field, and paths do not change
+    trust: tuple[str, ...] = option(
+        (), "modules of tasks and optimisers that may be imported although only a file or another host names them"
+    )
     log_level: Literal["debug", "info", "warning", "error"] = option("info", "lowest level that is logged on stderr")
     log_format: Literal["text", "json", "auto"] = option("text", "text, json, or auto: text in a terminal, else JSON")
 
@@ -66,7 +71,7 @@ def add_run_argument(parser: argparse.ArgumentParser) -> None:
 def add_common_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags that every verb has."""
     parser.add_argument("--config", type=Path, help="TOML file with settings (default $DREAMFLEET_CONFIG, else none)")
-    add_global_flags(parser, "log_level", "log_format")
+    add_global_flags(parser, "log_level", "log_format", "trust")
     parser.add_argument(
         "-q", "--quiet", dest="log_level", action="store_const", const="warning", default=argparse.SUPPRESS,
         help="log only warnings and errors, and draw no progress bar",
@@ -92,8 +97,19 @@ def complete_arguments(args: argparse.Namespace, environment: Mapping[str, str] 
     args.sources = {"flags": argparse.Namespace(**vars(args)), "environment": environment, "file": file}
     args.given, args.global_config = given, global_config
     args.listen, args.runs_dir, args.log_level = global_config.listen, global_config.runs_dir, global_config.log_level
+    trust((*global_config.trust, *_named_modules(args, environment, file)))
     logging.getLogger("dreamfleet").setLevel(global_config.log_level.upper())
     set_log_format(global_config.log_format)
+
+
+def _named_modules(args: argparse.Namespace, environment: Mapping[str, str], file: Mapping[str, Any]) -> list[str]:
+    """The modules of the tasks and optimisers that the user names by a flag, a variable or the configuration file."""
+    names: list[object] = []
+    for setting in ("task", "optimiser"):
+        given = getattr(args, setting, ())
+        names += given if isinstance(given, list) else [given]
+        names += [environment.get(f"{PREFIX}RUN_{setting.upper()}"), file.get("run", {}).get(setting)]
+    return [module_of(name) for name in names if isinstance(name, str)]
 
 
 def load_credentials(args: argparse.Namespace, roles: Collection[str] = ()) -> Credentials | None:

@@ -1,7 +1,8 @@
 """Looking up and loading tasks by name.
 
 A name is one that a package registers in the entry-point group `dreamfleet.tasks`; a registered family with an argument
-(`gym:LunarLander-v3`); or `module:attribute`, for an unregistered task.
+(`gym:LunarLander-v3`); or `module:attribute`, for an unregistered task. `gym:module:Environment-v0` names a module too.
+A name may come from a file or a message of somebody else, so only a trusted module is imported.
 """
 
 from __future__ import annotations
@@ -10,13 +11,13 @@ import difflib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.host.packages import install_command_for
+from dreamfleet.common.host.trusted_modules import check_trusted, import_trusted
 
 GROUP = "dreamfleet.tasks"
 _NAME = re.compile(r"[\w-][\w.-]*(:\S+)?", re.ASCII)
@@ -47,13 +48,20 @@ def registered_tasks() -> dict[str, EntryPoint]:
 
 def family_of(name: str) -> str:
     """The name under which workers announce a task: the registered name or family, else the whole name."""
-    head, colon, _ = name.partition(":")
-    return head if colon and head in registered_tasks() else name
+    return name if is_unregistered(name) else name.partition(":")[0]
 
 
 def is_unregistered(name: str) -> bool:
-    """Whether a task is an unregistered `module:attribute`, which workers must name with `--task`."""
-    return ":" in name and family_of(name) == name
+    """Whether a task's name chooses a module to import, so that workers must name the task with `--task`."""
+    return bool(module_of(name))
+
+
+def module_of(name: str) -> str:
+    """The module that a task's name makes a host import; empty if an installed package registers the task."""
+    head, colon, rest = name.partition(":")
+    if head == GYM:
+        return rest.rpartition(":")[0]
+    return head if colon and head not in registered_tasks() else ""
 
 
 def load_task(name: str) -> Any:
@@ -62,10 +70,12 @@ def load_task(name: str) -> Any:
     head, colon, rest = name.partition(":")
     try:
         if head in points:
+            if module := module_of(name):
+                check_trusted(module, f"task {name!r}")
             make = points[head].load()
             return make(rest) if colon else make()
         if colon:
-            return _task_class(import_module(head), rest)()
+            return _task_class(import_trusted(head, f"task {name!r}"), rest)()
     except ModuleNotFoundError as error:
         remedy = install_command_for(error.name) or (
             "install the package that has it, or name its folder in PYTHONPATH: the current folder is not searched"
@@ -87,7 +97,7 @@ def _task_class(module: Any, name: str) -> Any:
 
 def is_self_describing(name: str) -> bool:
     """Whether a task needs no bundle; `UsageError` if the task cannot be loaded here."""
-    if family_of(name) == GYM:
+    if name.partition(":")[0] == GYM:
         return True
     point = registered_tasks().get(name)
     if point is not None and point.dist is not None and point.dist.name == "dreamfleet":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -36,15 +36,16 @@ def rollout_path(folder: Path, generation: int, episode: int) -> Path:
     return folder / ROLLOUTS / f"{generation:06d}-{episode:04d}.npz"
 
 
-def resume_command(folder: Path, join: object = None, access_dir: Path | None = None) -> str:
+def resume_command(folder: Path, join: object = None, access_dir: Path | None = None, trust: Iterable[str] = ()) -> str:
     """The shell command that resumes the run in `folder`.
 
-    `join` is a secured run's join file, `access_dir` its authority's folder where that is not the default: the journal
-    keeps neither.
+    `join` is a secured run's join file, `access_dir` its authority's folder where that is not the default, `trust`
+    names modules to import: the journal keeps none of them.
     """
     joined = () if join is None else ("--join", join)
     access = () if join is None or access_dir is None else ("--access-dir", access_dir)
-    return shell_command("coordinator", "--resume", folder.name, "--runs-dir", folder.parent, *joined, *access)
+    words = ("--resume", folder.name, "--runs-dir", folder.parent, *joined, *access)
+    return shell_command("coordinator", *words, *(("--trust", *trust) if trust else ()))
 
 
 def check_movable(folder: Path) -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterable, Mapping
-from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.trusted_modules import import_trusted
 from dreamfleet.coordinator.optimisers.api import Optimiser, Search
 
 GROUP = "dreamfleet.optimisers"
@@ -44,7 +44,7 @@ def _find(name: str) -> Any:
         known = ", ".join(known_optimisers()) or "none"
         raise UsageError(f"unknown optimiser {name!r}: known are {known}, and your own as module:attribute")
     try:
-        return getattr(import_module(module), attribute)
+        return getattr(import_trusted(module, f"optimiser {name!r}"), attribute)
     except (ImportError, AttributeError) as error:
         raise UsageError(f"optimiser {name!r} cannot be loaded: {error}") from error
 

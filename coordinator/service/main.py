@@ -46,6 +46,7 @@ class RunRequest:
     credentials: Credentials | None = None
     join: Path | None = None  # the file of the credentials
     access_dir: Path = GlobalConfig.access_dir  # holds the list of revoked certificates
+    trust: tuple[str, ...] = ()  # modules that must be trusted again when the run is resumed
 
     @property
     def folder(self) -> Path:
@@ -62,7 +63,7 @@ class RunRequest:
     def resume_command(self, folder: Path | None = None) -> str:
         """The command that continues the run, also in a `folder` that it was moved to."""
         own_access_dir = None if self.access_dir == GlobalConfig.access_dir else self.access_dir
-        return resume_command(folder or self.folder, self.join, own_access_dir)
+        return resume_command(folder or self.folder, self.join, own_access_dir, self.trust)
 
 
 def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], None] = lambda _stop: None) -> Run:

@@ -16,7 +16,6 @@ from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL
 from dreamfleet.common.runs.run_provenance import RunProvenance, read_run_provenance, read_run_settings
-from dreamfleet.coordinator.optimisers.registry import known_optimisers
 from dreamfleet.coordinator.settings.config import LimitsConfig, RunConfig, config_values
 from dreamfleet.coordinator.settings.resume_settings import stored_network
 from dreamfleet.coordinator.settings.run_provenance import versions
@@ -48,15 +47,6 @@ class Rerun:
         if found.receipt.generations < 1:
             raise ControllerError("the controller's run closed no generation: there is nothing to repeat")
         return found
-
-    def check_optimiser(self, allowed: str | None) -> None:
-        """`UsageError` where the file names somebody's module, which runs as it is imported, and nobody allowed it."""
-        wanted = self.settings.optimiser
-        if wanted not in known_optimisers() and wanted != allowed:
-            raise UsageError(
-                f"the run's optimiser was {wanted!r}, and no file may choose what is imported: if you trust that "
-                f"module, say --optimiser {wanted}"
-            )
 
     @property
     def limits(self) -> LimitsConfig:

@@ -393,7 +393,7 @@ def follow(host_folder: HostFolder, request: dict[str, Any]) -> dict[str, Any]:
             over = not found.is_alive
             *lines, rest = (rest + log.read()).split(b"\n")
             for each in lines:
-                channel.send("line", each.decode(errors="replace"))
+                channel.send("line", each[:LONGEST_TAIL].decode(errors="replace"))
             if over or channel.wait_for_request():
                 return {**found.describe(), "ended": over}
 

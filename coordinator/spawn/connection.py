@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
+import signal
 import subprocess
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from importlib.resources import files
-from typing import Any
+from typing import Any, TypeVar
 
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError
+from dreamfleet.common.printable import one_line
+from dreamfleet.common.serialization.validation import MAX_TEXT, MalformedError, from_plain
 from dreamfleet.coordinator.spawn.agent import MARK
 
 # The user's flags come first, and ssh takes the first value of each option. BatchMode: nobody can type a password.
@@ -23,6 +27,10 @@ OPTIONS = ("-T", "-o", "BatchMode=yes", "-o", "ConnectTimeout=10", "-o", "Server
 TUNNEL = ("-o", "ControlMaster=no", "-o", "ControlPath=none", "-o", "ExitOnForwardFailure=yes")
 PYTHONS = ("python3", "python3.14", "python3.13", "python3.12", "python3.11", "python")
 KEPT_LINES = 50  # of ssh's messages
+MAX_MESSAGE = 4096  # bytes kept of one of them
+MAX_LINE = 1 << 20  # bytes of an answer, and of all that a host prints beside its answers
+MAX_PROGRESS = 1000  # messages of a request's progress
+QUICK, SLOW = 60.0, 1800.0  # seconds of silence: of an agent that starts or looks, of one that installs or drains
 PATIENCE = 5.0  # seconds for ssh to exit
 FORWARD = 30.0  # seconds for ssh to report the tunnel's port once the agent runs
 _PORT = re.compile(r"Allocated port (\d+) for remote forward to (\S+)")
@@ -51,6 +59,9 @@ OnMessage = Callable[[str, str], None]
 """Takes a message of the working agent: its kind, `say` or `line`, and the text."""
 
 
+T = TypeVar("T")
+
+
 def _ignore_message(_kind: str, _text: str) -> None:
     """Ignore a message."""
 
@@ -72,7 +83,10 @@ class Connection:
             _remote_command(python, len(program)),
         ]
         self._stderr_lines: deque[str] = deque(maxlen=KEPT_LINES)
+        self._forwards = frozenset(forwards)
         self._ports: dict[str, int] = {}
+        self._stray = 0  # bytes beside answers
+        self._fault = ""  # why this side ended the connection
         self._changed = threading.Condition()
         try:
             self._popen = subprocess.Popen(  # noqa: S603 - the user's ssh client
@@ -88,16 +102,23 @@ class Connection:
 
     def start_agent(self) -> None:
         """Start the agent and wait for it; `close` from another thread ends the wait."""
-        self._send(self._program)
-        self._answer(_ignore_message)
+        with self._patience(QUICK):
+            self._send(self._program)
+        self._answer(QUICK, _ignore_message)
 
     def ask(
-        self, do: str, on_message: OnMessage = _ignore_message, sent: Mapping[str, bytes] | None = None, **facts: Any
-    ) -> Any:
-        """Send a request and return its answer; `DreamfleetError` if it failed."""
+        self, do: str, answer: type[T], on_message: OnMessage = _ignore_message,
+        sent: Mapping[str, bytes] | None = None, silence: float | None = SLOW, **facts: Any,
+    ) -> T:  # fmt: skip
+        """Send a request and return its answer; `DreamfleetError` if it failed, or after so much `silence`."""
         names = [(name, len(data)) for name, data in (sent or {}).items()]
-        self._send(json.dumps({"do": do, "files": names, **facts}).encode() + b"\n", *(sent or {}).values())
-        return self._answer(on_message)
+        with self._patience(silence):
+            self._send(json.dumps({"do": do, "files": names, **facts}).encode() + b"\n", *(sent or {}).values())
+        try:
+            return from_plain(answer, self._answer(silence, on_message))
+        except MalformedError as error:
+            self._end(f"its answer to {do!r} has {error}: what runs there is not the agent of this version")
+            raise self._failure() from error
 
     def interrupt(self) -> None:
         """End a running `follow`. From any thread."""
@@ -133,21 +154,70 @@ class Connection:
                 self._popen.stdin.write(each)
             self._popen.stdin.flush()
 
-    def _answer(self, on_message: OnMessage) -> Any:
-        """The next answer; skips lines without our mark, which the remote shell prints."""
-        assert self._popen.stdout is not None
-        for line in self._popen.stdout:
-            if not line.startswith(MARK.encode()):
-                continue
-            ((kind, content),) = json.loads(line[len(MARK) :]).items()
-            if kind == "ok":
+    def _answer(self, silence: float | None, on_message: OnMessage) -> dict[str, Any]:
+        """The next answer; hands on the messages before it."""
+        progress = 0
+        while True:
+            with self._patience(silence):
+                kind, content = self._read_message()
+            if kind == "ok" and isinstance(content, dict):
                 return content
+            if kind not in ("failed", "say", "line") or not isinstance(content, str):
+                self._end("it answers in a form that no agent of this version uses")
+                raise self._failure()
             if kind == "failed":
-                raise DreamfleetError(content)
+                raise DreamfleetError(one_line(content[:MAX_TEXT]))
+            progress += kind == "say"
+            if progress > MAX_PROGRESS:
+                self._end(f"it reports progress without end: more than {MAX_PROGRESS} messages")
+                raise self._failure()
             on_message(kind, content)
+
+    def _read_message(self) -> tuple[Any, Any]:
+        """The next line with our mark, parsed; skips what the remote shell prints."""
+        assert self._popen.stdout is not None
+        mark, begins = MARK.encode(), True
+        while line := self._popen.stdout.readline(MAX_LINE):
+            if begins and line.startswith(mark) and line.endswith(b"\n"):
+                with suppress(ValueError, RecursionError, AttributeError):
+                    ((kind, content),) = json.loads(line[len(mark) :]).items()
+                    return kind, content
+                return None, None
+            begins = line.endswith(b"\n")
+            self._stray += len(line)
+            if self._stray >= MAX_LINE:
+                self._end(
+                    f"it prints more than {MAX_LINE >> 20} MiB that is no answer: `ssh {self._address} true` must "
+                    "print nothing, so look at its shell's startup files, such as .bashrc"
+                )
         raise self._failure()
 
+    @contextmanager
+    def _patience(self, silence: float | None) -> Iterator[None]:
+        """End the connection if the block takes longer; `None`: it may take forever."""
+        if silence is None:
+            yield
+            return
+        timer = threading.Timer(silence, self._end, (
+            f"it does not answer within {silence:.0f} s: `ssh {self._address} true` must end at once, so look at its "
+            "shell's startup files, such as .bashrc, and at its load",
+        ))  # fmt: skip
+        timer.daemon = True
+        timer.start()
+        try:
+            yield
+        finally:
+            timer.cancel()
+
+    def _end(self, fault: str) -> None:
+        """End a connection whose host misbehaves. From any thread."""
+        self._fault = self._fault or fault
+        with suppress(OSError):
+            os.killpg(self._popen.pid, signal.SIGKILL)
+
     def _failure(self) -> ConnectionFailedError:
+        if self._fault:
+            return ConnectionFailedError(self._fault)
         with suppress(subprocess.TimeoutExpired):
             self._popen.wait(PATIENCE)
         self._listener.join(PATIENCE)
@@ -155,11 +225,11 @@ class Connection:
 
     def _listen(self) -> None:
         assert self._popen.stderr is not None
-        for line in self._popen.stderr:
+        while line := self._popen.stderr.readline(MAX_MESSAGE):
             text = line.decode(errors="replace").rstrip()
             with self._changed:
                 self._stderr_lines.append(text)
-                if found := _PORT.search(text):
+                if (found := _PORT.search(text)) and found[2] in self._forwards:
                     self._ports[found[2]] = int(found[1])
                 self._changed.notify_all()
         with self._changed:

@@ -8,14 +8,25 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.printable import one_line
+from dreamfleet.common.serialization.validation import MAX_TEXT
 from dreamfleet.coordinator.spawn.agent import JOIN, JOIN_HERE, LEAST_FREE
+from dreamfleet.coordinator.spawn.answers import (
+    EndAnswer,
+    FollowAnswer,
+    HostAnswer,
+    InstallAnswer,
+    StartAnswer,
+    WorkerAnswer,
+)
 from dreamfleet.coordinator.spawn.config import Host
-from dreamfleet.coordinator.spawn.connection import Connection
+from dreamfleet.coordinator.spawn.connection import QUICK, SLOW, Connection
 from dreamfleet.coordinator.spawn.parcel import Parcel, pack, runs_here
 
+T = TypeVar("T")
 OnText = Callable[[str], None]
 FAILED = "failed"
 
@@ -55,16 +66,16 @@ class RemoteHost:
     def check(self) -> HostStatus:
         """Describe the host and what `bring_up` would do; changes nothing."""
         found = self._inspect(())
-        mine = next((each for each in found["workers"] if each["name"] == self.host.name and each["running"]), None)
+        mine = next((each for each in found.workers if each.name == self.host.name and each.running), None)
         if mine:
             return self._status("running", mine)
         environment = self._environment(found)
-        there = "is there" if environment in (None, *found["environments"]) else "is to be made"
-        version = ".".join(map(str, found["python"]))
+        there = "is there" if environment in (None, *found.environments) else "is to be made"
+        version = ".".join(map(str, found.python))
         return HostStatus(
             self.host.name,
             "ready",
-            f"Python {version}, {found['machine']}, {found['free'] / 1e9:.1f} GB free, its environment {there}",
+            f"Python {version}, {found.machine}, {found.free / 1e9:.1f} GB free, its environment {there}",
         )
 
     def bring_up(self) -> HostStatus:
@@ -76,17 +87,17 @@ class RemoteHost:
         words += ["--connect", *connect] if connect else []
         words += ["--join", JOIN_HERE] if self._fleet_address.join else []
         words += self.host.flags
-        facts = {"python": python, "words": words, "env": self.host.environment}
+        facts: dict[str, Any] = {"python": python, "words": words, "env": self.host.environment}
         text = json.dumps(facts, sort_keys=True).encode() + hashlib.sha256(self._fleet_address.join).digest()
         files = {JOIN: self._fleet_address.join} if self._fleet_address.join else {}
-        started = self._ask("start", sent=files, **facts, name=self.host.name, slots=self.host.spawn.slots,
+        started = self._ask("start", StartAnswer, sent=files, **facts, name=self.host.name, slots=self.host.spawn.slots,
                             held=bool(self.forwards), digest=hashlib.sha256(text).hexdigest())  # fmt: skip
-        return self._status(started["outcome"], started)
+        return self._status(started.outcome, started)
 
     def follow(self) -> HostStatus | None:
         """Pass on the worker's log until it ends; `None` if `stop_following` ended this first."""
-        followed = self._ask("follow", name=self.host.name)
-        return self._status("ended", followed) if followed["ended"] else None
+        followed = self._ask("follow", FollowAnswer, silence=None, name=self.host.name)
+        return self._status("ended", followed) if followed.ended else None
 
     def stop_following(self) -> None:
         """End a running `follow`. From any thread."""
@@ -98,8 +109,8 @@ class RemoteHost:
         if self._connection is None:
             self._connect(())
         names = None if all_workers else [self.host.name]
-        ended = self._ask("end", names=names, now=now, keep=keep)["ended"]
-        left = [each["name"] for each in ended if each["running"]]
+        ended = self._ask("end", EndAnswer, names=names, now=now, keep=keep).ended
+        left = [each.name for each in ended if each.running]
         if left:
             return HostStatus(self.host.name, "left", f"{', '.join(left)} left")
         return HostStatus(self.host.name, "nothing", "no worker runs there")
@@ -117,45 +128,47 @@ class RemoteHost:
             self._connection.close()
         self._connection.start_agent()
 
-    def _inspect(self, forwards: tuple[str, ...]) -> dict[str, Any]:
+    def _inspect(self, forwards: tuple[str, ...]) -> HostAnswer:
         self._connect(forwards)
-        found: dict[str, Any] = self._ask("look")
+        found = self._ask("look", HostAnswer, silence=QUICK)
         self._check(found)
         return found
 
-    def _check(self, found: Mapping[str, Any]) -> None:
-        if not found["writable"]:
-            raise DreamfleetError(f"{found['root']} cannot be written there: name another --remote-dir")
+    def _check(self, found: HostAnswer) -> None:
+        if not found.writable:
+            raise DreamfleetError(f"{found.root} cannot be written there: name another --remote-dir")
         name = self._environment(found)
-        if name is None or name in found["environments"]:
+        if name is None or name in found.environments:
             return
-        if not found["venv"]:
+        if not found.venv:
             raise DreamfleetError("its Python has no venv: install it there (Debian: apt install python3-venv)")
-        if found["free"] < LEAST_FREE:
+        if found.free < LEAST_FREE:
             raise DreamfleetError(
-                f"{found['free'] / 1e6:.0f} MB are free at {found['root']}, and an environment takes "
+                f"{found.free / 1e6:.0f} MB are free at {found.root}, and an environment takes "
                 f"{LEAST_FREE / 1e6:.0f}: make room there, or name another --remote-dir"
             )
-        pack_for(self.host.spawn.wheelhouse, found).check_fits(found["machine"])
+        pack_for(self.host.spawn.wheelhouse, found).check_fits(found.machine)
 
-    def _environment(self, found: Mapping[str, Any]) -> str | None:
+    def _environment(self, found: HostAnswer) -> str | None:
         """The worker's environment; `None` if dreamfleet is installed in the Python that the user named."""
-        if self.host.spawn.remote_python and found["installed"]:
+        if self.host.spawn.remote_python and found.installed:
             return None
-        return pack_for(self.host.spawn.wheelhouse, found).environment(tuple(found["python"]), found["machine"])
+        return pack_for(self.host.spawn.wheelhouse, found).environment(
+            (found.python[0], found.python[1]), found.machine
+        )
 
-    def _python(self, found: Mapping[str, Any]) -> str:
+    def _python(self, found: HostAnswer) -> str:
         """Install the worker if needed; the path of its Python."""
         name = self._environment(found)
         if name is None:
-            return str(found["executable"])
+            return found.executable
         parcel = pack_for(self.host.spawn.wheelhouse, found)
-        files = {} if name in found["environments"] else parcel.files()
-        if files and not runs_here(found["system"], found["machine"]):
-            self._on_progress(f"is {found['system']} on {found['machine']}: gymnasium draws there, which is slower")
-        made = self._ask("install", sent=files, environment=name, wheel=parcel.wheel.name,
+        files = {} if name in found.environments else parcel.files()
+        if files and not runs_here(found.system, found.machine):
+            self._on_progress(f"is {found.system} on {found.machine}: gymnasium draws there, which is slower")
+        made = self._ask("install", InstallAnswer, sent=files, environment=name, wheel=parcel.wheel.name,
                          offline=parcel.wheelhouse is not None)  # fmt: skip
-        return str(made["python"])
+        return made.python
 
     def _endpoints(self) -> list[str]:
         """The endpoints that the worker connects to: those given, or the remote ends of the tunnel."""
@@ -164,17 +177,23 @@ class RemoteHost:
         assert self._connection is not None
         return [f"tcp/127.0.0.1:{port}" for port in self._connection.ports(self.forwards)]
 
-    def _ask(self, do: str, sent: Mapping[str, bytes] | None = None, **facts: object) -> Any:
+    def _ask(
+        self, do: str, answer: type[T], *, sent: Mapping[str, bytes] | None = None, silence: float | None = SLOW,
+        **facts: object,
+    ) -> T:  # fmt: skip
         assert self._connection is not None
-        return self._connection.ask(do, self._on_message, sent, **self._root, **facts)
+        return self._connection.ask(do, answer, self._on_message, sent, silence, **self._root, **facts)
 
     def _on_message(self, kind: str, text: str) -> None:
-        (self._on_log_line if kind == "line" else self._on_progress)(text)
+        if kind == "line":
+            self._on_log_line(text)
+        else:
+            self._on_progress(one_line(text[:MAX_TEXT]))
 
-    def _status(self, state: str, worker: Mapping[str, Any]) -> HostStatus:
-        return HostStatus(self.host.name, state, worker["last"], worker["slots"] or None, worker["age"])
+    def _status(self, state: str, worker: WorkerAnswer) -> HostStatus:
+        return HostStatus(self.host.name, state, worker.last, worker.slots or None, worker.age)
 
 
-def pack_for(wheelhouse: Path | None, found: Mapping[str, Any]) -> Parcel:
+def pack_for(wheelhouse: Path | None, found: HostAnswer) -> Parcel:
     """The parcel for the system and processor of a host."""
-    return pack(wheelhouse, native=runs_here(found["system"], found["machine"]))
+    return pack(wheelhouse, native=runs_here(found.system, found.machine))

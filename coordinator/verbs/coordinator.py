@@ -17,6 +17,7 @@ from dreamfleet.common.cli.output import print_answer
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking
 from dreamfleet.common.host.resource_limits import check_room_for_session, raise_open_file_limit
+from dreamfleet.common.protocol.tasks import module_of
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE, LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.settings.presets import find_preset
@@ -93,9 +94,12 @@ def build_request(
     network = choose_addresses(own, args.global_config, kept, credentials)
     Network(network.listen, network.connect, credentials).check_open(insecure=network.insecure)
     global_config = args.global_config
+    code = module_of(config.optimiser) if config else ""
+    trust = tuple(dict.fromkeys(filter(None, (*(global_config.trust if "trust" in args.given else ()), code))))
     return RunRequest(
-        name, args.runs_dir, config, limits, network, start, credentials, global_config.join, global_config.access_dir
-    )
+        name, args.runs_dir, config, limits, network, start, credentials, global_config.join, global_config.access_dir,
+        trust,
+    )  # fmt: skip
 
 
 def serve_request(

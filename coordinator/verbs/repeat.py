@@ -39,7 +39,6 @@ def run(args: argparse.Namespace) -> int:
 
     controller, beside = find_controller(args.controller, args.runs_dir)
     again = Rerun.of(controller, find_bundle_of(controller, args.bundle, beside))
-    again.check_optimiser(args.optimiser)
     folder = args.runs_dir / check_run_name(args.run_name or f"{Path(args.controller).stem}-again")
     config, kept = again.plan(folder)
     if again.expected_difference:

@@ -7,6 +7,7 @@ imported first, `gym:my_package:MyWorld-v0`.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from importlib.metadata import packages_distributions
 from typing import Any
@@ -18,11 +19,13 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import Actions, Continuous, Discrete
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.trusted_modules import check_trusted
 from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, Assignment, Description, Policy, Task, World
 from dreamfleet.worker.tasks.policy import FlatPolicy
 
 RGB = "rgb_array"  # gymnasium's render mode that returns pictures
+_MODULE_PREFIX = re.compile(r"([\w.]+):")  # of an environment's name
 OPTIONS = ("environment", "normalise", "seed")
 NORMALISING_EPISODES = 20
 DEFAULT_MAX_STEPS = 10_000  # steps of an episode, if the environment was registered without a limit
@@ -97,6 +100,7 @@ class GymTask(Task):
         return Description(observations, world.actions.outputs, world.packages, world.version, text)
 
     def _make(self, arguments: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
+        _check_arguments(self.name, arguments)
         try:
             return gymnasium.make(self._id, disable_env_checker=True, **arguments)
         except gymnasium.error.DependencyNotInstalled as error:
@@ -130,6 +134,17 @@ class _RenderOnDemand(gymnasium.Wrapper[Any, Any, Any, Any]):
             return super().render()
         finally:
             self.unwrapped.render_mode = None
+
+
+def _check_arguments(task: str, arguments: Any) -> None:
+    """`UsageError` for an argument `module:Environment` of an untrusted module: some environments make others."""
+    if isinstance(arguments, str) and (found := _MODULE_PREFIX.match(arguments)):
+        check_trusted(found[1], f"argument {arguments!r:.100} of task {task!r}")
+    if isinstance(arguments, Mapping):
+        arguments = list(arguments.values())
+    if isinstance(arguments, list):
+        for each in arguments:
+            _check_arguments(task, each)
 
 
 def _build_world(environment: gymnasium.Env[Any, Any], name: str) -> World:

@@ -40,7 +40,8 @@ def test_an_optimiser_of_ones_own_is_found_by_entry_point(tmp_path):
     ("name", "says"),
     [
         ("cmea", "known are cma, cmaes-lra, cmaes-sep"),
-        ("nowhere:Optimiser", "cannot be loaded"),
+        ("nowhere:Optimiser", "--trust nowhere"),
+        ("tests.support.nowhere:Optimiser", "cannot be loaded"),
         (f"{MODULE}:Nothing", "cannot be loaded"),
         (f"{MODULE}:SaysNothing", "lacks requirement, options"),
         (f"{MODULE}:WithoutState", r"lacks state: dreamfleet\.coordinator\.optimisers\.api"),

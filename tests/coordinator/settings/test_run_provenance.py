@@ -1,6 +1,7 @@
 """The receipt in a reported controller: drawn up from the journal, and enough to begin the run again."""
 
 import json
+import sys
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -150,13 +151,12 @@ def test_a_run_that_closed_nothing_cannot_be_repeated(random_bundle):
         Rerun.of(replace(controller, provenance=provenance), random_bundle)
 
 
-def test_no_file_chooses_what_is_imported(random_bundle):
+def test_no_file_chooses_what_is_imported(random_bundle, tmp_path):
     again = Rerun.of(begun(random_bundle), random_bundle)
-    again.check_optimiser(None)
-    strange = replace(again, settings=replace(again.settings, optimiser="os:abort"))
-    with pytest.raises(UsageError, match="if you trust that module, say --optimiser os:abort"):
-        strange.check_optimiser(None)
-    strange.check_optimiser("os:abort")
+    strange = replace(again, settings=replace(again.settings, optimiser="antigravity:fly"))
+    with pytest.raises(UsageError, match="if you trust that module, say --trust antigravity"):
+        strange.plan(tmp_path / "again")
+    assert "antigravity" not in sys.modules
 
 
 def test_why_a_second_time_differs_is_said_as_far_as_it_is_known(make):

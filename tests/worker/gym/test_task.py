@@ -88,7 +88,8 @@ def test_observations_are_normalised_by_what_the_run_froze():
     ("name", "says"),
     [
         ("gym:Nothing-v0", "makes no environment 'Nothing-v0'"),
-        ("gym:no_such_module:X-v0", "No module named 'no_such_module'"),
+        ("gym:no_such_module:X-v0", "--trust no_such_module"),
+        ("gym:tests.support.no_such:X-v0", r"No module named 'tests\.support\.no_such'"),
         ("gym:", "makes no environment ''"),
         ("gym", "cannot be loaded"),
         ("gym:Blackjack-v1", "only Box observations"),

@@ -1,0 +1,221 @@
+"""Files of other people name a module in every place that holds a name: no verb imports it unless the user named it."""
+
+import io
+import json
+import os
+import shutil
+import sqlite3
+import sys
+from contextlib import closing
+from dataclasses import replace
+from importlib.metadata import entry_points
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.bundle import Bundle, write_bundle
+from dreamfleet.common.artifacts.controller import Controller, ControllerShape
+from dreamfleet.common.artifacts.trained_agent import AgentManifest, TrainedAgent
+from dreamfleet.common.cli import command_line
+from dreamfleet.common.files.archives import ArchiveLimits, DamagedArchiveError, read_arrays
+from dreamfleet.common.runs.episode_results import EpisodeResult
+from dreamfleet.common.runs.evaluation_report import EvaluationReport
+from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
+from tests.support.processes import ROOT
+
+MARK = "foreign_marker"  # the module that nobody named
+FIXTURES = ROOT / "tests" / "fixtures"
+OWN, GYM = f"{MARK}:World", f"gym:{MARK}:X-v0"
+# Verbs that read no file, journal, message or report of somebody else in which a task or an optimiser has a name.
+NAMELESS = {
+    "access.init", "access.issue", "access.list", "access.revoke", "baseline.evaluate", "baseline.export",
+    "baseline.record", "baseline.train", "bench.dispatch", "contrast", "dashboard", "demo", "doctor", "down", "drain",
+    "encode", "iterate", "pause", "pipeline", "resume", "router", "spawn", "status", "stop", "story", "tasks",
+    "train.mdnrnn", "train.vae", "up", "worker",
+}  # fmt: skip
+
+
+@pytest.fixture
+def mark(tmp_path, monkeypatch):
+    """A file that the module writes when it is imported, here or in a process that a verb starts."""
+    mark, modules = tmp_path / "imported", tmp_path / "modules"
+    modules.mkdir()
+    (modules / f"{MARK}.py").write_text(f"open({str(mark)!r}, 'w').close()\n")
+    monkeypatch.syspath_prepend(modules)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(modules), str(ROOT))))
+    monkeypatch.setenv("DREAMFLEET_TRUST", "")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    yield mark
+    sys.modules.pop(MARK, None)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch, mark):
+    """The current folder, with one file of each kind that names the module."""
+    monkeypatch.chdir(tmp_path)
+    small = Bundle.open(FIXTURES / "small.zip")
+    parts = {name: small.read(name) for name in small.manifest.parts}
+    for name, task in (("own", OWN), ("gym", GYM)):
+        bundle = write_bundle(tmp_path / f"{name}-bundle.zip", replace(small.manifest, task=task), parts)
+        write_controller(tmp_path / f"{name}.npz", task)
+        write_controller(tmp_path / f"{name}-seen" / "controller.npz", "car-racing", bundle)
+        write_controller(tmp_path / f"{name}-dreamt" / "controller.npz", "dream", bundle)
+        write_run(tmp_path / "runs" / name, bundle, task=task)
+        write_run(tmp_path / "runs" / f"{name}-dreamt", bundle)
+    write_controller(tmp_path / "nested.npz", "gym:CartPole-v1", options={"environment": {"env_id": f"{MARK}:X-v0"}})
+    write_run(tmp_path / "runs" / "optimiser", small, optimiser=f"{MARK}:Optimiser")
+    agent = AgentManifest("drqn", OWN, "box-64", ((0.0, 0.0, 0.0),), 1, 4)
+    graph = GraphBuilder("agent")
+    graph.add_output(graph.node("Identity", graph.constant(np.zeros((1, 1), np.float32))), "worth", 1, 1)
+    TrainedAgent(agent, graph.build()).save(tmp_path / "agent.zip")
+    write_reports(tmp_path)
+    command_line.main(["collect", "--data", "data", "--episodes", "2", "--steps", "5", "--jobs", "1"])
+    return tmp_path
+
+
+def write_controller(path, task, bundle=None, options=None):
+    path.parent.mkdir(exist_ok=True)
+    shape = bundle.controller_shape if bundle else ControllerShape(4, 2)
+    parameters = np.zeros(shape.size, np.float32)
+    text = json.dumps(options) if options else ""
+    Controller(shape, parameters, task, bundle.sha256 if bundle else "", receipt(task), text).save(path)
+    if bundle:
+        shutil.copy(bundle.path, path.parent / "bundle.zip")
+
+
+def receipt(task):
+    return {"generation": 1, "steps": 1, "run_uid": "ab"}
+
+
+def write_run(folder, bundle, **names):
+    """The folder of a run of the dream whose journal names others."""
+    shutil.copytree(FIXTURES / "runs" / "dream", folder)
+    shutil.copy(bundle.path, folder / "bundle.zip")
+    with closing(sqlite3.connect(folder / "journal.sqlite")) as journal, journal:
+        (text,) = journal.execute("SELECT value FROM run WHERE key = 'settings'").fetchone()
+        settings = json.loads(text)
+        settings["task"] |= {"bundle": bundle.sha256}
+        if "task" in names:
+            settings["task"]["task"] = names["task"]
+        if "optimiser" in names:
+            settings["optimiser"] = names["optimiser"]
+        journal.execute("UPDATE run SET value = ? WHERE key = 'settings'", (json.dumps(settings),))
+        journal.execute("DELETE FROM run WHERE key = 'ended'")
+    kept = Controller.load(folder / "controller.npz")
+    provenance = kept.provenance | {"settings": settings}
+    replace(kept, task=settings["task"]["task"], bundle=bundle.sha256, provenance=provenance).save(
+        folder / "controller.npz"
+    )
+
+
+def write_reports(folder):
+    drives = EpisodeResult(5000, 1.0, 1), EpisodeResult(5001, 2.0, 1)
+    for name, task in (("own", OWN), ("gym", GYM)):
+        controller = Controller.load(folder / f"{name}.npz")
+        report = EvaluationReport(f"{name}.npz", controller.sha256, task, task, "", "f", "1", 1.0, drives)
+        (folder / f"{name}.json").write_text(report.to_json())
+
+
+CONTROLLERS = ["own.npz", "gym.npz", "nested.npz"]
+CONTROLLERS += [f"{name}-{way}/controller.npz" for name in ("own", "gym") for way in ("seen", "dreamt")]
+BUNDLES = ["own-bundle.zip", "gym-bundle.zip"]
+RUNS = ["own", "gym", "own-dreamt", "gym-dreamt", "optimiser"]
+
+
+def beside(controller):
+    """The world model in a controller's folder."""
+    return "none" if "/" not in controller else f"{controller.partition('/')[0]}/bundle.zip"
+
+
+def commands():
+    short = ("--episodes", "1", "--jobs", "1")
+    serve = ("--listen", "tcp/127.0.0.1:0", "--minutes", "0.001")
+    for file in (*CONTROLLERS, "agent.zip"):
+        yield "evaluate", "--controller", file, *short
+        yield "record", "--controller", file, "--steps", "1", "--out", "a.mp4"
+        yield "live", "--controller", file, "--out", "pictures", "--seconds", "0.1"
+    for file in CONTROLLERS:
+        yield "collect", "--data", "new", "--controller", file, "--episodes", "2", "--jobs", "1"
+        yield "refit", file, "--to", "tiny", "--data", "data", "--out", "b.npz"
+        yield "coordinator", "--run", "x", "--init", file, "--bundle", beside(file), "--population", "1", *serve
+    for file in BUNDLES:
+        yield "coordinator", "--run", "x", "--bundle", file, "--population", "1", *serve
+        yield "inspect", file, "--out", "page.html"
+        yield "subspace", file, "--data", "data", "--out", "s.npz"
+        yield "unbundle", file, "--data", "unbundled"
+        yield "drive", "--dream", "--bundle", file, "--steps", "1"
+        yield "bench", "policy", "--bundle", file
+        yield "bench", "dream", "--bundle", file
+        yield "bench", "live", "--bundle", file
+        yield "bench", "env", "--bundle", file, "--episodes", "1"
+    yield "repeat", "optimiser", "--run", "again", "--listen", "tcp/127.0.0.1:0"
+    for run in RUNS:
+        yield "fork", run, "--run", f"{run}-more", *serve
+        yield "coordinator", "--resume", run, *serve
+        yield "replay", run, "--candidate", "1/0"
+        yield "inspect", run, "--out", "page.html"
+        yield "live", "--controller", run, "--generation", "3", "--out", "pictures", "--seconds", "0.1"
+        yield "collect", "--data", "new", "--from-run", run
+        yield "runs", "show", run
+        yield "runs", "receipt", run
+        yield "runs", "plot", run, "--out", "a.png"
+        yield "runs", "export", run, "--csv", "--out", f"csv-{run}"
+        yield "runs", "compare", run, run
+        yield "runs", "backup", run, "--to", f"backup-{run}"
+    yield "runs", "archive", "gym"
+    yield "runs", "list"
+    yield "runs", "delete", "own", "--yes"
+    for report in ("own.json", "gym.json"):
+        yield "reproduce", report, "--episodes", "1", "--jobs", "1"
+        yield "compare", report, report
+        yield "bundle", "--data", "data", "--out", "c.zip", "--measured", report
+
+
+def test_every_verb_is_tried_or_reads_no_names():
+    tried = {".".join(words[: 2 if words[0] in ("runs", "bench") else 1]) for words in commands()}
+    assert not tried & NAMELESS
+    assert tried | NAMELESS == {each.name for each in entry_points(group=command_line.GROUP)}
+
+
+@pytest.mark.slow
+def test_no_verb_imports_what_a_file_names(folder, mark, capfd):
+    refused, trace = 0, []
+    for words in commands():
+        try:
+            code = command_line.main(list(words))
+        except SystemExit as error:
+            code = error.code
+        said = capfd.readouterr()
+        trace.append((words[:5], code, said.err.strip()[-150:]))
+        open("/tmp/k/foreign.trace", "a").write(f"{trace[-1]}\n")
+        assert not mark.exists(), words
+        assert "Traceback" not in said.err, (words, said.err)
+        if f"--trust {MARK}" in said.err:
+            pass
+            refused += 1
+    assert refused > 40
+
+
+@pytest.mark.parametrize(("file", "task"), [("own.npz", OWN), ("gym.npz", GYM)])
+def test_what_the_user_names_is_imported(folder, mark, capfd, file, task):
+    words = ["evaluate", "--controller", file, "--episodes", "1", "--jobs", "1"]
+    assert command_line.main(words) == 2
+    assert f"task {task!r} is code in the module {MARK!r}" in (said := capfd.readouterr().err)
+    assert said.count("\n") == 1
+    assert not mark.exists()
+    assert command_line.main([*words, "--trust", MARK]) == 2  # it has no such world
+    assert mark.exists()
+
+
+def test_a_pickle_in_an_archive_is_never_loaded(tmp_path):
+    mark = tmp_path / "loaded"
+
+    class Evil:
+        def __reduce__(self):
+            return open, (str(mark), "w")
+
+    buffer = io.BytesIO()
+    np.savez(buffer, about=np.array([Evil()], dtype=object))
+    with pytest.raises(DamagedArchiveError, match="not an array of numbers or texts"):
+        read_arrays(buffer.getvalue(), ArchiveLimits(1 << 20))
+    assert not mark.exists()
