@@ -134,6 +134,17 @@ class BackgroundJobs:
             self.report.set_judged(outcome, self._journal.evaluated_vector(outcome.generation), self._history.steps)
         return work
 
+    def have_fallen_behind(self, count: int) -> bool:
+        """Whether each of the last `count` evaluated means is clearly below the best one before them."""
+        return self.evaluations.have_fallen_behind(count, self._evaluated_scores)
+
+    def _evaluated_scores(self, generation: int) -> dict[int, float]:
+        """An evaluated mean's scores by seed, from the journal (R28), whichever evaluation of that mean had them."""
+        vector, settings = self._journal.evaluated_vector(generation), self._settings
+        work = Evaluation(generation, vector, settings.evaluation_episodes).work(settings.task)
+        known = self._journal.fitness_of([each.job.digest for each in work])
+        return {each.job.seeds[0]: known[each.job.digest] for each in work if each.job.digest in known}
+
     def _evaluate(self, evaluation: Evaluation) -> list[Work]:
         wanted = [each.job.digest for each in evaluation.work(self._settings.task)]
         work = self.evaluations.open(evaluation, self._settings.task, self._journal.fitness_of(wanted))
