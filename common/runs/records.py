@@ -225,6 +225,11 @@ def expand_task_options(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {**settings, "task": task}
 
 
+def with_error(found: StoredEvaluation | StoredConfirmation) -> dict[str, Any]:
+    """The record as a plain dictionary for JSON and tables, with its standard error under `error`."""
+    return {**asdict(found), "error": found.error}
+
+
 def describe_score(found: StoredEvaluation | StoredConfirmation | None) -> str:
     """Describe the score of a mean, and whether it is confirmed or provisional."""
     if found is None:
