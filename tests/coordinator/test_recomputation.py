@@ -36,8 +36,8 @@ def started(processes, name, bundle, *flags):
         "--json", *flags, name=name,
     )  # fmt: skip
     processes.worker("--task", TASK, "--run", name)
-    code, out, err = coordinator.finish()
-    assert code == 0, err
+    code, out = coordinator.finish()
+    assert code == 0
     return json.loads(out.splitlines()[-1])
 
 
@@ -168,11 +168,10 @@ def check_search(found):
 
 
 def exported(processes, name, table):
-    code, _, err = processes.call(
-        "runs", "export", name, "--runs-dir", processes.runs, "--out", processes.folder / name
-    )
+    folder = processes.folder / name
+    code, _, err = processes.call("runs", "export", name, "--csv", "--runs-dir", processes.runs, "--out", folder)
     assert code == 0, err
-    with (processes.folder / name / f"{table}.csv").open() as file:
+    with (folder / f"{table}.csv").open() as file:
         return list(csv.DictReader(file))
 
 
@@ -193,7 +192,7 @@ def check_scores(processes, name, found, answer):
     assert [answer["best"]["mean"], answer["best"]["error"]] == pytest.approx(looks[best][:2])
     generation, mean, error = found.confirmed()
     with np.load(processes.runs / name / "controller.npz") as file:
-        report = json.loads(str(file["meta"]))["provenance"]
+        report = json.loads(str(file["about"]))["provenance"]
         np.testing.assert_array_equal(file["parameters"], found.evaluated[generation][0])
     assert (report["generation"], report["confirmed"]) == (generation, True)
     assert [report["validation_mean"], report["validation_error"]] == pytest.approx([mean, error])
@@ -202,6 +201,31 @@ def check_scores(processes, name, found, answer):
         assert [float(each["mean"]), float(each["error"])] == pytest.approx([mean, error])
     code, out, err = processes.call("runs", "show", name, "--runs-dir", processes.runs)
     assert f"scored {mean:.1f} ± {error:.1f} (standard error)" in out, err
+
+
+def check_status(processes, name, found):
+    """A coordinator that goes on and waits for workers tells the same of what was."""
+    coordinator = processes.start(
+        "coordinator", "--resume", name, "--runs-dir", processes.runs, "--listen", processes.endpoint,
+        "--generations", 99,
+    )  # fmt: skip
+    coordinator.wait_for("listening")
+    code, out, err = processes.call("status", "--connect", processes.endpoint, "--json")
+    coordinator.end()
+    assert code == 0, err
+    status = json.loads(out)
+    last, best = max(found.evaluated), max(found.evaluated, key=lambda each: found.look(each)[0])
+    for each, generation in ((status["evaluation"], last), (status["best"], best)):
+        assert each["generation"] == generation
+        mean, error, deviation, episodes = found.look(generation)
+        assert [each["mean"], each["error"], each["std"], each["episodes"]] == pytest.approx(
+            [mean, error, deviation, episodes]
+        )
+    confirmed = status["confirmed"]
+    assert (confirmed["generation"], confirmed["mean"], confirmed["error"]) == pytest.approx(found.confirmed())
+    fitness = found.fitness(last)
+    shown = [status["last"][each] for each in ("mean", "std", "best", "worst")]
+    assert shown == pytest.approx([fitness.mean(), fitness.std(), fitness.max(), fitness.min()])
 
 
 @pytest.mark.slow
@@ -214,3 +238,4 @@ def test_a_run_is_what_its_journal_comes_to(processes, random_bundle, kind):
     assert len(found.generations) == 7
     check_search(found)
     check_scores(processes, kind, found, answer)
+    check_status(processes, kind, found)
