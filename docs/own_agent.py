@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from dreamfleet.common.artifacts.actions import FIVE_CHOICES
 from dreamfleet.common.runs.seeds import validation_seeds
+from dreamfleet.common.runs.standard_error import format_with_error, standard_error
 
 DREAM = "dreamfleet.worker.dream:dreamfleet/CarRacingDream-v0"
 REALITY = "dreamfleet.worker.car_racing:dreamfleet/CarRacingLatent-v0"
@@ -150,8 +151,8 @@ def main() -> None:
         if len(scores) == 1:
             print(f"{name}: {scores[0]:.1f} on one real track", flush=True)
             continue
-        error = scores.std(ddof=1) / np.sqrt(len(scores))
-        summary = f"{scores.mean():.1f} ± {error:.1f} on {len(scores)} real tracks"
+        score = format_with_error(scores.mean(), standard_error(scores.tolist()))
+        summary = f"{score} on {len(scores)} real tracks"
         print(f"{name}: {summary} ({scores.min():.0f} to {scores.max():.0f})", flush=True)
     tracks.close()
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, Protocol
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
@@ -10,6 +11,15 @@ from matplotlib.ticker import MaxNLocator
 from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import begun_stages
+
+
+class ScoreWithError(Protocol):
+    """A mean that has a standard error, or none of one episode."""
+
+    @property
+    def error(self) -> float | None:
+        """The standard error."""
+
 
 PLOT_COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:olive")
 
@@ -22,7 +32,8 @@ def draw_fitness(axes: Any, run: RunFolder) -> list[Any]:
     """
     history, evaluations, settings = run.history(), run.evaluations(), run.settings
     number, mean, std, best = np.array([(each.number, each.mean, each.std, each.best) for each in history]).T
-    axes.fill_between(number, mean - std, mean + std, alpha=0.2, color="tab:blue", label="± 1 standard deviation")
+    spread = "± 1 standard deviation of the candidates"
+    axes.fill_between(number, mean - std, mean + std, alpha=0.2, color="tab:blue", label=spread)
     axes.plot(number, mean, color="tab:blue", label="mean of the population")
     axes.plot(number, best, color="tab:orange", linewidth=1, label="best candidate")
     stages = begun_stages(settings, history, evaluations)
@@ -39,7 +50,7 @@ def draw_fitness(axes: Any, run: RunFolder) -> list[Any]:
         episodes = f"{settings.evaluation_episodes} whole episodes"
         real.errorbar(
             [each.generation for each in evaluations], [each.mean for each in evaluations],
-            [each.error for each in evaluations], fmt="o-" if dreamt else "o", color="tab:green", capsize=3,
+            error_bars(evaluations), fmt="o-" if dreamt else "o", color="tab:green", capsize=3,
             label=f"evaluated mean{' in reality' if dreamt else ''}, {episodes} (± standard error)",
         )  # fmt: skip
         _draw_confirmed(real, run)
@@ -49,10 +60,15 @@ def draw_fitness(axes: Any, run: RunFolder) -> list[Any]:
     return [handle for each in drawn for handle in each.get_legend_handles_labels()[0]]
 
 
+def error_bars(found: Iterable[ScoreWithError]) -> list[float]:
+    """The lengths of error bars; a score without a standard error has no bar."""
+    return [np.nan if each.error is None else each.error for each in found]
+
+
 def _draw_confirmed(axes: Any, run: RunFolder) -> None:
     """Draw the run's confirmed score; it is often below the best evaluation, which is partly luck."""
     if (confirmed := run.confirmation()) is not None:
         axes.errorbar(
-            confirmed.generation, confirmed.mean, confirmed.error, fmt="*", color="tab:red", capsize=3, markersize=10,
-            label=f"reported: confirmed on {confirmed.episodes} fresh seeds (± standard error)",
+            confirmed.generation, confirmed.mean, error_bars([confirmed]), fmt="*", color="tab:red", capsize=3,
+            markersize=10, label=f"reported: confirmed on {confirmed.episodes} fresh seeds (± standard error)",
         )  # fmt: skip

@@ -213,7 +213,7 @@ def _fact(each: tuple[int, str, str], width: int) -> list[Text]:
 
 
 def _describe_generation(last: StoredGeneration) -> str:
-    return f"{last.mean:.1f} ± {last.std:.1f}  ({last.worst:.0f} to {last.best:.0f})"
+    return f"mean {last.mean:.1f}, deviation {last.std:.1f}  ({last.worst:.0f} to {last.best:.0f})"
 
 
 def _describe_optimiser(settings: RunSettings) -> str:

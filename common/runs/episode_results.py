@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from statistics import fmean, median, pstdev, stdev
+from statistics import fmean, median
 
+from dreamfleet.common.runs.standard_error import sample_std, standard_error
 from dreamfleet.common.serialization.validation import Count
 
 
@@ -57,14 +57,14 @@ class EpisodeResults:
         return fmean(self.scores)
 
     @property
-    def std(self) -> float:
-        """Population standard deviation of the scores."""
-        return pstdev(self.scores)
+    def std(self) -> float | None:
+        """Sample standard deviation of the scores (n - 1); `None` for a single episode."""
+        return sample_std(self.scores)
 
     @property
     def error(self) -> float | None:
         """Standard error of the mean, from the sample standard deviation; `None` for a single episode."""
-        return stdev(self.scores) / math.sqrt(len(self.scores)) if len(self.scores) > 1 else None
+        return standard_error(self.scores)
 
     @property
     def median(self) -> float:

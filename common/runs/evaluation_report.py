@@ -12,6 +12,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import read_text
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
+from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.serialization.optional_fields import OPTIONAL
 from dreamfleet.common.serialization.validation import Length, MalformedError, Seconds, from_plain_lenient
 
@@ -79,7 +80,7 @@ class EvaluationReport:
 
 
 def summary_figures(results: EpisodeResults) -> dict[str, Any]:
-    """The statistics of episodes as JSON has them; `error`, `finished`, `speed` and `braking` may be `None`."""
+    """The statistics of episodes as JSON has them; `std`, `error`, `finished`, `speed` and `braking` may be `None`."""
     return {
         "n": len(results.drives), "mean": results.mean, "std": results.std, "error": results.error,
         "median": results.median, "least": results.worst, "most": results.best, "steps": results.steps,
@@ -116,11 +117,11 @@ def _check_drives(drives: tuple[EpisodeResult, ...]) -> None:
 
 
 def _describe_score(found: EpisodeResults) -> str:
-    if found.error is None:
+    if found.std is None:
         return f"{found.mean:.1f} on one seed; judged by gymnasium's own environment"
-    error = f" ± {found.error:.1f} (standard error)"
+    score = format_with_error(found.mean, found.error)
     return (
-        f"{found.mean:.1f}{error} on {len(found.drives)} seeds, {found.worst:.0f} to {found.best:.0f}, "
+        f"{score} (standard error) on {len(found.drives)} seeds, {found.worst:.0f} to {found.best:.0f}, "
         f"median {found.median:.0f}, standard deviation {found.std:.1f}; judged by gymnasium's own environment"
     )
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from statistics import fmean, stdev
+from statistics import NormalDist, fmean
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.episode_results import EpisodeResults
+from dreamfleet.common.runs.standard_error import format_with_error, standard_error
 
 SIGNIFICANT_ERRORS = 2  # critical value in standard errors, for many seeds
 MANY_SEEDS = 30
@@ -37,18 +38,25 @@ class PairedDifference:
                 "--episodes"
             )
         differences = [other[seed] - one[seed] for seed in shared]
-        return cls(len(shared), fmean(differences), stdev(differences) / math.sqrt(len(shared)))
+        error = standard_error(differences)
+        assert error is not None
+        return cls(len(shared), fmean(differences), error)
 
     @property
     def critical_value(self) -> float:
         """Standard errors that a significant difference must exceed: two for many seeds, more for few.
 
         Student's t with `seeds - 1` degrees of freedom at the probability of two standard deviations of a normal
-        distribution, by its expansion in 1 / (seeds - 1) (Abramowitz & Stegun 26.7.5).
+        distribution: exact for one and two, else by its expansion in 1 / (seeds - 1) (Abramowitz & Stegun 26.7.5).
         """
         if self.seeds >= MANY_SEEDS:
             return SIGNIFICANT_ERRORS
         z, freedom = float(SIGNIFICANT_ERRORS), self.seeds - 1
+        within = 2 * NormalDist().cdf(z) - 1
+        if freedom == 1:
+            return math.tan(math.pi / 2 * within)
+        if freedom == 2:
+            return within * math.sqrt(2 / (1 - within**2))
         first, second = (z**3 + z) / 4, (5 * z**5 + 16 * z**3 + 3 * z) / 96
         third = (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384
         return z + first / freedom + second / freedom**2 + third / freedom**3
@@ -72,10 +80,19 @@ class PairedDifference:
         """A text for display."""
         if self.mean == self.error == 0:
             return f"the same scores, to the bit, on {self.seeds} equal seeds"
-        found = f"{self.mean:+.1f} ± {self.error:.1f} (standard error) on {self.seeds} equal seeds"
+        size = format_with_error(self.mean, self.error, sign="+")
+        found = f"{size} (standard error) on {self.seeds} equal seeds"
         if self.is_significant:
             return f"{found}: {'better' if self.mean > 0 else 'worse'}"
         return f"{found}: not significant, as it is under {self.threshold_text}"
+
+
+def is_clearly_below(scores: Mapping[int, float], others: Mapping[int, float]) -> bool:
+    """Whether `scores` by seed are significantly below `others`; fewer than two common seeds show nothing."""
+    if len(scores.keys() & others.keys()) < 2:
+        return False
+    found = PairedDifference.of(others, scores)
+    return found.is_significant and found.mean < 0
 
 
 def _scores_by_seed(evaluated: EpisodeResults) -> dict[int, float]:

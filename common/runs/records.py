@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Annotated, Any, Literal
 
 from dreamfleet.common.artifacts.controller import ControllerShape
@@ -14,6 +13,11 @@ from dreamfleet.common.errors import JournalError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.messages import Horizon, Packages, Patience, Share, TaskSpec
+from dreamfleet.common.runs.standard_error import (
+    error_from_population_std,
+    error_from_sample_std,
+    format_with_error,
+)
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
 from dreamfleet.common.serialization.validation import Between, Count, Length, MalformedError, from_plain
 
@@ -190,7 +194,7 @@ class StoredEvaluation:
     generation: int
     episodes: EpisodeCount
     mean: float
-    std: float
+    std: float  # of the population: `episodes` in the denominator, in every journal and status
     failed: Count = field(default=0, metadata=OPTIONAL)  # further episodes, which have no score
 
     @property
@@ -199,13 +203,9 @@ class StoredEvaluation:
         return -self.failed, self.mean
 
     @property
-    def error(self) -> float:
-        """Standard error of the mean."""
-        return self.std / math.sqrt(self.episodes)
-
-    def is_clearly_below(self, other: StoredEvaluation) -> bool:
-        """Whether its mean is below the other's by more than two standard errors of the difference."""
-        return other.mean - self.mean > 2 * math.hypot(other.error, self.error)
+    def error(self) -> float | None:
+        """Standard error of the mean; `None` for one episode."""
+        return error_from_population_std(self.std, self.episodes)
 
 
 @dataclass(frozen=True)
@@ -224,9 +224,9 @@ class StoredConfirmation:
     failed: Count = field(default=0, metadata=OPTIONAL)  # further episodes, which have no score
 
     @property
-    def error(self) -> float:
-        """Standard error of the mean."""
-        return self.std / math.sqrt(self.episodes)
+    def error(self) -> float | None:
+        """Standard error of the mean; `None` for one episode."""
+        return error_from_sample_std(self.std, self.episodes)
 
     def covers(self, best: StoredEvaluation | None) -> bool:
         """Whether the choice considered the best evaluated mean; if not, the run has been continued since."""
@@ -260,12 +260,17 @@ def expand_task_options(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {**settings, "task": task}
 
 
+def with_error(found: StoredEvaluation | StoredConfirmation) -> dict[str, Any]:
+    """The record as a plain dictionary for JSON and tables, with its standard error under `error`."""
+    return {**asdict(found), "error": found.error}
+
+
 def describe_score(found: StoredEvaluation | StoredConfirmation | None) -> str:
     """Describe the score of a mean, and whether it is confirmed or provisional."""
     if found is None:
         return "the last mean; it was not evaluated"
     score = f"generation {found.generation}'s mean scored {format_mean(found)}"
-    score += " (standard error)" if found.episodes > 1 else ""
+    score += " (standard error)" if found.error is not None else ""
     failed = f"; {plural(found.failed, 'more episode')} failed" if found.failed else ""
     if isinstance(found, StoredConfirmation):
         seeds = plural(found.episodes, "fresh validation seed")
@@ -276,4 +281,4 @@ def describe_score(found: StoredEvaluation | StoredConfirmation | None) -> str:
 
 def format_mean(found: StoredEvaluation | StoredConfirmation) -> str:
     """Format a mean with its standard error, if it has more than one episode."""
-    return f"{found.mean:.1f}" if found.episodes == 1 else f"{found.mean:.1f} ± {found.error:.1f}"
+    return format_with_error(found.mean, found.error)

@@ -191,10 +191,14 @@ class RunFolder:
         ]
 
     def scores(self, generation: int, *, confirming: bool = False) -> dict[int, float]:
-        """The scores of a generation's mean by validation seed, in its evaluation or in its confirmation."""
+        """The scores of a generation's mean by validation seed, in its evaluation or in its confirmation.
+
+        A run that has converged evaluates one mean several times, and its results are stored with the first generation.
+        """
         since, until = (CONFIRMING_OFFSET, VALIDATION.stop) if confirming else (0, CHOOSING_OFFSET)
         query = (
-            "SELECT seed, fitness FROM result WHERE kind = 'evaluate' AND generation = ? AND episode BETWEEN ? AND ?"
+            "SELECT seed, fitness FROM result WHERE kind = 'evaluate' AND episode BETWEEN ?2 AND ?3 AND generation IN "
+            "(SELECT generation FROM evaluation WHERE vector = (SELECT vector FROM evaluation WHERE generation = ?1))"
         )
         return dict(self._journal.rows("if", query, generation, since, until - 1))
 

@@ -5,6 +5,7 @@ They are a pure function of the run's settings and of the generations and evalua
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -78,11 +79,17 @@ def _temperature_at(
         return temperature
     for number in range(settings.evaluate_every - 1, last + 1, settings.evaluate_every):
         evaluation = finished.get(number)
-        if evaluation is not None and best is not None and evaluation.is_clearly_below(best):
+        if evaluation is not None and best is not None and _fell_behind(evaluation, best):
             temperature, best = min(temperature * settings.heat, MAX_TEMPERATURE), None
         elif evaluation is not None and (best is None or evaluation.mean > best.mean):
             best = evaluation
     return temperature
+
+
+def _fell_behind(evaluation: StoredEvaluation, best: StoredEvaluation) -> bool:
+    """The rule that runs with `heat` raised by, kept to the bit: unpaired errors with `episodes` in the denominator."""
+    errors = (each.std / math.sqrt(each.episodes) for each in (best, evaluation))
+    return best.mean - evaluation.mean > 2 * math.hypot(*errors)
 
 
 def scoring_params_at(

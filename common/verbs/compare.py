@@ -11,6 +11,7 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.evaluation_report import EvaluationReport, read_evaluation_report
 from dreamfleet.common.runs.paired_difference import PairedDifference
+from dreamfleet.common.runs.standard_error import format_with_error
 
 SUMMARY = "print the paired difference of each report of `evaluate --out` from the first"
 EXTRAS = ()
@@ -38,8 +39,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _line(path: Path, found: EvaluationReport) -> str:
-    error = "" if found.results.error is None else f" ± {found.results.error:.1f}"
-    return f"{path}: {found.name}, {found.results.mean:.1f}{error} on {len(found.drives)} seeds"
+    score = format_with_error(found.results.mean, found.results.error)
+    return f"{path}: {found.name}, {score} on {len(found.drives)} seeds"
 
 
 def _warn(first: Path, base: EvaluationReport, path: Path, other: EvaluationReport) -> None:

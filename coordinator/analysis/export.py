@@ -13,8 +13,14 @@ from typing import Any
 from dreamfleet.common.errors import MissingExtraError, UsageError
 from dreamfleet.common.files.atomic_write import open_output, reporting_write_errors
 from dreamfleet.common.files.regular_files import is_file, is_folder
-from dreamfleet.common.files.tensorboard import EXTRA, open_event_file
-from dreamfleet.common.runs.records import StoredCandidate, StoredConfirmation, StoredEvaluation, StoredGeneration
+from dreamfleet.common.files.tensorboard import EXTRA, EventFileWriter, open_event_file
+from dreamfleet.common.runs.records import (
+    StoredCandidate,
+    StoredConfirmation,
+    StoredEvaluation,
+    StoredGeneration,
+    with_error,
+)
 from dreamfleet.common.runs.run_folder import RunFolder
 
 EVENTS = "events.out.tfevents.*"  # names of TensorBoard's files
@@ -69,10 +75,16 @@ def export_tensorboard(run: RunFolder, folder: Path) -> list[Path]:
                        fitness__worst=each.worst, search__sigma=each.sigma, effort__steps=each.steps,
                        effort__seconds=each.seconds)  # fmt: skip
         for judged in run.evaluations():
-            events.add(judged.generation, score__evaluated=judged.mean, score__evaluated_error=judged.error)
+            _add_score(events, judged, "evaluated")
         if (confirmed := run.confirmation()) is not None:
-            events.add(confirmed.generation, score__confirmed=confirmed.mean, score__confirmed_error=confirmed.error)
+            _add_score(events, confirmed, "confirmed")
     return sorted(folder.glob(EVENTS))
+
+
+def _add_score(events: EventFileWriter, found: StoredEvaluation | StoredConfirmation, name: str) -> None:
+    """Add a mean's score, and its standard error if it has one."""
+    error = {} if found.error is None else {f"score__{name}_error": found.error}
+    events.add(found.generation, **{f"score__{name}": found.mean, **error})
 
 
 @contextmanager
@@ -91,7 +103,7 @@ def _tables(run: RunFolder) -> Iterator[tuple[str, list[str], list[Row]]]:
     for name, (kind, read) in TABLES.items():
         judged = name in JUDGED
         columns = [each.name for each in fields(kind)] + ["error"] * judged
-        if rows := [asdict(each) | ({"error": each.error} if judged else {}) for each in read(run)]:
+        if rows := [with_error(each) if judged else asdict(each) for each in read(run)]:
             yield name, columns, rows
 
 

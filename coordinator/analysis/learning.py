@@ -21,7 +21,7 @@ class Point:
 
     effort: Effort
     score: float
-    error: float  # standard error of the mean
+    error: float | None  # standard error of the mean; `None` for one episode
 
     @classmethod
     def of(cls, effort: Effort, found: StoredEvaluation | StoredConfirmation) -> Point:

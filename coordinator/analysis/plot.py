@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from dreamfleet.common.files.atomic_write import open_output
-from dreamfleet.common.monitoring.fitness_chart import PLOT_COLOURS, draw_fitness
+from dreamfleet.common.monitoring.fitness_chart import PLOT_COLOURS, draw_fitness, error_bars
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.effort import Effort, format_steps
@@ -88,7 +88,7 @@ def _draw_curve(axes: Any, curve: LearningCurve, colour: str, spent: Callable[[E
     axes.errorbar(
         [spent(each.effort) for each in points],
         [each.score for each in points],
-        [each.error for each in points],
+        error_bars(points),
         fmt="o-",
         color=colour,
         markersize=4,
@@ -102,7 +102,7 @@ def _draw_curve(axes: Any, curve: LearningCurve, colour: str, spent: Callable[[E
         ends = [spent(reported.effort), spent(last.effort)], [reported.score, last.score]
         axes.plot(*ends, ":", color=colour, linewidth=1)
     axes.errorbar(
-        spent(last.effort), last.score, last.error, fmt="*", color=colour, markersize=13, capsize=3,
+        spent(last.effort), last.score, error_bars([last]), fmt="*", color=colour, markersize=13, capsize=3,
         markeredgecolor="black", label=f"{curve.name}, confirmed on fresh seeds: {last.score:.0f}",
     )  # fmt: skip
 

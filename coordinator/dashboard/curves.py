@@ -138,7 +138,7 @@ def _effort_columns(efforts: Sequence[Effort]) -> dict[str, list[float]]:
     }
 
 
-def _rounded(value: float) -> float | None:
-    """The number with 5 digits; `None` for NaN and infinity."""
-    short = float(f"{value:.5g}")
+def _rounded(value: float | None) -> float | None:
+    """The number with 5 digits; `None` for NaN and infinity, and for no number."""
+    short = math.nan if value is None else float(f"{value:.5g}")
     return short if math.isfinite(short) else None

@@ -15,6 +15,7 @@ from dreamfleet.common.runs.effort import format_steps
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_paths import resume_command
 from dreamfleet.common.runs.stages import describe_steps
+from dreamfleet.common.runs.standard_error import format_with_error
 
 LIVE, LOST, OVER = "live", "lost", "over"
 NONE = "-"
@@ -115,8 +116,8 @@ def _tile(name: str, value: str, caption: str) -> dict[str, str]:
 
 
 def format_score(found: StoredEvaluation | StoredConfirmation) -> str:
-    """Format a mean with its standard error."""
-    return f"{found.mean:,.1f} ± {found.error:,.1f}"
+    """Format a mean with its standard error, if it has one."""
+    return format_with_error(found.mean, found.error, sign=",")
 
 
 def _last_generation_caption(last: StoredGeneration | None) -> str:

@@ -13,7 +13,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from statistics import fmean, stdev
+from statistics import fmean
 
 from rich.console import Console
 from rich.live import Live
@@ -40,6 +40,7 @@ from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.runs.records import best_evaluation
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import CONTROLLER
+from dreamfleet.common.runs.standard_error import format_with_error, standard_error
 from dreamfleet.coordinator.experiments.local_run import LocalRun
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE
 
@@ -235,13 +236,13 @@ def median_drive(drives: Mapping[int, float]) -> tuple[int, float]:
     return sorted(drives.items(), key=lambda drive: (drive[1], drive[0]))[(len(drives) - 1) // 2]
 
 
-def _format_score(mean: float, error: float, episodes: int) -> str:
-    return f"{mean:.0f} ± {error:.0f} ({episodes})"
+def _format_score(mean: float, error: float | None, episodes: int) -> str:
+    return f"{format_with_error(mean, error, 0)} ({episodes})"
 
 
 def _format_drives(scores: Sequence[float]) -> str:
-    error = stdev(scores) / math.sqrt(len(scores)) if len(scores) > 1 else 0.0
-    return f"{_format_score(fmean(scores), error, len(scores))}, {min(scores):.0f} to {max(scores):.0f}"
+    score = _format_score(fmean(scores), standard_error(scores), len(scores))
+    return f"{score}, {min(scores):.0f} to {max(scores):.0f}"
 
 
 def _evaluation_flags(every: int, tracks: int, confirming: int) -> dict[str, object]:

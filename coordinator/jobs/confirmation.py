@@ -20,6 +20,7 @@ from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.records import StoredConfirmation
 from dreamfleet.common.runs.seeds import CHOOSING_OFFSET, CONFIRMING_OFFSET, validation_seeds
+from dreamfleet.common.runs.standard_error import sample_std
 from dreamfleet.coordinator.jobs.work import Work, make_work
 
 FINALISTS = 4
@@ -140,7 +141,7 @@ class Confirmation:
         self._remaining = judged[: _better_half(judged)]
 
     def _outcome(self, scores: np.ndarray[tuple[int], np.dtype[np.float64]], failed: int) -> StoredConfirmation:
-        std = float(scores.std(ddof=1)) if len(scores) > 1 else 0.0
+        std = sample_std(scores.tolist()) or 0.0  # of one episode there is none, as `error` says
         last = self._remaining[0].generation
         return StoredConfirmation(last, len(scores), float(scores.mean()), std, self._closed, failed)
 

@@ -6,15 +6,19 @@ R28: an evaluation is computed only from accepted results on fixed tracks, so a 
 from __future__ import annotations
 
 from bisect import bisect
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.runs.paired_difference import is_clearly_below
 from dreamfleet.common.runs.records import StoredEvaluation
 from dreamfleet.common.runs.seeds import validation_seeds
 from dreamfleet.coordinator.jobs.work import Work, make_work
+
+FindScores = Callable[[int], Mapping[int, float]]
+"""Finds the scores of a finished evaluation by seed, from its generation; a seed without a score is missing."""
 
 
 @dataclass(frozen=True)
@@ -131,12 +135,12 @@ class Evaluations:
         """The finished evaluation of the highest rank; of equals the earliest."""
         return self._bests[-1] if self._bests else None
 
-    def have_fallen_behind(self, count: int) -> bool:
-        """Whether each of the last `count` evaluations is clearly below the best one before them.
+    def have_fallen_behind(self, count: int, find_scores: FindScores) -> bool:
+        """Whether each of the last `count` evaluations is clearly below the best one before them, paired by seed.
 
         This shows that the search exploits the dream: fitness in the dream rises while the real score falls.
         """
         if len(self.rows) <= count:
             return False
-        best = self._bests[-count - 1]
-        return all(each.is_clearly_below(best) for each in self.rows[-count:])
+        best = find_scores(self._bests[-count - 1].generation)
+        return all(is_clearly_below(find_scores(each.generation), best) for each in self.rows[-count:])

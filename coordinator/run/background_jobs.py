@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from math import isnan, nan
 
 from dreamfleet.common.protocol.messages import Job
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation
@@ -135,6 +136,18 @@ class BackgroundJobs:
             self._confirmation, self._confirmed = None, outcome
             self.report.set_judged(outcome, self._journal.evaluated_vector(outcome.generation), self._history.steps)
         return work
+
+    def have_fallen_behind(self, count: int) -> bool:
+        """Whether each of the last `count` evaluated means is clearly below the best one before them."""
+        return self.evaluations.have_fallen_behind(count, self._evaluated_scores)
+
+    def _evaluated_scores(self, generation: int) -> dict[int, float]:
+        """An evaluated mean's scores by seed, from the journal (R28), whichever evaluation of that mean had them."""
+        vector, settings = self._journal.evaluated_vector(generation), self._settings
+        work = Evaluation(generation, vector, settings.evaluation_episodes).work(settings.task)
+        known = self._journal.fitness_of([each.job.digest for each in work])
+        scores = {each.job.seeds[0]: known.get(each.job.digest, nan) for each in work}
+        return {seed: score for seed, score in scores.items() if not isnan(score)}
 
     def _evaluate(self, evaluation: Evaluation) -> list[Work]:
         wanted = [each.job.digest for each in evaluation.work(self._settings.task)]

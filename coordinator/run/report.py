@@ -26,7 +26,7 @@ class ValidationScore:
     """A mean's score on validation tracks. Unless it is `confirmed`, the mean was also chosen by these tracks."""
 
     mean: float
-    error: float  # standard error of the mean
+    error: float | None  # standard error of the mean; `None` for one episode
     episodes: int
     confirmed: bool
 

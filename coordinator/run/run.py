@@ -347,7 +347,7 @@ class Run:
         best = evaluations.best
         if limits.target is not None and best is not None and best.mean >= limits.target:
             return f"the mean of generation {best.generation} reached {best.mean:.1f}"
-        if best is not None and limits.parted and evaluations.have_fallen_behind(limits.parted):
+        if best is not None and limits.parted and self.background_jobs.have_fallen_behind(limits.parted):
             return f"the evaluated mean fell behind generation {best.generation}'s"
         return None
 

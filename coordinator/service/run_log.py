@@ -16,7 +16,7 @@ from typing import Any
 from dreamfleet.common.monitoring.eta import estimate_eta, summarise_status
 from dreamfleet.common.monitoring.status import Status
 from dreamfleet.common.protocol.tasks import is_unregistered
-from dreamfleet.common.runs.records import StoredGeneration
+from dreamfleet.common.runs.records import StoredGeneration, format_mean, with_error
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, Credentials, describe_time_left
 from dreamfleet.common.transport.network import Network, is_loopback
 from dreamfleet.coordinator.run.run import Run
@@ -64,9 +64,9 @@ class RunLog:
         evaluations = self._run.background_jobs.evaluations
         if len(evaluations) > self._evaluations_logged:
             for each in islice(evaluations.finished.values(), self._evaluations_logged, None):  # as they finished
-                log.info("evaluation of generation %d's mean: %.1f ± %.1f (standard error), %d episodes",
-                         each.generation, each.mean, each.error, each.episodes,
-                         extra={"facts": {"event": "evaluation", **asdict(each), "error": each.error}})  # fmt: skip
+                log.info("evaluation of generation %d's mean: %s%s, %d episodes",
+                         each.generation, format_mean(each), "" if each.error is None else " (standard error)",
+                         each.episodes, extra={"facts": {"event": "evaluation", **with_error(each)}})  # fmt: skip
             self._evaluations_logged = len(evaluations)
 
     def write_notes(self) -> None:

@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from typing import Any, Protocol, TypeVar
 
-from dreamfleet.common.monitoring.status import STATUS_SCHEMA_VERSION, Event, Population, WorkerStatus
+from dreamfleet.common.monitoring.status import STATUS_SCHEMA_VERSION, Event, Population, Status, WorkerStatus
 from dreamfleet.common.protocol.codec import encode_json
 from dreamfleet.common.protocol.messages import MAX_MESSAGE
-from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration, with_error
 from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.coordinator.dispatch.event_log import FleetEvent
 from dreamfleet.coordinator.jobs.generation import CandidateScores
@@ -60,13 +60,22 @@ def encode_status(snapshot: Snapshot) -> bytes:
     """The status with the first rows of each list; fewer rows if the rest is unusually long."""
     share = 1.0
     while True:
-        payload = encode_json(_with_heads(snapshot, share))
+        payload = _encode_with_errors(_with_heads(snapshot, share))
         if len(payload) <= MAX_MESSAGE or share < 0.01:
             return payload
         share /= 2
 
 
-def _with_heads(snapshot: Snapshot, share: float) -> Any:
+def _encode_with_errors(status: Status) -> bytes:
+    """The document with the standard error of each score, which follows from its other fields."""
+    plain = json.loads(encode_json(status))
+    for name in ("evaluation", "best", "confirmed"):
+        if (found := getattr(status, name)) is not None:
+            plain[name] = with_error(found)
+    return json.dumps(plain, allow_nan=False).encode()
+
+
+def _with_heads(snapshot: Snapshot, share: float) -> Status:
     candidates = int(HEAD_CANDIDATES * share)
     whole = snapshot.full_status()
     return replace(
@@ -96,7 +105,7 @@ def _history(snapshot: Snapshot, offset: int, limit: int) -> dict[str, Any]:
 def _evaluations(snapshot: Snapshot, offset: int, limit: int) -> dict[str, Any]:
     found = snapshot.evaluations
     rows = _head(found[offset : offset + min(limit, PAGE)], PAGE_BYTES)
-    return {"offset": offset, "total": len(found), "evaluations": [asdict(each) for each in rows]}
+    return {"offset": offset, "total": len(found), "evaluations": [with_error(each) for each in rows]}
 
 
 def _candidates(snapshot: Snapshot, generation: str | None, offset: int, limit: int) -> dict[str, Any]:
@@ -125,9 +134,9 @@ def _event(each: FleetEvent, now: float) -> Event:
 def _best(snapshot: Snapshot, offset: int) -> dict[str, Any]:
     """The best evaluation and the reported controller, with its parameters from `offset` on."""
     best, reported = snapshot.status.best, snapshot.reported
-    document = {"best": None if best is None else asdict(best), "evaluations": snapshot.status.evaluations}
+    document = {"best": None if best is None else with_error(best), "evaluations": snapshot.status.evaluations}
     confirmed = snapshot.status.confirmed
-    document["confirmed"] = None if confirmed is None else asdict(confirmed)
+    document["confirmed"] = None if confirmed is None else with_error(confirmed)
     if reported is None:
         return {**document, "controller": None}
     controller = reported.controller()

@@ -177,7 +177,7 @@ def _report(
     args: argparse.Namespace, run: Run, request: RunRequest, outcome: ExitReport, *, nothing_new: bool
 ) -> None:  # fmt: skip
     from dreamfleet.common.monitoring.eta import format_duration
-    from dreamfleet.common.runs.records import describe_score
+    from dreamfleet.common.runs.records import describe_score, with_error
     from dreamfleet.common.runs.run_paths import CONTROLLER
     from dreamfleet.common.runs.times import elapsed_seconds
 
@@ -190,8 +190,8 @@ def _report(
         "controller": controller,
         "continue": again,
     }
-    facts["best"] = None if run.best is None else vars(run.best)
-    facts["confirmed"] = None if run.confirmed is None else {**vars(run.confirmed), "error": run.confirmed.error}
+    facts["best"] = None if run.best is None else with_error(run.best)
+    facts["confirmed"] = None if run.confirmed is None else with_error(run.confirmed)
     judged = run.confirmed or run.best
     score = f"; {describe_score(judged)}" if judged else ""
     if run.ended is None:

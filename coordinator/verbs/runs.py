@@ -18,7 +18,7 @@ from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.files.regular_files import is_folder, path_exists
 from dreamfleet.common.monitoring.eta import format_duration
 from dreamfleet.common.printable import format_setting
-from dreamfleet.common.runs.records import RunSettings, StoredGeneration, best_evaluation, describe_score
+from dreamfleet.common.runs.records import RunSettings, StoredGeneration, best_evaluation, describe_score, with_error
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.common.runs.run_paths import ARCHIVE as ARCHIVE_FOLDER
@@ -129,9 +129,9 @@ def show_run(args: argparse.Namespace) -> int:
     begun = begun_stages(settings, history, evaluations) if settings.stages else ()
     if args.json:
         rows: dict[str, Any] = {"history": [asdict(each) for each in history]}
-        rows["evaluations"] = [asdict(each) for each in evaluations]
+        rows["evaluations"] = [with_error(each) for each in evaluations]
         rows["stages"] = [{"number": each.stage.number, "since": each.since, "after": each.why} for each in begun]
-        reported = None if confirmed is None else {**asdict(confirmed), "error": confirmed.error}
+        reported = None if confirmed is None else with_error(confirmed)
         rows["classes"] = asdict(classes)
         print(json.dumps({**facts, "settings": asdict(settings), "confirmed": reported, **rows}, indent=2))
         return 0

@@ -16,7 +16,9 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, open_output
 from dreamfleet.common.printable import format_setting, printable_lines
+from dreamfleet.common.runs.records import format_mean, with_error
 from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.standard_error import format_with_error
 
 if TYPE_CHECKING:
     from dreamfleet.coordinator.analysis.comparison import ComparedRun, EqualBudget, EvaluatedMean
@@ -77,9 +79,8 @@ def _run_row(side: ComparedRun) -> dict[str, object]:
         "run": side.name,
         "task": side.settings.task.task,
         "spent": side.total.description,
-        "last evaluation": None if last is None else f"{last.score:.1f} ± {last.error:.1f}",
-        "confirmed": None if confirmed is None else f"{confirmed.mean:.1f} ± {confirmed.error:.1f} on "
-        f"{confirmed.episodes} seeds",
+        "last evaluation": None if last is None else format_with_error(last.score, last.error),
+        "confirmed": None if confirmed is None else f"{format_mean(confirmed)} on {confirmed.episodes} seeds",
     }  # fmt: skip
 
 
@@ -110,7 +111,7 @@ def _format_budget(sides: Sequence[ComparedRun], equal: EqualBudget) -> str:
 def _format_evaluation(look: EvaluatedMean | None) -> str:
     if look is None:
         return "had nothing evaluated"
-    return f"{look.point.score:.1f} ± {look.point.error:.1f} (generation {look.generation})"
+    return f"{format_with_error(look.point.score, look.point.error)} (generation {look.generation})"
 
 
 def _run_differences(sides: Sequence[ComparedRun], equal: Sequence[EqualBudget]) -> Iterator[dict[str, Any]]:
@@ -134,7 +135,7 @@ def _run_differences(sides: Sequence[ComparedRun], equal: Sequence[EqualBudget])
 
 
 def _run_facts(side: ComparedRun) -> dict[str, Any]:
-    confirmed = side.confirmed and {**asdict(side.confirmed), "error": side.confirmed.error}
+    confirmed = side.confirmed and with_error(side.confirmed)
     effort = {**asdict(side.total), "core_hours": side.total.core_hours}
     return {"run": side.name, "world": side.world, "effort": effort, "confirmed": confirmed}
 

@@ -1,5 +1,6 @@
 """Recorded results belong to the shipped controllers, and the page repeats them."""
 
+import json
 import subprocess
 
 import pytest
@@ -20,6 +21,10 @@ def test_a_record_is_of_a_shipped_controller_and_the_page_has_its_figures(path, 
     assert found.bundle == find_bundle_of(controller, None).sha256
     assert set(found.results.seeds) <= set(TEST)
     assert f"{found.results.mean:.1f} ± {found.results.error:.1f}" in (ROOT / "docs" / "results.md").read_text()
+    plain = json.loads(path.read_text())
+    assert {name: plain[name] for name in ("std", "error")} == pytest.approx(
+        {"std": found.results.std, "error": found.results.error}
+    )
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.runs.standard_error import format_with_error, standard_error
+
 Floats = NDArray[np.float64]
 STRENGTH = 1e-3  # of the ridge penalty, per sample, on features of variance 1
 UNITS, UPDATES, BATCH, RATE, DECAY = 64, 2000, 256, 2e-3, 1e-2  # of the network
@@ -146,12 +148,12 @@ class Estimate:
     """A value and its standard error."""
 
     value: float
-    error: float
+    error: float | None  # `None` for the mean of one value
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Estimate:
-        """The mean of two or more values and its standard error."""
-        return cls(float(np.mean(values)), float(np.std(values, ddof=1) / len(values) ** 0.5))
+        """The mean of values and its standard error."""
+        return cls(float(np.mean(values)), standard_error([float(each) for each in values]))
 
     def __str__(self) -> str:
-        return f"{self.value:.2f} ± {self.error:.2f}"
+        return format_with_error(self.value, self.error, 2)

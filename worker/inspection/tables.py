@@ -83,7 +83,7 @@ def measured_rows(measured: Any) -> Iterator[tuple[str, str]]:
             yield f"dreamt share of {each['quantity']} above {each['rare']:.3g}", _estimate(each["found"]["dream"])
 
 
-def _estimate(figure: dict[str, float]) -> str:
+def _estimate(figure: dict[str, Any]) -> str:
     return str(Estimate(figure["value"], figure["error"]))
 
 

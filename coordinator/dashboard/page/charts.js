@@ -87,7 +87,7 @@ const star = (of, x, name, ink, more = {}) => ({
   type: "scatter", mode: "markers", x: [x], y: [of.mean], name,
   error_y: { type: "data", array: [of.error], color: colour(ink), thickness: 1.4, width: 4 },
   marker: { color: colour(ink), size: 14, symbol: "star", line: { color: colour("card"), width: 1 } },
-  hovertemplate: "%{y:.4~g} ± %{error_y.array:.2~g}",
+  hovertemplate: of.error === null ? "%{y:.4~g}" : "%{y:.4~g} ± %{error_y.array:.2~g}",
   ...more,
 });
 

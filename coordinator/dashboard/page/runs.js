@@ -124,7 +124,7 @@ const runRow = (each, page) => {
 const describe = (each, key) => {
   if (key === "created") return each.begun ?? "";
   const error = each[`${key}_error`];
-  if (error) return `${number(each[key])} ± ${number(error)}`;
+  if (typeof error === "number") return `${number(each[key])} ± ${number(error)}`;
   if (key === "generations") return number(each.generations, 0);
   return NUMBERS.has(key) ? number(each[key]) : (each[key] ?? "");
 };

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from statistics import fmean, stdev
+from statistics import fmean
 from typing import Any
 
 from dreamfleet.common.runs.paired_difference import PairedDifference
+from dreamfleet.common.runs.standard_error import format_with_error, standard_error
 
 # Figures of held-out drives, as `train mdnrnn` names them; and the score in reality.
 FIGURES = {
@@ -50,8 +50,7 @@ class SeedMean:
     def text(self) -> str:
         """In words."""
         digits = 1 if self.figure == SCORE else 3
-        error = "" if self.error is None else f" ± {self.error:.{digits}f}"
-        return f"{self.mean:.{digits}f}{error}"
+        return format_with_error(self.mean, self.error, digits)
 
 
 def rows(outcomes: Sequence[TrialResult]) -> list[dict[str, object]]:
@@ -69,9 +68,7 @@ def rows(outcomes: Sequence[TrialResult]) -> list[dict[str, object]]:
 def means(outcomes: Sequence[TrialResult]) -> list[SeedMean]:
     """Every figure of every kind over its seeds; the standard error is among seeds, not among tracks."""
     return [
-        SeedMean(
-            kind, figure, len(found), fmean(found), stdev(found) / math.sqrt(len(found)) if len(found) > 1 else None
-        )
+        SeedMean(kind, figure, len(found), fmean(found), standard_error(found))
         for kind in _kinds(outcomes)
         for figure in (*FIGURES, SCORE)
         if (found := list(_by_seed(outcomes, kind, figure).values()))
@@ -93,15 +90,15 @@ def describe_difference(kind: str, first: str, figure: str, found: PairedDiffere
     digits = 1 if figure == SCORE else 3
     label = "score in reality" if figure == SCORE else figure.replace("_", " ")
     verdict = "" if found.is_significant else f": none, for one under {found.threshold_text} is none"
-    size = f"{found.mean:+.{digits}f} ± {found.error:.{digits}f} over {found.seeds} seeds"
-    return f"{label}: {kind} less {first} {size}{verdict}"
+    size = format_with_error(found.mean, found.error, digits, sign="+")
+    return f"{label}: {kind} less {first} {size} over {found.seeds} seeds{verdict}"
 
 
 def _reality(found: TrialResult) -> str:
     if found.score is None:
         return "not evaluated"
-    error = f" ± {found.error:.0f}" if found.error is not None and found.tracks > 1 else ""  # of one track: none
-    return f"{found.score:.0f}{error} on {found.tracks}{'' if found.confirmed else ', provisional'}"
+    score = format_with_error(found.score, found.error, 0)
+    return f"{score} on {found.tracks}{'' if found.confirmed else ', provisional'}"
 
 
 def _kinds(outcomes: Sequence[TrialResult]) -> list[str]:

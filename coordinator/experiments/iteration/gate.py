@@ -15,6 +15,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from dreamfleet.common.runs.standard_error import format_with_error
+
 MARGIN = 0.02
 ERRORS = 2.0
 KNOWS, LOSES = "knows", "loses"
@@ -29,7 +31,7 @@ class Figure:
     error: float
 
     def __str__(self) -> str:
-        return f"{self.value:.2f} ± {self.error:.2f}"
+        return format_with_error(self.value, self.error, 2)
 
     def is_clearly_below(self, other: Figure) -> bool:
         """Whether it is clearly worse than the other one."""
@@ -76,14 +78,18 @@ def knows(probe: Mapping[str, Any] | None) -> Figure | None:
 
 
 def loses(losses: Mapping[str, Any] | None) -> Figure | None:
-    """Of `inspect --losses --json`: of the dreams that begin furthest before a loss; `None` without calm ones."""
+    """Of `inspect --losses --json`: of the dreams that begin furthest before a loss; `None` without calm ones.
+
+    One beginning of a kind has no standard error, so that it decides nothing: `None` too.
+    """
     if not losses or "losses" not in losses:
         return None
     begun = {each["begun"]: each["figures"]["lost"]["dream"] for each in losses["losses"]["begun"]}
     before = next((each for name, each in begun.items() if name != CALM), None)
     if before is None or CALM not in begun:
         return None
-    return Figure(before["value"] - begun[CALM]["value"], math.hypot(before["error"], begun[CALM]["error"]))
+    errors = before["error"], begun[CALM]["error"]
+    return None if None in errors else Figure(before["value"] - begun[CALM]["value"], math.hypot(*errors))
 
 
 def _mean(values: Iterable[float]) -> float:

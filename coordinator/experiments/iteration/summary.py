@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dreamfleet.common.printable import plural
+from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.coordinator.experiments.iteration.gate import KNOWS, LOSES
 from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
 from dreamfleet.coordinator.experiments.iteration.ledger import FinishedPhase, IterationLedger
@@ -46,8 +47,8 @@ def format_score(score: Mapping[str, Any] | None) -> str:
     if score is None:
         return "not evaluated"
     provisional = "" if score["confirmed"] else ", provisional"
-    error = f" ± {score['error']:.0f}" if score["episodes"] > 1 else ""  # of one track there is none
-    return f"{score['mean']:.0f}{error} on {plural(score['episodes'], 'track')}{provisional}"
+    error = score["error"] if score["episodes"] > 1 else None  # older ledgers have 0 for one track
+    return f"{format_with_error(score['mean'], error, 0)} on {plural(score['episodes'], 'track')}{provisional}"
 
 
 def describe_rounds(layout: IterationFolder, ledger: IterationLedger) -> list[dict[str, Any]]:
@@ -98,7 +99,7 @@ def _figures(ledger: IterationLedger, number: int, phase: str) -> dict[str, Any]
 
 def _figure(gate: Mapping[str, Any] | None, name: str) -> str | None:
     found = gate and gate["new"].get(name)
-    return f"{found['value']:.2f} ± {found['error']:.2f}" if found else None
+    return format_with_error(found["value"], found["error"], 2) if found else None
 
 
 def _model_state(row: Mapping[str, Any]) -> str | None:

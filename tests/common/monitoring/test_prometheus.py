@@ -11,7 +11,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from dreamfleet.common.monitoring.prometheus import MAX_REASONS, MAX_WORKERS, exposition
 from dreamfleet.common.monitoring.status import Throughput
 from dreamfleet.common.protocol.host_classes import MAX_LISTED, HostClasses
-from dreamfleet.common.runs.records import StoredConfirmation
+from dreamfleet.common.runs.records import StoredConfirmation, StoredEvaluation
 from tests.support.samples import STATUS
 
 GRAFANA = Path(__file__).parents[3] / "deploy" / "grafana" / "dreamfleet.json"
@@ -48,6 +48,13 @@ def test_unknown_values_have_no_sample():
     found = read(dataclasses.replace(STATUS, last=None, recent=(), evaluation=None, best=None))
     for name in ("fitness", "evaluated_score", "confirmed_score", "temperature", "eta_seconds", "worker_job_seconds"):
         assert f"dreamfleet_{name}" not in found
+
+
+def test_a_score_of_one_episode_has_no_sample_of_its_error():
+    found = read(dataclasses.replace(STATUS, best=StoredEvaluation(4, 1, 120.5, 0.0)))
+    assert found["dreamfleet_best_evaluated_score"][0][1] == 120.5
+    assert "dreamfleet_best_evaluated_score_error" not in found
+    assert found["dreamfleet_evaluated_score_error"][0][1] == STATUS.evaluation.error
 
 
 def test_results_by_host_class_sum_to_the_total():

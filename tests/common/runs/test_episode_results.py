@@ -31,7 +31,7 @@ def test_statistics_weight_episodes_by_their_steps():
     found = EpisodeResults.of(reversed(DRIVES))
     assert found.seeds == (10_000, 10_001, 10_002)
     assert (found.mean, found.median, found.worst, found.best) == (670.0, 850.0, 250.0, 910.0)
-    assert found.std == pytest.approx(np.std(found.scores))
+    assert found.std == pytest.approx(np.std(found.scores, ddof=1))
     assert found.error == pytest.approx(np.std(found.scores, ddof=1) / np.sqrt(3))
     assert (found.above(800), found.above(910), found.steps, found.finished) == (2 / 3, 0.0, 2000, 1)
     assert (found.speed, found.braking) == (pytest.approx(60.0), pytest.approx(0.1))
@@ -110,10 +110,10 @@ def test_a_difference_is_paired_by_seed():
 def test_a_difference_under_two_standard_errors_is_not_significant():
     found = PairedDifference.between(scored(100, 500, 900).results, scored(200, 400, 930).results)
     assert not found.is_significant
-    assert found.description.endswith("not significant, as it is under 4.4 standard errors of so few seeds")
+    assert found.description.endswith("not significant, as it is under 4.5 standard errors of so few seeds")
     assert PairedDifference(30, 1.0, 0.6).description.endswith("not significant, as it is under two standard errors")
-    bounds = [round(PairedDifference(seeds, 0, 1).critical_value, 2) for seeds in (4, 8, 16)]
-    assert bounds == [3.28, 2.43, 2.18]  # t itself: 3.31, 2.43, 2.18
+    bounds = [round(PairedDifference(seeds, 0, 1).critical_value, 2) for seeds in (2, 3, 4, 8, 16)]
+    assert bounds == [13.97, 4.53, 3.28, 2.43, 2.18]  # t itself: 13.97, 4.53, 3.31, 2.43, 2.18
     assert (
         PairedDifference.between(*[JUDGEMENT.results] * 2).description
         == "the same scores, to the bit, on 3 equal seeds"

@@ -17,6 +17,7 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.host.processes import command
 from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.coordinator.verbs.runs_analysis import SAME_SEEDS
 from tests.support.disks import small_disk
 from tests.support.events import scalars
 from tests.support.processes import DEADLINE
@@ -129,6 +130,31 @@ def confirm(runs, text):
         if text:
             journal.execute("INSERT INTO run VALUES ('confirmed', ?)", (text,))
     journal.close()
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet", "tensorboard"])
+def test_an_evaluation_of_one_episode_has_no_error_in_any_export_or_view(runs, tmp_path, capsys, kind):
+    with closing(sqlite3.connect(runs / "reality" / "journal.sqlite")) as journal, journal:
+        journal.execute("UPDATE evaluation SET episodes = 1, std = 0")
+    out = export(runs, tmp_path, f"--{kind}")
+    if kind == "csv":
+        rows = list(csv.DictReader((out / "evaluations.csv").read_text().splitlines()))
+        assert {row["error"] for row in rows} == {""}
+    elif kind == "parquet":
+        assert set(parquet.read_table(out / "evaluations.parquet").column("error").to_pylist()) == {None}
+    else:
+        assert "score/evaluated" in scalars(out)
+        assert "score/evaluated_error" not in scalars(out)
+    capsys.readouterr()
+    shutil.copytree(runs / "reality", runs / "other")
+    for verb in (["show", "reality"], ["compare", "reality", "other"], ["show", "reality", "--json"]):
+        assert command_line.main(["runs", *verb, "--runs-dir", str(runs)]) == 0
+    told = capsys.readouterr().out
+    assert "±" not in told.replace(SAME_SEEDS, "")
+    assert {each["error"] for each in json.loads(told[told.index("{\n") :])["evaluations"]} == {None}
+    for name in (["reality"], ["reality", "other"]):
+        path = tmp_path / f"{len(name)}.svg"
+        assert command_line.main(["runs", "plot", *name, "--out", str(path), "--runs-dir", str(runs)]) == 0
 
 
 def test_no_table_of_an_earlier_export_stands_among_those_of_a_later_one(runs, tmp_path):

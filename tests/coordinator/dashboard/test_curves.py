@@ -72,6 +72,7 @@ def test_an_evaluation_of_an_open_generation_has_the_total_effort():
     spent = cumulative_effort(Effort(), [], 3)
     odd = dataclasses.replace(data(3), evaluations=[StoredEvaluation(2**62, 1, 1.0, 0.0)])
     assert curves(odd, None, spent)["evaluations"]["steps"] == [0]
+    assert curves(odd, None, spent)["evaluations"]["error"] == [None], "of one episode"
     empty = RunData(STATUS.settings, [], [], StoredConfirmation(3, 4, 1.0, 0.5, 9))
     assert curves(empty, None, [])["confirmed"]["steps"] == 0
 

@@ -21,6 +21,7 @@ from dreamfleet.common.protocol.messages import (
 )
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.run.worker_protocol import WorkerProtocol
 from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
@@ -327,6 +328,30 @@ def test_a_run_whose_population_is_one_point_ends_with_that_reason(tmp_path, ran
         bench.restart()
         assert len(bench.run.history) == closed
         assert bench.run.ended
+
+
+def test_parted_compares_the_same_scores_before_and_after_a_restart(tmp_path, random_bundle):
+    """R28: it reads them from the journal. Equal means share their results, whichever generation asked for them."""
+    settings = replace(SETTINGS, collect_every=0, evaluate_every=1, evaluation_episodes=4)
+    bench = Bench(tmp_path / "night", random_bundle.path, settings, generations=3)
+    while bench.run.ended is None:
+        for send in bench.run.fleet.dispatch(bench.now):
+            for work in send.content.work:
+                bench.deliver(send.identity, Result(work.job.digest, work.job.digest[0] / 10, 10, 0.1, None, None))
+
+    def compared():
+        jobs = bench.run.background_jobs
+        return [jobs._evaluated_scores(each.generation) for each in jobs.evaluations.rows]
+
+    before = compared()
+    assert [len(each) for each in before] == [4, 4, 4]
+    bench.journal.schedule_evaluation(Evaluation(9, bench.journal.evaluated_vector(1), 4))
+    bench.journal.finish_evaluation(9, 1.0, 1.0)
+    bench.journal.commit()
+    bench.restart()
+    assert compared() == [*before, before[1]]
+    with RunFolder(bench.path) as run:
+        assert [run.scores(each.generation) for each in run.evaluations()] == [*before, before[1]]
 
 
 def test_a_reached_limit_stays_reached_when_the_last_evaluation_contradicts_it(tmp_path, random_bundle):

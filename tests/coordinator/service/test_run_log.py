@@ -15,7 +15,7 @@ def test_the_summary_shows_generation_score_speed_workers_and_time_left():
     status = dataclasses.replace(STATUS, limits={"minutes": 30.0}, throughput=Throughput(987.5, 448000, 1080.0))
     text, facts = summary(status)
     assert text == (
-        "running, generation 7 (3/8 episodes), best mean 120.5 ± 7.6, 988 steps/s, 1 worker with 8 slots, "
+        "running, generation 7 (3/8 episodes), best mean 120.5 ± 7.8, 988 steps/s, 1 worker with 8 slots, "
         "18 of 30 minutes, 12 s a generation, about 12 min to go"
     )
     assert (facts["event"], facts["generation"], facts["workers"]) == ("summary", 7, 1)

@@ -79,7 +79,7 @@ def test_kinds_are_compared_seed_by_seed():
     assert (nats.mean, nats.seeds, nats.is_significant) == (pytest.approx(-0.01), 2, True)
     assert (score.mean, score.is_significant) == (-15.0, False)
     assert describe_difference("attentive", "plain", "score", score).endswith(
-        "over 2 seeds: none, for one under 10.4 standard errors of so few seeds is none"
+        "over 2 seeds: none, for one under 14.0 standard errors of so few seeds is none"
     )
     (plain,) = [each for each in means(outcomes) if (each.kind, each.figure) == ("plain", "score")]
     assert plain.text == "600.0 ± 100.0"
@@ -95,5 +95,5 @@ def test_one_seed_has_no_error_and_no_difference_and_what_was_not_evaluated_no_s
 
 
 def test_a_score_of_one_track_has_no_standard_error():
-    (row,) = rows([TrialResult("plain", 1, 10, {}, -80.0, 0.0, 1)])
+    (row,) = rows([TrialResult("plain", 1, 10, {}, -80.0, None, 1)])
     assert row["reality"] == "-80 on 1, provisional"

@@ -1,0 +1,53 @@
+from math import sqrt
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.runs.records import StoredConfirmation, StoredEvaluation, describe_score, format_mean, with_error
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.standard_error import format_with_error, sample_std, standard_error
+
+RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
+
+
+def test_a_standard_error_has_the_samples_standard_deviation():
+    assert standard_error([1.0, 3.0]) == pytest.approx(1.0)  # with n in the denominator 29 % less
+    assert sample_std([1.0, 3.0]) == pytest.approx(sqrt(2))
+    assert (sample_std([5.0]), standard_error([5.0])) == (None, None)
+
+
+@pytest.mark.parametrize("episodes", [2, 3, 64])
+def test_an_evaluation_and_a_confirmation_of_equal_scores_have_equal_errors(episodes):
+    """An evaluation is stored with the population's standard deviation, a confirmation with the sample's."""
+    scores = np.random.default_rng(episodes).normal(500, 100, episodes)
+    evaluation = StoredEvaluation(1, episodes, float(scores.mean()), float(scores.std()))
+    confirmation = StoredConfirmation(1, episodes, float(scores.mean()), float(scores.std(ddof=1)), 2)
+    expected = pytest.approx(scores.std(ddof=1) / sqrt(episodes))
+    assert (evaluation.error, confirmation.error, standard_error(scores.tolist())) == (expected, expected, expected)
+
+
+@pytest.mark.parametrize("found", [StoredEvaluation(3, 1, 812.5, 0.0), StoredConfirmation(3, 1, 812.5, 0.0, 4)])
+def test_one_episode_has_no_error_wherever_it_is_read(found):
+    assert found.error is None
+    assert with_error(found)["error"] is None
+    assert format_mean(found) == "812.5"
+    assert "±" not in describe_score(found)
+
+
+def test_a_mean_without_an_error_is_printed_without_one():
+    assert format_with_error(1234.56, 7.89) == "1234.6 ± 7.9"
+    assert format_with_error(1234.56, 7890.1, sign=",") == "1,234.6 ± 7,890.1"
+    assert format_with_error(0.5, 0.25, 2, sign="+") == "+0.50 ± 0.25"
+    assert format_with_error(812.4, None, 0) == "812"
+
+
+@pytest.mark.parametrize("name", ["dream", "reality"])
+def test_evaluations_of_journals_of_earlier_versions_have_the_errors_of_their_results(name):
+    with RunFolder(RUNS / name) as run:
+        evaluations = run.evaluations()
+        assert evaluations
+        for each in evaluations:
+            scores = list(run.scores(each.generation).values())
+            assert len(scores) == each.episodes
+            assert each.error == pytest.approx(np.std(scores, ddof=1) / sqrt(len(scores)))

@@ -1,0 +1,241 @@
+"""A run's figures, computed again from its journal alone: by SQL, NumPy and pycma, and none of this program's code.
+
+The file is the second opinion. So formulas stand here once more, and only the run itself is started by the program.
+"""
+
+import csv
+import hashlib
+import json
+import sqlite3
+from contextlib import closing
+
+import cma
+import numpy as np
+import pytest
+
+TASK = "tests.support.tasks:Toy"
+SCHEDULE = """
+[[stage]]
+generations = 3
+
+[[stage]]
+population = 9
+episodes = 5
+sigma0 = 0.2
+racing = true
+"""
+CHOOSING, CONFIRMING, FIRST_VALIDATION = 10_000, 20_000, 20_000  # episodes that choose, that confirm; the first seed
+CONFIRM_EPISODES, FINALISTS = 12, 4
+
+
+def started(processes, name, bundle, *flags):
+    """A run to its end; what the coordinator answered."""
+    coordinator = processes.coordinator(
+        "--bundle", bundle.path, "--task", TASK, "--population", 6, "--episodes", 4, "--sigma0", 0.3, "--seed", 7,
+        "--evaluate-every", 1, "--evaluation-episodes", 5, "--confirm-episodes", CONFIRM_EPISODES, "--generations", 6,
+        "--json", *flags, name=name,
+    )  # fmt: skip
+    processes.worker("--task", TASK, "--run", name)
+    code, out = coordinator.finish()
+    assert code == 0
+    return json.loads(out.splitlines()[-1])
+
+
+class Recomputed:
+    """Everything that follows from the journal's settings, populations and accepted results."""
+
+    def __init__(self, path):
+        with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as journal:
+            self.facts = dict(journal.execute("SELECT key, value FROM run"))
+            self.generations = journal.execute(
+                "SELECT number, seeds, sigma, mean, std, best, worst, steps FROM generation ORDER BY number"
+            ).fetchall()
+            self.candidates = {
+                (generation, number): (np.frombuffer(vector, "<f4"), fitness)
+                for generation, number, vector, fitness in journal.execute(
+                    "SELECT generation, number, vector, fitness FROM candidate"
+                )
+            }
+            self.evaluated = {
+                generation: (np.frombuffer(vector, "<f4"), mean, std)
+                for generation, vector, mean, std in journal.execute(
+                    "SELECT generation, vector, mean, std FROM evaluation ORDER BY generation"
+                )
+            }
+            self.results = {}
+            for kind, generation, candidate, episode, seed, fitness, steps in journal.execute(
+                "SELECT kind, generation, candidate, episode, seed, fitness, steps FROM result"
+            ):
+                self.results.setdefault((kind, generation, candidate), {})[episode] = seed, fitness, steps
+        self.settings = json.loads(self.facts["settings"])
+
+    def stage(self, generation):
+        """Population, episodes, racing, step size and number of the stage; stages here end by generations alone."""
+        found = {name: self.settings.get(name, False) for name in ("population", "episodes", "racing", "sigma0")}
+        number, until = 1, float("inf")
+        for index, stage in enumerate(self.settings.get("stages", []), 1):
+            if generation >= (0 if index == 1 else until):
+                number = index
+                found |= {name: stage[name] for name in found if name in stage}
+            until = stage.get("generations", float("inf"))
+        return found, number
+
+    def fitness(self, generation):
+        """Each candidate's mean over its own episodes, and its rank by the first half, of which the better race on."""
+        stage, _ = self.stage(generation)
+        rows = [self.results["score", generation, number] for number in range(stage["population"])]
+        first = -(-stage["episodes"] // 2) if stage["racing"] else stage["episodes"]
+        early = np.array([np.mean([row[episode][1] for episode in range(first)]) for row in rows])
+        better = set(np.argsort(-early, kind="stable")[: -(-len(rows) // 2)])
+        for number, row in enumerate(rows):
+            assert sorted(row) == list(range(stage["episodes"] if number in better else first))
+        return np.array([np.mean([row[episode][1] for episode in sorted(row)]) for row in rows])
+
+    def look(self, generation):
+        """Mean, standard error and population deviation of one evaluation."""
+        scores = np.array(
+            [fitness for episode, (_, fitness, _) in sorted(self.results["evaluate", generation, 0].items())
+             if episode < CHOOSING]
+        )  # fmt: skip
+        return scores.mean(), scores.std(ddof=1) / np.sqrt(len(scores)), scores.std(), len(scores)
+
+    def drive(self, generation, first, count):
+        """The scores of one mean in a round of the confirmation, on seeds that follow from the episode's number."""
+        rows = self.results["evaluate", generation, 0]
+        assert [rows[episode][0] for episode in range(first, first + count)] == [
+            FIRST_VALIDATION + episode for episode in range(first, first + count)
+        ]
+        return np.array([rows[episode][1] for episode in range(first, first + count)])
+
+    def confirmed(self):
+        """The generation that successive halving leaves, with its mean and standard error on fresh seeds."""
+        looks = {generation: self.look(generation) for generation in self.evaluated}
+        left = sorted(looks, key=lambda each: (-looks[each][0], each))[:FINALISTS]
+        totals = {each: (looks[each][0] * looks[each][3], looks[each][3]) for each in left}
+        first = CHOOSING
+        while len(left) > 1:
+            count = CONFIRM_EPISODES // len(left)
+            for each in left:
+                total, seen = totals[each]
+                totals[each] = total + self.drive(each, first, count).sum(), seen + count
+            left.sort(key=lambda each: (-totals[each][0] / totals[each][1], each))
+            first, left = first + count, left[: -(-len(left) // 2)]
+        scores = self.drive(left[0], CONFIRMING, CONFIRM_EPISODES)
+        return left[0], scores.mean(), scores.std(ddof=1) / np.sqrt(CONFIRM_EPISODES)
+
+
+def search(mean, stage, number, seed):
+    """pycma with the run's random numbers; a later stage's search has a seed of its own."""
+    if number > 1:
+        text = f"dreamfleet search {seed} {number}".encode()
+        span, first = 2**53 - 2**20, 2**20
+        seed = (first + int.from_bytes(hashlib.sha256(text).digest()[:8], "little") % span) % 2**32
+    random = np.random.Generator(np.random.PCG64(seed))
+    options = {
+        "popsize": stage["population"], "CMA_diagonal": True, "seed": np.nan, "verbose": -9,
+        "randn": lambda *shape: random.standard_normal(shape),
+    }  # fmt: skip
+    return cma.CMAEvolutionStrategy(mean, stage["sigma0"], options)
+
+
+def check_search(found):
+    """Population, step size, fitness, ranks and statistics of each generation, and the mean that was evaluated."""
+    strategy, begun = None, 0
+    for number, seeds, sigma, mean, std, best, worst, steps in found.generations:
+        stage, place = found.stage(number)
+        if strategy is None or (place != begun and ("population" in stage)):
+            start = np.zeros(len(found.candidates[0, 0][0])) if strategy is None else strategy.mean
+            strategy, begun = search(start, stage, place, found.settings["seed"]), place
+        assert sigma == pytest.approx(np.median(strategy.stds), rel=1e-12)
+        asked = strategy.ask()
+        for index, each in enumerate(asked):
+            np.testing.assert_array_equal(found.candidates[number, index][0], np.asarray(each).astype("<f4"))
+        assert (number, len(asked)) not in found.candidates
+        assert len(json.loads(seeds)) == stage["episodes"]
+        if mean is None:
+            continue  # the generation that was open at the end
+        fitness = found.fitness(number)
+        stored = np.array([found.candidates[number, index][1] for index in range(len(asked))])
+        np.testing.assert_allclose(stored, fitness, rtol=1e-14)
+        np.testing.assert_array_equal(np.argsort(-stored, kind="stable"), np.argsort(-fitness, kind="stable"))
+        expected = fitness.mean(), fitness.std(), fitness.max(), fitness.min()
+        assert (mean, std, best, worst) == pytest.approx(expected, rel=1e-12)
+        rows = [found.results["score", number, index] for index in range(len(asked))]
+        assert steps == sum(each[2] for row in rows for each in row.values())
+        assert {row[0][0] for row in rows} == {json.loads(seeds)[0]}, "all candidates drive the same seeds"
+        strategy.tell(asked, (-stored).tolist())
+        np.testing.assert_array_equal(found.evaluated[number][0], strategy.mean.astype("<f4"))
+
+
+def exported(processes, name, table):
+    folder = processes.folder / name
+    code, _, err = processes.call("runs", "export", name, "--csv", "--runs-dir", processes.runs, "--out", folder)
+    assert code == 0, err
+    with (folder / f"{table}.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def check_scores(processes, name, found, answer):
+    """Each place that shows an evaluation or the confirmed score has the same mean and error."""
+    looks = {generation: found.look(generation) for generation in found.evaluated}
+    for generation, (mean, _, deviation, _) in looks.items():
+        assert found.evaluated[generation][1:] == pytest.approx((mean, deviation))
+    code, out, err = processes.call("runs", "show", name, "--runs-dir", processes.runs, "--json")
+    assert code == 0, err
+    shown = json.loads(out)
+    for rows in (shown["evaluations"], exported(processes, name, "evaluations")):
+        assert [int(each["generation"]) for each in rows] == list(looks)
+        for each in rows:
+            assert [float(each["mean"]), float(each["error"])] == pytest.approx(looks[int(each["generation"])][:2])
+    best = max(looks, key=lambda each: looks[each][0])
+    assert answer["best"]["generation"] == best
+    assert [answer["best"]["mean"], answer["best"]["error"]] == pytest.approx(looks[best][:2])
+    generation, mean, error = found.confirmed()
+    with np.load(processes.runs / name / "controller.npz") as file:
+        report = json.loads(str(file["about"]))["provenance"]
+        np.testing.assert_array_equal(file["parameters"], found.evaluated[generation][0])
+    assert (report["generation"], report["confirmed"]) == (generation, True)
+    assert [report["validation_mean"], report["validation_error"]] == pytest.approx([mean, error])
+    for each in (answer["confirmed"], shown["confirmed"], *exported(processes, name, "confirmation")):
+        assert int(each["generation"]) == generation
+        assert [float(each["mean"]), float(each["error"])] == pytest.approx([mean, error])
+    code, out, err = processes.call("runs", "show", name, "--runs-dir", processes.runs)
+    assert f"scored {mean:.1f} ± {error:.1f} (standard error)" in out, err
+
+
+def check_status(processes, name, found):
+    """A coordinator that goes on and waits for workers tells the same of what was."""
+    coordinator = processes.start(
+        "coordinator", "--resume", name, "--runs-dir", processes.runs, "--listen", processes.endpoint,
+        "--generations", 99,
+    )  # fmt: skip
+    coordinator.wait_for("listening")
+    code, out, err = processes.call("status", "--connect", processes.endpoint, "--json")
+    coordinator.end()
+    assert code == 0, err
+    status = json.loads(out)
+    last, best = max(found.evaluated), max(found.evaluated, key=lambda each: found.look(each)[0])
+    for each, generation in ((status["evaluation"], last), (status["best"], best)):
+        assert each["generation"] == generation
+        mean, error, deviation, episodes = found.look(generation)
+        assert [each["mean"], each["error"], each["std"], each["episodes"]] == pytest.approx(
+            [mean, error, deviation, episodes]
+        )
+    confirmed = status["confirmed"]
+    assert (confirmed["generation"], confirmed["mean"], confirmed["error"]) == pytest.approx(found.confirmed())
+    fitness = found.fitness(last)
+    shown = [status["last"][each] for each in ("mean", "std", "best", "worst")]
+    assert shown == pytest.approx([fitness.mean(), fitness.std(), fitness.max(), fitness.min()])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["plain", "racing", "schedule"])
+def test_a_run_is_what_its_journal_comes_to(processes, random_bundle, kind):
+    flags = {"plain": (), "racing": ("--racing",), "schedule": ("--schedule", processes.folder / "stages.toml")}[kind]
+    (processes.folder / "stages.toml").write_text(SCHEDULE)
+    answer = started(processes, kind, random_bundle, *flags)
+    found = Recomputed(processes.runs / kind / "journal.sqlite")
+    assert len(found.generations) == 7
+    check_search(found)
+    check_scores(processes, kind, found, answer)
+    check_status(processes, kind, found)
