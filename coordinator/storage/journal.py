@@ -8,18 +8,17 @@ import shutil
 import sqlite3
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from math import nan
 from pathlib import Path
 from time import time
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.errors import DiskFullError, JournalError
+from dreamfleet.common.errors import JournalError
 from dreamfleet.common.files.atomic_write import atomic_write, fsync_path, reporting_unwritable_folder
 from dreamfleet.common.protocol.host_classes import HostClasses, class_from_fingerprint, count_results
 from dreamfleet.common.protocol.messages import Job, Result
@@ -35,10 +34,8 @@ from dreamfleet.coordinator.jobs.confirmation import Finalist
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollection
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
+from dreamfleet.coordinator.storage.journal_connection import JournalConnection
 from dreamfleet.coordinator.storage.journal_file import (
-    check_database,
-    copy_database,
-    file_stamp,
     journal_errors,
     sqlite_side_files,
 )
@@ -62,28 +59,14 @@ class StoredOpenGeneration:
     seconds: float = 0.0  # for which it could be scored so far
 
 
-class Journal:
-    """The journal of one coordinator's life. Writes wait in memory, in order, until `commit` or the next read."""
+class Journal(JournalConnection):
+    """The journal of one coordinator's life."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        super().__init__(path)
         self._incarnation = 0
-        self._stamp: tuple[int, int] | None = None  # of the file, as the last commit left it
-        self._opened: int | None = None  # the latest generation
         self._effort: Effort | None = None  # of every result, once somebody asked
         self._counted: Counter[tuple[str, str]] | None = None  # results by class and fingerprint, likewise
-        self._writes: list[tuple[str, list[tuple[Any, ...]]]] = []  # a statement, and a row for each time it runs
-        self._uncommitted: list[tuple[str, list[tuple[Any, ...]]]] = []  # those that ran since the last commit
-        with journal_errors(path):
-            self._connection = sqlite3.connect(path, timeout=5)
-            try:
-                schema.migrate(self._connection, schema.check_schema(self._connection, path))
-                self._connection.execute("PRAGMA journal_mode = WAL")
-                self._connection.execute("PRAGMA synchronous = FULL")
-                self._connection.execute("PRAGMA cache_spill = OFF")  # only a commit can find the disk full
-            except BaseException:
-                self._connection.close()
-                raise
 
     @classmethod
     def create(
@@ -117,41 +100,6 @@ class Journal:
             fsync_path(folder)
         return cls(path)
 
-    def close(self) -> None:
-        """Fold the write-ahead log into the journal and release it."""
-        self._connection.close()
-
-    @property
-    def is_overwritten(self) -> bool:
-        """Whether somebody else wrote into the journal's own file, and what it holds now is not what was committed.
-
-        Only a commit of this connection writes there, so the file is looked into where its time or size is another's.
-        """
-        if self._stamp in (None, file_stamp(self.path)):
-            return False
-        self._stamp = file_stamp(self.path)
-        where = f"file:{self.path.absolute()}?mode=ro"  # what lies there, and not what this connection remembers
-        try:
-            with closing(sqlite3.connect(where, uri=True)) as reader:
-                return check_database(reader) != ("ok", self._opened)
-        except sqlite3.Error:
-            return True
-
-    def save_copy(self, path: Path) -> None:
-        """Write all that is committed into a new file, checked, whole or not at all."""
-        aside = path.with_name(f".{path.name}.part")
-        try:
-            with journal_errors(path):
-                found = copy_database(self._connection, aside)
-            if found != ("ok", self._opened):
-                raise JournalError("the data of the open connection is not whole: restore the folder from a copy")
-            fsync_path(aside)
-            aside.replace(path)
-            fsync_path(path.parent)
-        finally:
-            for left in (aside, *sqlite_side_files(aside)):
-                left.unlink(missing_ok=True)
-
     def check_incarnation(self) -> None:
         """`JournalError` if another coordinator began a life in this journal: a lock held neither of them back."""
         found = int(self.fact("incarnation") or 0)
@@ -160,32 +108,6 @@ class Journal:
                 f"another coordinator serves {self.path} too (incarnation {found}, this one is {self._incarnation}): "
                 "this one leaves; what it committed is whole, and the other one goes on with it"
             )
-
-    def commit(self) -> None:
-        """Make everything written so far durable; after `DiskFullError` it may be called again."""
-        own = self._stamp in (None, file_stamp(self.path))
-        try:
-            self._flush()
-            with journal_errors(self.path):
-                self._connection.commit()
-        except DiskFullError:
-            with suppress(sqlite3.Error):
-                self._connection.rollback()
-            self._writes, self._uncommitted = [*self._uncommitted, *self._writes], []
-            raise
-        self._uncommitted = []
-        if own:  # else somebody wrote there since the last commit, which `is_overwritten` looks into
-            self._stamp = file_stamp(self.path)
-
-    @property
-    def has_writes(self) -> bool:
-        """Whether something waits for the next commit."""
-        return bool(self._writes) or self._connection.in_transaction
-
-    def fact(self, key: str) -> str | None:
-        """One of the run's facts, such as `uid` or `fingerprint`."""
-        row = self._read_row("SELECT value FROM run WHERE key = ?", key)
-        return None if row is None else str(row[0])
 
     def fingerprint(self) -> str | None:
         """The fingerprint of the host of the first accepted result; `None` before it.
@@ -215,14 +137,6 @@ class Journal:
         if self.fact("ended") is None:
             self.set_fact(ENDED_AT, _now())
         self.set_fact("ended", why)
-
-    def set_fact(self, key: str, value: str) -> None:
-        """Write one of the run's facts."""
-        self._write("INSERT OR REPLACE INTO run (key, value) VALUES (?, ?)", key, value)
-
-    def drop_fact(self, key: str) -> None:
-        """Forget one of the run's facts."""
-        self._write("DELETE FROM run WHERE key = ?", key)
 
     def begin_incarnation(self) -> int:
         """Number of this life of the coordinator, from 1; durable before anything is published."""
@@ -434,32 +348,6 @@ class Journal:
         """The mean after a generation that was scheduled to be evaluated."""
         (vector,) = self._read_row("SELECT vector FROM evaluation WHERE generation = ?", generation)
         return bytes(vector)
-
-    def _write(self, statement: str, *values: Any) -> None:
-        self._write_all(statement, [values])
-
-    def _write_all(self, statement: str, rows: list[tuple[Any, ...]]) -> None:
-        if self._writes and self._writes[-1][0] == statement:
-            self._writes[-1][1].extend(rows)
-        else:
-            self._writes.append((statement, rows))
-
-    def _flush(self) -> None:
-        writes, self._writes = self._writes, []
-        self._uncommitted += writes
-        with journal_errors(self.path):
-            for statement, rows in writes:
-                self._connection.executemany(statement, rows)
-
-    def _read(self, query: str, *values: Any) -> list[Any]:
-        """All rows of a query: a damaged page raises its error here, not in the code that iterates over the rows."""
-        self._flush()
-        with journal_errors(self.path):
-            return self._connection.execute(query, values).fetchall()
-
-    def _read_row(self, query: str, *values: Any) -> Any:
-        """The first row of a query; `None` if there is none."""
-        return next(iter(self._read(query, *values)), None)
 
 
 def _now() -> str:

@@ -1,0 +1,135 @@
+"""The connection of a journal's only writer: writes wait in memory until a commit, which a full disk only delays."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import Any
+
+from dreamfleet.common.errors import DiskFullError, JournalError
+from dreamfleet.common.files.atomic_write import fsync_path
+from dreamfleet.common.runs import schema
+from dreamfleet.coordinator.storage.journal_file import (
+    check_database,
+    copy_database,
+    file_stamp,
+    journal_errors,
+    sqlite_side_files,
+)
+
+
+class JournalConnection:
+    """An open journal. Writes wait in memory, in order, until `commit` or the next read."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._stamp: tuple[int, int] | None = None  # of the file, as the last commit left it
+        self._opened: int | None = None  # the latest generation
+        self._writes: list[tuple[str, list[tuple[Any, ...]]]] = []  # a statement, and a row for each time it runs
+        self._uncommitted: list[tuple[str, list[tuple[Any, ...]]]] = []  # those that ran since the last commit
+        with journal_errors(path):
+            self._connection = sqlite3.connect(path, timeout=5)
+            try:
+                schema.migrate(self._connection, schema.check_schema(self._connection, path))
+                self._connection.execute("PRAGMA journal_mode = WAL")
+                self._connection.execute("PRAGMA synchronous = FULL")
+                self._connection.execute("PRAGMA cache_spill = OFF")  # only a commit can find the disk full
+            except BaseException:
+                self._connection.close()
+                raise
+
+    def close(self) -> None:
+        """Fold the write-ahead log into the journal and release it."""
+        self._connection.close()
+
+    @property
+    def is_overwritten(self) -> bool:
+        """Whether somebody else wrote into the journal's own file, and what it holds now is not what was committed.
+
+        Only a commit of this connection writes there, so the file is looked into where its time or size is another's.
+        """
+        if self._stamp in (None, file_stamp(self.path)):
+            return False
+        self._stamp = file_stamp(self.path)
+        where = f"file:{self.path.absolute()}?mode=ro"  # what lies there, and not what this connection remembers
+        try:
+            with closing(sqlite3.connect(where, uri=True)) as reader:
+                return check_database(reader) != ("ok", self._opened)
+        except sqlite3.Error:
+            return True
+
+    def save_copy(self, path: Path) -> None:
+        """Write all that is committed into a new file, checked, whole or not at all."""
+        aside = path.with_name(f".{path.name}.part")
+        try:
+            with journal_errors(path):
+                found = copy_database(self._connection, aside)
+            if found != ("ok", self._opened):
+                raise JournalError("the data of the open connection is not whole: restore the folder from a copy")
+            fsync_path(aside)
+            aside.replace(path)
+            fsync_path(path.parent)
+        finally:
+            for left in (aside, *sqlite_side_files(aside)):
+                left.unlink(missing_ok=True)
+
+    def commit(self) -> None:
+        """Make everything written so far durable; after `DiskFullError` it may be called again."""
+        own = self._stamp in (None, file_stamp(self.path))
+        try:
+            self._flush()
+            with journal_errors(self.path):
+                self._connection.commit()
+        except DiskFullError:
+            with suppress(sqlite3.Error):
+                self._connection.rollback()
+            self._writes, self._uncommitted = [*self._uncommitted, *self._writes], []
+            raise
+        self._uncommitted = []
+        if own:  # else somebody wrote there since the last commit, which `is_overwritten` looks into
+            self._stamp = file_stamp(self.path)
+
+    @property
+    def has_writes(self) -> bool:
+        """Whether something waits for the next commit."""
+        return bool(self._writes) or self._connection.in_transaction
+
+    def fact(self, key: str) -> str | None:
+        """One of the run's facts, such as `uid` or `fingerprint`."""
+        row = self._read_row("SELECT value FROM run WHERE key = ?", key)
+        return None if row is None else str(row[0])
+
+    def set_fact(self, key: str, value: str) -> None:
+        """Write one of the run's facts."""
+        self._write("INSERT OR REPLACE INTO run (key, value) VALUES (?, ?)", key, value)
+
+    def drop_fact(self, key: str) -> None:
+        """Forget one of the run's facts."""
+        self._write("DELETE FROM run WHERE key = ?", key)
+
+    def _write(self, statement: str, *values: Any) -> None:
+        self._write_all(statement, [values])
+
+    def _write_all(self, statement: str, rows: list[tuple[Any, ...]]) -> None:
+        if self._writes and self._writes[-1][0] == statement:
+            self._writes[-1][1].extend(rows)
+        else:
+            self._writes.append((statement, rows))
+
+    def _flush(self) -> None:
+        writes, self._writes = self._writes, []
+        self._uncommitted += writes
+        with journal_errors(self.path):
+            for statement, rows in writes:
+                self._connection.executemany(statement, rows)
+
+    def _read(self, query: str, *values: Any) -> list[Any]:
+        """All rows of a query: a damaged page raises its error here, not in the code that iterates over the rows."""
+        self._flush()
+        with journal_errors(self.path):
+            return self._connection.execute(query, values).fetchall()
+
+    def _read_row(self, query: str, *values: Any) -> Any:
+        """The first row of a query; `None` if there is none."""
+        return next(iter(self._read(query, *values)), None)
