@@ -22,7 +22,7 @@ ROUNDS = 20  # a process may fork while the others are looked for
 _TOKEN = f"{os.getpid()}-{os.urandom(8).hex()}"
 _numbers = itertools.count()
 _lock = threading.Lock()
-_sessions: set[int] = set()  # the guard is told of them
+_sessions: set[int] = set()  # those that the guard knows
 _guard: subprocess.Popen[bytes] | None = None
 
 
@@ -37,7 +37,7 @@ class Descendants:
     def starting(self) -> Iterator[None]:
         """Start children inside; `OSError` if their guard cannot be started."""
         with _lock:
-            _tell_guard()
+            _update_guard()
             before = os.environ.get(VARIABLE)
             os.environ[VARIABLE] = f"{before or ''}{_TOKEN} {self._mark} "
             try:
@@ -54,7 +54,7 @@ class Descendants:
         with _lock:
             _sessions.add(leader)
             with suppress(OSError):
-                _tell_guard(leader)
+                _update_guard(leader)
 
     def kill(self) -> None:
         """End them all with SIGKILL."""
@@ -66,7 +66,7 @@ class Descendants:
             if self._session in _sessions:
                 _sessions.remove(self._session)
                 with suppress(OSError):
-                    _tell_guard(-self._session)
+                    _update_guard(-self._session)
         self._session = None
 
 
@@ -87,7 +87,10 @@ def kill_descendants(mark: str, sessions: Set[int]) -> None:
 def _find(mark: bytes, sessions: Set[int]) -> Iterator[int]:
     """The process ids of running descendants."""
     own = os.getpid()
-    for process in Path("/proc").glob("[0-9]*"):
+    processes: list[Path] = []
+    with suppress(OSError):  # no `/proc`, or no descriptor left to read it
+        processes = list(Path("/proc").glob("[0-9]*"))
+    for process in processes:
         with suppress(OSError):  # it has ended, or is another user's
             if (pid := int(process.name)) == own:
                 continue
@@ -99,8 +102,8 @@ def _find(mark: bytes, sessions: Set[int]) -> Iterator[int]:
                 yield pid
 
 
-def _tell_guard(*sessions: int) -> None:
-    """Tell the guard of begun sessions and, negative, of ended ones; start it if there is none."""
+def _update_guard(*sessions: int) -> None:
+    """Report begun sessions to the guard and, negative, ended ones; start it if there is none."""
     global _guard  # noqa: PLW0603 - one a process, as multiprocessing's resource tracker
     if _guard is None or _guard.poll() is not None:
         _guard = subprocess.Popen(  # noqa: S603 - this file in our own interpreter
