@@ -7,6 +7,7 @@ As a script, this file is the guard: when the process that started it ends, also
 
 from __future__ import annotations
 
+import atexit
 import itertools
 import os
 import signal
@@ -18,6 +19,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 VARIABLE = "DREAMFLEET_DESCENDS_FROM"  # marks, each followed by a space
+GUARD_LIMIT = 2.0  # seconds in which the guard ends the descendants of a process that exits
 ROUNDS = 20  # a process may fork while the others are looked for
 _TOKEN = f"{os.getpid()}-{os.urandom(8).hex()}"
 _numbers = itertools.count()
@@ -111,9 +113,20 @@ def _update_guard(*sessions: int) -> None:
             stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             start_new_session=True, bufsize=0, cwd="/",
         )  # fmt: skip
+        atexit.unregister(_end_guard)
+        atexit.register(_end_guard)
         sessions = (*_sessions, *sessions)
     assert _guard.stdin is not None
     _guard.stdin.write("".join(f"{each}\n" for each in sessions).encode())
+
+
+def _end_guard() -> None:
+    """Have the guard end all descendants now."""
+    assert _guard is not None
+    assert _guard.stdin is not None
+    with suppress(OSError, subprocess.TimeoutExpired):
+        _guard.stdin.close()
+        _guard.wait(GUARD_LIMIT)
 
 
 def main() -> None:
