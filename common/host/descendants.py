@@ -7,6 +7,7 @@ As a script, this file is the guard: when the process that started it ends, also
 
 from __future__ import annotations
 
+import atexit
 import itertools
 import os
 import signal
@@ -18,11 +19,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 VARIABLE = "DREAMFLEET_DESCENDS_FROM"  # marks, each followed by a space
+GUARD_LIMIT = 2.0  # seconds in which the guard ends the descendants of a process that exits
 ROUNDS = 20  # a process may fork while the others are looked for
 _TOKEN = f"{os.getpid()}-{os.urandom(8).hex()}"
 _numbers = itertools.count()
 _lock = threading.Lock()
-_sessions: set[int] = set()  # the guard is told of them
+_sessions: set[int] = set()  # those that the guard knows
 _guard: subprocess.Popen[bytes] | None = None
 
 
@@ -37,7 +39,7 @@ class Descendants:
     def starting(self) -> Iterator[None]:
         """Start children inside; `OSError` if their guard cannot be started."""
         with _lock:
-            _tell_guard()
+            _update_guard()
             before = os.environ.get(VARIABLE)
             os.environ[VARIABLE] = f"{before or ''}{_TOKEN} {self._mark} "
             try:
@@ -54,7 +56,7 @@ class Descendants:
         with _lock:
             _sessions.add(leader)
             with suppress(OSError):
-                _tell_guard(leader)
+                _update_guard(leader)
 
     def kill(self) -> None:
         """End them all with SIGKILL."""
@@ -66,7 +68,7 @@ class Descendants:
             if self._session in _sessions:
                 _sessions.remove(self._session)
                 with suppress(OSError):
-                    _tell_guard(-self._session)
+                    _update_guard(-self._session)
         self._session = None
 
 
@@ -87,7 +89,10 @@ def kill_descendants(mark: str, sessions: Set[int]) -> None:
 def _find(mark: bytes, sessions: Set[int]) -> Iterator[int]:
     """The process ids of running descendants."""
     own = os.getpid()
-    for process in Path("/proc").glob("[0-9]*"):
+    processes: list[Path] = []
+    with suppress(OSError):  # no `/proc`, or no descriptor left to read it
+        processes = list(Path("/proc").glob("[0-9]*"))
+    for process in processes:
         with suppress(OSError):  # it has ended, or is another user's
             if (pid := int(process.name)) == own:
                 continue
@@ -99,8 +104,8 @@ def _find(mark: bytes, sessions: Set[int]) -> Iterator[int]:
                 yield pid
 
 
-def _tell_guard(*sessions: int) -> None:
-    """Tell the guard of begun sessions and, negative, of ended ones; start it if there is none."""
+def _update_guard(*sessions: int) -> None:
+    """Report begun sessions to the guard and, negative, ended ones; start it if there is none."""
     global _guard  # noqa: PLW0603 - one a process, as multiprocessing's resource tracker
     if _guard is None or _guard.poll() is not None:
         _guard = subprocess.Popen(  # noqa: S603 - this file in our own interpreter
@@ -108,9 +113,20 @@ def _tell_guard(*sessions: int) -> None:
             stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             start_new_session=True, bufsize=0, cwd="/",
         )  # fmt: skip
+        atexit.unregister(_end_guard)
+        atexit.register(_end_guard)
         sessions = (*_sessions, *sessions)
     assert _guard.stdin is not None
     _guard.stdin.write("".join(f"{each}\n" for each in sessions).encode())
+
+
+def _end_guard() -> None:
+    """Have the guard end all descendants now."""
+    assert _guard is not None
+    assert _guard.stdin is not None
+    with suppress(OSError, subprocess.TimeoutExpired):
+        _guard.stdin.close()
+        _guard.wait(GUARD_LIMIT)
 
 
 def main() -> None:

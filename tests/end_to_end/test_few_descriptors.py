@@ -76,13 +76,13 @@ def test_a_user_with_few_processes_gets_one_line_and_no_traceback(processes, ran
         "setpriv", "--reuid=54321", "--clear-groups", f"--inh-caps={able}", f"--ambient-caps={able}",
         "bash", "-c", f'ulimit -u {processes_allowed}; exec "$@"', "-",
     )  # fmt: skip
-    told = ("--run", "test", "--task", tasks.TOY)
+    flags = ("--run", "test", "--task", tasks.TOY)
     words = {
-        "worker": ("--connect", processes.endpoint, "--slots", 8, *told),
+        "worker": ("--connect", processes.endpoint, "--slots", 8, *flags),
         "coordinator": (
             "--listen",
             processes.endpoint,
-            *told,
+            *flags,
             "--runs-dir",
             processes.runs,
             "--bundle",

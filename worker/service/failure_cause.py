@@ -67,7 +67,7 @@ def encodable(text: str) -> str:
 
 
 def _text(error: BaseException) -> str:
-    """The first line of an exception's message, printable; a simulator's own exceptions may fail to tell it."""
+    """The first line of an exception's message, printable; a simulator's own exceptions may fail to give it."""
     try:
         lines = str(error)[: 10 * MAX_TEXT].strip().splitlines()
         return one_line(lines[0]) if lines else ""
