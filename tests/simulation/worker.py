@@ -195,7 +195,7 @@ class Worker:
         if self.membership.must_rejoin(now, hands):
             self.membership.note_hello_sent(now, RETRY * self._jitter)
             self._ask(now)
-        self.left = self.membership.is_over(now, busy=any(self.turns) or len(self.outbox) > 0)
+        self.left = bool(self.membership.find_end(now, busy=any(self.turns) or len(self.outbox) > 0))
 
     def _ask(self, now: float) -> None:
         self._question += 1

@@ -45,6 +45,7 @@ class Hand:
         self.refusal = None
         self.packages = NUMERIC_PACKAGES  # in the run's fingerprint
         self.classes = True  # whether it supports host classes
+        self.reasons = True  # whether it reads why a worker leaves
         self.worker = None
         self.slots = 0  # in its status
         self.offsets = queue.SimpleQueue()  # of the requested parts of the bundle
@@ -128,13 +129,14 @@ class Hand:
     def job(self, episode=0, kind="score"):
         return samples.job(episode, kind, spec=self.spec)
 
-    def batch(self, number, *jobs, vectors=(WHOLE,), cancels=(), accepted=(), **head):
+    def batch(self, number, *jobs, vectors=(WHOLE,), cancels=(), accepted=(), ended=False, **head):
         verdicts = tuple(Verdict(job.digest, "accepted") for job in accepted)
         whole = {
             "run_uid": self.run_uid, "incarnation": self.incarnation, "nonce": self.nonce,
             "numbering": self.numbering, **head,
         }  # fmt: skip
-        return JobBatch(**whole, number=number, vectors=vectors, jobs=jobs, cancels=cancels, verdicts=verdicts)
+        return JobBatch(**whole, number=number, vectors=vectors, jobs=jobs, cancels=cancels, verdicts=verdicts,
+                        ended=ended)  # fmt: skip
 
     def send(self, number, *jobs, **content):
         self.put(encode(self.batch(number, *jobs, **content)))
@@ -157,7 +159,7 @@ class Hand:
                 run=self.run, run_uid=self.run_uid, incarnation=self.incarnation, nonce=self.nonce,
                 why=why, remedy=remedy,
                 spec={} if why else asdict(self.spec), intervals={} if why else asdict(self.intervals),
-                packages=self.packages, numbering=self.numbering, classes=self.classes,
+                packages=self.packages, numbering=self.numbering, classes=self.classes, reasons=self.reasons,
             )  # fmt: skip
             query.reply(keys.hello(self.run), encode_json(reply), encoding="application/json")
         self._said.put(request)

@@ -2,23 +2,88 @@
 
 import pytest
 
+from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.worker.service import membership
 from tests.support import tasks
-from tests.support.hand import DEADLINE
+from tests.support.hand import DEADLINE, SECOND, tag
 from tests.support.stage import drained, wait_for
 
 
+def test_with_exit_when_done_it_leaves_when_its_coordinator_says_that_the_run_has_ended(stage, cached):
+    hand = stage.hand(tasks.SLOW_TOY)
+    _, served = stage.worker(exit_when_done=True)
+    assert hand.hello().leaves_with_run
+    hand.beat(lambda beat: beat.capacity > 0)
+    hand.send(1, hand.job())
+    hand.beat(lambda beat: beat.running)
+    hand.send(0, vectors=(), ended=True)
+    assert served.result(DEADLINE) is None
+    assert hand.beat(lambda beat: beat.reason).reason == "the run has ended"
+
+
+@pytest.mark.parametrize("back", ["the same life", "the next life"])
+def test_with_exit_when_done_it_keeps_its_results_for_a_coordinator_that_comes_back(stage, cached, monkeypatch, back):
+    monkeypatch.setattr(membership, "NEXT_RUN_AFTER", 0.0)
+    hand = stage.hand(tasks.SLOW_TOY)
+    _, served = stage.worker(exit_when_done=True)
+    hand.ready()
+    job = hand.job()
+    hand.send(1, job)
+    hand.beat(lambda beat: beat.running)
+    hand.vanish()
+    hand.beat(lambda beat: tag(job) in beat.unacked)
+    assert not served.done()
+    if back == "the next life":
+        hand.nonce, hand.incarnation = SECOND, 2
+    hand.appear()
+    hand.hello()
+    assert hand.result(job).fitness is not None
+    assert not served.done()
+
+
 @pytest.mark.parametrize("when", ["before it joined", "afterwards"])
-def test_with_exit_when_done_it_leaves_when_its_run_is_over(stage, cached, monkeypatch, when):
-    monkeypatch.setattr(membership, "COORDINATOR_GONE_AFTER", 0.3)
+def test_with_exit_when_done_it_fails_after_long_without_a_coordinator_and_says_what_is_lost(stage, said, cached, when):
     hand = stage.hand()
     if when == "before it joined":
         hand.vanish()
-    _, served = stage.worker(exit_when_done=True)
+    _, served = stage.worker(exit_when_done=True, coordinator_timeout=0.5)
     hand.hello()
     if when == "afterwards":
         hand.beat(lambda beat: beat.capacity > 0)
+        hand.send(1, hand.job())
+        hand.result(hand.job())
         hand.vanish()
+    error = served.exception(DEADLINE)
+    assert isinstance(error, ConnectionFailedError)
+    assert ("1 finished result" in str(error)) == (when == "afterwards")
+    assert "--coordinator-timeout" in str(error)
+
+
+def test_it_tells_its_coordinator_why_it_leaves(stage, cached):
+    hand = stage.hand()
+    made, served = stage.worker()
+    hand.ready()
+    made.stop()
+    assert hand.beat(lambda beat: beat.reason).reason == "drained after a signal"
+    assert served.result(DEADLINE) is None
+
+
+def test_it_tells_why_it_fails_before_it_can_score(stage):
+    hand = stage.hand()
+    hand.total = lambda: 1 << 60
+    _, served = stage.worker(exit_when_done=True)
+    error = served.exception(DEADLINE)
+    said = hand.beat()
+    assert (said.capacity, said.reason) == (0, str(error))
+
+
+def test_it_tells_an_older_coordinator_no_reason(stage, cached):
+    hand = stage.hand()
+    hand.reasons = False
+    made, served = stage.worker()
+    hand.ready()
+    made.stop()
+    assert hand.beat(lambda beat: beat.capacity == 0).reason == ""
     assert served.result(DEADLINE) is None
 
 
@@ -80,7 +145,7 @@ def test_its_lifetime_ends_without_a_run_too(stage, coordinator):
 
 
 def test_late_events_of_the_last_runs_slots_do_not_reach_the_next_run(stage, said, cached, monkeypatch):
-    monkeypatch.setattr(membership, "COORDINATOR_GONE_AFTER", 0.3)
+    monkeypatch.setattr(membership, "NEXT_RUN_AFTER", 0.3)
     hand = stage.hand(run="one")
     hand.slots = 0
     stage.worker(run=None, any=True)

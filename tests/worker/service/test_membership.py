@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from dreamfleet.worker.service.membership import (
-    COORDINATOR_GONE_AFTER,
+    NEXT_RUN_AFTER,
+    NEXT_RUN_PATIENCE,
     SILENT_BEATS,
     UPLOAD_GRACE,
     LeaveConditions,
@@ -18,6 +19,7 @@ from dreamfleet.worker.service.membership import (
 
 BEAT = 1.0
 PATIENCE = SILENT_BEATS * BEAT
+TIMEOUT = 60.0  # of a coordinator out of sight
 IDLE = WorkerLoad(idle=True, awaits_verdict=False, uploading=False)
 BUSY = WorkerLoad(idle=False, awaits_verdict=False, uploading=False)
 OWED = WorkerLoad(idle=False, awaits_verdict=True, uploading=False)
@@ -42,10 +44,10 @@ def test_it_says_no_hello_while_its_coordinator_is_in_sight_and_active():
 
 def test_it_leaves_a_run_that_ends_at_once_and_not_the_next_one():
     member = joined()
-    member.end_run()
-    assert member.is_over(1.0, busy=True)
+    member.end_run("the run has ended")
+    assert member.find_end(1.0, busy=True)
     member.join("another run's", BEAT, now=2.0)
-    assert not member.is_over(3.0, busy=False)
+    assert not member.find_end(3.0, busy=False)
 
 
 @pytest.mark.parametrize(("hands", "after"), [(IDLE, PATIENCE), (OWED, PATIENCE), (UPLOADING, PATIENCE + UPLOAD_GRACE)])
@@ -95,16 +97,16 @@ def test_stopped_once_it_drains_until_all_is_delivered():
     assert member.start_draining_if_due(1.0)
     assert not member.start_draining_if_due(1.1), "it begins once"
     assert (member.is_leaving(1.1), member.draining) == (True, True)
-    assert not member.is_over(30.9, busy=True)
-    assert member.is_over(1.1, busy=False)
-    assert member.is_over(31.1, busy=True), "but not for ever"
+    assert not member.find_end(30.9, busy=True)
+    assert member.find_end(1.1, busy=False)
+    assert member.find_end(31.1, busy=True), "but not for ever"
 
 
 def test_stopped_twice_it_leaves_at_once():
     member = joined()
     member.stop()
     member.stop()
-    assert member.is_over(0.0, busy=True)
+    assert member.find_end(0.0, busy=True)
 
 
 def test_it_drains_at_the_end_of_its_lifetime_which_begins_before_any_run():
@@ -117,19 +119,43 @@ def test_it_drains_at_the_end_of_its_lifetime_which_begins_before_any_run():
 
 
 @pytest.mark.parametrize("seen", [True, False])
-def test_it_leaves_a_run_without_a_coordinator_if_configured(seen):
-    leaves, stays = (joined(visible=seen, leaves_without_coordinator=each) for each in (True, False))
+def test_a_worker_that_leaves_with_its_run_gives_up_a_coordinator_only_after_long_patience(seen):
+    leaves = joined(visible=seen, leaves_with_run=True, coordinator_timeout=TIMEOUT)
+    stays = joined(visible=seen, coordinator_timeout=TIMEOUT)
+    since = 1e6 if seen else 0.0
     for member in (leaves, stays):
         if seen:
-            assert not member.is_over(1e6, busy=False)
+            assert not member.find_end(1e6, busy=False)
             member.remove_coordinator("first", 1e6)
-        since = 1e6 if seen else 0.0
-        member.remove_coordinator(
-            "never seen", since + COORDINATOR_GONE_AFTER
-        )  # losing a token twice does not restart the clock
-        assert not member.is_over(since + COORDINATOR_GONE_AFTER, busy=True)
-    assert leaves.is_over(since + COORDINATOR_GONE_AFTER + 0.1, busy=True)
-    assert not stays.is_over(math.inf, busy=False)
+        member.remove_coordinator("never seen", since + 1.0)  # losing a token twice does not restart the clock
+        assert not member.find_end(since + TIMEOUT, busy=True)
+        assert not member.find_end(since + TIMEOUT, busy=False), "it waits for a restart although it has nothing"
+        assert not member.gives_up(since + TIMEOUT)
+    assert "out of sight" in leaves.find_end(since + TIMEOUT + 0.1, busy=True)
+    assert leaves.gives_up(since + TIMEOUT + 0.1)
+    assert not stays.find_end(math.inf, busy=False)
+    leaves.add_coordinator("second")
+    assert not leaves.find_end(math.inf, busy=True)
+
+
+def test_a_worker_of_any_run_goes_on_soon_but_not_at_once_with_results():
+    member = joined(serves_any=True)
+    member.remove_coordinator("first", 0.0)
+    assert not member.find_end(NEXT_RUN_AFTER, busy=False)
+    assert member.find_end(NEXT_RUN_AFTER + 0.1, busy=False)
+    assert not member.find_end(NEXT_RUN_PATIENCE, busy=True)
+    assert member.find_end(NEXT_RUN_PATIENCE + 0.1, busy=True)
+    assert not member.gives_up(math.inf), "that is no failure"
+
+
+def test_a_drained_worker_names_why():
+    stopped, expired = joined(drain_timeout=30.0), joined(lifetime=1.0)
+    stopped.stop()
+    for member in (stopped, expired):
+        assert member.start_draining_if_due(1.0)
+    assert "signal" in stopped.find_end(2.0, busy=False)
+    assert "left when the time" in stopped.find_end(32.0, busy=True)
+    assert "lifetime" in expired.find_end(2.0, busy=False)
 
 
 class AnyOrder(RuleBasedStateMachine):
@@ -141,8 +167,12 @@ class AnyOrder(RuleBasedStateMachine):
     def __init__(self):
         super().__init__()
         self.now = 0.0
-        self.terms = LeaveConditions(lifetime=200.0, drain_timeout=30.0, leaves_without_coordinator=True)
-        self.member = joined(visible=False, lifetime=200.0, drain_timeout=30.0, leaves_without_coordinator=True)
+        self.terms = LeaveConditions(
+            lifetime=200.0, drain_timeout=30.0, leaves_with_run=True, coordinator_timeout=TIMEOUT
+        )
+        self.member = joined(
+            visible=False, lifetime=200.0, drain_timeout=30.0, leaves_with_run=True, coordinator_timeout=TIMEOUT
+        )
         self.seen, self.of, self.doubt = set(), "first", False
         self.spoke = self.alone = self.allowed = 0.0
         self.stops = self.drains = 0
@@ -214,16 +244,14 @@ class AnyOrder(RuleBasedStateMachine):
         assert self.member.is_leaving(self.now) == (self.stops > 0 or self.now >= self.terms.lifetime)
         assert self.drains <= 1
         for busy in (True, False):
-            is_over = self.member.is_over(self.now, busy)
+            is_over = bool(self.member.find_end(self.now, busy))
             if self.stops > 1:
                 assert is_over
             elif self.drains:
-                alone = (
-                    not self.seen and self.now - self.alone > COORDINATOR_GONE_AFTER
-                )  # nobody could receive its results
-                assert is_over == (not busy or self.now > self.drain_until or alone)
+                assert is_over == (not busy or self.now > self.drain_until)
             else:
-                assert is_over == (not self.seen and self.now - self.alone > COORDINATOR_GONE_AFTER)
+                given_up = not self.seen and self.now - self.alone > TIMEOUT
+                assert is_over == (given_up and not self.member.is_leaving(self.now))
 
 
 TestAnyOrder = AnyOrder.TestCase

@@ -1,0 +1,95 @@
+"""Workers whose coordinator is out of sight for a while, and what a run says of workers that left."""
+
+import json
+import time
+
+import pytest
+
+from tests.support import tasks
+from tests.support.processes import DEADLINE, ROOT
+from tests.support.relay import Relay
+
+OUTAGE = 8.0  # seconds; a worker with --exit-when-done once left after five
+SETTINGS = ("--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 2, "--evaluate-every", 0, "--generations", 2)
+ENVIRONMENT = """
+import gymnasium
+gymnasium.register("There-v0", entry_point="gymnasium.envs.classic_control:CartPoleEnv", max_episode_steps=50)
+"""
+
+
+@pytest.fixture
+def relay(processes):
+    made = Relay(processes.port)
+    yield made
+    made.close()
+
+
+@pytest.mark.slow
+def test_a_cut_link_costs_neither_the_worker_nor_its_results(processes, random_bundle, relay):
+    coordinator = processes.coordinator("--bundle", random_bundle.path, *SETTINGS)
+    worker = processes.worker("--task", tasks.SLOW_TOY, "--exit-when-done", endpoint=relay.endpoint)
+    worker.wait_for("joined run")
+    relay.hold()
+    relay.cut()
+    worker.wait_for("out of sight")
+    time.sleep(OUTAGE)
+    assert worker.popen.poll() is None
+    relay.release()
+    worker.wait_for("in sight again")
+    assert coordinator.finish()[0] == 0
+    assert worker.finish()[0] == 0
+    assert "the run has ended" in "".join(worker.lines)
+
+
+@pytest.mark.slow
+def test_a_coordinator_that_comes_back_finds_its_worker(processes, random_bundle):
+    coordinator = processes.coordinator("--bundle", random_bundle.path, *SETTINGS)
+    worker = processes.worker("--task", tasks.SLOW_TOY, "--exit-when-done")
+    worker.wait_for("joined run")
+    coordinator.end()
+    worker.wait_for("out of sight")
+    time.sleep(OUTAGE)
+    assert worker.popen.poll() is None
+    resumed = processes.start(
+        "coordinator", "--resume", "test", "--runs-dir", processes.runs, "--listen", processes.endpoint
+    )
+    assert resumed.finish()[0] == 0
+    assert worker.finish()[0] == 0
+
+
+def test_a_coordinator_that_is_gone_for_good_fails_its_worker(processes, random_bundle):
+    coordinator = processes.coordinator("--bundle", random_bundle.path, *SETTINGS)
+    worker = processes.worker("--task", tasks.SLOW_TOY, "--exit-when-done", "--coordinator-timeout", 1)
+    worker.wait_for("joined run")
+    coordinator.end()
+    assert worker.finish()[0] == 1
+    assert "was out of sight for 1 s" in worker.lines[-1]
+
+
+def test_a_run_says_why_its_worker_left_and_the_worker_in_one_line(processes):
+    there = processes.folder / "there"
+    there.mkdir()
+    (there / "its_module.py").write_text(ENVIRONMENT)
+    coordinator = processes.start(
+        "coordinator", "--run", "test", "--runs-dir", processes.runs, "--listen", processes.endpoint,
+        "--task", "gym:its_module:There-v0", "--population", 4, "--generations", 1,
+        inside=("env", f"PYTHONPATH={ROOT}:{there}"),
+    )  # fmt: skip
+    coordinator.wait_for("incarnation")
+    code, _, err = processes.call("worker", "--connect", processes.endpoint, "--slots", 1)
+    assert code == 1
+    assert "Traceback" not in err
+    why = "a slot cannot start: UsageError: gymnasium makes no environment"
+    assert why in err.splitlines()[-1]
+    coordinator.wait_for("left (a slot cannot start")
+    deadline = time.monotonic() + DEADLINE
+    while not (status := processes.status())["workers"].get("left"):
+        assert time.monotonic() < deadline
+    (row,) = status["worker_list"]
+    assert (row["state"], status["workers"]["lost"]) == ("left", 0)
+    assert why in row["reason"]
+    _, out, _ = processes.call("status", "test", "--connect", processes.endpoint)
+    assert "left" in out
+    assert "none has joined" not in out
+    _, out, _ = processes.call("story", "test", "--connect", processes.endpoint, "--json")
+    assert why in json.loads(out)[-1]["why"]
