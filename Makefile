@@ -6,8 +6,8 @@ SUPPLY := .venv-supply
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 SOURCES := pyproject.toml constraints.txt $(wildcard worker/car_racing/native/*)
 
-.PHONY: demo test test-newest slow setup check wheel long box2d-py simulate chaos weekend sanitize bundle worker-size stranger reproduce \
-  reproduce-evolution lock audit sbom structure clean
+.PHONY: demo test test-newest slow setup check wheel long box2d-py simulate chaos weekend fuzz sanitize bundle worker-size \
+  stranger reproduce reproduce-evolution lock audit sbom structure clean
 
 demo: $(VENV)/.demo  ## evolve a controller here, judge it, plot it, record it
 	$(BIN)/dreamfleet demo $(ARGS)
@@ -64,6 +64,9 @@ weekend: $(VENV)/.dev  ## about MINUTES of a run that nobody watches, under outa
 
 chaos: $(VENV)/.dev  ## a fleet under FAULTS seeded faults gives the bits of one that nobody disturbs
 	$(BIN)/python -m tests.chaos.chaos --faults $(or $(FAULTS),200) --seed $(or $(SEED),7) $(ARGS)
+
+fuzz: $(VENV)/.dev  ## CALLS command lines with odd values, drawn by SEED, of every verb or of those that begin with VERB
+	$(BIN)/python -m tests.fuzz --calls $(or $(CALLS),2000) --seed $(or $(SEED),1) $(if $(VERB),--verb $(VERB)) $(ARGS)
 
 sanitize: $(VENV)/.dev  ## 200,000 steps of the native picture under AddressSanitizer: ten minutes
 	mkdir -p build

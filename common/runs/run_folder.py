@@ -138,7 +138,7 @@ class RunFolder:
 
     @property
     def duration_seconds(self) -> float | None:
-        """Seconds from the run's beginning to its end, pauses included; `None` if its clocks do not tell."""
+        """Seconds from the run's beginning to its end, pauses included; `None` if they are unknown."""
         return elapsed_seconds(self.created, self.ended_at or "")
 
     @property

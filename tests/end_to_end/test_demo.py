@@ -107,3 +107,10 @@ def test_without_the_page_none_is_begun(processes, random_bundle):
     demo.popen.send_signal(signal.SIGINT)
     assert demo.finish()[0] == 130
     assert not any(b"dashboard" in each for each in words)
+
+
+def test_a_name_that_no_run_can_have_makes_no_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("../x", "x" * 60):
+        assert main(["demo", "--no-page", "--run", name, "--runs-dir", "runs"]) == 2
+    assert list(tmp_path.iterdir()) == []

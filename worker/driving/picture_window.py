@@ -6,6 +6,7 @@ import numpy as np
 import pygame
 from numpy.typing import NDArray
 
+from dreamfleet.common.printable import printable
 from dreamfleet.worker.driving.drive_window import BACKGROUND, FAINT, QUIT_KEYS, open_display
 
 INITIAL_SIZE = 720, 680  # pixels, until there is a picture
@@ -43,7 +44,7 @@ class PictureWindow:
 
     def _open(self, size: tuple[int, int]) -> None:
         self._surface = open_display(size, REMEDY)
-        pygame.display.set_caption(f"dreamfleet: {self._name}")
+        pygame.display.set_caption(f"dreamfleet: {printable(self._name)}")
 
     def _show_text(self, text: str) -> None:
         self._surface.fill(BACKGROUND)

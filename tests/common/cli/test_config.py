@@ -1,5 +1,6 @@
 from argparse import ArgumentParser, Namespace
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import pytest
@@ -105,3 +106,21 @@ def test_flags_for_some_fields_of_a_section():
     add_flags(parser, ThingConfig, only=["count"], texts={"count": "so many"})
     assert "so many" in parser.format_help()
     assert "--rate" not in parser.format_help()
+
+
+def test_an_empty_variable_of_a_number_or_a_choice_is_as_none():
+    empty = {f"DREAMFLEET_THING_{name}": "" for name in ("COUNT", "RATE", "COLOUR", "LOUD", "LIMIT", "NAMES")}
+    file = {"thing": {"count": 5, "colour": "blue", "names": ["f"]}}
+    assert load(ThingConfig, "thing", file=file, environment=empty) == ThingConfig(5, colour="blue", names=())
+
+
+def test_a_byte_order_mark_and_another_systems_line_ends_are_read(tmp_path):
+    (tmp_path / "marked.toml").write_bytes(b"\xef\xbb\xbf[thing]\r\ncount = 1\r\n")
+    assert read_toml(tmp_path / "marked.toml", ["thing"]) == {"thing": {"count": 1}}
+
+
+def test_a_folder_or_a_device_is_no_configuration_file(tmp_path):
+    with pytest.raises(UsageError, match=r"cannot be read as TOML: it is a folder$"):
+        read_toml(tmp_path, [])
+    with pytest.raises(UsageError, match=r"cannot be read as TOML: it is not a regular file$"):
+        read_toml(Path("/dev/zero"), [])

@@ -38,3 +38,8 @@ def test_without_a_screen_the_error_names_other_ways(monkeypatch):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(NoDisplayError, match=r"write a file by --out live\.mp4"), PictureWindow("night"):
         pass
+
+
+def test_its_title_takes_a_name_that_is_no_utf_8(unseen):
+    with PictureWindow("\udcff\udc80"):
+        assert pygame.display.get_caption()[0] == "dreamfleet: \\udcff\\udc80"

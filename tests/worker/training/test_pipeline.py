@@ -236,3 +236,8 @@ def test_another_preset_than_the_data_sets_is_refused(tmp_path):
     (tmp_path / "preset.json").write_text('{"preset": "paper"}')
     with pytest.raises(UsageError, match="give --preset paper"):
         call("--data", tmp_path)
+
+
+def test_a_seed_beyond_torchs_is_refused():
+    with pytest.raises(UsageError, match="--seed must be from 0 to 8796093022208"):
+        TrainConfig(**{**vars(PRESETS["tiny"].vae), "seed": 10**20})
