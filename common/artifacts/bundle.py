@@ -44,6 +44,7 @@ REQUIRED = (ENCODER, DECODER, POLICY, INITIAL_LATENTS_PART)
 MAX_BUNDLE = 256 << 20  # bytes, of the file and of its members together; the largest known bundle has 16 MB
 LIMITS = ArchiveLimits(MAX_BUNDLE)
 _MAX_MANIFEST = 1_000_000
+MAX_ARRAY = 64 << 20  # bytes of a part that is an array: it is copied as float32 when it is read
 MAX_RECORDED_STATES = 16_384  # states; 19 MB with the default layers
 
 
@@ -233,6 +234,8 @@ def _check_part(path: Path, manifest: BundleManifest, name: str, data: bytes) ->
         )
     if name.endswith(".onnx") and not has_finite_weights(data):
         raise BundleError(f"{path}: {name} has weights that are NaN or infinite; train the model again")
+    if name in (INITIAL_LATENTS_PART, RECORDED_STATES) and len(data) > MAX_ARRAY:
+        raise BundleError(f"{path}: {name} unpacks to {len(data) >> 20} MiB, and at most {MAX_ARRAY >> 20} are read")
     if name == INITIAL_LATENTS_PART:
         _check_latents(path, manifest, data)
     if name == RECORDED_STATES:

@@ -176,7 +176,9 @@ def _check_end(file: BinaryIO, limits: ArchiveLimits) -> None:
     if size < _END_BYTES or end[:4] != _END or end[-2:] != b"\0\0":
         raise DamagedArchiveError("it does not end as an archive does")
     if tail[:4] == _END_64 and size > len(end):
-        raise DamagedArchiveError("it is larger than an archive of this kind may be")
+        raise DamagedArchiveError(
+            "it is in the form zip64, which only archives beyond 4 GiB need: write it again without"
+        )
     (directory,) = struct.unpack_from("<I", end, 12)
     if directory > limits.members * _DIRECTORY_BYTES:
         raise DamagedArchiveError("its directory is too long")

@@ -106,7 +106,7 @@ class Authority:
         expires = (now + timedelta(days=days)).replace(microsecond=0)
         check_output_path(out)
         if out.exists():
-            raise UsageError(f"{out} exists: name another --out, or remove it first")
+            raise UsageError(f"{out} exists: name another --out")
         with self._locked_ledger() as ledger:
             seat, shared = _assign_seat(ledger, role, name), {"ca": self._pem, "connect": tuple(connect)}
             who = Credentials(role, seat, name, min(expires, self._certificate.not_valid_after_utc), **shared)  # type: ignore[arg-type]

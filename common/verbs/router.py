@@ -91,6 +91,6 @@ def _write_config(path: Path, network: Network) -> None:
         with open_new(path) as file:
             file.write(json.dumps(zenoh_config(network, None), indent=2).encode())
     except FileExistsError:
-        raise UsageError(f"--write-config {path} exists: name another, or remove it first") from None
+        raise UsageError(f"--write-config {path} exists: name another") from None
     except OSError as error:
         raise DreamfleetError(f"cannot write {path}: {error.strerror}; choose another --write-config") from error

@@ -67,7 +67,7 @@ def export_parquet(run: RunFolder, folder: Path) -> list[Path]:
 def export_tensorboard(run: RunFolder, folder: Path) -> list[Path]:
     """Write a TensorBoard event file; `UsageError` if the folder has one, since TensorBoard would merge both."""
     if is_folder(folder) and any(folder.glob(EVENTS)):
-        raise UsageError(f"{folder} holds TensorBoard's events already: delete them, or choose another --out")
+        raise UsageError(f"{folder} holds TensorBoard's events already: choose another --out")
     with _remove_on_failure(folder), open_event_file(folder) as events:
         events.add_text("settings", f"```\n{run.settings.to_json()}\n```")
         for each in run.history():

@@ -446,6 +446,7 @@ def main() -> None:
     """Answer requests until the connection closes, then end the workers that used its tunnel."""
     os.umask(0o077)
     channel, held = Channel(), list[dict[str, Any]]()
+    print(flush=True)  # noqa: T201 - what the shell printed may lack its line end
     channel.send("ok", {})
     try:
         while True:

@@ -153,9 +153,7 @@ class RemoteHost:
         """The worker's environment; `None` if dreamfleet is installed in the Python that the user named."""
         if self.host.spawn.remote_python and found.installed:
             return None
-        return pack_for(self.host.spawn.wheelhouse, found).environment(
-            (found.python[0], found.python[1]), found.machine
-        )
+        return pack_for(self.host.spawn.wheelhouse, found).environment(found.python, found.machine)
 
     def _python(self, found: HostAnswer) -> str:
         """Install the worker if needed; the path of its Python."""

@@ -183,7 +183,7 @@ def archive_run(args: argparse.Namespace) -> int:
     open_run(args.runs_dir, args.run_name).close()
     source, target = args.runs_dir / args.run_name, args.runs_dir / ARCHIVE_FOLDER / args.run_name
     if target.exists():
-        raise JournalError(f"{target} exists; rename or delete it first")
+        raise JournalError(f"{target} exists; rename it first")
     check_movable(source)
     with run_lock(source), reporting_folder_errors(source):
         target.parent.mkdir(exist_ok=True)

@@ -103,7 +103,7 @@ def _load_training(path: Path, name: str, model: str) -> TrainingCurves:
     found = {part: LossCurve(_make_line(rows, part), _make_line(rows, HELD_OUT + part)) for part in UNITS}
     curves = {part: curve for part, curve in found.items() if list(_lines(curve))}
     if not curves:
-        raise DatasetError(f"{path} holds no loss curve ({', '.join(UNITS)}); delete it, training writes it again")
+        raise DatasetError(f"{path} holds no loss curve ({', '.join(UNITS)}); move it away, or choose another --data")
     wholes = {update: whole for update, row in rows.items() if (whole := _held_out(row)) is not None}
     return TrainingCurves(name, model, max(rows), curves, min(wholes, key=wholes.__getitem__, default=None))
 
@@ -132,7 +132,7 @@ def read_points(path: Path) -> Points:
         if not all(type(each) in (int, float) and abs(each) < MOST for point in points for each in point.values()):
             raise ValueError("a point is no finite number")
     except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
-        raise DatasetError(f"{path} holds no loss curve ({error}); delete it, training writes it again") from error
+        raise DatasetError(f"{path} holds no loss curve ({error}); move it away, or choose another --data") from error
     return points
 
 

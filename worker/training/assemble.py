@@ -117,7 +117,7 @@ def _load_models(folder: Path) -> tuple[Weights, Weights, VAEConfig, MDNRNNConfi
     vae_config, rnn_config = load_config(paths[0], VAEConfig), load_config(paths[1], MDNRNNConfig)
     for path, arrays in zip(paths, (vae, rnn), strict=True):
         if not all(np.isfinite(array).all() for array in arrays.values()):
-            raise DatasetError(f"{path} holds NaN or infinity; delete it and train again")
+            raise DatasetError(f"{path} holds NaN or infinity; train again with --new")
     if vae_config.latent != rnn_config.latent:
         raise DatasetError(f"the VAE has {vae_config.latent} latents, the MDN-RNN {rnn_config.latent}: train it again")
     if train_mdnrnn.mdnrnn_vae_hash(folder) != latents_encoder_hash(folder):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
@@ -60,9 +60,7 @@ def load_checkpoint(
         if optimiser is not None:
             _restore_adam(optimiser, moments)
     except (OSError, ValueError, KeyError, TypeError, RuntimeError, RecursionError, SafetensorError) as error:
-        raise DatasetError(
-            f"checkpoint {path} does not fit or is damaged ({error}); delete it or give --new to begin anew"
-        ) from error
+        raise DatasetError(f"checkpoint {path} does not fit or is damaged ({error}); {_remedy(path)}") from error
     return progress
 
 
@@ -72,7 +70,7 @@ def load_config(path: Path, kind: type[T]) -> T:
     try:
         return from_plain(kind, json.loads(about["config"])) if "config" in about else kind()
     except (ValueError, TypeError, RecursionError, MalformedError, UsageError) as error:
-        raise DatasetError(f"checkpoint {path} is damaged ({error}); delete it to train anew") from error
+        raise DatasetError(f"checkpoint {path} is damaged ({error}); {_remedy(path)}") from error
 
 
 def load_progress(path: Path) -> dict[str, Any]:
@@ -80,8 +78,16 @@ def load_progress(path: Path) -> dict[str, Any]:
     try:
         progress: dict[str, Any] = json.loads(_read_metadata(path)["progress"])
     except (ValueError, KeyError, RecursionError) as error:
-        raise DatasetError(f"checkpoint {path} is damaged ({error}); delete it to train anew") from error
+        raise DatasetError(f"checkpoint {path} is damaged ({error}); {_remedy(path)}") from error
     return progress
+
+
+def _remedy(path: Path) -> str:
+    """What to do about a checkpoint that cannot be used: only one that is surely ours may be deleted."""
+    with suppress(OSError, SafetensorError), safe_open(path, "np") as file:
+        if "progress" in (file.metadata() or {}):
+            return "delete it, or give --new, to train anew"
+    return "if another program wrote it, choose another --data; else move it away and train anew"
 
 
 def _read_metadata(path: Path) -> Mapping[str, str]:
@@ -98,7 +104,7 @@ def _open_checkpoint(path: Path) -> Iterator[Any]:
         with safe_open(path, "np") as file:
             yield file
     except (OSError, SafetensorError) as error:
-        raise DatasetError(f"checkpoint {path} is damaged ({error}); delete it to train anew") from error
+        raise DatasetError(f"checkpoint {path} is damaged ({error}); {_remedy(path)}") from error
 
 
 def _select_prefix(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:

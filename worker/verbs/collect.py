@@ -54,9 +54,10 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.worker.training.config_flags import apply_flags
     from dreamfleet.worker.training.data.collect import collect, missing_numbers
     from dreamfleet.worker.training.data.data_folder import resolve_preset, store_preset
-    from dreamfleet.worker.training.data.dataset import existing_episodes
+    from dreamfleet.worker.training.data.dataset import check_no_foreign_files, existing_episodes
     from dreamfleet.worker.training.presets import find_preset
 
+    check_no_foreign_files(args.data)
     preset = find_preset(resolve_preset(args.data, args.preset))
     config, pilots = apply_flags(preset.collect, args), _load_pilots(args)
     frames = done = 0

@@ -73,3 +73,10 @@ def test_refusals_are_logged_once_are_bounded_and_end_with_admission():
     assert "a" not in refused_workers.latest
     refused_workers.remove("w3/9")
     assert "w3" not in refused_workers.latest
+
+
+def test_a_family_does_not_stand_for_a_member_that_names_a_module():
+    task = "gym:some_module:World-v0"
+    _, remedy = find_refusal(hello(tasks=("gym",)), task, None)
+    assert f"dreamfleet worker --task {task}" in remedy
+    assert find_refusal(hello(tasks=("gym", task), packages=PACKAGES), task, None, PACKAGES) is None

@@ -164,12 +164,13 @@ def foreign(tmp_path, monkeypatch):
     return mark
 
 
-def test_a_task_that_it_did_not_announce_is_never_imported(stage, cached, tmp_path, monkeypatch):
+@pytest.mark.parametrize("task", ["foreign_world:World", "gym:foreign_world:X-v0"])
+def test_a_task_that_it_did_not_announce_is_never_imported(stage, cached, tmp_path, monkeypatch, task):
     mark = foreign(tmp_path, monkeypatch)
-    stage.hand("foreign_world:World")
+    stage.hand(task)
     _, served = stage.worker(exit_when_done=True)
     assert isinstance(error := served.exception(DEADLINE), RefusedError)
-    assert "'foreign_world:World', which this worker did not announce" in str(error)
+    assert f"{task!r}, which this worker did not announce: start it with --task {task}" in str(error)
     assert not mark.exists()
 
 
@@ -182,10 +183,11 @@ def test_with_any_a_run_of_an_unannounced_task_is_skipped(stage, said, cached):
     other.ready()
 
 
-def test_a_child_imports_no_task_that_its_worker_did_not_announce(tmp_path, monkeypatch):
+@pytest.mark.parametrize("task", ["foreign_world:World", "gym:foreign_world:X-v0"])
+def test_a_child_imports_no_task_that_its_worker_did_not_announce(tmp_path, monkeypatch, task):
     mark, events = foreign(tmp_path, monkeypatch), queue.SimpleQueue()
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
-    slot = Slot(0, TaskSpec("foreign_world:World", "", 100, 0), None, events, (tasks.TOY,))
+    slot = Slot(0, TaskSpec(task, "", 100, 0), None, events, (tasks.TOY, "gym"))
     failure = events.get(timeout=DEADLINE)[1].failure
     assert failure.text.startswith("RefusedError: ")
     slot.stop()

@@ -10,10 +10,11 @@ import pytest
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, INITIAL_LATENTS_PART, POLICY, RECORDED_STATES, write_bundle
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.onnx_checks import has_finite_weights
+from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import BundleError, DatasetError
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble, export_graphs, make_manifest
-from dreamfleet.worker.training.data.dataset import load_arrays
+from dreamfleet.worker.training.data.dataset import check_whole, load_arrays
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, PolicyStep
@@ -247,3 +248,32 @@ def test_a_graph_of_endless_fields_is_not_looked_through(random_bundle, tmp_path
     parts = {**parts_of(random_bundle), DREAM_GRAPH: b"\x40\x00" * 10**6}
     with pytest.raises(BundleError, match="has more than 500000 fields"):
         write_bundle(tmp_path / "b.zip", random_bundle.manifest, parts)
+
+
+@pytest.mark.parametrize("place", ["", "episodes"])
+@pytest.mark.parametrize("content", ["arrays", "half"])
+def test_files_of_another_program_are_named_and_never_advised_to_be_deleted(tmp_path, place, content, capsys):
+    (tmp_path / "episodes").mkdir()
+    path = tmp_path / place / "000001.npz"
+    np.savez(path, x=np.zeros(3), y=np.zeros(3))
+    if content == "half":
+        path.write_bytes(path.read_bytes()[:100])
+    before = path.read_bytes()
+    assert main(["pipeline", "--data", str(tmp_path), "--scale", "0.01"]) == 1
+    said = capsys.readouterr().err
+    assert "000001.npz is damaged, or of another program" in said
+    assert "choose another --data" in said
+    assert "delete" not in said
+    assert not (tmp_path / "preset.json").exists()
+    with pytest.raises(DatasetError, match="choose another --data") as said:
+        load_arrays(path, "action")
+    assert "delete" not in str(said.value)
+    assert path.read_bytes() == before
+    assert [each.name for each in tmp_path.rglob("*.npz")] == ["000001.npz"]
+
+
+def test_a_damaged_episode_of_ours_may_be_deleted(tmp_path):
+    path = tmp_path / "000001.npz"
+    np.savez(path, action=np.zeros((3, 3)), reward=np.zeros(3), ended=np.array(False))
+    with pytest.raises(DatasetError, match="delete it, and run the verb that wrote it again"):
+        check_whole([path], "picture")

@@ -128,7 +128,7 @@ def test_a_damaged_checkpoint_is_refused_with_the_remedy(tmp_path, content):
         lambda: train_vae.train_vae(tmp_path, SHORT, ignore),
         lambda: load_weights(tmp_path / train_vae.CHECKPOINT),
     ):
-        with pytest.raises(DatasetError, match="delete it"):
+        with pytest.raises(DatasetError, match="if another program wrote it, choose another --data; else move it away"):
             attempt()
 
 

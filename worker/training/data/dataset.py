@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -18,6 +19,7 @@ WORLD = "car-racing"  # the task of data sets
 POOL_EPISODES = 48  # episodes whose frames are shuffled together
 POOL_FRAMES = 16_000  # most frames of a pool, unless one episode has more: 200 MB at 64x64, 440 MB at 96x96
 VALIDATION_EVERY = 20  # every 20th episode is held out, whole
+OWN_MEMBERS = frozenset(("action.npy", "reward.npy", "ended.npy"))  # of every episode
 LIMITS = ArchiveLimits(512 << 20)  # bytes of an episode: 19,000 pictures at 96x96
 
 
@@ -72,7 +74,36 @@ def load_arrays(path: Path, *names: str) -> Arrays:
 
 
 def _damaged(path: Path, error: Exception) -> DatasetError:
-    return DatasetError(f"{path} is damaged ({error}); delete it and run the verb that wrote it again")
+    return DatasetError(f"{path} is damaged ({error}); {_remedy(path)}")
+
+
+def is_own_file(path: Path) -> bool:
+    """Whether an archive is surely of this program: an episode, a controller or a subspace, by its members' names."""
+    try:
+        with open_regular(path, LIMITS.size) as file, open_archive(file, LIMITS) as archive:
+            return archive.names >= OWN_MEMBERS or "about.npy" in archive.names
+    except (OSError, DamagedArchiveError):
+        return False
+
+
+def _remedy(path: Path) -> str:
+    if is_own_file(path):
+        return "delete it, and run the verb that wrote it again"
+    return "no verb of dreamfleet is known to have written it: choose another --data, or move it away"
+
+
+def check_no_foreign_files(folder: Path) -> None:
+    """`DatasetError` names the first archive in a data folder that is not surely of this program."""
+    for place in (folder, folder / "episodes"):
+        try:
+            names = sorted(each.name for each in os.scandir(place) if each.name.endswith(".npz"))
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise DatasetError(f"{place} cannot be read ({error.strerror}): choose another --data") from error
+        for name in names:
+            if not name.startswith(".") and not is_own_file(place / name):
+                raise DatasetError(f"{place / name} is damaged, or of another program; {_remedy(place / name)}")
 
 
 def check_whole(paths: Sequence[Path], *names: str) -> None:
@@ -84,9 +115,7 @@ def check_whole(paths: Sequence[Path], *names: str) -> None:
         except (OSError, DamagedArchiveError) as error:
             raise _damaged(path, error) from error
         if missing:
-            raise DatasetError(
-                f"{path} lacks {', '.join(sorted(missing))}; delete it and run the verb that wrote it again"
-            )
+            raise DatasetError(f"{path} lacks {', '.join(sorted(missing))}; {_remedy(path)}")
 
 
 def check_pictures(paths: Sequence[Path], size: int) -> None:

@@ -1,0 +1,41 @@
+"""Workers on hosts whose login shell is no Bourne shell, or whose startup files print, hang, or print without end."""
+
+import pytest
+
+from tests.end_to_end.test_spawn import rows_of, words
+from tests.support.processes import DEADLINE
+from tests.support.programs import find_program
+
+BASH = 'BASH_ENV=$HOME/.bashrc exec bash -c "$SSH_ORIGINAL_COMMAND"'  # as bash reads it under sshd
+FISH, TCSH = (f'exec {shell} -c "$SSH_ORIGINAL_COMMAND"' for shell in ("fish", "tcsh"))  # as sshd calls a login shell
+SHELLS = {
+    "fish": (FISH, ".config/fish/config.fish", "echo 'dreamfleet-host, but not ours: welcome to $fish'"),
+    "tcsh": (TCSH, ".cshrc", "echo 'Welcome!'"),
+    "banner": (BASH, ".bashrc", "echo Welcome; echo 'Do not disturb' >&2; printf 'no line end'"),
+    "hanging": (BASH, ".bashrc", "sleep 1000"),
+    "endless": (BASH, ".bashrc", "while :; do echo Welcome; done"),
+    "waiting": (BASH, ".bashrc", "read -r answer; exit 0"),
+}
+GOOD = ("fish", "tcsh")
+
+
+@pytest.mark.slow
+@pytest.mark.needs_programs("sshd", "ssh", "fish", "tcsh")
+def test_any_login_shell_serves_and_a_broken_one_is_one_row(processes, hosts):
+    for name, (command, file, text) in SHELLS.items():
+        path = (
+            hosts.add(name, ForceCommand=command, path=f"{find_program('fish').rpartition('/')[0]}:/usr/bin:/bin").home
+            / file
+        )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"{text}\n")
+    spawn = ("spawn", *SHELLS, "--connect", processes.endpoint, "--no-tunnel", "--slots", 1, *words(hosts))
+    rows = rows_of(processes, *spawn, code=1, patience=3 * DEADLINE)
+    assert {name: rows[name]["state"] for name in ("fish", "tcsh", "banner")} == dict.fromkeys(
+        ("fish", "tcsh", "banner"), "started"
+    )
+    assert "does not answer within 60 s" in rows["hanging"]["what"]
+    assert "prints more than 1 MiB that is no answer" in rows["endless"]["what"]
+    assert "the ssh connection ended" in rows["waiting"]["what"]
+    down = rows_of(processes, "down", "fish", "tcsh", "banner", "--now", "--ssh", hosts.ssh)
+    assert {row["state"] for row in down.values()} == {"left"}
