@@ -167,7 +167,7 @@ def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
     resent = f", {plural(waste.resent_batches, 'batch', 'batches')} sent again" if waste.resent_batches else ""
     yield 4, "waste", f"{waste.share:.1%}, {plural(waste.reissued, 'job')} issued again{resent}"
     if status.classes.total:
-        yield 4 if status.classes.mixed else 7, "hosts", status.classes.description
+        yield 4 if status.classes.mixed or status.classes.varying else 7, "hosts", status.classes.description
     if status.expires is not None:
         left = datetime.fromtimestamp(status.expires, UTC) - datetime.now(UTC)
         yield 0 if left < EXPIRY_WARNING else 8, "join file", f"the coordinator's: {describe_time_left(left)}"

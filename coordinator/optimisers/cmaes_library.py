@@ -23,6 +23,11 @@ from dreamfleet.coordinator.optimisers.api import Search, State
 from dreamfleet.coordinator.optimisers.checkpoint import tag, untag
 
 
+def _seed_of(search: Search) -> int:
+    """The library takes 32 bits: a larger seed is folded."""
+    return search.seed % 2**32
+
+
 class CmaesOptimiser(ABC):
     """A strategy of the library as an `Optimiser`."""
 
@@ -116,7 +121,7 @@ class Separable(CmaesOptimiser):
     def _build(self, search: Search) -> Any:
         if search.dimension < 2:
             raise UsageError("cmaes-sep needs at least 2 parameters: give --optimiser cma")
-        return cmaes.SepCMA(search.mean.copy(), search.sigma0, seed=search.seed, population_size=search.population)
+        return cmaes.SepCMA(search.mean.copy(), search.sigma0, seed=_seed_of(search), population_size=search.population)
 
 
 class RateAdapted(CmaesOptimiser):
@@ -153,5 +158,5 @@ class RateAdapted(CmaesOptimiser):
             # Below 4 a single parent is selected: mu_eff is 1, and so the rate of the rank-mu update 0 (equation 58).
             raise UsageError(f"cmaes-lra needs a population of at least 4, not {search.population}: give --population")
         return cmaes.CMA(
-            search.mean.copy(), search.sigma0, seed=search.seed, population_size=search.population, lr_adapt=True
+            search.mean.copy(), search.sigma0, seed=_seed_of(search), population_size=search.population, lr_adapt=True
         )
