@@ -16,13 +16,16 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points, version
+from itertools import takewhile
 from typing import NoReturn, Protocol
 
 from dreamfleet.common.errors import DreamfleetError, MissingExtraError, UsageError
 from dreamfleet.common.host.logs import configure_logging, report_failure
+from dreamfleet.common.printable import one_line
 
 GROUP = "dreamfleet.verbs"
 EXIT_INTERRUPTED = 130
+MIN_LIKENESS = 0.65  # of an unknown flag and the one that is suggested
 LAST_STREAM = 2  # file descriptor of stderr
 DESCRIPTION = "Evolve World-Models controllers on whatever machines you have."
 EXIT_CODES = (
@@ -71,9 +74,20 @@ class Parser(argparse.ArgumentParser):
 
     def _refuse(self, unknown: Sequence[str]) -> NoReturn:
         flags = [word.split("=")[0] for word in unknown if word.startswith("--")]
-        near = [each for flag in flags for each in difflib.get_close_matches(flag, self._option_string_actions, n=1)]
+        near = [each for flag in flags for each in _nearest_flag(flag, self._option_string_actions)]
         hint = f"; did you mean {', '.join(dict.fromkeys(near))}?" if near else ""
         self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
+
+
+def _nearest_flag(flag: str, known: Iterable[str]) -> list[str]:
+    """The known flag that is most like an unknown one, if any is: an equal beginning counts most."""
+
+    def likeness(other: str) -> float:
+        begins = len(list(takewhile(lambda pair: pair[0] == pair[1], zip(flag[2:], other[2:], strict=False))))
+        return difflib.SequenceMatcher(None, flag[2:], other[2:]).ratio() + 0.1 * min(begins, 4)
+
+    best = max((each for each in known if each.startswith("--")), key=likeness, default="")
+    return [best] if best and likeness(best) >= MIN_LIKENESS else []
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -88,6 +102,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except DreamfleetError as error:
         report_failure(str(error))
         return error.exit_code
+    except MemoryError as error:
+        what = f" ({one_line(str(error))})" if str(error) else ""
+        report_failure(f"not enough memory on this host{what}: what was written before is whole; give it less to hold")
+        return 1
     except KeyboardInterrupt:
         report_failure("interrupted")
         return EXIT_INTERRUPTED

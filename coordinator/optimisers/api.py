@@ -50,14 +50,27 @@ class Search:
         return value
 
 
+@dataclass(frozen=True)
+class Footprint:
+    """Bytes that an optimiser needs: at its peak in memory, and of its state in the journal.
+
+    >>> Footprint(memory=8 * 10**9, state=10**9).state
+    1000000000
+    """
+
+    memory: int
+    state: int
+
+
 class Optimiser(Protocol):
     """Maximises fitness. The coordinator calls `ask` and `tell` in turn, and `state` only after `tell`.
 
     `requirement` is what pip installs to get these very bits, such as "cma==4.5.0". A state names it, and is continued
     by the same one alone. `options` says which options there are, and what each takes.
 
-    It may have one thing more, which is shown: `axis_ratio`, a float, how many times longer the longest axis of its
-    distribution is than the shortest.
+    It may have two things more. `axis_ratio`, a float, is shown: how many times longer the longest axis of its
+    distribution is than the shortest. `footprint(dimension, population, options)`, a class method, returns a
+    `Footprint`, so that a search which this host cannot hold is refused before it is built.
 
     >>> from dreamfleet.coordinator.optimisers.cmaes_library import Separable
     >>> optimiser: Optimiser = Separable(Search(mean=np.zeros(3), population=8, sigma0=0.5, seed=1))

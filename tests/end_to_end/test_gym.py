@@ -96,6 +96,7 @@ def test_what_can_be_scored_in_is_listed(processes):
     ("settings", "says"),
     [
         (("--task", "gym:Nothing-v0"), "makes no environment 'Nothing-v0'"),
+        (("--task", "CartPole-v1"), "gymnasium's environments are written gym:CartPole-v1"),
         (("--task", "gym:CartPole-v1", "--environment", "wings"), "write KEY=VALUE"),
         (("--task", "gym:CartPole-v1", "--environment", "wings=2"), "takes no such arguments"),
         (("--task", "gym:CartPole-v1", "--temperature", "1.5"), "only tasks with a world model"),
@@ -152,7 +153,7 @@ def test_a_run_in_an_environment_that_is_not_deterministic_promises_no_bits(proc
     coordinator = processes.coordinator(
         "--task", ODD, "--environment", "fault=noise", "--population", 4, "--generations", 2, "--evaluate-every", 0
     )
-    coordinator.wait_for("is not deterministic, so no fitness can be recomputed to the bit")
+    assert "is not deterministic, so no fitness can be recomputed to the bit" in "".join(coordinator.lines)
     processes.worker("--exit-when-done")
     assert coordinator.finish()[0] == 0
     code, out, err = processes.call("runs", "show", "test", "--runs-dir", processes.runs)

@@ -133,7 +133,8 @@ class Scorer:
     def host_class(self) -> str:
         """The class of this host: hosts of one class compute the same bits in this task.
 
-        `NON_DETERMINISTIC` if a second probe episode computes other bits than the first one. Without a probe episode (`probe_steps` 0), or if it fails, the class comes from the host's fingerprint.
+        `NON_DETERMINISTIC` if a second probe episode computes other bits than the first one. Without a probe episode
+        (`probe_steps` 0), or if it fails, the class comes from the host's fingerprint.
         """
         steps = getattr(self._task, "probe_steps", Task.probe_steps)
         with suppress(Exception):  # the first job will report the same error

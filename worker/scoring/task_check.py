@@ -1,7 +1,7 @@
 """A trial of a task before a run begins in it: its environment is made, reset and stepped. Called as a process.
 
-`common/cli/task_check.py` starts it, because an environment may hang or crash. It reads a request from stdin. It writes
-lines of JSON: a step's name before each step, which may take until the step's limit, and reports, of which the last counts.
+`common/cli/task_check.py` starts it, because an environment may hang or crash. It reads a request from stdin and writes
+lines of JSON: a step's name before each step, to which a limit applies, and reports, of which the last counts.
 """
 
 from __future__ import annotations

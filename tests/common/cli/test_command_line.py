@@ -23,6 +23,7 @@ def points(*more):
     [
         (("coordinator", "--populaton", "8"), "unrecognized arguments: --populaton 8; did you mean --population?"),
         (("coordinator", "--evaluate-evry=3"), "did you mean --evaluate-every?"),
+        (("coordinator", "--popsize", "8"), "unrecognized arguments: --popsize 8; did you mean --population?"),
         (("worker", "--conect", "tcp/a:1"), "did you mean --connect?"),
         (("train", "vae", "--data", "x", "--updats", "3"), "did you mean --updates?"),
         (("status", "--xyzzy"), "unrecognized arguments: --xyzzy\n"),
@@ -112,3 +113,14 @@ def test_closed_streams_are_replaced(tmp_path):
     command = ["bash", "-c", '"$@" <&- >&- 2>&-', "-", sys.executable, "-c", program]
     number = subprocess.run(command, cwd=tmp_path, check=False, timeout=DEADLINE).returncode
     assert number > command_line.LAST_STREAM
+
+
+def test_a_lack_of_memory_is_one_line(monkeypatch, capsys):
+    def fail(*_):
+        raise MemoryError("Unable to allocate 81.7 GiB")
+
+    monkeypatch.setattr("dreamfleet.common.cli.command_line.run_verb", fail)
+    assert command_line.main(["tasks"]) == 1
+    assert capsys.readouterr().err.startswith(
+        "dreamfleet: not enough memory on this host (Unable to allocate 81.7 GiB): "
+    )
