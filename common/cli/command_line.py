@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points, version
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, NoReturn, Protocol
 
@@ -22,9 +23,11 @@ from dreamfleet.common.errors import DreamfleetError, MissingExtraError, UsageEr
 from dreamfleet.common.host.logs import configure_logging, report_failure
 from dreamfleet.common.host.standard_streams import discard_stdout, prepare_streams
 from dreamfleet.common.host.stop_signals import interrupts
+from dreamfleet.common.printable import one_line
 
 GROUP = "dreamfleet.verbs"
 EXIT_INTERRUPTED = 130
+MIN_LIKENESS = 0.65  # of an unknown flag and the one that is suggested
 DESCRIPTION = "Evolve World-Models controllers on whatever machines you have."
 EXIT_CODES = (
     "Exit codes: 0 done; 1 it failed, was refused, or the answer is no; 2 the command or a setting is wrong; 130 it "
@@ -76,7 +79,7 @@ class Parser(argparse.ArgumentParser):
 
     def _refuse(self, unknown: Sequence[str]) -> NoReturn:
         flags = [word.split("=")[0] for word in unknown if word.startswith("--")]
-        near = [each for flag in flags for each in difflib.get_close_matches(flag, self._option_string_actions, n=1)]
+        near = [each for flag in flags for each in _nearest_flag(flag, self._option_string_actions)]
         if near:
             raise UsageError(
                 f"unrecognized arguments: {' '.join(unknown)}; did you mean {', '.join(dict.fromkeys(near))}?"
@@ -89,6 +92,17 @@ class Parser(argparse.ArgumentParser):
         if action.type is Path and "" in arg_strings:  # would be the current folder
             raise argparse.ArgumentError(action, "expected a path, not an empty text")
         return super()._get_values(action, arg_strings)
+
+
+def _nearest_flag(flag: str, known: Iterable[str]) -> list[str]:
+    """The known flag that is most like an unknown one, if any is: an equal beginning counts most."""
+
+    def likeness(other: str) -> float:
+        begins = len(list(takewhile(lambda pair: pair[0] == pair[1], zip(flag[2:], other[2:], strict=False))))
+        return difflib.SequenceMatcher(None, flag[2:], other[2:]).ratio() + 0.1 * min(begins, 4)
+
+    best = max((each for each in known if each.startswith("--")), key=likeness, default="")
+    return [best] if best and likeness(best) >= MIN_LIKENESS else []
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -109,6 +123,10 @@ def _report(error: BaseException) -> int:
     if isinstance(error, DreamfleetError):
         report_failure(str(error))
         return error.exit_code
+    if isinstance(error, MemoryError):
+        what = f" ({one_line(str(error))})" if str(error) else ""
+        report_failure(f"not enough memory on this host{what}: what was written before is whole; give it less to hold")
+        return 1
     if isinstance(error, KeyboardInterrupt) or interrupts.seen:
         report_failure("interrupted")
         return EXIT_INTERRUPTED

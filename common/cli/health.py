@@ -13,6 +13,7 @@ from pathlib import Path
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.bundle_store import default_cache, shipped_bundles
+from dreamfleet.common.cli.task_check import try_task
 from dreamfleet.common.errors import AccessError, DreamfleetError
 from dreamfleet.common.host.packages import PACKAGES, install_command, package_version
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, describe_time_left, read_join_file
@@ -42,15 +43,26 @@ class Finding:
     remedy: str
 
 
-def run_checks(runs_dir: Path, join: Path | None = None) -> list[Finding]:
-    """Run all checks: those of this module, of the join file if any, and those in the entry points `GROUP`."""
+def run_checks(runs_dir: Path, join: Path | None = None, task: str | None = None) -> list[Finding]:
+    """Run all checks: of this module, of the join file and the task if any, and those in the entry points `GROUP`."""
     registered = [finding for point in entry_points(group=GROUP) for finding in point.load()()]
     folders = [
         _check_writable("cache", default_cache(), "everything"),
         _check_writable("runs", runs_dir, "coordinator"),
     ]
     joined = [] if join is None else [_check_join_file(join)]
-    return [*_check_packages(), _check_box2d(), *_check_bundles(), *registered, *folders, *joined]
+    tried = [] if task is None else _check_task(task)
+    return [*_check_packages(), _check_box2d(), *_check_bundles(), *registered, *folders, *joined, *tried]
+
+
+def _check_task(task: str) -> Iterator[Finding]:
+    found, name = try_task(task, {}), f"task {task}"
+    if found.fault:
+        yield Finding(name, False, True, found.fault, "worker", f"dreamfleet tasks {task}")
+        return
+    remedy = "results cannot be recomputed to the bit until that is mended"
+    text = "; ".join([found.varies or "can be scored", *found.warnings])
+    yield Finding(name, not found.varies, False, text, "worker", remedy)
 
 
 def _check_join_file(path: Path) -> Finding:

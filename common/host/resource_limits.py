@@ -1,4 +1,4 @@
-"""Resource limits of this process: cores, open files, and the threads of numeric libraries."""
+"""Resource limits of this process: cores, memory, open files, and the threads of numeric libraries."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import errno
 import math
 import os
 import resource
+import sys
 import threading
 from contextlib import suppress
 from pathlib import Path
 
 from dreamfleet.common.errors import DreamfleetError
 
-_CGROUPS, _OWN_CGROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+_CGROUPS, _OWN_CGROUP, _MEMINFO = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup"), Path("/proc/meminfo")
 
 
 def usable_cores(groups: Path = _CGROUPS, own: Path = _OWN_CGROUP) -> int:
@@ -21,18 +22,43 @@ def usable_cores(groups: Path = _CGROUPS, own: Path = _OWN_CGROUP) -> int:
     `groups` is the cgroup file system, `own` the file that lists this process's cgroups.
     """
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    quotas = [quota for folder in _cgroup_folders(groups, own) if (quota := _cpu_quota(folder)) is not None]
+    quotas = [quota for folder in _cgroup_folders(groups, own, "cpu") if (quota := _cpu_quota(folder)) is not None]
     return max(1, min([allowed, *(math.ceil(quota) for quota in quotas)]))
 
 
-def _cgroup_folders(groups: Path, own: Path) -> list[Path]:
-    """The folders of this process's cgroup and its parents: all their quotas apply."""
-    found = [groups, groups / "cpu"]
+def usable_memory(groups: Path = _CGROUPS, own: Path = _OWN_CGROUP, host: Path = _MEMINFO) -> int:
+    """The bytes that this process can have at most: memory and swap of the host, cgroup limits, `ulimit -v`.
+
+    Other processes may hold some of them. `host` is the file that lists the host's memory.
+    """
+    limits = [
+        limit for folder in _cgroup_folders(groups, own, "memory") if (limit := _memory_limit(folder)) is not None
+    ]
+    address_space, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if address_space != resource.RLIM_INFINITY:
+        limits.append(address_space)
+    with suppress(OSError, ValueError, KeyError):
+        sizes = dict(line.split(":") for line in host.read_text().splitlines())
+        limits.append(sum(int(sizes[name].split()[0]) * 1024 for name in ("MemTotal", "SwapTotal")))
+    return min(limits, default=sys.maxsize)
+
+
+def _memory_limit(folder: Path) -> int | None:
+    """A cgroup's memory limit in bytes; `None` if unlimited."""
+    for name in ("memory.max", "memory.limit_in_bytes"):  # versions 2 and 1
+        with suppress(OSError, ValueError):  # "max", or bytes
+            return int((folder / name).read_text())
+    return None
+
+
+def _cgroup_folders(groups: Path, own: Path, controller: str) -> list[Path]:
+    """The folders of this process's cgroup and its parents: all their limits apply."""
+    found = [groups, groups / controller]
     with suppress(OSError):
         for line in own.read_text().splitlines():
             _, controllers, path = line.split(":", 2)
-            root = groups / "cpu" if "cpu" in controllers.split(",") else groups
-            if controllers in ("", "cpu", "cpu,cpuacct", "cpuacct,cpu"):
+            root = groups / controller if controller in controllers.split(",") else groups
+            if not controllers or controller in controllers.split(","):
                 below = Path(path.lstrip("/"))
                 found += [root / each for each in (below, *below.parents)]
     return found

@@ -172,7 +172,7 @@ def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
         worked = status.throughput.seconds + status.generation.seconds
         yield 6, "time", f"{format_duration(worked)} of work in {format_duration(status.elapsed)}"
     if status.classes.total:
-        yield 4 if status.classes.mixed else 7, "hosts", status.classes.description
+        yield 4 if status.classes.mixed or status.classes.varying else 7, "hosts", status.classes.description
     if status.expires is not None:
         left = datetime.fromtimestamp(status.expires, UTC) - datetime.now(UTC)
         yield 0 if left < EXPIRY_WARNING else 8, "join file", f"the coordinator's: {describe_time_left(left)}"

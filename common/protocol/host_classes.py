@@ -17,6 +17,7 @@ from dreamfleet.common.protocol.messages import HostClass
 from dreamfleet.common.serialization.validation import Count, Length, Text
 
 BY_FINGERPRINT = "fingerprint-"  # prefix of classes that are derived from a fingerprint
+NON_DETERMINISTIC = "non-deterministic"  # the class of a host where equal episodes gave other bits
 MAX_LISTED = 4  # classes in a status, and fingerprints of each class
 MAX_FINGERPRINT_CHARS = 200  # of a fingerprint in a status
 
@@ -59,10 +60,18 @@ class HostClasses:
         return self.total > 1
 
     @property
+    def varying(self) -> int:
+        """The number of results that no host can recompute to the bit, as far as they are listed."""
+        return sum(each.results for each in self.largest if each.host_class == NON_DETERMINISTIC)
+
+    @property
     def description(self) -> str:
         """A text for display."""
         if not self.largest:
             return "no result yet"
+        if self.varying:
+            share = self.varying / max(self.results, 1)
+            return f"not deterministic: {share:.1%} of results cannot be recomputed to the bit"
         if not self.mixed:
             by = ", by its fingerprint" if self.largest[0].host_class.startswith(BY_FINGERPRINT) else ""
             return f"one class{by}: to the bit"

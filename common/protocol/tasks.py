@@ -21,6 +21,7 @@ from dreamfleet.common.host.trusted_modules import check_trusted, import_trusted
 
 GROUP = "dreamfleet.tasks"
 _NAME = re.compile(r"[\w-][\w.-]*(:\S+)?", re.ASCII)
+_ENVIRONMENT = re.compile(r"-v\d+$", re.ASCII)  # as the names of gymnasium's environments end
 GYM = "gym"  # the family of gymnasium's environments; they need no bundle
 DREAM = "dream"  # the task whose candidates are scored in the world model
 
@@ -83,6 +84,8 @@ def load_task(name: str) -> Any:
         raise UsageError(f"task {name!r} cannot be loaded: no module {error.name!r} here; {remedy}") from error
     except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise UsageError(f"task {name!r} cannot be loaded: {error}") from error
+    if not colon and _ENVIRONMENT.search(name):
+        raise UsageError(f"unknown task {name!r}: gymnasium's environments are written {GYM}:{name}")
     known = ", ".join(f"{each}:ENVIRONMENT" if each == GYM else each for each in points) or "none"
     raise UsageError(f"unknown task {name!r}: known are {known}")
 

@@ -12,6 +12,7 @@ VALIDATION = range(20_000, 1_000_000)
 # Offsets of the first validation seeds for choosing and for confirming the report; evaluations use those before.
 CHOOSING_OFFSET, CONFIRMING_OFFSET = 10_000, 20_000
 TRAINING_FIRST = 2**20
+FOLDED_END = 2**31  # seeds below it fit into a signed number of 32 bits
 TRAINING_LAST = 2**53 - 1  # the largest integer that JSON represents exactly
 
 
@@ -34,6 +35,14 @@ def search_seed(run_seed: int, stage: int) -> int:
     In the first stage it is the run's seed; in others it has 32 bits, as some libraries require.
     """
     return run_seed if stage == 1 else _derive_seed(f"dreamfleet search {run_seed} {stage}") % 2**32
+
+
+def fold_seed(seed: int) -> int:
+    """The seed in 31 bits, for environments that take no more: a smaller one is itself, the others become its rest.
+
+    The result is a training seed too: at least `TRAINING_FIRST`.
+    """
+    return seed if seed < FOLDED_END else TRAINING_FIRST + seed % (FOLDED_END - TRAINING_FIRST)
 
 
 def validation_seeds(episodes: int, first: int = 0) -> tuple[int, ...]:

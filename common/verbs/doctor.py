@@ -26,6 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--role", choices=ALL_ROLES, default="coordinator",
         help="exit 1 if this installation cannot play this role (default coordinator, which the others build on)",
     )  # fmt: skip
+    parser.add_argument("--task", metavar="TASK", help="also check this task's environment, such as gym:LunarLander-v3")
     add_global_flags(parser, "runs_dir", "join")
     add_json_flag(parser)
 
@@ -35,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.common.cli.health import missing_for_role, run_checks
     from dreamfleet.common.host.fingerprint import fingerprint
 
-    findings = run_checks(args.runs_dir, args.global_config.join)
+    findings = run_checks(args.runs_dir, args.global_config.join, args.task)
     roles = {role: missing_for_role(role, findings) for role in ALL_ROLES}
     host = {"python": platform.python_version(), "platform": platform.platform(), "cores": usable_cores(),
             "fingerprint": fingerprint()}  # fmt: skip

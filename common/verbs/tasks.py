@@ -1,32 +1,78 @@
-"""`dreamfleet tasks`: the tasks that this installation can score."""
+"""`dreamfleet tasks`: the tasks that this installation can score, or the check of one of them."""
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterator
+from dataclasses import asdict
 from importlib.metadata import EntryPoint
+from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.output import print_rows
+from dreamfleet.common.errors import UsageError
 
-SUMMARY = "list the tasks that installed packages register, and what keeps one from running here"
+if TYPE_CHECKING:
+    from dreamfleet.common.cli.task_check import TaskReport
+
+SUMMARY = "list the tasks that installed packages register, or check one as a run does before it begins"
 EXTRAS = ()
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
+    parser.add_argument(
+        "task", nargs="?", metavar="TASK", help="check this one, such as gym:LunarLander-v3: make, reset and step it"
+    )
+    parser.add_argument(
+        "--environment", nargs="+", default=(), metavar="KEY=VALUE", help="arguments of gym:ENVIRONMENT, as in JSON"
+    )
     parser.add_argument("--json", action="store_true", help="print them as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print one line per task; exit 0 even if one cannot run."""
-    from dreamfleet.common.protocol.tasks import registered_tasks
+    """Print one line per task, and exit 0 even if one cannot run; or check one, and exit 1 if it cannot be scored."""
+    from dreamfleet.common.protocol.tasks import is_self_describing, registered_tasks
 
-    rows = [_row(name, point) for name, point in registered_tasks().items()]
+    points = registered_tasks()
+    if args.task in points and not is_self_describing(args.task):  # its runs need a world model, which tells its sizes
+        points = {args.task: points[args.task]}
+    elif args.task is not None:
+        return _check(args)
+    if args.environment:
+        raise UsageError("--environment is of one gym:ENVIRONMENT: name it, such as gym:LunarLander-v3")
+    rows = [_row(name, point) for name, point in points.items()]
     if args.json:
         print(json.dumps(rows, indent=2))
         return 0
     print_rows([{name: row[name] for name in ("task", "package", "here")} for row in rows])
     return 0
+
+
+def _check(args: argparse.Namespace) -> int:
+    from dreamfleet.common.cli.key_values import ENVIRONMENT_EXAMPLE, parse_arguments
+    from dreamfleet.common.cli.task_check import try_task
+    from dreamfleet.common.protocol.tasks import check_task
+
+    check_task(args.task)
+    arguments = parse_arguments("--environment", args.environment, ENVIRONMENT_EXAMPLE)
+    found = try_task(args.task, {"environment": arguments} if arguments else {})
+    if args.json:
+        print(json.dumps({"task": args.task, **asdict(found)}, indent=2))
+    else:
+        print_rows([{"check": name, "found": text} for name, text in _findings(found)])
+    return 1 if found.fault else 0
+
+
+def _findings(found: TaskReport) -> Iterator[tuple[str, str]]:
+    if found.fault or found.description is None:
+        yield "cannot be scored", found.fault
+        return
+    about = found.description
+    yield "can be scored", f"{about.observations} observations, {about.outputs} outputs, {', '.join(about.packages)}"
+    if found.compared:
+        yield ("not deterministic", found.varies) if found.varies else ("equal seeds", "give equal episodes")
+    yield from (("warning", text) for text in found.warnings)
 
 
 def _row(name: str, point: EntryPoint) -> dict[str, object]:

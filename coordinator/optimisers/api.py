@@ -50,16 +50,30 @@ class Search:
         return value
 
 
+@dataclass(frozen=True)
+class Footprint:
+    """Bytes that an optimiser needs: at its peak in memory, and of its state in the journal.
+
+    >>> Footprint(memory=8 * 10**9, state=10**9).state
+    1000000000
+    """
+
+    memory: int
+    state: int
+
+
 class Optimiser(Protocol):
     """Maximises fitness. The coordinator calls `ask` and `tell` in turn, and `state` only after `tell`.
 
     `requirement` is what pip installs to get these very bits, such as "cma==4.5.0". A state names it, and is continued
     by the same one alone. `options` says which options there are, and what each takes.
 
-    Two more attributes are optional. `axis_ratio`, a float, is shown: how many times longer the longest axis of the
+    Three more attributes are optional. `axis_ratio`, a float, is shown: how many times longer the longest axis of the
     distribution is than the shortest. `redraw(indices)` is needed by `--on-failure redraw`: it replaces candidates of
     the last `ask`, which failed, and returns the new ones `(len(indices), dimension)`. `tell` then refers to these. A
     candidate that was not drawn at random may stay as it is. The result must not depend on `prepare`.
+    `footprint(dimension, population, options)`, a class method, returns a `Footprint`, so that a search which this
+    host cannot hold is refused before it is built.
 
     >>> from dreamfleet.coordinator.optimisers.cmaes_library import Separable
     >>> optimiser: Optimiser = Separable(Search(mean=np.zeros(3), population=8, sigma0=0.5, seed=1))

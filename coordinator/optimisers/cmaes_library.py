@@ -19,8 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.coordinator.optimisers.api import Search, State
+from dreamfleet.coordinator.optimisers.api import Footprint, Search, State
 from dreamfleet.coordinator.optimisers.checkpoint import tag, untag
+
+
+def _seed_of(search: Search) -> int:
+    """The library takes 32 bits: a larger seed is folded."""
+    return search.seed % 2**32
 
 
 class CmaesOptimiser(ABC):
@@ -29,11 +34,18 @@ class CmaesOptimiser(ABC):
     requirement: ClassVar[str] = f"cmaes=={version('cmaes')}"
     options: ClassVar[Mapping[str, str]] = {}
     state_names: ClassVar[tuple[str, ...]]  # of the attributes, without their underscore
+    matrices: ClassVar[tuple[int, int]] = (0, 0)  # square ones in memory at the peak, as measured, and in the state
 
     def __init__(self, search: Search) -> None:
         self._search = search
         self._strategy = self._build(search)
         self._asked: list[NDArray[np.float64]] = []
+
+    @classmethod
+    def footprint(cls, dimension: int, population: int, options: Mapping[str, str]) -> Footprint:  # noqa: ARG003
+        """As measured: so many populations, and the class's `matrices`."""
+        peak, kept = cls.matrices
+        return Footprint(8 * (5 * population * dimension + peak * dimension**2), 8 * kept * dimension**2)
 
     @abstractmethod
     def _build(self, search: Search) -> Any:
@@ -126,7 +138,7 @@ class Separable(CmaesOptimiser):
     def _build(self, search: Search) -> Any:
         if search.dimension < 2:
             raise UsageError("cmaes-sep needs at least 2 parameters: give --optimiser cma")
-        return cmaes.SepCMA(search.mean.copy(), search.sigma0, seed=search.seed, population_size=search.population)
+        return cmaes.SepCMA(search.mean.copy(), search.sigma0, seed=_seed_of(search), population_size=search.population)
 
 
 class RateAdapted(CmaesOptimiser):
@@ -146,6 +158,8 @@ class RateAdapted(CmaesOptimiser):
         "mean", "sigma", "C", "p_sigma", "pc", "g", "Emean", "ESigma", "Vmean", "VSigma", "eta_mean", "eta_Sigma",
     )  # fmt: skip
 
+    matrices: ClassVar[tuple[int, int]] = (34, 2)
+
     def _draw(self, count: int) -> list[NDArray[np.float64]]:
         """Sample candidates (equations 38 to 40 of Hansen 2016).
 
@@ -162,5 +176,5 @@ class RateAdapted(CmaesOptimiser):
             # Below 4 a single parent is selected: mu_eff is 1, and so the rate of the rank-mu update 0 (equation 58).
             raise UsageError(f"cmaes-lra needs a population of at least 4, not {search.population}: give --population")
         return cmaes.CMA(
-            search.mean.copy(), search.sigma0, seed=search.seed, population_size=search.population, lr_adapt=True
+            search.mean.copy(), search.sigma0, seed=_seed_of(search), population_size=search.population, lr_adapt=True
         )

@@ -18,7 +18,7 @@ from dreamfleet.common.runs.seeds import search_seed
 from dreamfleet.common.runs.stages import Stage
 from dreamfleet.coordinator.optimisers.api import Search
 from dreamfleet.coordinator.optimisers.checkpoint import PREFIX, Checkpoint, Head
-from dreamfleet.coordinator.optimisers.registry import build_optimiser
+from dreamfleet.coordinator.optimisers.registry import build_optimiser, check_memory
 
 Covariance = Literal["diagonal", "full"]
 
@@ -59,10 +59,19 @@ class EvolutionConfig:
     def search(self, start: NDArray[np.float64]) -> Search:
         """What the optimiser is built from, to begin at `start` `(dimension,)`: of a subspace at its origin."""
         mean = start if self.space is None else np.zeros(self.space.dimension)
+        return Search(mean, self.population, self.sigma0, self.seed, self.options)
+
+    @property
+    def options(self) -> dict[str, str]:
+        """The optimiser's options."""
         # It is a setting of its own, older than options; its default is none, so that every optimiser takes it.
         covariance = () if self.covariance == "diagonal" else (f"covariance={self.covariance}",)
-        options = _options([*self.optimiser_options, *covariance])
-        return Search(mean, self.population, self.sigma0, self.seed, options)
+        return _options([*self.optimiser_options, *covariance])
+
+    @property
+    def searched_dimension(self) -> int:
+        """The number of parameters, or of a subspace's coordinates."""
+        return self.dimension if self.space is None else self.space.dimension
 
 
 class Evolution:
@@ -75,6 +84,7 @@ class Evolution:
 
     def __init__(self, config: EvolutionConfig, start: NDArray[np.float64] | None = None) -> None:
         self._config = config
+        check_memory(config.optimiser, config.searched_dimension, config.population, config.options)
         self._origin = np.zeros(config.dimension) if start is None else np.asarray(start, dtype=np.float64)
         self._optimiser = build_optimiser(config.optimiser, config.search(self._origin))
         self._is_open = False  # after `ask`, before `tell`
@@ -118,8 +128,7 @@ class Evolution:
     def _check(self, drawn: object, count: int) -> NDArray[np.float64]:
         """The parameters `(count, dimension)` of what the optimiser drew."""
         asked = np.asarray(drawn, dtype=np.float64)
-        space = self._config.space
-        wanted = count, self._config.dimension if space is None else space.dimension
+        wanted = count, self._config.searched_dimension
         if asked.shape != wanted:
             raise DreamfleetError(f"optimiser {self._config.optimiser!r} asked for {asked.shape} numbers, not {wanted}")
         asked = self._to_parameters(asked)

@@ -17,7 +17,7 @@ with catch_warnings():
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.coordinator.optimisers import pycma_state
-from dreamfleet.coordinator.optimisers.api import Search, State
+from dreamfleet.coordinator.optimisers.api import Footprint, Search, State
 
 HISTORY = 100  # entries that stay of each of pycma's histories
 FURTHEST_FACTOR = 1e60  # from one: a factor that is further away is brought back
@@ -46,6 +46,12 @@ class Pycma:
         self._normals = Normals(search.seed)
         self._asked: list[NDArray[np.float64]] = []
         self._begin(search.mean)
+
+    @classmethod
+    def footprint(cls, dimension: int, population: int, options: Mapping[str, str]) -> Footprint:
+        """As measured: so many populations and, with `full`, so many square matrices, of which four are state."""
+        square = dimension**2 if options.get("covariance") == "full" else 0
+        return Footprint(8 * (9 * population * dimension + 14 * square), 8 * 4 * square)
 
     @property
     def mean(self) -> NDArray[np.float64]:

@@ -8,10 +8,12 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.resource_limits import usable_memory
 from dreamfleet.common.host.trusted_modules import import_trusted
-from dreamfleet.coordinator.optimisers.api import Optimiser, Search
+from dreamfleet.coordinator.optimisers.api import Footprint, Optimiser, Search
 
 GROUP = "dreamfleet.optimisers"
+LARGEST_STATE = 10**9  # bytes that SQLite keeps in one value
 _OF_CLASS = tuple(Optimiser.__annotations__)
 _OF_INSTANCE = tuple(name for name in vars(Optimiser) if not name.startswith("_"))
 
@@ -33,6 +35,24 @@ def build_optimiser(name: str, search: Search) -> Optimiser:
     optimiser: Optimiser = kind(search)
     _refuse_incomplete(name, optimiser, _OF_INSTANCE)
     return optimiser
+
+
+def check_memory(name: str, dimension: int, population: int, options: Mapping[str, str]) -> None:
+    """`UsageError` if this host cannot hold such a search of the optimiser, or the journal its state."""
+    count = getattr(_find(name), "footprint", None)
+    if count is None:
+        return
+    needed: Footprint = count(dimension, population, options)
+    own = f"optimiser {name} with {dimension:,} parameters and a population of {population:,}"
+    remedy = "give --covariance diagonal" if options.get("covariance") == "full" else (
+        "give fewer --hidden-units, a smaller --population, or an optimiser of the diagonal alone (cma, cmaes-sep)"
+    )  # fmt: skip
+    if needed.memory > (here := usable_memory()):
+        raise UsageError(
+            f"{own} needs {needed.memory / 1e9:,.1f} GB of memory, this host has {here / 1e9:,.1f}: {remedy}"
+        )
+    if needed.state > LARGEST_STATE:
+        raise UsageError(f"{own} has a state of {needed.state / 1e9:,.1f} GB, a journal keeps 1 GB at most: {remedy}")
 
 
 def _find(name: str) -> Any:

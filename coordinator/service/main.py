@@ -26,6 +26,7 @@ from dreamfleet.common.transport.session import Network
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.service.service import Service
 from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, LimitsConfig, NetworkConfig, RunConfig
+from dreamfleet.coordinator.settings.environment_check import check_environment
 from dreamfleet.coordinator.settings.resume_settings import serving_facts
 from dreamfleet.coordinator.settings.start import SUBSPACE_FACT, StartPoint
 from dreamfleet.coordinator.storage.file_watch import FileWatch
@@ -125,7 +126,7 @@ def _open_journal(request: RunRequest, folder: Path, settings: RunSettings, bund
 def _resolve_settings(request: RunRequest, folder: Path) -> tuple[RunSettings, Bundle | None]:
     """The run's settings, and its verified bundle if its task needs one."""
     if request.config is not None:
-        return _resolve_new_settings(request.config, request.start)
+        return _resolve_new_settings(request.config, request.start, strict=request.network.strict)
     with open_run(request.runs_dir, request.name) as stored:
         settings = stored.settings
     if not settings.task.bundle:
@@ -133,9 +134,12 @@ def _resolve_settings(request: RunRequest, folder: Path) -> tuple[RunSettings, B
     return settings, Bundle.open(folder / BUNDLE, settings.task.bundle)
 
 
-def _resolve_new_settings(config: RunConfig, start: StartPoint | None) -> tuple[RunSettings, Bundle | None]:
+def _resolve_new_settings(
+    config: RunConfig, start: StartPoint | None, *, strict: bool
+) -> tuple[RunSettings, Bundle | None]:
     if start is not None and config.needs_no_bundle == (not start.bundle):
         config = start.apply_to(config)
+    config = check_environment(config, strict=strict)
     bundle = None if config.needs_no_bundle else find_bundle(config.bundle or DEFAULT_BUNDLE)
     settings = config.settings(bundle)
     if start is not None:

@@ -17,11 +17,12 @@ from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, Variant
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.cli.config import option
+from dreamfleet.common.cli.key_values import parse_arguments
 from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.protocol.messages import MAX_OPTIONS, Horizon, Patience, Share, TaskSpec, Temperature
-from dreamfleet.common.protocol.tasks import GYM, check_task, describe_task, is_self_describing
+from dreamfleet.common.protocol.tasks import GYM, Description, check_task, describe_task, is_self_describing
 from dreamfleet.common.runs.records import (
     STAGE_FIELDS,
     ConfirmationEpisodes,
@@ -37,7 +38,6 @@ from dreamfleet.common.transport.network import parse_metrics_address
 from dreamfleet.coordinator.settings.schedule import check_schedule, split_first_stage
 from dreamfleet.coordinator.settings.task_options import (
     check_normalisation,
-    parse_arguments,
     parse_environment,
 )
 
@@ -149,6 +149,7 @@ class RunConfig:
     preset_variant: tuple[str, ...] = ()  # the preset's variant, which `variant` overrides name by name
     stages: tuple[StageSettings, ...] = field(default=(), metadata={"record": RunSettings})  # read from the schedule
     loaded_subspace: Subspace | None = None  # read from the file that `subspace` names
+    description: Description | None = None  # of a task without bundle, where the check of the task gave it
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -264,7 +265,7 @@ class RunConfig:
             }
             named = " and ".join(flag for flag, is_given in given.items() if is_given)
             raise UsageError(f"{named}: only tasks with a world model take this; leave it out for {self.task}")
-        description = describe_task(self.task, self._description_options())
+        description = self.description or describe_task(self.task, self.description_options())
         options = description.options if self.task_options is None else self.task_options
         shape = ControllerShape(description.observations, description.outputs, self._hidden)
         if len(options) > MAX_OPTIONS:
@@ -275,7 +276,7 @@ class RunConfig:
         check_normalisation(options, description.observations)
         return self._spec("", shape, options, description.version), shape, description.packages
 
-    def _description_options(self) -> dict[str, Any]:
+    def description_options(self) -> dict[str, Any]:
         """The options under which the task describes itself."""
         if self.task_options is not None:
             return {"environment": parse_environment(self.task_options)}

@@ -58,6 +58,8 @@ class Rerun:
         """Why it is known beforehand that the bits may be others; empty: nothing speaks against equal ones."""
         if self.receipt.mixed or (self.receipt.classes is not None and self.receipt.classes.mixed):
             return "the first run took hosts of several classes: expect another controller"
+        if self.receipt.classes is not None and self.receipt.classes.varying:
+            return "the first run's environment is not deterministic: expect another controller"
         if self.receipt.fingerprint is None:
             return "the receipt names no hosts of the first run: whether the bits will be equal is not known"
         return ""
@@ -141,6 +143,8 @@ class Rerun:
         first, here = self.receipt, versions()
         if first.mixed:
             return "the first run took hosts of several classes, so that its last bits are its own"
+        if stored.classes.varying:
+            return "the environment is not deterministic, so that no run of it has the same bits again"
         if stored.classes.mixed:
             return f"this time hosts of several classes scored ({stored.classes.description}): --strict keeps to one"
         if (classes := self._both_classes(stored)) and classes[0] != classes[1]:

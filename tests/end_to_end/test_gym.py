@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
+from tests.support.environments import ODD
 from tests.support.processes import DEADLINE
 
 NORMAL = ("--normalise", "--population", 32, "--episodes", 4, "--evaluation-episodes", 16)
@@ -95,6 +96,7 @@ def test_what_can_be_scored_in_is_listed(processes):
     ("settings", "says"),
     [
         (("--task", "gym:Nothing-v0"), "makes no environment 'Nothing-v0'"),
+        (("--task", "CartPole-v1"), "gymnasium's environments are written gym:CartPole-v1"),
         (("--task", "gym:CartPole-v1", "--environment", "wings"), "write KEY=VALUE"),
         (("--task", "gym:CartPole-v1", "--environment", "wings=2"), "takes no such arguments"),
         (("--task", "gym:CartPole-v1", "--temperature", "1.5"), "only tasks with a world model"),
@@ -126,3 +128,47 @@ def test_it_is_learnt_from_zero_on_two_workers_and_one_gives_the_same_bits(proce
     print(f"{name}: {answer['mean']:.1f}, standard error {answer['std'] / 50**0.5:.1f}, 50 unseen seeds")  # noqa: T201
     assert answer["mean"] > wanted
     assert evolve(processes, "alone", 1, *settings) == two
+
+
+def test_what_a_run_is_begun_in_is_tried_first(processes):
+    odd = ("--run", "odd", "--runs-dir", processes.runs, "--task", ODD, "--environment")
+    code, _, err = processes.call("coordinator", *odd, "fault=old step")
+    assert code == 2
+    assert err.splitlines()[-1].startswith(f"dreamfleet: {ODD} cannot be scored: its step returns 4 values")
+    code, _, err = processes.call("coordinator", *odd, "fault=noise", "--strict")
+    assert code == 2
+    assert "is not deterministic, so --strict cannot hold" in err
+    assert not (processes.runs / "odd").exists()
+    code, out, _ = processes.call("tasks", ODD, "--environment", "fault=noise", "--json")
+    assert (code, json.loads(out)["varies"][:13]) == (0, "equal actions")
+    code, out, _ = processes.call("tasks", ODD, "--environment", "fault=crash")
+    assert (code, "crashed (SIGSEGV)" in out) == (1, True)
+    assert processes.call("tasks", "car-racing")[0] == 0
+    code, out, _ = processes.call("doctor", "--task", ODD)
+    assert (code, f"task {ODD}\tcan be scored" in out) == (0, True)
+
+
+@pytest.mark.slow
+def test_a_run_in_an_environment_that_is_not_deterministic_promises_no_bits(processes):
+    coordinator = processes.coordinator(
+        "--task", ODD, "--environment", "fault=noise", "--population", 4, "--generations", 2, "--evaluate-every", 0
+    )
+    assert "is not deterministic, so no fitness can be recomputed to the bit" in "".join(coordinator.lines)
+    processes.worker("--exit-when-done")
+    assert coordinator.finish()[0] == 0
+    code, out, err = processes.call("runs", "show", "test", "--runs-dir", processes.runs)
+    assert (code, "not deterministic: 100.0% of results cannot be recomputed to the bit" in out) == (0, True), err
+    replay = ("replay", "test", "--runs-dir", processes.runs, "--candidate", "1/0")
+    code, out, err = processes.call(*replay)
+    assert (code, "another fitness: the environment is not deterministic" in out, "DIFFERS" in out) == (1, True, False)
+    assert "not the same again anywhere" in err
+    code, out, err = processes.call(*replay, "--tolerance", 1000)
+    assert (code, "another fitness, within 1000" in out) == (0, True), err
+
+
+@pytest.mark.slow
+def test_seeds_that_an_environment_refuses_are_folded(processes):
+    settings = ("--task", ODD, "--population", 4, "--generations", 1, "--evaluate-every", 0, "--seed", 2**40)
+    folded = evolve(processes, "folded", 1, *settings, "--environment", "fault=bits")
+    assert np.isfinite(folded[0]).all()
+    assert folded != evolve(processes, "whole", 1, *settings)

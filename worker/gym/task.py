@@ -23,6 +23,7 @@ from dreamfleet.common.host.trusted_modules import check_trusted
 from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, Assignment, Description, Policy, Task, World
 from dreamfleet.worker.tasks.policy import FlatPolicy
+from dreamfleet.worker.tasks.reset import reset_folded
 
 RGB = "rgb_array"  # gymnasium's render mode that returns pictures
 _MODULE_PREFIX = re.compile(r"([\w.]+):")  # of an environment's name
@@ -190,7 +191,7 @@ def _measure_normalisation(
     environment.action_space.seed(seed)
     seen = []
     for episode in range(NORMALISING_EPISODES):
-        observation, _ = environment.reset(seed=seed + episode)
+        observation = reset_folded(environment, seed + episode)
         over, steps = False, 0
         while not over and steps < DEFAULT_MAX_STEPS:
             steps += 1

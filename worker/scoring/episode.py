@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.worker.scoring.rollout import Rollout
 from dreamfleet.worker.tasks.api import Policy, Score
+from dreamfleet.worker.tasks.reset import reset_folded
 
 MAX_OFF_COURSE_STEPS = 100  # most steps off the course that are charged: a lost course is one loss, however long
 
@@ -56,7 +57,7 @@ def run_episode(
     The episode ends when the environment ends it, after `horizon` steps, or after `patience` steps without a positive
     reward. `begin` may change the environment right after its reset.
     """
-    observation, _ = environment.reset(seed=episode_config.seed)
+    observation = reset_folded(environment, episode_config.seed)
     if begin is not None:
         observation = begin(environment, observation)
     # Only a `RewardAwarePolicy` has it; `isinstance` with a protocol takes 70 microseconds, as long as some steps.

@@ -3,6 +3,7 @@
 A short episode uses everything that a fitness depends on: the simulator and its picture, the policy with its world
 model, and the batch of tasks such as the dream. All numbers on the way are hashed, not only the scores, because another
 rounding shows in the last bits of nearly any sum of products. It remains a sample: rarer differences are not found.
+A host whose second probe computes other bits than its first one has the class `NON_DETERMINISTIC`.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from dreamfleet.worker.scoring.watched_policy import WatchedPolicy
 from dreamfleet.worker.tasks.api import Batch, Policy, StepSnapshot, WatchableBatch
 
 SEED = 0  # used by no run
+REPEAT_LIMIT = 10.0  # seconds of the first probe from which on it is not repeated: a child must be ready in time
 PROBE_CONTROLLERS = 4  # controllers that get the observations of the first one's episode
 MAX_PARAMETER = 0.25  # small enough that the actions differ and are not all at a bound
 

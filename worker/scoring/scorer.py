@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import cached_property, lru_cache
+from time import monotonic
 from typing import Any
 
 import gymnasium
@@ -15,10 +16,10 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.fingerprint import fingerprint
-from dreamfleet.common.protocol.host_classes import class_from_fingerprint
+from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, class_from_fingerprint
 from dreamfleet.common.protocol.messages import Kind, TaskSpec
 from dreamfleet.worker.scoring.episode import EpisodeConfig, score
-from dreamfleet.worker.scoring.host_class_probe import HostClassProbe
+from dreamfleet.worker.scoring.host_class_probe import REPEAT_LIMIT, HostClassProbe
 from dreamfleet.worker.scoring.rollout import Rollout
 from dreamfleet.worker.scoring.watched_policy import WatchedPolicy
 from dreamfleet.worker.tasks.api import (
@@ -132,17 +133,24 @@ class Scorer:
     def host_class(self) -> str:
         """The class of this host: hosts of one class compute the same bits in this task.
 
-        Without a probe episode (`probe_steps` 0), or if it fails, the class comes from the host's fingerprint.
+        `NON_DETERMINISTIC` if a second probe episode computes other bits than the first one. Without a probe episode
+        (`probe_steps` 0), or if it fails, the class comes from the host's fingerprint.
         """
         steps = getattr(self._task, "probe_steps", Task.probe_steps)
-        found, size = HostClassProbe(), self._assignment.controller.size
         with suppress(BaseException):  # `SystemExit` too: the first job will report the same error
             if steps > 0:
-                found.add_episode(self._environment, self._policy, size, steps)
-                if self._batch_for is not None:
-                    found.add_batch(self._batch_for(self.spec.with_overrides(horizon=steps)), size)
-                return found.host_class
+                began = monotonic()
+                found = self._probe(steps)
+                repeat = monotonic() - began < REPEAT_LIMIT
+                return found if not repeat or self._probe(steps) == found else NON_DETERMINISTIC
         return class_from_fingerprint(fingerprint(self.world.packages))
+
+    def _probe(self, steps: int) -> str:
+        found, size = HostClassProbe(), self._assignment.controller.size
+        found.add_episode(self._environment, self._policy, size, steps)
+        if self._batch_for is not None:
+            found.add_batch(self._batch_for(self.spec.with_overrides(horizon=steps)), size)
+        return found.host_class
 
     def episode_config(self, kind: Kind, seed: int, spec: TaskSpec | None = None) -> EpisodeConfig:
         """The episode of a job with this kind and seed, in the run's specification or in `spec`."""

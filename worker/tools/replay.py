@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.host.resource_limits import pin_thread_pools
-from dreamfleet.common.protocol.host_classes import class_from_fingerprint
+from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, class_from_fingerprint
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.scoring_params import scoring_params_of
 
@@ -24,6 +24,7 @@ class ReplayedEpisode:
     replayed: float
     host_class: str  # of the host that scored it
     own: bool  # whether this host is of the same class, so that the bits must be equal
+    deterministic: bool = True  # whether equal episodes give equal bits, as far as hosts have found
 
     @property
     def same(self) -> bool:
@@ -50,10 +51,12 @@ def replay(run: RunFolder, generation: int, candidate: int) -> Iterator[Replayed
 
     scoring_params, own = scoring_params_of(run, generation), run.spec
     scorer = Scorer(own, Bundle.open(run.bundle_path, own.bundle) if own.bundle else None)
-    here = scorer.host_class, class_from_fingerprint(fingerprint(run.settings.packages))
+    here = {scorer.host_class, class_from_fingerprint(fingerprint(run.settings.packages))}
     for result in results:
         score = scorer.score("score", parameters, result.seed, spec=scoring_params.episode_spec(result.episode))
+        deterministic = NON_DETERMINISTIC not in (scorer.host_class, result.host_class)
         yield ReplayedEpisode(
-            result.episode, result.seed, result.fitness, score.fitness, result.host_class, result.host_class in here
-        )
+            result.episode, result.seed, result.fitness, score.fitness, result.host_class,
+            deterministic and result.host_class in here, deterministic,
+        )  # fmt: skip
     scorer.close()

@@ -58,7 +58,10 @@ def run(args: argparse.Namespace) -> int:
         for each in episodes:
             print(f"episode {each.episode}  seed {each.seed}  stored {each.stored!r}  replayed {each.replayed!r}  "
                   f"{_describe_match(each, args.tolerance)}")  # fmt: skip
-    if unchecked:
+    if varying := sum(not each.deterministic for each in episodes):
+        print(f"{varying} of {len(episodes)} episodes were driven in an environment that is not deterministic: their "
+              "bits are not the same again anywhere; --tolerance N compares them", file=sys.stderr)  # fmt: skip
+    elif unchecked:
         print(f"{unchecked} of {len(episodes)} episodes were scored by hosts of another class: whether they are right "
               "cannot be checked here to the bit; --tolerance N compares them", file=sys.stderr)  # fmt: skip
     return 0 if False not in agree and True in agree else 1
@@ -68,6 +71,10 @@ def _describe_match(each: ReplayedEpisode, tolerance: float | None) -> str:
     if each.same:
         return "same bits"
     agrees = each.agrees(tolerance)
+    if not each.deterministic:
+        return f"another fitness, {'within' if agrees else 'outside'} {tolerance:g}" if agrees is not None else (
+            "another fitness: the environment is not deterministic"
+        )  # fmt: skip
     if agrees is None:
         return f"not checkable here: of class {each.host_class}"
     return f"within {tolerance:g}, of class {each.host_class}" if agrees else "DIFFERS"

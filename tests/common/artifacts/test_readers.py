@@ -202,7 +202,7 @@ def test_damaged_task_options(watched):
     source = random.Random(4)
 
     def read(text):
-        RunConfig(task="gym:A-v0", task_options=text)._description_options()
+        RunConfig(task="gym:A-v0", task_options=text).description_options()
         check_normalisation(text, 2)
 
     for _ in range(COUNT):

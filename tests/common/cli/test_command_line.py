@@ -30,6 +30,7 @@ def points(*more):
     [
         (("coordinator", "--populaton", "8"), "unrecognized arguments: --populaton 8; did you mean --population?"),
         (("coordinator", "--evaluate-evry=3"), "did you mean --evaluate-every?"),
+        (("coordinator", "--popsize", "8"), "unrecognized arguments: --popsize 8; did you mean --population?"),
         (("worker", "--conect", "tcp/a:1"), "did you mean --connect?"),
         (("train", "vae", "--data", "x", "--updats", "3"), "did you mean --updates?"),
         (("status", "--xyzzy"), "unrecognized arguments: --xyzzy; `dreamfleet status --help` lists the flags\n"),
@@ -233,3 +234,14 @@ def test_ctrl_c_in_a_finaliser_is_not_lost(monkeypatch, capsys):
     monkeypatch.setattr(command_line, "load_verb", lambda _: command_line.SimpleVerb("odd", lambda parser: None, run))
     assert command_line.main(["tasks"]) == command_line.EXIT_INTERRUPTED
     assert capsys.readouterr().err == "dreamfleet: interrupted\n"
+
+
+def test_a_lack_of_memory_is_one_line(monkeypatch, capsys):
+    def fail(*_):
+        raise MemoryError("Unable to allocate 81.7 GiB")
+
+    monkeypatch.setattr("dreamfleet.common.cli.command_line.run_verb", fail)
+    assert command_line.main(["tasks"]) == 1
+    assert capsys.readouterr().err.startswith(
+        "dreamfleet: not enough memory on this host (Unable to allocate 81.7 GiB): "
+    )

@@ -3,7 +3,7 @@
 import json
 import os
 import subprocess
-import sys
+import venv
 from importlib.metadata import distribution
 from pathlib import Path
 
@@ -24,7 +24,8 @@ def top_of(name):
 
 @pytest.fixture
 def bare(tmp_path):
-    """A folder of links to only the coordinator's packages."""
+    """A folder of links to only the coordinator's packages, beside an interpreter that has no packages of its own."""
+    venv.create(tmp_path / "venv", symlinks=True)
     site = tmp_path / "site"
     site.mkdir()
     for name in COORDINATOR:
@@ -35,7 +36,7 @@ def bare(tmp_path):
 
 def call(bare, tmp_path, *words, module=("-m", "dreamfleet")):
     seen = {**environment(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join([str(bare), str(ROOT)])}
-    command = [sys.executable, "-S", "-P", *module, *words]
+    command = [bare.parent / "venv/bin/python", "-P", *module, *words]
     return subprocess.run(command, env=seen, capture_output=True, text=True, check=False, timeout=DEADLINE)
 
 

@@ -1,10 +1,10 @@
-"""Usable cores by affinity masks and cgroup quotas."""
+"""Usable cores by affinity masks and cgroup quotas, and usable memory."""
 
 import os
 
 import pytest
 
-from dreamfleet.common.host.resource_limits import usable_cores
+from dreamfleet.common.host.resource_limits import usable_cores, usable_memory
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinity on this system")
 
@@ -73,3 +73,19 @@ def test_a_system_without_affinity(monkeypatch, tmp_path):
 
 def test_this_host_has_at_most_as_many_cores_as_the_affinity_mask():
     assert 1 <= usable_cores() <= len(os.sched_getaffinity(0))
+
+
+def test_memory_is_that_of_the_host_and_its_swap_within_the_limits_of_all_cgroups(host, tmp_path):
+    groups, own, write = host
+    info = tmp_path / "meminfo"
+    info.write_text("MemTotal:       8 kB\nMemFree:        1 kB\nSwapTotal:      2 kB\nHugePages_Total:       0\n")
+    assert usable_memory(groups, own, info) == 10 * 1024
+    write("memory.max", "max\n")
+    assert usable_memory(groups, own, info) == 10 * 1024
+    own.write_text("0::/a/b\n")
+    write("a/memory.max", "5000\n")
+    assert usable_memory(groups, own, info) == 5000
+    own.write_text("4:memory:/c\n")
+    write("memory/c/memory.limit_in_bytes", "4000\n")
+    assert usable_memory(groups, own, info) == 4000
+    assert usable_memory(tmp_path / "none", tmp_path / "nothing", tmp_path / "nothing") > 10 * 1024

@@ -60,3 +60,12 @@ def test_training_seeds_are_unique_and_in_the_training_range():
 def test_validation_and_test_seeds_are_disjoint():
     assert not set(seeds.validation_seeds(100)) & set(seeds.TEST)
     assert seeds.validation_seeds(3) == (20000, 20001, 20002)
+
+
+def test_a_folded_seed_is_a_training_seed_and_small_ones_are_their_own():
+    small = [0, 10_000, seeds.TRAINING_FIRST, 2**31 - 1]
+    assert [seeds.fold_seed(seed) for seed in small] == small
+    assert seeds.fold_seed(2**31) == 2**31 % (2**31 - seeds.TRAINING_FIRST) + seeds.TRAINING_FIRST
+    many = {seeds.fold_seed(seeds.training_seed(1, generation, 0)) for generation in range(1000)}
+    assert len(many) > 990
+    assert all(seeds.TRAINING_FIRST <= each < 2**31 for each in many)

@@ -40,3 +40,9 @@ def test_noise_slows_the_rate_adapted_one_down():
         ours.ask()
         ours.tell(random.standard_normal(LAMBDA))
     assert untag(json.loads(str(ours.state()["scalars"]))["eta_mean"]) < 0.3
+
+
+@pytest.mark.parametrize("kind", [RateAdapted, Separable])
+def test_a_seed_of_more_than_the_librarys_bits_is_folded(kind):
+    folded, own = (kind(Search(np.zeros(4), LAMBDA, 0.1, seed)).ask() for seed in (2**40 + 5, 5))
+    assert np.array_equal(folded, own)

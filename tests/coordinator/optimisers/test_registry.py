@@ -7,7 +7,9 @@ import pytest
 
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.coordinator.optimisers import registry
+from dreamfleet.coordinator.optimisers.api import Search
 from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
+from dreamfleet.coordinator.optimisers.registry import build_optimiser, check_memory
 
 MODULE = "tests.support.optimisers"
 
@@ -133,3 +135,24 @@ def test_starting_the_command_line_imports_no_optimiser():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip().endswith("set()")
     assert entry_points(group=registry.GROUP)
+
+
+def test_a_state_that_the_journal_cannot_keep_is_refused(monkeypatch):
+    monkeypatch.setattr("dreamfleet.coordinator.optimisers.registry.usable_memory", lambda: 10**18)
+    check_memory("cma", 5_000, 32, {"covariance": "full"})
+    with pytest.raises(
+        UsageError, match=r"has a state of 1\.2 GB, a journal keeps 1 GB at most: give --covariance diag"
+    ):
+        check_memory("cma", 6_000, 32, {"covariance": "full"})
+    with pytest.raises(UsageError, match=r"cmaes-lra .* has a state of 1\.6 GB"):
+        check_memory("cmaes-lra", 10_000, 32, {})
+    check_memory("cmaes-sep", 10**6, 32, {})
+
+
+@pytest.mark.parametrize(("name", "options"), [("cma", {"covariance": "full"}), ("cmaes-lra", {})])
+def test_the_counted_state_is_what_is_kept(name, options):
+    optimiser = build_optimiser(name, Search(np.zeros(300), 8, 0.1, 1, options))
+    for _ in range(3):
+        optimiser.tell(-np.square(optimiser.ask() - 1).sum(axis=1))
+    counted = type(optimiser).footprint(300, 8, options).state
+    assert sum(each.nbytes for each in optimiser.state().values()) == pytest.approx(counted, rel=0.1)

@@ -238,6 +238,14 @@ def test_a_run_that_says_nothing_of_optimisers_keeps_the_words_of_the_first_vers
         ({"optimiser": "cmaes-sep", "covariance": "full"}, "give --covariance diagonal"),
         ({"optimiser_options": ("restarts=3",)}, "has no option 'restarts', it knows: covariance"),
         ({"population": 2}, "at least 3 for 867 parameters"),
+        (
+            {"controller": "hidden", "hidden_units": 10**5, "covariance": "full"},
+            "needs .* GB of memory, this host has .*: give --covariance diagonal",
+        ),
+        (
+            {"controller": "hidden", "hidden_units": 10**5, "population": 10**5},
+            "needs .* GB of memory, this host has .*: give fewer --hidden-units, a smaller --population",
+        ),
     ],
 )
 def test_what_an_optimiser_cannot_do_is_refused_before_there_is_a_run(random_bundle, changes, says):

@@ -1,0 +1,59 @@
+"""gym:tests.support.environments:Odd-v0: an environment with one fault, which its argument `fault` names."""
+
+import os
+import random
+import signal
+import sys
+import time
+
+import gymnasium
+import numpy as np
+
+ODD = "gym:tests.support.environments:Odd-v0"
+
+
+class Odd(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-10, 10, (2,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, fault="", render_mode=None):
+        self._fault = fault
+        self._steps = 0  # of all episodes
+        if fault == "noisy":
+            print("a simulator greets")  # noqa: T201
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if self._fault == "bits" and seed is not None and seed >= 2**32:
+            raise ValueError("Seed must be between 0 and 2**32 - 1")
+        if self._fault == "exit":
+            sys.exit(3)
+        if self._fault == "exit at once":
+            os._exit(3)
+        if self._fault == "crash":
+            os.kill(os.getpid(), signal.SIGSEGV)
+        if self._fault == "hang":
+            time.sleep(3600)
+        if self._fault == "checker" and seed == 123:  # gymnasium's checker alone resets so
+            os._exit(4)
+        at = self.np_random.uniform(-1, 1, 2)
+        self._at = {"random": np.random.uniform(-1, 1, 2), "nan": np.full(2, np.nan), "outside": np.full(2, 99.0)}.get(  # noqa: NPY002
+            self._fault, at
+        )
+        answer = self._at.astype(np.float32)
+        return answer if self._fault == "old reset" else (answer, {})
+
+    def step(self, action):
+        self._steps += 1
+        self._at = 0.9 * self._at + (0.1 if action else -0.1)
+        self._at += {"noise": random.random(), "carry": 0.01 * self._steps, "hash": hash("a") % 997}.get(self._fault, 0)
+        if self._fault == "raise":
+            raise RuntimeError("the engine\nstalled")
+        reward = float(-np.abs(self._at).sum())
+        reward = {"array": np.zeros(2), "infinite": np.inf, "none": None}.get(self._fault, reward)
+        answer = self._at.astype(np.float32), reward, False
+        return (*answer, {}) if self._fault == "old step" else (*answer, False, {})
+
+
+gymnasium.register("Odd-v0", Odd, max_episode_steps=20)
+gymnasium.register("OddEndless-v0", Odd)

@@ -1,0 +1,249 @@
+"""A trial of a task before a run begins in it: its environment is made, reset and stepped. Called as a process.
+
+`common/cli/task_check.py` starts it, because an environment may hang or crash. It reads a request from stdin and writes
+lines of JSON: a step's name before each step, to which a limit applies, and reports, of which the last counts.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from time import monotonic
+from typing import TYPE_CHECKING, Any
+
+from dreamfleet.common.cli.task_check import Trial
+from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.host.resource_limits import pin_thread_pools
+from dreamfleet.common.printable import one_line
+from dreamfleet.common.protocol.tasks import describe_task
+
+if TYPE_CHECKING:
+    from dreamfleet.common.protocol.tasks import Description
+    from dreamfleet.worker.tasks.api import Task
+
+MEND = "mend the environment, or wrap it"
+SLOW_RESET = 2.0  # seconds; gymnasium's checker resets a dozen times, so it is left out where resets are slower
+PICTURE_DIMENSIONS = 2
+ADVICE = re.compile(r"infinity|we recommend")  # warnings of gymnasium's checker that are about style
+COLOURS = re.compile(r"\x1b\[\d+m|WARN: ")
+
+
+class FaultError(Exception):
+    """The environment cannot be scored; the text says why."""
+
+
+@dataclass
+class CheckedEnvironment:
+    """An environment whose answers are checked as the episode loop gets them."""
+
+    environment: Any
+    observations: int
+    announce: Callable[[str], None]
+    first: Any = None  # the first observation since the last reset
+    warnings: list[str] = field(default_factory=list)
+    reset_seconds: float = 0.0
+
+    def reset(self, *, seed: int) -> Any:
+        """Reset it; `FaultError` unless it gives a finite observation of the right size, and its info."""
+        self.announce(f"reset(seed={seed})")
+        began = monotonic()
+        answer = self.environment.reset(seed=seed)
+        self.reset_seconds = monotonic() - began
+        self.announce("its first steps")
+        if not (isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], Mapping)):
+            raise FaultError(
+                f"its reset returns {_describe(answer)}, not an observation and a dictionary: that is the API from "
+                f"before gymnasium 0.26; {MEND}"
+            )
+        self.first = answer[0]
+        if not self._check_observation(self.first):
+            raise FaultError(f"its first observation holds NaN or infinity; {MEND}")
+        return answer
+
+    def step(self, action: Any) -> Any:
+        """Step it; `FaultError` unless it gives five values with one finite number as the reward."""
+        try:
+            answer = self.environment.step(action)
+        except (ValueError, TypeError):  # gymnasium's wrappers fail where the environment's own answer is malformed
+            _check_step(self.environment.unwrapped.step(action))
+            raise
+        _check_step(answer)
+        self._check_observation(answer[0])
+        return answer
+
+    def _check_observation(self, observation: Any) -> bool:
+        import numpy as np
+
+        if np.size(observation) != self.observations:
+            raise FaultError(
+                f"its observation is {_describe(observation)}, but its observation space has {self.observations} "
+                f"numbers; {MEND}"
+            )
+        finite = bool(np.isfinite(np.asarray(observation, dtype=np.float64)).all())
+        text = "an observation holds NaN or infinity, from which no controller can act"
+        if not finite and text not in self.warnings:
+            self.warnings.append(text)
+        return finite
+
+
+def _check_step(answer: Any) -> None:
+    import numpy as np
+
+    if not isinstance(answer, tuple) or len(answer) != 5:
+        raise FaultError(
+            f"its step returns {_describe(answer)}, not five values (observation, reward, terminated, truncated, "
+            f"info): that is the API from before gymnasium 0.26; {MEND}"
+        )
+    reward = answer[1]
+    if np.ndim(reward) or not isinstance(np.asarray(reward).item(), (bool, int, float)):
+        raise FaultError(f"its reward is {_describe(reward)}, not one number; {MEND}")
+    if not np.isfinite(float(reward)):
+        raise FaultError(f"its reward is {float(reward)}, not a finite number; {MEND}")
+
+
+def _describe(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"{len(value)} values"
+    shape = getattr(value, "shape", None)
+    return f"an array of shape {shape}" if shape else f"a value of type {type(value).__name__}"
+
+
+def run_trial(
+    name: str, options: Mapping[str, Any], announce: Callable[[str], None], *, thorough: bool
+) -> Iterator[Trial]:
+    """Describe the task, drive its probe episode, and yield what was found.
+
+    `thorough`: drive the episode twice and normalise, then yield again with what gymnasium's checker says.
+    `UsageError` if the task cannot be described, `FaultError` if its environment cannot be scored.
+    """
+    announce("making it")
+    description = describe_task(name, {key: value for key, value in options.items() if key != "normalise"})
+    from dreamfleet.worker.scoring.host_class_probe import REPEAT_LIMIT  # needs gymnasium, as the task may not
+
+    checked, drive = _prepare(name, description, announce)
+    began = monotonic()
+    trial = Trial(asdict(description), episode=drive(), first=_digest(checked.first), warnings=checked.warnings)
+    trial.seconds = monotonic() - began
+    if thorough and trial.episode and trial.seconds < REPEAT_LIMIT:
+        trial.repeated = drive()
+    if thorough and options.get("normalise"):
+        announce("")
+        trial.description = asdict(describe_task(name, options))
+    if thorough:
+        trial.warnings += _describe_pictures(name, checked.environment)
+        if checked.reset_seconds >= SLOW_RESET:
+            trial.warnings.append(f"a reset took {checked.reset_seconds:.0f} s, so gymnasium's checker was left out")
+    yield trial
+    if thorough and checked.reset_seconds < SLOW_RESET:
+        announce("gymnasium's checker")
+        trial.warnings += _check_by_gymnasium(checked.environment)
+        yield trial
+    announce("close()")
+    with suppress(Exception):
+        checked.environment.close()
+
+
+def _prepare(
+    name: str, description: Description, announce: Callable[[str], None]
+) -> tuple[CheckedEnvironment, Callable[[], str]]:
+    """The task's environment, and what drives its probe episode and returns the digest; empty: there is no probe."""
+    from dreamfleet.common.artifacts.controller import ControllerShape
+    from dreamfleet.common.protocol.messages import TaskSpec
+    from dreamfleet.worker.scoring.host_class_probe import HostClassProbe
+    from dreamfleet.worker.tasks.api import Assignment
+    from dreamfleet.worker.tasks.registry import find_task
+
+    task: Task = find_task(name)
+    shape = ControllerShape(description.observations, description.outputs)
+    assignment = Assignment(
+        TaskSpec(name, "", 1000, 0, shape, options=description.options, version=description.version)
+    )
+    environment: Any = CheckedEnvironment(task.make_environment(assignment), description.observations, announce)
+    policy = task.make_policy(assignment)
+
+    def drive() -> str:
+        if task.probe_steps <= 0:
+            return ""
+        probe = HostClassProbe()
+        probe.add_episode(environment, policy, shape.size, task.probe_steps)
+        return probe.host_class
+
+    return environment, drive
+
+
+def _digest(value: Any) -> str:
+    from dreamfleet.worker.scoring.host_class_probe import HostClassProbe
+
+    probe = HostClassProbe()
+    probe.add_value(value)
+    return probe.host_class
+
+
+def _check_by_gymnasium(environment: Any) -> list[str]:
+    """What gymnasium's own checker finds in an environment that does not come with gymnasium."""
+    import gymnasium
+    from gymnasium.utils.env_checker import check_env
+
+    own = environment.unwrapped
+    if not isinstance(own, gymnasium.Env) or type(own).__module__.startswith("gymnasium.envs."):
+        return []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            check_env(own, skip_render_check=True, skip_close_check=True)
+            found = []
+        except (Exception, SystemExit) as error:  # environments may raise anything
+            found = [str(error) or type(error).__name__]
+    texts = [COLOURS.sub("", str(each.message)) for each in caught if issubclass(each.category, UserWarning)]
+    return [f"gymnasium's checker: {one_line(text)}" for text in [*found, *texts] if not ADVICE.search(text)]
+
+
+def _describe_pictures(name: str, environment: Any) -> list[str]:
+    shape = getattr(environment.observation_space, "shape", None) or ()
+    if len(shape) < PICTURE_DIMENSIONS:
+        return []
+    better = "task car-racing drives this track on a world model" if "CarRacing" in name else (
+        "a world model, or a wrapper, could make few numbers of it (docs/tasks.md)"
+    )  # fmt: skip
+    return [f"it observes pictures of shape {tuple(shape)}, and the controller has a weight for each value: {better}"]
+
+
+def main() -> None:
+    """Answer the request on stdin; whatever the environment prints goes to stderr."""
+    request = json.load(sys.stdin)
+    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    os.environ["SDL_VIDEODRIVER"] = "dummy"
+    pin_thread_pools()
+    step = "loading it"
+
+    def announce(name: str) -> None:
+        nonlocal step
+        step = name
+        print(json.dumps({"step": name}), file=out, flush=True)
+
+    def report(found: dict[str, Any]) -> None:
+        print(json.dumps({"report": found}), file=out, flush=True)
+
+    name = request["task"]
+    try:
+        for trial in run_trial(name, request["options"], announce, thorough=request["thorough"]):
+            report(asdict(trial))
+    except DreamfleetError as error:
+        report({"fault": str(error) if isinstance(error, UsageError) else f"{name}: {error}"})
+    except FaultError as error:
+        report({"fault": f"{name} cannot be scored: {error}"})
+    except (Exception, SystemExit) as error:  # environments may raise anything
+        what = one_line(f"{type(error).__name__}: {error}")
+        report({"fault": f"{name} cannot be scored: {step} raised {what}; {MEND}"})
+    os._exit(0)  # what the environment left running must not keep it
+
+
+if __name__ == "__main__":
+    main()
