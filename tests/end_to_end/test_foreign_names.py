@@ -140,20 +140,22 @@ def commands(port=0):
         yield "collect", "--data", "new", "--controller", file, "--episodes", "2", "--jobs", "1"
         yield "refit", file, "--to", "tiny", "--data", "data", "--out", "b.npz"
         yield "coordinator", "--run", "x", "--init", file, "--bundle", beside(file), *serve
+    for file in BUNDLES[:1]:
+        yield "bench", "policy", "--bundle", file
+        yield "bench", "dream", "--bundle", file
+        yield "bench", "live", "--bundle", file
+        yield "bench", "env", "--bundle", file, "--episodes", "1"
     for file in BUNDLES:
         yield "coordinator", "--run", "x", "--bundle", file, *serve
         yield "inspect", file, "--out", "page.html"
         yield "subspace", file, "--data", "data", "--out", "s.npz"
         yield "unbundle", file, "--data", "unbundled"
         yield "drive", "--dream", "--bundle", file, "--steps", "1"
-        yield "bench", "policy", "--bundle", file
-        yield "bench", "dream", "--bundle", file
-        yield "bench", "live", "--bundle", file
-        yield "bench", "env", "--bundle", file, "--episodes", "1"
     yield "repeat", "optimiser", "--run", "again", *serve
     for run in RUNS:
         yield "fork", run, "--run", f"{run}-more", *serve
-        yield "coordinator", "--resume", run, *serve
+        own = ("--listen", "tcp/127.0.0.1:0") if run == "optimiser" else serve  # it is refused after it listens
+        yield "coordinator", "--resume", run, *own
         yield "replay", run, "--candidate", "1/0"
         yield "inspect", run, "--out", "page.html"
         yield "live", "--controller", run, "--generation", "3", "--out", "pictures", "--seconds", "0.1"
