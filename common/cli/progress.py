@@ -22,6 +22,7 @@ from rich.progress import (
 from rich.table import Column, Table
 
 UNLIMITED_WIDTH = 10_000  # columns: a console on which nothing is truncated
+LARGEST_TOTAL = 10**15  # items: of more, rich cannot estimate the remaining time
 LOG_INTERVAL = 60.0  # seconds between two lines where no bar can be drawn, such as in a log
 BAR_WIDTH, MIN_BAR_WIDTH = 40, 8  # columns of a bar: preferred, and the least before other columns are left out
 
@@ -31,7 +32,7 @@ class Bar:
 
     def __init__(self, progress: Progress, description: str, total: int) -> None:
         self._progress = progress
-        self._task = progress.add_task(description, total=total, note="")
+        self._task = progress.add_task(description, total=min(total, LARGEST_TOTAL), note="")
         self._last_logged = time.monotonic()
 
     def update(self, done: int, note: str = "") -> None:

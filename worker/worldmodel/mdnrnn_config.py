@@ -7,6 +7,7 @@ from typing import Literal
 
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.worldmodel.layer_sizes import check_sizes
 from dreamfleet.worker.worldmodel.loss_factors import added_option, check_factors, loss_factor
 
 Reward = Literal["none", "positive", "notebook", "value"]
@@ -41,6 +42,7 @@ class MDNRNNConfig:
     first_reward: float = added_option(0.0, "previous reward's label at the first step of a drive")
 
     def __post_init__(self) -> None:
+        check_sizes(self)
         if min(self.latent, self.actions, self.hidden, self.mixtures, self.attention_units) < 1 or self.window < 0:
             raise UsageError("an MDN-RNN's sizes must be at least 1, its window at least 0")
         if not 0 <= self.dropout < 1:

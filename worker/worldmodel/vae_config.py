@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.worldmodel.layer_sizes import check_sizes
 from dreamfleet.worker.worldmodel.loss_factors import added_option, check_factors, loss_factor
 
 LEAK = 0.2  # slope of the leaky activation below zero
@@ -59,6 +60,7 @@ class VAEConfig:
     )
 
     def __post_init__(self) -> None:
+        check_sizes(self)
         if self.picture not in (64, 96):
             raise UsageError(f"a VAE's pictures are 64 or 96 pixels wide, not {self.picture}")
         if min(self.channels, default=0) < 1 or self.latent < 1:

@@ -45,3 +45,11 @@ def test_a_quiet_verb_draws_no_bar(capsys, monkeypatch, level, drawn):
     with progress_bar("evaluate", 4, "episodes") as bar:
         bar.update(4)
     assert ("evaluate" in capsys.readouterr().err) == drawn
+
+
+def test_a_total_beyond_every_number_is_drawn():
+    progress = make_progress("updates", Console(file=io.StringIO(), width=80))
+    bar = Bar(progress, "training", 10**400)
+    for done in range(9):
+        bar.update(done)
+        progress.get_renderable()

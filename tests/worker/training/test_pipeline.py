@@ -21,6 +21,8 @@ from dreamfleet.worker.training.presets import PRESETS, TrainConfig, find_preset
 from dreamfleet.worker.verbs import encode as encode_verb
 from dreamfleet.worker.verbs import pipeline
 from dreamfleet.worker.worldmodel.inference import Encoder, PolicyStep
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.drives import write_drive, write_drives
 
 SHORT = TrainConfig(updates=2, batch=8, rate=1e-3)
@@ -241,3 +243,9 @@ def test_another_preset_than_the_data_sets_is_refused(tmp_path):
 def test_a_seed_beyond_torchs_is_refused():
     with pytest.raises(UsageError, match="--seed must be from 0 to 8796093022208"):
         TrainConfig(**{**vars(PRESETS["tiny"].vae), "seed": 10**20})
+
+
+@pytest.mark.parametrize("config", [VAEConfig, MDNRNNConfig])
+def test_a_size_beyond_torchs_is_refused(config):
+    with pytest.raises(UsageError, match=r"--latent must be at most 16384, not 18446744073709551616"):
+        config(latent=2**64)
