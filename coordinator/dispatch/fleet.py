@@ -104,11 +104,7 @@ class Fleet:
             member.gone_since = now
 
     def handle_farewell(self, identity: str, why: str, now: float) -> None:
-        """Note that a worker leaves, and why.
-
-        R24: the reason is for people, who see it in status, log and story. A worker that fails before it could score
-        says it in its first heartbeat.
-        """
+        """Note that a worker leaves, and why (R24)."""
         if member := self.members.get(identity):
             member.farewell = one_line(why)
             self.handle_departure(identity, now)
@@ -342,8 +338,7 @@ class Fleet:
             self.jobs.record_failure(identity, result, self._now, "" if member is None else member.host_class)
             self.counts["errors"] += 1
             if member is not None:
-                self._drop_lease(member, result.digest)
-                self.jobs[result.digest].lost_steps.pop(identity, None)  # the result's own steps count
+                self._drop_lease(member, result.digest, counted=True)
             return "refused", None
         pending = self.jobs.accept(result)
         self.counts["discarded_steps"] += pending.steps_lost_to(identity, result.steps)
@@ -422,14 +417,14 @@ class Fleet:
         self.jobs.add_holder(move.digest, move.taker)
         given.setdefault(move.taker, []).append(self.jobs[move.digest].work)
 
-    def _drop_lease(self, member: Member, digest: bytes) -> None:
-        """End a lease without a result.
+    def _drop_lease(self, member: Member, digest: bytes, *, counted: bool = False) -> None:
+        """End a lease without a valid result; `counted`: what the worker did is waste already.
 
         R3: when the last lease of a wanted job ends, the job goes back into the queue.
         """
-        lease, pending = member.leases.pop(digest, None), self.jobs.get(digest)
-        if lease is not None and pending is not None and (lease.steps or lease.finished):
-            pending.lost_steps[member.identity] = None if lease.finished else lease.steps
+        lease = member.leases.pop(digest, None)
+        if lease is not None and not counted and digest in self.jobs:
+            self.jobs[digest].lost_steps[member.identity] = None if lease.finished else lease.steps or 0
         if self.jobs.remove_holder(digest, member.identity):
             self.counts["reissued"] += 1
             self.event_log.add(self._now, "reissued", member.identity, digest)

@@ -10,7 +10,7 @@ from tests.support.processes import DEADLINE, ROOT
 from tests.support.relay import Relay
 
 OUTAGE = 8.0  # seconds; a worker with --exit-when-done once left after five
-SETTINGS = ("--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 2, "--evaluate-every", 0, "--generations", 2)
+SETTINGS = ("--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 2, "--evaluate-every", 0, "--generations", 3)
 ENVIRONMENT = """
 import gymnasium
 gymnasium.register("There-v0", entry_point="gymnasium.envs.classic_control:CartPoleEnv", max_episode_steps=50)
@@ -28,7 +28,7 @@ def relay(processes):
 def test_a_cut_link_costs_neither_the_worker_nor_its_results(processes, random_bundle, relay):
     coordinator = processes.coordinator("--bundle", random_bundle.path, *SETTINGS)
     worker = processes.worker("--task", tasks.SLOW_TOY, "--exit-when-done", endpoint=relay.endpoint)
-    worker.wait_for("joined run")
+    coordinator.wait_for("generation 0: mean")
     relay.hold()
     relay.cut()
     worker.wait_for("out of sight")
@@ -45,7 +45,7 @@ def test_a_cut_link_costs_neither_the_worker_nor_its_results(processes, random_b
 def test_a_coordinator_that_comes_back_finds_its_worker(processes, random_bundle):
     coordinator = processes.coordinator("--bundle", random_bundle.path, *SETTINGS)
     worker = processes.worker("--task", tasks.SLOW_TOY, "--exit-when-done")
-    worker.wait_for("joined run")
+    coordinator.wait_for("generation 0: mean")
     coordinator.end()
     worker.wait_for("out of sight")
     time.sleep(OUTAGE)
@@ -60,7 +60,7 @@ def test_a_coordinator_that_comes_back_finds_its_worker(processes, random_bundle
 def test_a_coordinator_that_is_gone_for_good_fails_its_worker(processes, random_bundle):
     coordinator = processes.coordinator("--bundle", random_bundle.path, *SETTINGS)
     worker = processes.worker("--task", tasks.SLOW_TOY, "--exit-when-done", "--coordinator-timeout", 1)
-    worker.wait_for("joined run")
+    coordinator.wait_for("generation 0: mean")
     coordinator.end()
     assert worker.finish()[0] == 1
     assert "was out of sight for 1 s" in worker.lines[-1]

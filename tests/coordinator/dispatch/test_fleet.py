@@ -173,6 +173,73 @@ def test_a_worker_that_vanishes_without_leaving_is_listed_as_lost_until_it_is_ba
     assert not fleet.departed
 
 
+def test_a_worker_that_says_why_it_leaves_is_listed_with_that_and_its_jobs_are_free():
+    fleet = fleet_of(A, B, jobs=1)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    fleet.handle_farewell(A, "no\nroom\x1b[2J", 1.0)
+    fleet.tick(1.0 + 2 * DEPARTURE_GRACE)
+    assert digests(fleet.dispatch(1.2), B) == [digest]
+    gone = fleet.departed[A]
+    assert (gone.farewell, gone.is_lost) == ("no room\\x1b[2J", False)
+    event = next(each for each in fleet.event_log.view().latest(A) if each.what == "left")
+    assert event.why == gone.farewell
+    assert gone.farewell in fleet.notes[-1]
+    fleet.add_worker(A, 1, "f", 3.0)
+    fleet.handle_heartbeat(A, beat(), 3.0)
+    assert not fleet.departed, "it is back"
+
+
+def test_a_guest_that_cannot_score_says_why_in_its_first_heartbeat():
+    fleet = fleet_of(B, jobs=1)
+    fleet.add_worker(A, 1, "f", 1.0)
+    fleet.handle_heartbeat(A, beat(0), 1.0)
+    fleet.handle_farewell(A, "no environment", 1.0)
+    fleet.tick(1.0 + 2 * DEPARTURE_GRACE)
+    assert list(fleet.departed) == [A]
+    assert A not in fleet.members
+    fleet.handle_farewell("stranger/00000009", "filling the list", 2.0)
+    fleet.tick(3.0)
+    assert list(fleet.departed) == [A]
+
+
+@pytest.mark.parametrize(("last", "wasted"), [("running", 4), ("finished", 10), ("queued", 0)])
+def test_what_a_lost_worker_had_done_of_a_job_is_waste_once_another_has_scored_it(last, wasted):
+    fleet = fleet_of(A, jobs=1)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    shown = {"running": "running", "finished": "unacked", "queued": "queued"}[last]
+    fleet.handle_heartbeat(A, beat(seen=1, steps=4, **{shown: [digest]}), 1.0)
+    fleet.handle_departure(A, 1.0)
+    fleet.tick(2.0)
+    fleet.add_worker(B, 1, "f", 2.0)
+    fleet.handle_heartbeat(B, beat(), 2.0)
+    assert digests(fleet.dispatch(2.0), B) == [digest]
+    assert fleet.counts["discarded_steps"] == 0
+    fleet.handle_result(B, result(digest), 3.0)
+    assert fleet.counts["discarded_steps"] == wasted
+
+
+def test_a_worker_that_brings_its_result_after_all_wasted_nothing():
+    fleet = fleet_of(A, jobs=1)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    fleet.handle_heartbeat(A, beat(seen=1, unacked=[digest]), 1.0)
+    fleet.handle_departure(A, 1.0)
+    fleet.tick(2.0)
+    fleet.add_worker(A, 1, "f", 2.0)
+    fleet.handle_heartbeat(A, beat(unacked=[digest]), 2.0)
+    fleet.handle_result(A, result(digest), 2.0)
+    assert fleet.counts["discarded_steps"] == 0
+
+
+def test_a_failed_job_is_wasted_once():
+    fleet = fleet_of(A, B, jobs=1)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    fleet.handle_heartbeat(A, beat(seen=1, steps=4, running=[digest]), 1.0)
+    fleet.handle_result(A, result(digest, error="it broke"), 1.0)
+    fleet.dispatch(1.0)
+    fleet.handle_result(B, result(digest), 2.0)
+    assert fleet.counts["discarded_steps"] == 10
+
+
 def test_the_list_of_lost_workers_is_bounded():
     fleet = fleet_of(*(f"h{number}/0" for number in range(MAX_DEPARTED + 3)))
     for name in list(fleet.members):
