@@ -15,6 +15,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.bundle_store import default_cache, shipped_bundles
 from dreamfleet.common.cli.task_check import try_task
 from dreamfleet.common.errors import AccessError, DreamfleetError
+from dreamfleet.common.files.file_system import file_system_type, is_network, lock_problem
 from dreamfleet.common.host.packages import PACKAGES, install_command, package_version
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, describe_time_left, read_join_file
 
@@ -116,5 +117,9 @@ def _check_writable(name: str, path: Path, role: str) -> Finding:
             free = shutil.disk_usage(where).free
     except OSError as error:
         return Finding(f"{name} folder", False, True, f"{path}: {error.strerror}", role, remedy)
+    if name == "runs" and (problem := lock_problem(where)):
+        return Finding("runs folder", False, True, problem, role, "point $DREAMFLEET_RUNS_DIR to a local disk")
     found = f"{path}, {free / 1e9:.1f} GB free"
+    if name == "runs" and is_network(kind := file_system_type(where)):
+        found += f", on a network file system ({kind})"
     return Finding(f"{name} folder", free > MIN_FREE_BYTES, True, found, role, remedy)

@@ -11,6 +11,7 @@ from types import NoneType
 from typing import Any
 
 from dreamfleet.common.errors import JournalError
+from dreamfleet.common.files.file_system import lock_problem
 from dreamfleet.common.files.regular_files import check_regular
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.runs import schema
@@ -31,7 +32,7 @@ class JournalReader:
     """A read-only connection to the journal at `path`; every failure is a `JournalError`."""
 
     def __init__(self, path: Path) -> None:
-        self._run = path.parent.name
+        self._run, self._path = path.parent.name, path
         self._connection, self.version = _connect_read_only(path)
 
     def close(self) -> None:
@@ -82,7 +83,7 @@ class JournalReader:
         except (sqlite3.Error, OverflowError, UnicodeError) as error:
             if _is_locked(error):
                 raise JournalError(
-                    f"the journal of run {self._run} cannot be read: {_describe_with_remedy(error)}"
+                    f"the journal of run {self._run} cannot be read: {_describe_with_remedy(error, self._path)}"
                 ) from error
             raise self.damage_error(one_line(str(error))) from error
 
@@ -129,7 +130,7 @@ def _connect_read_only(path: Path, *, rolled_back: bool = False) -> tuple[sqlite
         if getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_READONLY_ROLLBACK and not rolled_back:
             _roll_back(path)
             return _connect_read_only(path, rolled_back=True)
-        raise JournalError(f"{path} cannot be read: {_describe_with_remedy(error)}") from error
+        raise JournalError(f"{path} cannot be read: {_describe_with_remedy(error, path)}") from error
     except JournalError:
         connection.close()
         raise
@@ -146,6 +147,9 @@ def _is_locked(error: Exception) -> bool:
     return isinstance(error, sqlite3.Error) and getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_BUSY
 
 
-def _describe_with_remedy(error: Exception) -> str:
+def _describe_with_remedy(error: Exception, path: Path) -> str:
+    code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+    if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_IOERR) and (problem := lock_problem(path.parent)):
+        return f"{one_line(str(error))}; {problem}"
     what = "end the program that keeps it locked" if _is_locked(error) else "restore it from a copy"
     return f"{one_line(str(error))}; {what}"

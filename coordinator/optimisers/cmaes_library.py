@@ -34,18 +34,11 @@ class CmaesOptimiser(ABC):
     requirement: ClassVar[str] = f"cmaes=={version('cmaes')}"
     options: ClassVar[Mapping[str, str]] = {}
     state_names: ClassVar[tuple[str, ...]]  # of the attributes, without their underscore
-    matrices: ClassVar[tuple[int, int]] = (0, 0)  # square ones in memory at the peak, as measured, and in the state
 
     def __init__(self, search: Search) -> None:
         self._search = search
         self._strategy = self._build(search)
         self._asked: list[NDArray[np.float64]] = []
-
-    @classmethod
-    def footprint(cls, dimension: int, population: int, options: Mapping[str, str]) -> Footprint:  # noqa: ARG003
-        """As measured: so many populations, and the class's `matrices`."""
-        peak, kept = cls.matrices
-        return Footprint(8 * (5 * population * dimension + peak * dimension**2), 8 * kept * dimension**2)
 
     @abstractmethod
     def _build(self, search: Search) -> Any:
@@ -158,7 +151,10 @@ class RateAdapted(CmaesOptimiser):
         "mean", "sigma", "C", "p_sigma", "pc", "g", "Emean", "ESigma", "Vmean", "VSigma", "eta_mean", "eta_Sigma",
     )  # fmt: skip
 
-    matrices: ClassVar[tuple[int, int]] = (34, 2)
+    @classmethod
+    def footprint(cls, dimension: int, population: int, options: Mapping[str, str]) -> Footprint:  # noqa: ARG003
+        """As measured: two square matrices for each candidate while it is told, and 18 more, of which two are state."""
+        return Footprint(8 * (2 * population + 18) * dimension**2, 8 * 2 * dimension**2)
 
     def _draw(self, count: int) -> list[NDArray[np.float64]]:
         """Sample candidates (equations 38 to 40 of Hansen 2016).

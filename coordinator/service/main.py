@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sqlite3
 from collections.abc import Callable
 from contextlib import ExitStack, closing
@@ -14,6 +15,7 @@ from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.cli.global_config import GlobalConfig
 from dreamfleet.common.errors import ConnectionFailedError, JournalError, UsageError
 from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
+from dreamfleet.common.files.file_system import file_system_type, is_network, lock_problem
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.protocol.messages import Intervals
 from dreamfleet.common.runs.records import RunSettings
@@ -32,6 +34,8 @@ from dreamfleet.coordinator.settings.start import SUBSPACE_FACT, StartPoint
 from dreamfleet.coordinator.storage.file_watch import FileWatch
 from dreamfleet.coordinator.storage.journal import Journal
 from dreamfleet.coordinator.storage.served_bundle import ServedBundle
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,7 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
     folder = request.folder
     if request.config is not None and request.name == ARCHIVE:
         raise UsageError(f"{ARCHIVE!r} is where archived runs lie: choose another name")
+    _check_file_system(folder)
     settings, bundle = _resolve_settings(request, folder)
     with reporting_unwritable_folder(request.runs_dir, "choose another --runs-dir", JournalError):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -95,6 +100,15 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
             raise ConnectionFailedError(
                 f"{error}; the run is made, and begins with: {request.resume_command()}"
             ) from error
+
+
+def _check_file_system(folder: Path) -> None:
+    """`JournalError` if the run's file system keeps no locks; a warning if other hosts may share it."""
+    if problem := lock_problem(folder):
+        raise JournalError(problem)
+    if is_network(kind := file_system_type(folder)):
+        log.warning("%s is on a network file system (%s): read this run's files on this host alone, or a `runs backup`",
+                    folder, kind)  # fmt: skip
 
 
 def _service(request: RunRequest, file_watch: FileWatch, bundle: ServedBundle | None) -> Service:

@@ -8,6 +8,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 from dreamfleet.common.errors import DiskFullError, DreamfleetError, JournalError
+from dreamfleet.common.files.file_system import lock_problem
 
 
 def check_database(connection: sqlite3.Connection) -> tuple[str, int | None]:
@@ -50,7 +51,10 @@ def journal_errors(path: Path) -> Iterator[None]:
     except sqlite3.OperationalError as error:
         if getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_FULL:
             raise DiskFullError(f"cannot write {path}: {error}; make room") from error
-        raise JournalError(f"cannot write {path}: {error}; nothing counted that was not written before") from error
+        problem = f"; {text}" if (text := lock_problem(path.parent)) else ""
+        raise JournalError(
+            f"cannot write {path}: {error}; nothing counted that was not written before{problem}"
+        ) from error
     except sqlite3.IntegrityError as error:
         raise JournalError(
             f"{path} was not written: {error}; what was committed before is whole, and the run can be continued"

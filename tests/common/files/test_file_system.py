@@ -1,0 +1,71 @@
+"""The type of a file system by the kernel's list, and locks that fail."""
+
+import errno
+import sys
+from pathlib import Path
+
+import pytest
+
+from dreamfleet.common.files.file_system import file_system_type, is_network, lock_problem
+from tests.support.no_locks import UNAVAILABLE
+
+LIST = """\
+22 1 8:1 / / rw,relatime shared:1 - ext4 /dev/sda1 rw
+30 22 0:40 / /home rw,relatime shared:2 - nfs4 filer:/home rw,vers=4.2
+31 30 8:2 / /home/me/fast\\040disk rw - xfs /dev/sdb1 rw
+32 22 0:41 / /mnt/box rw - fuse.sshfs me@box: rw
+33 22 0:42 / /mnt/lake rw - lustre mds@tcp:/lake rw
+34 22 8:3 / /mnt/stick rw - fuseblk /dev/sdc1 rw
+35 22 0:43 / /mnt/box/over rw - tmpfs none rw
+36 35 0:44 / /mnt/box/over rw - cifs //box/over rw
+broken line
+"""
+
+
+@pytest.mark.parametrize(
+    ("path", "found", "network"),
+    [
+        ("/somewhere", "ext4", False), ("/home", "nfs4", True), ("/home/me/runs", "nfs4", True),
+        ("/homer", "ext4", False), ("/home/me/fast disk/runs", "xfs", False), ("/mnt/box/runs", "fuse.sshfs", True),
+        ("/mnt/lake", "lustre", True), ("/mnt/stick", "fuseblk", False), ("/mnt/box/over/x", "cifs", True),
+    ],
+)  # fmt: skip
+def test_the_longest_and_last_mount_says_the_type(tmp_path, path, found, network):
+    mounts = tmp_path / "mountinfo"
+    mounts.write_text(LIST)
+    assert file_system_type(Path(path), mounts) == found
+    assert is_network(found) is network
+
+
+def test_without_a_list_the_type_is_not_known(tmp_path):
+    assert file_system_type(tmp_path, tmp_path / "none") == ""
+    assert not is_network("")
+
+
+def test_locks_work_here_and_the_trial_leaves_nothing(tmp_path):
+    assert lock_problem(tmp_path / "runs" / "night") == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("error", "said"), [(errno.ENOLCK, "database is locked"), (errno.EOPNOTSUPP, "disk I/O error")]
+)
+def test_where_locks_fail_the_cause_and_the_remedy_are_named(processes, error, said):
+    """`ENOLCK`: NFS without its lock daemon; `EOPNOTSUPP`: a FUSE file system without locks."""
+    broken = (sys.executable, "-m", "tests.support.no_locks", str(error))
+    refused = processes.start("coordinator", "--run", "new", "--runs-dir", processes.runs, inside=broken)
+    code, _ = refused.finish()
+    if code == UNAVAILABLE:
+        pytest.skip("no seccomp filter here")
+    text = "".join(refused.lines)
+    assert code == 1
+    assert f"SQLite says {said}; choose a --runs-dir on a local disk, such as $TMPDIR" in text
+    assert not (processes.runs / "new").exists()
+    begun = processes.coordinator("--generations", 1)
+    shown = processes.start("runs", "show", "test", "--runs-dir", processes.runs, inside=broken)
+    assert shown.finish()[0] == 1
+    assert f"cannot be read: {said}; locks fail on {processes.runs / 'test'}" in "".join(shown.lines)
+    doctor = processes.start("doctor", "--runs-dir", processes.runs, inside=broken)
+    code, out = doctor.finish()
+    assert (code, f"missing\truns folder\tlocks fail on {processes.runs}" in out) == (1, True)
+    begun.end()
