@@ -19,7 +19,7 @@ from dreamfleet.common.protocol.messages import (
     ResultBatch,
     UploadPart,
 )
-from dreamfleet.common.runs.records import RunSettings
+from dreamfleet.common.runs.records import RunSettings, StoredEvaluation
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.run.run import Run
@@ -346,7 +346,7 @@ def test_parted_compares_the_same_scores_before_and_after_a_restart(tmp_path, ra
     before = compared()
     assert [len(each) for each in before] == [4, 4, 4]
     bench.journal.schedule_evaluation(Evaluation(9, bench.journal.evaluated_vector(1), 4))
-    bench.journal.finish_evaluation(9, 1.0, 1.0)
+    bench.journal.finish_evaluation(9, StoredEvaluation(9, 1, 1.0, 0.0), 0)
     bench.journal.commit()
     bench.restart()
     assert compared() == [*before, before[1]]

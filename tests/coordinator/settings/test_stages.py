@@ -130,7 +130,7 @@ def test_limits_count_over_the_whole_run(staged):
 def test_the_log_says_when_a_stage_begins_and_why(staged):
     bench = staged("night")
     bench.drive(lambda _: 0)
-    said = [note for note in bench.run.fleet.notes if "stage" in note]
+    said = [note for note in bench.run.take_notes() if "stage" in note]
     assert said == [
         "generation 0 is in stage 1 of 4 (1000 steps, patience 100, 6 x 1 episode, a new search with step size 0.1)",
         "stage 2 of 4 (400 steps, 6 x 2 episodes, racing, the search goes on) begins with generation 2 after "
