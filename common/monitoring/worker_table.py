@@ -85,7 +85,9 @@ def _row_height(each: WorkerStatus, width: int) -> int:
 
 def _reason_lines(each: WorkerStatus, width: int) -> list[str]:
     """Why a worker left, beneath its row."""
-    return [f"  {line}"[:width] for line in textwrap.wrap(printable(each.reason), max(width - COLUMN_GAP, 1))]
+    room, text = max(width - COLUMN_GAP, 1), printable(each.reason)
+    lines = textwrap.wrap(text, room) if cell_len(text) == len(text) else chop_cells(text, room)
+    return [f"{' ' * COLUMN_GAP}{line}" for line in lines]
 
 
 def _build_table(

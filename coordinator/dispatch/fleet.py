@@ -13,7 +13,7 @@ from itertools import count
 from typing import Literal
 
 from dreamfleet.common.monitoring.status import EventKind
-from dreamfleet.common.printable import one_line, plural
+from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.messages import MAX_SLOTS, Heartbeat, Result, Verdict, VerdictWord
 from dreamfleet.coordinator.dispatch.event_log import EventLog
 from dreamfleet.coordinator.dispatch.failures import JobFailure
@@ -103,12 +103,6 @@ class Fleet:
         if (member := self.members.get(identity)) and member.gone_since is None:
             member.gone_since = now
 
-    def handle_farewell(self, identity: str, why: str, now: float) -> None:
-        """Note that a worker leaves, and why (R24)."""
-        if member := self.members.get(identity):
-            member.farewell = one_line(why)
-            self.handle_departure(identity, now)
-
     def note_refusal(self, identity: str, note: str, why: str) -> None:
         """Log that a worker was refused; the caller bounds how many are (R26)."""
         self.notes.append(note)
@@ -132,6 +126,8 @@ class Fleet:
         if member.is_guest:  # R26: only now is it logged, as strangers could fill the log with names
             self._note_arrival(identity, now, "back" if identity in self.departed else "joined")
             self.departed.remove(identity)
+            if beat.reason:  # R24: it fails before it can score, and has no token that could vanish
+                self.handle_departure(identity, now)
         beat = self._check_numbering(member, beat)
         if self.single_job:
             beat = replace(beat, capacity=min(beat.capacity, beat.slots))

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from enum import Enum, auto
 
+from dreamfleet.common.printable import one_line
 from dreamfleet.common.protocol.messages import MAX_LEASES, Heartbeat, Result, Verdict
 from dreamfleet.coordinator.dispatch.host_stats import HostStats
 from dreamfleet.coordinator.dispatch.packing import BatchContent
@@ -74,8 +75,8 @@ class Member:
     host_stats: HostStats = field(default_factory=HostStats)
     capacity: int = 0  # slots that take jobs; 0, and so no credit, before the first heartbeat and once it drains
     leaves_with_run: bool = False  # it reads that the run has ended, and then exits
-    gone_since: float | None = None  # when its token vanished, or it said farewell
-    farewell: str = ""  # why it leaves, as it said itself
+    gone_since: float | None = None  # when its token vanished, or its first heartbeat was its last
+    farewell: str = ""  # why it leaves, by its last heartbeat
     silent: bool = False
     is_guest: bool = True  # until its first heartbeat
     number: int = 0  # of the last batch in its numbering
@@ -158,6 +159,7 @@ class Member:
         with credit.
         """
         self.is_guest = False
+        self.farewell = one_line(beat.reason)
         self.capacity, self.slots, self.confirmed = beat.capacity, beat.slots, beat.seen
         self.load, self.steps_per_second, self.drawn_by = beat.load, beat.steps_per_second, beat.drawn_by
         if beat.running and beat.steps_per_second:

@@ -91,8 +91,6 @@ class WorkerProtocol:
     def handle_heartbeat(self, worker: str, beat: Heartbeat, now: float) -> None:
         """Reconcile what a worker holds, and its class, before it gets more work."""
         self._fleet.handle_heartbeat(worker, beat, now)
-        if beat.reason:
-            self._fleet.handle_farewell(worker, beat.reason, now)
         self._admission.update_class(worker, beat.host_class)
         for running in beat.running:
             digest = self._fleet.jobs.digest_of_tag(running.tag)

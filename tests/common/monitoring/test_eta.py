@@ -8,6 +8,8 @@ from dreamfleet.common.monitoring.eta import describe_state, estimate_eta, forma
 from dreamfleet.common.monitoring.status import EpisodeProgress, GenerationStatus, Throughput, WorkerCount
 from tests.support.samples import BEST, CLOSED, STATUS
 
+WORKER = STATUS.worker_list[0]
+
 
 def status(limits=(), seconds=None, gone=0.0, **changes):
     recent = tuple(dataclasses.replace(CLOSED, seconds=each) for each in changes.pop("paces", (4.5, 4.6, 900.0)))
@@ -129,6 +131,13 @@ def test_unknown_limits_are_ignored(strange):
             "waiting for workers: none has joined yet",
         ),
         ({"state": "waiting for workers", "workers": WorkerCount(0, 0)}, "waiting for workers: none is present"),
+        (
+            {
+                "state": "waiting for workers",
+                "worker_list": (dataclasses.replace(WORKER, state="left", reason="no memory"),),
+            },
+            f"waiting for workers: none of 1 is present; {WORKER.worker} left 0.3 s ago: no memory",
+        ),
         (
             {"state": "waiting for workers", "refused": {"old-host": "no AVX2"}},
             "waiting for workers; old-host cannot join: no AVX2",

@@ -138,6 +138,14 @@ def test_an_ended_run_shows_its_last_generations_candidates():
     assert "generation 6     8/8 episodes, so far -12 to 140" in text
 
 
+@pytest.mark.parametrize("width", [30, 80, 200])
+def test_why_a_worker_left_stands_beneath_it(width):
+    left = dataclasses.replace(STATUS.worker_list[0], state="left", reason="no environment\x1b[2J " + "word " * 30)
+    panel = drawn(dataclasses.replace(STATUS, worker_list=(left,)), width)
+    assert panel.count("word") == 30
+    assert "\x1b" not in panel
+
+
 def test_workers_beyond_the_first_are_counted():
     known = dataclasses.replace(STATUS.workers, known=31)
     assert "and 30 more" in drawn(dataclasses.replace(STATUS, workers=known), 80)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from dreamfleet.common.monitoring.status import WorkerCount
 from dreamfleet.coordinator.dashboard.page_state import RunSnapshot, page_state
 from tests.support.samples import STATUS
 
@@ -47,3 +48,11 @@ def test_a_lost_run_with_its_journal_here_shows_the_whole_command():
         in (page_state(look(101.0, Path("/data/runs") / STATUS.run))["sentence"])
     )
     assert f"--resume {STATUS.run}, with --runs-dir and --join" in page_state(look(101.0))["sentence"]
+
+
+def test_a_worker_that_left_is_shown_with_its_reason_and_is_not_counted_as_silent():
+    gone = replace(STATUS.worker_list[0], state="left", reason="no memory\x1b")
+    document = page_state(look(worker_list=(gone,), workers=WorkerCount(0, 1, 0, 1)))
+    assert document["workers"]["reason"] == ["no memory\\x1b"]
+    assert "1 left" in document["fleet"]
+    assert "silent" not in document["fleet"]

@@ -39,10 +39,10 @@ def work(count, kind="score", generation=0):
     return make_work(SPEC, kind, generation, 0, vector, range(1000, 1000 + count))
 
 
-def beat(capacity=1, seen=0, numbering=0, queued=(), running=(), unacked=(), rate=0.0, steps=5):
+def beat(capacity=1, seen=0, numbering=0, queued=(), running=(), unacked=(), rate=0.0, steps=5, reason=""):
     return Heartbeat(
         **HEAD, nonce="n", numbering=numbering, seen=seen, capacity=capacity, slots=capacity, load=0.0,
-        steps_per_second=rate, drawn_by="-",
+        steps_per_second=rate, drawn_by="-", reason=reason,
         queued=tuple(digest[:TAG_BYTES] for digest in queued),
         running=tuple(RunningJob(digest[:TAG_BYTES], steps) for digest in running),
         unacked=tuple(digest[:TAG_BYTES] for digest in unacked),
@@ -176,7 +176,8 @@ def test_a_worker_that_vanishes_without_leaving_is_listed_as_lost_until_it_is_ba
 def test_a_worker_that_says_why_it_leaves_is_listed_with_that_and_its_jobs_are_free():
     fleet = fleet_of(A, B, jobs=1)
     (digest,) = digests(fleet.dispatch(0.0), A)
-    fleet.handle_farewell(A, "no\nroom\x1b[2J", 1.0)
+    fleet.handle_heartbeat(A, beat(0, seen=1, queued=[digest], reason="no\nroom\x1b[2J"), 1.0)
+    fleet.handle_departure(A, 1.0)
     fleet.tick(1.0 + 2 * DEPARTURE_GRACE)
     assert digests(fleet.dispatch(1.2), B) == [digest]
     gone = fleet.departed[A]
@@ -192,14 +193,22 @@ def test_a_worker_that_says_why_it_leaves_is_listed_with_that_and_its_jobs_are_f
 def test_a_guest_that_cannot_score_says_why_in_its_first_heartbeat():
     fleet = fleet_of(B, jobs=1)
     fleet.add_worker(A, 1, "f", 1.0)
-    fleet.handle_heartbeat(A, beat(0), 1.0)
-    fleet.handle_farewell(A, "no environment", 1.0)
+    fleet.handle_heartbeat(A, beat(0, reason="no environment"), 1.0)
     fleet.tick(1.0 + 2 * DEPARTURE_GRACE)
     assert list(fleet.departed) == [A]
     assert A not in fleet.members
-    fleet.handle_farewell("stranger/00000009", "filling the list", 2.0)
+    fleet.handle_heartbeat("stranger/00000009", beat(0, reason="filling the list"), 2.0)
     fleet.tick(3.0)
     assert list(fleet.departed) == [A]
+
+
+def test_a_strangers_farewell_in_the_name_of_a_live_worker_ends_with_its_next_heartbeat():
+    fleet = fleet_of(A)
+    fleet.handle_heartbeat(A, beat(0, reason="forged"), 1.0)
+    fleet.tick(1.0 + 2 * DEPARTURE_GRACE)
+    fleet.handle_heartbeat(A, beat(), 2.0)
+    assert fleet.members[A].takes_jobs
+    assert not fleet.members[A].farewell
 
 
 @pytest.mark.parametrize(("last", "wasted"), [("running", 4), ("finished", 10), ("queued", 0)])
