@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import queue
 import signal
 import subprocess
@@ -86,9 +87,11 @@ def _run_trial(request: Mapping[str, Any], limit: float) -> TrialResult:
     with tempfile.TemporaryFile() as printed:
         child = subprocess.Popen(  # noqa: S603 - our own interpreter and module
             [*parent_death_command(), sys.executable, "-P", "-m", CHILD],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=printed, text=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=printed, text=True, start_new_session=True,
         )  # fmt: skip
-        reader = threading.Thread(target=_read, args=(child, json.dumps(request), lines), daemon=True)
+        reader = threading.Thread(
+            target=_read, args=(child, json.dumps({**request, "path": sys.path}), lines), daemon=True
+        )
         reader.start()
         try:
             while (line := lines.get(timeout=limit if step else None)) is not None:
@@ -100,7 +103,8 @@ def _run_trial(request: Mapping[str, Any], limit: float) -> TrialResult:
         except queue.Empty:
             failure = f"{step} took longer than {limit:g} s"
         finally:
-            child.kill()
+            if child.poll() is None:
+                os.killpg(child.pid, signal.SIGKILL)  # with a simulator that it may have started
             child.wait()
             reader.join()
             for each in (child.stdin, child.stdout):
