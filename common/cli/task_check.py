@@ -26,7 +26,7 @@ REMEDY = "draw all randomness from self.np_random, which reset(seed=...) seeds, 
 
 
 @dataclass
-class TrialResult:
+class TaskTrial:
     """What one child process reports."""
 
     description: dict[str, Any] = field(default_factory=dict)
@@ -70,7 +70,7 @@ def try_task(name: str, options: Mapping[str, Any], limit: float = STEP_LIMIT) -
     return TaskReport(Description(**description), "", tuple(warnings), compared, varies)
 
 
-def _find_difference(first: TrialResult, second: TrialResult) -> str:
+def _find_difference(first: TaskTrial, second: TaskTrial) -> str:
     if second.first and first.first != second.first:
         return f"two resets with one seed give different first observations: {REMEDY}"
     if first.repeated and first.repeated != first.episode:
@@ -80,7 +80,7 @@ def _find_difference(first: TrialResult, second: TrialResult) -> str:
     return ""
 
 
-def _run_trial(request: Mapping[str, Any], limit: float) -> TrialResult:
+def _run_trial(request: Mapping[str, Any], limit: float) -> TaskTrial:
     """Run one child and return its last report; without one the fault says what it was doing as it hung or crashed."""
     lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
     name, step, trial = request["task"], "loading it", None
@@ -97,7 +97,7 @@ def _run_trial(request: Mapping[str, Any], limit: float) -> TrialResult:
             while (line := lines.get(timeout=limit if step else None)) is not None:
                 answer = json.loads(line)
                 if "report" in answer:
-                    trial = TrialResult(**answer["report"])
+                    trial = TaskTrial(**answer["report"])
                 step = answer.get("step", step)
             failure = "" if child.wait() == 0 else f"{step or 'normalising'} {_describe_end(child, printed)}"
         except queue.Empty:
@@ -111,7 +111,7 @@ def _run_trial(request: Mapping[str, Any], limit: float) -> TrialResult:
                 assert each is not None
                 each.close()
     if trial is None:
-        return TrialResult(fault=f"{name} cannot be scored: {failure or 'the trial ended without a report'}")
+        return TaskTrial(fault=f"{name} cannot be scored: {failure or 'the trial ended without a report'}")
     trial.warnings += [failure] if failure else []
     return trial
 

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, field, fields
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
-from dreamfleet.common.cli.task_check import TrialResult
+from dreamfleet.common.cli.task_check import TaskTrial
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.printable import one_line
@@ -115,7 +115,7 @@ def _describe(value: Any) -> str:
 
 def run_trial(
     name: str, options: Mapping[str, Any], announce: Callable[[str], None], *, thorough: bool
-) -> Iterator[TrialResult]:
+) -> Iterator[TaskTrial]:
     """Describe the task, drive its probe episode, and yield what was found.
 
     `thorough`: drive the episode twice and normalise, then yield again with what gymnasium's checker says.
@@ -127,7 +127,7 @@ def run_trial(
 
     checked, drive = _prepare(name, description, announce)
     began = monotonic()
-    trial = TrialResult(_plain(description), episode=drive(), first=_digest(checked.first), warnings=checked.warnings)
+    trial = TaskTrial(_plain(description), episode=drive(), first=_digest(checked.first), warnings=checked.warnings)
     trial.seconds = monotonic() - began
     if thorough and trial.episode and trial.seconds < REPEAT_LIMIT:
         trial.repeated = drive()
