@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import queue
 import signal
 import subprocess
@@ -25,7 +26,7 @@ REMEDY = "draw all randomness from self.np_random, which reset(seed=...) seeds, 
 
 
 @dataclass
-class CheckTrial:
+class TaskTrial:
     """What one child process reports."""
 
     description: dict[str, Any] = field(default_factory=dict)
@@ -69,7 +70,7 @@ def try_task(name: str, options: Mapping[str, Any], limit: float = STEP_LIMIT) -
     return TaskReport(Description(**description), "", tuple(warnings), compared, varies)
 
 
-def _find_difference(first: CheckTrial, second: CheckTrial) -> str:
+def _find_difference(first: TaskTrial, second: TaskTrial) -> str:
     if second.first and first.first != second.first:
         return f"two resets with one seed give different first observations: {REMEDY}"
     if first.repeated and first.repeated != first.episode:
@@ -79,35 +80,38 @@ def _find_difference(first: CheckTrial, second: CheckTrial) -> str:
     return ""
 
 
-def _run_trial(request: Mapping[str, Any], limit: float) -> CheckTrial:
+def _run_trial(request: Mapping[str, Any], limit: float) -> TaskTrial:
     """Run one child and return its last report; without one the fault says what it was doing as it hung or crashed."""
     lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
     name, step, trial = request["task"], "loading it", None
     with tempfile.TemporaryFile() as printed:
         child = subprocess.Popen(  # noqa: S603 - our own interpreter and module
             [*parent_death_command(), sys.executable, "-P", "-m", CHILD],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=printed, text=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=printed, text=True, start_new_session=True,
         )  # fmt: skip
-        reader = threading.Thread(target=_read, args=(child, json.dumps(request), lines), daemon=True)
+        reader = threading.Thread(
+            target=_read, args=(child, json.dumps({**request, "path": sys.path}), lines), daemon=True
+        )
         reader.start()
         try:
             while (line := lines.get(timeout=limit if step else None)) is not None:
                 answer = json.loads(line)
                 if "report" in answer:
-                    trial = CheckTrial(**answer["report"])
+                    trial = TaskTrial(**answer["report"])
                 step = answer.get("step", step)
             failure = "" if child.wait() == 0 else f"{step or 'normalising'} {_describe_end(child, printed)}"
         except queue.Empty:
             failure = f"{step} took longer than {limit:g} s"
         finally:
-            child.kill()
+            if child.poll() is None:
+                os.killpg(child.pid, signal.SIGKILL)  # with a simulator that it may have started
             child.wait()
             reader.join()
             for each in (child.stdin, child.stdout):
                 assert each is not None
                 each.close()
     if trial is None:
-        return CheckTrial(fault=f"{name} cannot be scored: {failure or 'the trial ended without a report'}")
+        return TaskTrial(fault=f"{name} cannot be scored: {failure or 'the trial ended without a report'}")
     trial.warnings += [failure] if failure else []
     return trial
 

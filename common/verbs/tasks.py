@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.common.protocol.tasks import is_self_describing, registered_tasks
 
     points = registered_tasks()
-    if args.task in points and not is_self_describing(args.task):  # its runs need a world model, which tells its sizes
+    if args.task in points and not is_self_describing(args.task):  # its runs need a world model
         points = {args.task: points[args.task]}
     elif args.task is not None:
         return _check(args)

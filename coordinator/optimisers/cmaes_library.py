@@ -153,7 +153,7 @@ class RateAdapted(CmaesOptimiser):
 
     @classmethod
     def footprint(cls, dimension: int, population: int, options: Mapping[str, str]) -> Footprint:  # noqa: ARG003
-        """As measured: two square matrices for each candidate while it is told, and 18 more, of which two are state."""
+        """As measured: in an update two square matrices for each candidate and 18 more, of which two are state."""
         return Footprint(8 * (2 * population + 18) * dimension**2, 8 * 2 * dimension**2)
 
     def _draw(self, count: int) -> list[NDArray[np.float64]]:

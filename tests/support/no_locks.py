@@ -1,7 +1,7 @@
 """`python -m tests.support.no_locks ERRNO COMMAND...`: run a command for which POSIX locks fail.
 
-A seccomp filter makes the kernel answer `fcntl(F_SETLK)` with the error; it outlives exec. Exit code 77: it is not to
-be had here.
+A seccomp filter makes the kernel answer `fcntl(F_SETLK)` with the error; it outlives exec. Exit code 77: this
+host has no such filter.
 """
 
 import ctypes

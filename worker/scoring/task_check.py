@@ -13,18 +13,17 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
-from dreamfleet.common.cli.task_check import TrialResult
+from dreamfleet.common.cli.task_check import TaskTrial
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.printable import one_line
-from dreamfleet.common.protocol.tasks import describe_task
+from dreamfleet.common.protocol.tasks import Description, describe_task
 
 if TYPE_CHECKING:
-    from dreamfleet.common.protocol.tasks import Description
     from dreamfleet.worker.tasks.api import Task
 
 MEND = "mend the environment, or wrap it"
@@ -116,7 +115,7 @@ def _describe(value: Any) -> str:
 
 def run_trial(
     name: str, options: Mapping[str, Any], announce: Callable[[str], None], *, thorough: bool
-) -> Iterator[TrialResult]:
+) -> Iterator[TaskTrial]:
     """Describe the task, drive its probe episode, and yield what was found.
 
     `thorough`: drive the episode twice and normalise, then yield again with what gymnasium's checker says.
@@ -128,13 +127,13 @@ def run_trial(
 
     checked, drive = _prepare(name, description, announce)
     began = monotonic()
-    trial = TrialResult(asdict(description), episode=drive(), first=_digest(checked.first), warnings=checked.warnings)
+    trial = TaskTrial(_plain(description), episode=drive(), first=_digest(checked.first), warnings=checked.warnings)
     trial.seconds = monotonic() - began
     if thorough and trial.episode and trial.seconds < REPEAT_LIMIT:
         trial.repeated = drive()
     if thorough and options.get("normalise"):
         announce("")
-        trial.description = asdict(describe_task(name, options))
+        trial.description = _plain(describe_task(name, options))
     if thorough:
         trial.warnings += _describe_pictures(name, checked.environment)
         if checked.reset_seconds >= SLOW_RESET:
@@ -147,6 +146,10 @@ def run_trial(
     announce("close()")
     with suppress(Exception):
         checked.environment.close()
+
+
+def _plain(description: Description) -> dict[str, Any]:
+    return {each.name: getattr(description, each.name) for each in fields(Description)}
 
 
 def _prepare(
@@ -217,6 +220,7 @@ def _describe_pictures(name: str, environment: Any) -> list[str]:
 def main() -> None:
     """Answer the request on stdin; whatever the environment prints goes to stderr."""
     request = json.load(sys.stdin)
+    sys.path[:] = request["path"]
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     os.environ["SDL_VIDEODRIVER"] = "dummy"
@@ -229,7 +233,7 @@ def main() -> None:
         print(json.dumps({"step": name}), file=out, flush=True)
 
     def report(found: dict[str, Any]) -> None:
-        print(json.dumps({"report": found}), file=out, flush=True)
+        print(json.dumps({"report": found}, default=int), file=out, flush=True)
 
     name = request["task"]
     try:

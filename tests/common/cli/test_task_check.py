@@ -6,12 +6,6 @@ import pytest
 
 from dreamfleet.common.cli.task_check import try_task
 from tests.support.environments import ODD
-from tests.support.processes import ROOT
-
-
-@pytest.fixture(autouse=True)
-def importable(monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
 
 
 def trial(fault, name=ODD, **options):

@@ -157,7 +157,7 @@ def test_a_locked_journal_is_not_called_damaged(folder, monkeypatch):
     other.execute("PRAGMA journal_mode = delete")
     other.execute("BEGIN EXCLUSIVE")
     connect = sqlite3.connect
-    monkeypatch.setattr(sqlite3, "connect", lambda *args, **more: connect(*args, timeout=0, **more))
+    monkeypatch.setattr(sqlite3, "connect", lambda *args, **more: connect(*args, **{**more, "timeout": 0}))
     with pytest.raises(JournalError, match="end the program that keeps it locked"):
         RunFolder(folder)
     other.execute("ROLLBACK")

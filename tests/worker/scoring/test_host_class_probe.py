@@ -5,12 +5,13 @@ import pytest
 
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.host.fingerprint import fingerprint
-from dreamfleet.common.protocol.host_classes import class_from_fingerprint
+from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, HostClasses, class_from_fingerprint
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.scoring.host_class_probe import HostClassProbe, fixed_parameters
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tasks.policy import FlatPolicy
 from tests.support import tasks
+from tests.support.environments import ODD
 
 CART_POLE = TaskSpec("gym:CartPole-v1", "", 500, 0, ControllerShape(4, 2))
 
@@ -73,3 +74,11 @@ def test_the_parameters_are_the_same_bits_everywhere():
     assert (
         fixed_parameters(3).tobytes().hex() == fixed_parameters(867)[:3].tobytes().hex() == "cebb713d192207beda4c353e"
     )
+
+
+@pytest.mark.parametrize("fault", ["noise", "random", "carry"])
+def test_an_environment_that_is_not_deterministic_has_a_class_of_its_own(fault):
+    options = f'{{"environment": {{"fault": "{fault}"}}}}'
+    found = Scorer(TaskSpec(ODD, "", 20, 0, ControllerShape(2, 2), options=options)).host_class
+    assert found == NON_DETERMINISTIC
+    assert HostClasses.of({(found, "x"): 3}).description.startswith("not deterministic: 100.0% of results")
