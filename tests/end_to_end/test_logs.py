@@ -38,19 +38,19 @@ def test_an_orderly_end_is_not_logged_as_a_loss(processes, random_bundle):
         "--task", tasks.TOY, "--generations", 100000,
     )  # fmt: skip
     own, drained = (processes.worker("--task", tasks.TOY, "--name", name, *more)
-                    for name, more in (("own", ("--exit-when-done",)), ("drained", ())))  # fmt: skip
+                    for name, more in (("own", ("--exit-when-done", "--coordinator-timeout", 1)), ("drained", ())))  # fmt: skip
     own.wait_for("joined run test")
     drained.wait_for("joined run test")
     coordinator.wait_for("generation 0: mean")
     drained.popen.terminate()
-    assert "left: " in coordinator.wait_for("worker drained/")
+    assert "left (drained after a signal): " in coordinator.wait_for("worker drained/")
     code, out, err = processes.call("status", "test", "--connect", processes.endpoint)
     assert (code, "╭─ test · running" in out) == (0, True), err
     for verb, said in (("pause", "paused: by hand"), ("resume", "resumed"), ("stop", "")):
         assert processes.call(verb, "test", "--connect", processes.endpoint)[0] == 0
         coordinator.wait_for(said)
     assert "this worker leaves too" in own.wait_for("the coordinator of run test")
-    assert own.finish()[0] == 0
+    assert own.finish()[0] == 1, "the run was stopped, and has not ended"
 
 
 @pytest.mark.slow
