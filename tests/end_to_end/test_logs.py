@@ -37,8 +37,9 @@ def test_an_orderly_end_is_not_logged_as_a_loss(processes, random_bundle):
         "--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
         "--task", tasks.TOY, "--generations", 100000,
     )  # fmt: skip
+    leaves = "--exit-when-done", "--coordinator-timeout", 1
     own, drained = (processes.worker("--task", tasks.TOY, "--name", name, *more)
-                    for name, more in (("own", ("--exit-when-done", "--coordinator-timeout", 1)), ("drained", ())))  # fmt: skip
+                    for name, more in (("own", leaves), ("drained", ())))  # fmt: skip
     own.wait_for("joined run test")
     drained.wait_for("joined run test")
     coordinator.wait_for("generation 0: mean")
