@@ -37,20 +37,21 @@ def test_an_orderly_end_is_not_logged_as_a_loss(processes, random_bundle):
         "--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
         "--task", tasks.TOY, "--generations", 100000,
     )  # fmt: skip
+    leaves = "--exit-when-done", "--coordinator-timeout", 1
     own, drained = (processes.worker("--task", tasks.TOY, "--name", name, *more)
-                    for name, more in (("own", ("--exit-when-done",)), ("drained", ())))  # fmt: skip
+                    for name, more in (("own", leaves), ("drained", ())))  # fmt: skip
     own.wait_for("joined run test")
     drained.wait_for("joined run test")
     coordinator.wait_for("generation 0: mean")
     drained.popen.terminate()
-    assert "left: " in coordinator.wait_for("worker drained/")
+    assert "left (drained after a signal): " in coordinator.wait_for("worker drained/")
     code, out, err = processes.call("status", "test", "--connect", processes.endpoint)
     assert (code, "╭─ test · running" in out) == (0, True), err
     for verb, said in (("pause", "paused: by hand"), ("resume", "resumed"), ("stop", "")):
         assert processes.call(verb, "test", "--connect", processes.endpoint)[0] == 0
         coordinator.wait_for(said)
     assert "this worker leaves too" in own.wait_for("the coordinator of run test")
-    assert own.finish()[0] == 0
+    assert own.finish()[0] == 1, "the run was stopped, and has not ended"
 
 
 @pytest.mark.slow

@@ -120,7 +120,7 @@ def test_through_a_tunnel_workers_serve_a_coordinator_on_loopback_and_end_with_t
 def test_a_log_is_followed_until_the_worker_ends_or_somebody_has_seen_enough(processes, hosts):
     a, coordinator = hosts.add("a"), processes.coordinator(*TOY, "--generations", 10**6)
     flags = ("--connect", processes.endpoint, "--no-tunnel", "--follow")
-    own = ("--worker-flags", f"--task {tasks.TOY} --exit-when-done")
+    own = ("--worker-flags", f"--task {tasks.TOY} --exit-when-done --coordinator-timeout 1")
     command = processes.start("spawn", "a", *words(hosts, *flags, *own))
     coordinator.wait_for("generation 1: mean")
     command.popen.send_signal(signal.SIGINT)

@@ -59,7 +59,7 @@ def test_with_exit_when_done_it_fails_after_long_without_a_coordinator_and_says_
     assert "--coordinator-timeout" in str(error)
 
 
-def test_it_tells_its_coordinator_why_it_leaves(stage, cached):
+def test_it_says_to_its_coordinator_why_it_leaves(stage, cached):
     hand = stage.hand()
     made, served = stage.worker()
     hand.ready()
@@ -68,7 +68,7 @@ def test_it_tells_its_coordinator_why_it_leaves(stage, cached):
     assert served.result(DEADLINE) is None
 
 
-def test_it_tells_why_it_fails_before_it_can_score(stage):
+def test_it_says_why_it_fails_before_it_can_score(stage):
     hand = stage.hand()
     hand.total = lambda: 1 << 60
     _, served = stage.worker(exit_when_done=True)
@@ -77,7 +77,7 @@ def test_it_tells_why_it_fails_before_it_can_score(stage):
     assert (said.capacity, said.reason) == (0, str(error))
 
 
-def test_it_tells_an_older_coordinator_no_reason(stage, cached):
+def test_it_sends_an_older_coordinator_no_reason(stage, cached):
     hand = stage.hand()
     hand.reasons = False
     made, served = stage.worker()
