@@ -13,7 +13,7 @@ import cma
 import numpy as np
 import pytest
 
-TASK = "tests.support.tasks:Toy"
+TASK, BRITTLE = "tests.support.tasks:Toy", "tests.support.tasks:Brittle"
 SCHEDULE = """
 [[stage]]
 generations = 3
@@ -28,15 +28,16 @@ CHOOSING, CONFIRMING, FIRST_VALIDATION = 10_000, 20_000, 20_000  # episodes that
 CONFIRM_EPISODES, FINALISTS = 12, 4
 
 
-def started(processes, name, bundle, *flags):
+def started(processes, name, bundle, *flags, task=TASK):
     """A run to its end; what the coordinator answered."""
     coordinator = processes.coordinator(
-        "--bundle", bundle.path, "--task", TASK, "--population", 6, "--episodes", 4, "--sigma0", 0.3, "--seed", 7,
+        "--bundle", bundle.path, "--task", task, "--population", 6, "--episodes", 4, "--sigma0", 0.3, "--seed", 7,
         "--evaluate-every", 1, "--evaluation-episodes", 5, "--confirm-episodes", CONFIRM_EPISODES, "--generations", 6,
         "--json", *flags, name=name,
     )  # fmt: skip
-    processes.worker("--task", TASK, "--run", name)
+    worker = processes.worker("--task", task, "--run", name)
     code, out = coordinator.finish()
+    worker.end()
     assert code == 0
     return json.loads(out.splitlines()[-1])
 
@@ -67,6 +68,11 @@ class Recomputed:
                 "SELECT kind, generation, candidate, episode, seed, fitness, steps FROM result"
             ):
                 self.results.setdefault((kind, generation, candidate), {})[episode] = seed, fitness, steps
+            self.failed = {}
+            for kind, generation, candidate, episode in journal.execute(
+                "SELECT kind, generation, candidate, episode FROM failure"
+            ):
+                self.failed.setdefault((kind, generation, candidate), set()).add(episode)
         self.settings = json.loads(self.facts["settings"])
 
     def stage(self, generation):
@@ -81,9 +87,16 @@ class Recomputed:
         return found, number
 
     def fitness(self, generation):
-        """Each candidate's mean over its own episodes, and its rank by the first half, of which the better race on."""
+        """Each candidate's mean over its own episodes; NaN for one that failed. In a race the better half goes on."""
         stage, _ = self.stage(generation)
-        rows = [self.results["score", generation, number] for number in range(stage["population"])]
+        places = [("score", generation, number) for number in range(stage["population"])]
+        if any(place in self.failed for place in places):
+            assert not stage["racing"]
+            return np.array(
+                [np.nan if place in self.failed else
+                 np.mean([self.results[place][episode][1] for episode in range(stage["episodes"])]) for place in places]
+            )  # fmt: skip
+        rows = [self.results[place] for place in places]
         first = -(-stage["episodes"] // 2) if stage["racing"] else stage["episodes"]
         early = np.array([np.mean([row[episode][1] for episode in range(first)]) for row in rows])
         better = set(np.argsort(-early, kind="stable")[: -(-len(rows) // 2)])
@@ -101,27 +114,38 @@ class Recomputed:
 
     def drive(self, generation, first, count):
         """The scores of one mean in a round of the confirmation, on seeds that follow from the episode's number."""
-        rows = self.results["evaluate", generation, 0]
-        assert [rows[episode][0] for episode in range(first, first + count)] == [
-            FIRST_VALIDATION + episode for episode in range(first, first + count)
-        ]
-        return np.array([rows[episode][1] for episode in range(first, first + count)])
+        rows, failed = self.results["evaluate", generation, 0], self.failures(generation)
+        scored = [episode for episode in range(first, first + count) if episode not in failed]
+        assert [rows[episode][0] for episode in scored] == [FIRST_VALIDATION + episode for episode in scored]
+        return np.array([rows[episode][1] for episode in scored])
+
+    def failures(self, generation):
+        """The episodes of a mean's evaluation and confirmation that failed."""
+        return self.failed.get(("evaluate", generation, 0), set())
+
+    def rank(self, generation):
+        """Evaluated means are ordered by failed episodes, then by their score; of equals the earliest is better."""
+        failed = sum(episode < CHOOSING for episode in self.failures(generation))
+        return failed, -self.look(generation)[0], generation
 
     def confirmed(self):
         """The generation that successive halving leaves, with its mean and standard error on fresh seeds."""
         looks = {generation: self.look(generation) for generation in self.evaluated}
-        left = sorted(looks, key=lambda each: (-looks[each][0], each))[:FINALISTS]
+        left = sorted(looks, key=self.rank)[:FINALISTS]
+        failed = {each: self.rank(each)[0] for each in left}
         totals = {each: (looks[each][0] * looks[each][3], looks[each][3]) for each in left}
         first = CHOOSING
         while len(left) > 1:
             count = CONFIRM_EPISODES // len(left)
             for each in left:
                 total, seen = totals[each]
-                totals[each] = total + self.drive(each, first, count).sum(), seen + count
-            left.sort(key=lambda each: (-totals[each][0] / totals[each][1], each))
+                scores = self.drive(each, first, count)
+                totals[each] = total + scores.sum(), seen + len(scores)
+                failed[each] += count - len(scores)
+            left.sort(key=lambda each: (failed[each], -totals[each][0] / totals[each][1], each))
             first, left = first + count, left[: -(-len(left) // 2)]
         scores = self.drive(left[0], CONFIRMING, CONFIRM_EPISODES)
-        return left[0], scores.mean(), scores.std(ddof=1) / np.sqrt(CONFIRM_EPISODES)
+        return left[0], scores.mean(), scores.std(ddof=1) / np.sqrt(len(scores))
 
 
 def search(mean, stage, number, seed):
@@ -155,15 +179,17 @@ def check_search(found):
         if mean is None:
             continue  # the generation that was open at the end
         fitness = found.fitness(number)
-        stored = np.array([found.candidates[number, index][1] for index in range(len(asked))])
+        stored = np.array([found.candidates[number, index][1] for index in range(len(asked))], dtype=np.float64)
         np.testing.assert_allclose(stored, fitness, rtol=1e-14)
         np.testing.assert_array_equal(np.argsort(-stored, kind="stable"), np.argsort(-fitness, kind="stable"))
-        expected = fitness.mean(), fitness.std(), fitness.max(), fitness.min()
+        scored = fitness[np.isfinite(fitness)]
+        expected = scored.mean(), scored.std(), scored.max(), scored.min()
         assert (mean, std, best, worst) == pytest.approx(expected, rel=1e-12)
-        rows = [found.results["score", number, index] for index in range(len(asked))]
+        rows = [found.results["score", number, index] for index in np.flatnonzero(np.isfinite(fitness)).tolist()]
         assert steps == sum(each[2] for row in rows for each in row.values())
         assert {row[0][0] for row in rows} == {json.loads(seeds)[0]}, "all candidates drive the same seeds"
-        strategy.tell(asked, (-stored).tolist())
+        last = np.nextafter(stored[np.isfinite(stored)].min(), -np.inf)  # for those that failed
+        strategy.tell(asked, (-np.where(np.isfinite(stored), stored, last)).tolist())
         np.testing.assert_array_equal(found.evaluated[number][0], strategy.mean.astype("<f4"))
 
 
@@ -187,7 +213,7 @@ def check_scores(processes, name, found, answer):
         assert [int(each["generation"]) for each in rows] == list(looks)
         for each in rows:
             assert [float(each["mean"]), float(each["error"])] == pytest.approx(looks[int(each["generation"])][:2])
-    best = max(looks, key=lambda each: looks[each][0])
+    best = min(looks, key=found.rank)
     assert answer["best"]["generation"] == best
     assert [answer["best"]["mean"], answer["best"]["error"]] == pytest.approx(looks[best][:2])
     generation, mean, error = found.confirmed()
@@ -214,7 +240,7 @@ def check_status(processes, name, found):
     coordinator.end()
     assert code == 0, err
     status = json.loads(out)
-    last, best = max(found.evaluated), max(found.evaluated, key=lambda each: found.look(each)[0])
+    last, best = max(found.evaluated), min(found.evaluated, key=found.rank)
     for each, generation in ((status["evaluation"], last), (status["best"], best)):
         assert each["generation"] == generation
         mean, error, deviation, episodes = found.look(generation)
@@ -224,6 +250,8 @@ def check_status(processes, name, found):
     confirmed = status["confirmed"]
     assert (confirmed["generation"], confirmed["mean"], confirmed["error"]) == pytest.approx(found.confirmed())
     fitness = found.fitness(last)
+    assert status["last"].get("failed", 0) == np.isnan(fitness).sum()
+    fitness = fitness[np.isfinite(fitness)]
     shown = [status["last"][each] for each in ("mean", "std", "best", "worst")]
     assert shown == pytest.approx([fitness.mean(), fitness.std(), fitness.max(), fitness.min()])
 
@@ -239,3 +267,14 @@ def test_a_run_is_what_its_journal_comes_to(processes, random_bundle, kind):
     check_search(found)
     check_scores(processes, kind, found, answer)
     check_status(processes, kind, found)
+
+
+@pytest.mark.slow
+def test_a_run_with_failures_is_what_its_journal_comes_to(processes, random_bundle):
+    answer = started(processes, "brittle", random_bundle, "--evaluation-episodes", 9, task=BRITTLE)
+    found = Recomputed(processes.runs / "brittle" / "journal.sqlite")
+    kinds = {kind for kind, _, _ in found.failed}
+    assert kinds == {"score", "evaluate"}, "choose another seed"
+    check_search(found)
+    check_scores(processes, "brittle", found, answer)
+    check_status(processes, "brittle", found)

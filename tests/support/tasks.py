@@ -100,6 +100,22 @@ class Rounded(Toy):
         return gymnasium.wrappers.TransformReward(made, lambda reward: reward * (1 - odd))
 
 
+class Brittle(Toy):
+    """A tenth of the episodes raises, by parameters and seed."""
+
+    name = f"{MODULE}:Brittle"
+
+    def make_environment(self, assignment):
+        return BrittleEnvironment()
+
+
+class BrittleEnvironment(ToyEnvironment):
+    def step(self, action):
+        if self._left == 7 and hashlib.sha256(action.tobytes() + self._target.tobytes()).digest()[0] < 26:
+            raise ArithmeticError(f"the world of {id(self)} is brittle")
+        return super().step(action)
+
+
 class Raising(Toy):
     name = RAISING
 
