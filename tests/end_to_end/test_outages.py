@@ -76,7 +76,9 @@ def test_a_run_says_why_its_worker_left_and_the_worker_in_one_line(processes):
         inside=("env", f"PYTHONPATH={ROOT}:{there}"),
     )  # fmt: skip
     coordinator.wait_for("incarnation")
-    code, _, err = processes.call("worker", "--connect", processes.endpoint, "--slots", 1)
+    code, _, err = processes.call(
+        "worker", "--connect", processes.endpoint, "--slots", 1, "--task", "gym:its_module:There-v0"
+    )
     assert code == 1
     assert "Traceback" not in err
     why = "a slot cannot start: UsageError: gymnasium makes no environment"
