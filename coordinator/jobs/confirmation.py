@@ -64,7 +64,8 @@ class Confirmation:
         self._closed = closed
         self._remaining = list(finalists)
         self._next = CHOOSING_OFFSET  # the first track of the next choosing round
-        self._digests: list[bytes] = []  # of the open round, finalist by finalist
+        self._work: list[Work] = []  # of the open round, finalist by finalist
+        self._digests: list[bytes] = []  # of its jobs
         self._scores: dict[bytes, float] = {}
 
     @property
@@ -93,6 +94,18 @@ class Confirmation:
     def in_progress(self) -> bool:
         """Whether scores of the open round are missing."""
         return len(self._scores) < len(self._digests)
+
+    @property
+    def failed_share(self) -> float:
+        """The share of the open round's episodes that failed for good."""
+        return sum(map(isnan, self._scores.values())) / max(len(self._digests), 1)
+
+    def retry_failed(self) -> list[Work]:
+        """Want the failed episodes of the open round again; their jobs."""
+        failed = {digest for digest, score in self._scores.items() if isnan(score)}
+        for digest in failed:
+            del self._scores[digest]
+        return [each for each in self._work if each.job.digest in failed]
 
     def advance(self, known: FindScores) -> list[Work]:
         """Close a complete round and open the next one; return its missing jobs, none once there is an outcome."""
@@ -124,6 +137,7 @@ class Confirmation:
             for each in self._remaining
             for job in make_work(self._spec, "evaluate", each.generation, 0, each.vector, seeds, first=first)
         ]
+        self._work = work
         self._digests = [each.job.digest for each in work]
         self._scores = dict(known(self._digests))
         return [each for each in work if each.job.digest not in self._scores]
