@@ -60,8 +60,9 @@ class BackgroundJobs:
         if (found := self.evaluations.find_excessive(self._failure_limit)) is not None:
             generation, failed, total = found
             return f"{failed} of {plural(total, 'episode')} of the evaluation of generation {generation}'s mean failed"
-        if self._confirmation is not None and self._confirmation.failed_share > self._failure_limit:
-            return f"{self._confirmation.failed_share:.0%} of the episodes of the confirmation's open round failed"
+        if self._confirmation is not None and self._confirmation.has_failed:
+            failed, (_, total) = self._confirmation.failed_count, self._confirmation.progress
+            return f"{failed} of {plural(total, 'episode')} of the confirmation failed"
         return None
 
     def retry_failed(self) -> list[Work]:
@@ -150,7 +151,7 @@ class BackgroundJobs:
             episodes, finalists = self._settings.confirm_episodes, self._journal.finalists(FINALISTS)
             if not (episodes and finalists):
                 return []
-            self._confirmation = Confirmation(self._settings.task, episodes, finalists, closed)
+            self._confirmation = Confirmation(self._settings.task, episodes, finalists, closed, self._failure_limit)
         work = self._confirmation.advance(self._journal.fitness_of)
         if self._confirmation.failed:
             return []

@@ -378,7 +378,7 @@ class Run:
         if work := self.background_jobs.confirm():
             self.fleet.notes.append(self.background_jobs.round_description)
             self.fleet.jobs.offer(work)
-        else:
+        elif self.background_jobs.too_many_failed is None:
             self._end()
 
     def _begin_ending(self, reason: str) -> None:

@@ -107,14 +107,14 @@ def test_the_bits_are_the_same_on_any_fleet_and_through_restarts(failing, tmp_pa
     def fails(job):
         return (job.vector[0] + job.seeds[0]) % 256 < 40
 
-    whole = failing("whole", settings=settings, fails=fails).story()
+    whole = failing("whole", settings=settings, fails=fails, limit=1.0).story()
     assert sum(each.failed for each in whole[0])
-    lone = Failing(tmp_path / "lone" / "night", random_bundle.path, settings, fails=fails)
+    lone = Failing(tmp_path / "lone" / "night", random_bundle.path, settings, fails=fails, limit=1.0)
     lone.hosts = [A]
     lone.run.fleet.handle_departure(B, lone.now)
     lone.serve()
     assert lone.story() == whole
-    killed = Failing(tmp_path / "killed" / "night", random_bundle.path, settings, fails=fails)
+    killed = Failing(tmp_path / "killed" / "night", random_bundle.path, settings, fails=fails, limit=1.0)
     while not killed.run.ended:
         killed.serve(stop=lambda run: run.fleet.counts["accepted"] + run.fleet.counts["errors"] > 12)
         if not killed.run.ended:
