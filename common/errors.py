@@ -46,13 +46,13 @@ class JournalError(DreamfleetError):
     """A run's journal is missing, damaged, locked, not writable, or not a journal."""
 
 
-class DiskFullError(JournalError):
-    """The disk of a run is full; what was not written can be written once there is room."""
+class NotWritableNowError(JournalError):
+    """The disk of a run is full, or its journal locked; what was not written can be written later."""
 
 
 def write_error(path: object, error: OSError) -> JournalError:
     """The error for a file of a run that cannot be written."""
-    kind = DiskFullError if error.errno in (ENOSPC, EDQUOT) else JournalError
+    kind = NotWritableNowError if error.errno in (ENOSPC, EDQUOT) else JournalError
     return kind(f"cannot write {path}: {error.strerror}; make room")
 
 

@@ -12,7 +12,7 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from math import nan
 
-from dreamfleet.common.errors import DiskFullError
+from dreamfleet.common.errors import NotWritableNowError
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.messages import Job, Result
@@ -33,7 +33,7 @@ from dreamfleet.coordinator.run.work_clock import WorkClock
 from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 
-DISK_RETRY = 2.0  # seconds until a full disk is tried again
+WRITE_RETRY = 2.0  # seconds until a full disk or a locked journal is tried again
 
 
 class Run:
@@ -150,7 +150,7 @@ class Run:
     def advance(self, now: float) -> bool:
         """Close the complete generation and open the next one; whether a generation was opened."""
         closed = len(self.history)
-        if self.stalled is not None:
+        if self.stalled is not None or (self.generation.complete and not self._flush()):
             return False
         self._settle_failures()
         while self.ended is None and self.paused is None and self.generation.complete and not self._is_waiting:
@@ -167,7 +167,8 @@ class Run:
     def commit(self) -> bool:
         """Make everything so far durable, then write the reported controller if it is due; whether that succeeded.
 
-        On a full disk the run waits: it gives out no jobs and closes no generation until a later call succeeds.
+        On a full disk or a locked journal the run waits: it gives out no jobs and closes no generation until a later
+        call succeeds.
         """
         if self.stalled is None and self._journal.has_writes:
             self._journal.set_seconds(self.generation.number, self.work_clock.seconds)
@@ -176,20 +177,29 @@ class Run:
         try:
             self._journal.commit()
             self.background_jobs.report.save()
-        except DiskFullError as error:
-            self.wait_for_room(error)
+        except NotWritableNowError as error:
+            self.wait_until_writable(error)
             return False
         if self.stalled is not None:
             self.stalled, self.fleet.paused = None, self.paused is not None
-            self.fleet.notes.append("there is room on the disk again: the run goes on")
+            self.fleet.notes.append("the journal can be written again: the run goes on")
         return True
 
-    def wait_for_room(self, error: DiskFullError) -> None:
+    def _flush(self) -> bool:
+        """Take the journal's lock before a generation closes, which nothing may interrupt; whether that succeeded."""
+        try:
+            self._journal.flush()
+        except NotWritableNowError as error:
+            self.wait_until_writable(error)
+            return False
+        return True
+
+    def wait_until_writable(self, error: NotWritableNowError) -> None:
         """Give out no jobs until what could not be written is written."""
         if self.stalled is None:
             self.fleet.notes.append(f"paused: {error}, and the run goes on by itself")
         self.stalled, self.fleet.paused = f"{error}, and the run goes on by itself", True
-        self._retry_at = self._now + DISK_RETRY
+        self._retry_at = self._now + WRITE_RETRY
 
     def leave(self) -> None:
         """Make everything durable and write the reported controller before the coordinator exits."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 
-from dreamfleet.common.errors import DiskFullError, DreamfleetError, InternalError
+from dreamfleet.common.errors import DreamfleetError, InternalError, NotWritableNowError
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol import keys
@@ -167,8 +167,8 @@ class WorkerProtocol:
         """The result of a kept rollout with its file saved; `None` while the file is on its way or the disk is full."""
         try:
             return self._collections.receive(worker, result, self._fleet.find_job_for_result(worker, result))
-        except DiskFullError as error:  # the worker sends both again
-            self._run.wait_for_room(error)
+        except NotWritableNowError as error:  # the worker sends both again
+            self._run.wait_until_writable(error)
             return None
 
     def _most_steps(self, job: Job) -> int:

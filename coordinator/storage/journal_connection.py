@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sqlite3
-from contextlib import closing, suppress
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from dreamfleet.common.errors import DiskFullError, JournalError
+from dreamfleet.common.errors import JournalError, NotWritableNowError
 from dreamfleet.common.files.atomic_write import fsync_path
 from dreamfleet.common.runs import schema
 from dreamfleet.coordinator.storage.journal_file import (
@@ -75,20 +76,33 @@ class JournalConnection:
                 left.unlink(missing_ok=True)
 
     def commit(self) -> None:
-        """Make everything written so far durable; after `DiskFullError` it may be called again."""
+        """Make everything written so far durable; after `NotWritableNowError` it may be called again."""
         own = self._stamp in (None, file_stamp(self.path))
-        try:
+        self.flush()
+        with self._kept_writes(), journal_errors(self.path):
+            self._connection.commit()
+        self._uncommitted = []
+        if own:  # else somebody wrote there since the last commit, which `is_overwritten` looks into
+            self._stamp = file_stamp(self.path)
+
+    def flush(self) -> None:
+        """Begin a transaction with everything written so far; until its commit no other program can lock the journal.
+
+        After `NotWritableNowError` it may be called again.
+        """
+        with self._kept_writes():
             self._flush()
-            with journal_errors(self.path):
-                self._connection.commit()
-        except DiskFullError:
+
+    @contextmanager
+    def _kept_writes(self) -> Iterator[None]:
+        """Keep all writes since the last commit for another try, should this one fail."""
+        try:
+            yield
+        except NotWritableNowError:
             with suppress(sqlite3.Error):
                 self._connection.rollback()
             self._writes, self._uncommitted = [*self._uncommitted, *self._writes], []
             raise
-        self._uncommitted = []
-        if own:  # else somebody wrote there since the last commit, which `is_overwritten` looks into
-            self._stamp = file_stamp(self.path)
 
     @property
     def has_writes(self) -> bool:

@@ -7,8 +7,13 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from dreamfleet.common.errors import DiskFullError, DreamfleetError, JournalError
+from dreamfleet.common.errors import DreamfleetError, JournalError, NotWritableNowError
 from dreamfleet.common.files.file_system import lock_problem
+
+REMEDIES = {
+    sqlite3.SQLITE_FULL: "make room",
+    sqlite3.SQLITE_BUSY: "end the program that keeps it locked",
+}  # of errors after which the same writes may succeed later
 
 
 def check_database(connection: sqlite3.Connection) -> tuple[str, int | None]:
@@ -49,8 +54,8 @@ def journal_errors(path: Path) -> Iterator[None]:
     except DreamfleetError:
         raise
     except sqlite3.OperationalError as error:
-        if getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_FULL:
-            raise DiskFullError(f"cannot write {path}: {error}; make room") from error
+        if (remedy := REMEDIES.get(getattr(error, "sqlite_errorcode", 0) & 0xFF)) is not None:
+            raise NotWritableNowError(f"cannot write {path}: {error}; {remedy}") from error
         problem = f"; {text}" if (text := lock_problem(path.parent)) else ""
         raise JournalError(
             f"cannot write {path}: {error}; nothing counted that was not written before{problem}"

@@ -2,15 +2,15 @@
 
 import os
 import shutil
+import sqlite3
 import subprocess
+from contextlib import closing
 
 import numpy as np
 import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
-
-pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount a small disk")
 
 DRIVES = 30
 ROOM = 900_000  # bytes: for a while of journal, and not for a drive
@@ -19,6 +19,8 @@ ROOM = 900_000  # bytes: for a while of journal, and not for a drive
 @pytest.fixture
 def small_disk(tmp_path):
     """A file system of 19 MB, of which the world model's copy takes 14."""
+    if os.geteuid() != 0:
+        pytest.skip("only root can mount a small disk")
     place = tmp_path / "disk"
     place.mkdir()
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=19m", "tmpfs", place], check=False).returncode:
@@ -54,6 +56,21 @@ def test_a_run_on_a_full_disk_waits_and_goes_on_by_itself_to_the_same_bits(proce
     with open_run(small_disk, "small") as one, open_run(processes.runs, "whole") as other:
         history = [(each.number, each.mean) for each in one.history()]
         assert history == [(each.number, each.mean) for each in other.history()]
+
+
+def test_a_run_whose_journal_is_locked_waits_and_goes_on(processes, random_bundle):
+    flags = ("--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 1, "--evaluate-every", 0, "--generations", 12)
+    locked = processes.coordinator("--bundle", random_bundle.path, *flags)
+    processes.worker("--task", tasks.SLOW_TOY)
+    locked.wait_for("generation 0: mean")
+    with closing(sqlite3.connect(processes.runs / "test" / "journal.sqlite", timeout=60)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        locked.wait_for("locked; end the program that keeps it locked, and the run goes on")
+        other.rollback()
+    locked.wait_for("can be written again")
+    assert locked.finish()[0] == 0
+    with open_run(processes.runs, "test") as run:
+        assert len(run.history()) == 12
 
 
 @pytest.mark.slow

@@ -101,6 +101,9 @@ class MemoryJournal:
         """No rule hangs on the time of a generation, which is written with them."""
         return False
 
+    def flush(self) -> None:
+        """Nobody else locks it."""
+
     def set_seconds(self, generation: int, seconds: float) -> None:
         """No rule hangs on it."""
 
