@@ -12,6 +12,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+from dreamfleet.worker.tasks.api import Score
 from tests.support.tasks import Toy, ToyEnvironment
 
 MODULE = "tests.support.rough_tasks"
@@ -187,6 +188,57 @@ class Hungry(Rough):
 
     def misbehave(self):
         self.held = [bytearray(os.urandom(1) * (16 << 20)) for _ in range(4096)]
+
+
+def leak_descriptors():
+    while True:
+        os.dup(0)
+
+
+def hang():
+    time.sleep(600)
+
+
+def starve():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def fail():
+    raise RuntimeError("this process is poisoned")
+
+
+POISONS = {each.__name__: each for each in (fail, leak_descriptors, segfault, hang, starve)}
+POISON = "DREAMFLEET_TEST_POISON"
+
+
+class Poisoned(Rough):
+    """Only the first episode of a process ends well."""
+
+    steps = 0
+
+    def misbehave(self):
+        self.steps += 1
+        if self.steps > 10:
+            POISONS[os.environ[POISON]]()
+
+
+class PoisonedBatch(Toy):
+    """From the second group of a process on, the last fitness of a group is out of bounds."""
+
+    batch_size = 4
+
+    def make_batch(self, assignment):
+        return SpoiltBatch()
+
+
+class SpoiltBatch:
+    groups = 0
+
+    def score(self, episodes, on_step):
+        self.groups += 1
+        on_step(10 * len(episodes))
+        fine = [Score(1.0, 10)] * (len(episodes) - 1)
+        return [*fine, Score(1.0 if self.groups == 1 else 1e200, 10)]
 
 
 class Mute(Exception):  # noqa: N818

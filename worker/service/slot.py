@@ -14,18 +14,21 @@ from typing import Any
 
 from dreamfleet.common.errors import BundleError, DreamfleetError
 from dreamfleet.common.printable import truncate
+from dreamfleet.common.protocol.failures import is_host_failure
 from dreamfleet.common.protocol.messages import Job, Result, TaskSpec
 from dreamfleet.worker.service.child import ChildReady
 from dreamfleet.worker.service.child_process import EXIT_GRACE, ChildMessage, ChildProcess
-from dreamfleet.worker.service.failure_cause import describe_crash, describe_exit
+from dreamfleet.worker.service.failure_cause import describe_crash, describe_exit, is_hosts_fault
 from dreamfleet.worker.service.failure_log import ScoringFailure
 from dreamfleet.worker.service.frame_sampler import SampledFrame
 from dreamfleet.worker.service.job_group import GroupDone, JobGroup, JobWithVector
 
 log = logging.getLogger(__name__)
 FAILED_STARTS = 3  # failed starts in a row that end the worker
+STARVED_STARTS = 15  # the same where the host is at fault; the pauses between them add up to 602 seconds
+START_RETRY_DELAY = 2.0  # seconds until the next try, where no child could be started; doubled where the host is short
+MAX_STARVED_DELAY = 60.0  # the longest of these pauses
 MAX_NAME_LENGTH = 100  # characters of `drawn_by`
-START_RETRY_DELAY = 2.0  # seconds until the next try, where the host had no resources for a child
 REMEDY = "give it fewer --slots, or this host more room (ulimit -n, ulimit -u, memory, the disk of temporary files)"
 MAX_START_DELAY = 30.0  # the longest pause before a new child, where children end one after another without a result
 START_LIMIT = 120.0  # seconds that a child may take to load task and world model; doubled with each failed start
@@ -85,7 +88,7 @@ class Slot:
         self._groups_are_short = False  # whether the last one was
         self._progress = (0, 0.0)  # steps, and when they last grew; before the child is ready, when it was started
         self._child_number = 0
-        self._failed_starts = 0
+        self._failed_starts = self._starved_starts = 0  # in a row; the host is at fault for the starved ones
         self._useless_children = 0  # children in a row that ended without a finished group
         self._start_at = 0.0
         self._child: ChildProcess | None = None  # `None` until `_start_at`
@@ -189,12 +192,12 @@ class Slot:
                 self._child.abandon_group(group.number)
 
     def handle(self, event: SlotEvent) -> tuple[Result, ...]:
-        """Handle one of this slot's events; return the results if it ended a group."""
+        """Handle one of this slot's events; return the results that it brings."""
         if event.child_number != self._child_number:
             return ()
         if isinstance(event.message, ChildReady):
             self.ready, self.drawn_by = True, truncate(event.message.drawn_by, MAX_NAME_LENGTH) or "-"
-            self._failed_starts = 0
+            self._failed_starts = self._starved_starts = 0
             self._reset_progress()
         elif isinstance(event.message, GroupDone):
             running = self._groups[0].number if self._groups else None  # a forked copy of the child may answer again
@@ -243,6 +246,11 @@ class Slot:
             self._events.put(("slot", SlotEvent(self.number, self._child_number, None)))
 
     def _finish_group(self, done: GroupDone) -> tuple[Result, ...]:
+        """Take a group's results.
+
+        R8: a child may be poisoned by what it scored before, so only a fresh one fails a job. Another child is
+        replaced, and the new one scores the failed jobs first.
+        """
         group = self._groups.popleft()
         self._useless_children = 0
         self._groups_are_short = (
@@ -251,16 +259,27 @@ class Slot:
             and sum(each.seconds for each in done.results) < SHORT_GROUP
         )
         self._reset_progress()
+        failed = {each.digest for each in done.results if each.fitness is None}
+        if failed and group.number > 1:
+            group.work = [work for work in group.work if work[0].digest in failed]
+            self._groups.appendleft(group)
+            log.warning("slot %d failed%s; a fresh process tries again", self.number, _describe_jobs(group.jobs))
+            self._restart()
+            return tuple(each for each in done.results if each.fitness is not None)
         if self._child and not self._groups and 0 < self._memory_limit < (resident_bytes := self._child.memory):
             log.warning("slot %d holds %d MiB; starting another", self.number, resident_bytes >> 20)
-            self.stop()
-            self._start()
+            self._restart()
         return done.results
 
-    def _replace_child(self) -> tuple[Result, ...]:
-        """Replace a child that is gone; return errors for the jobs that it was scoring.
+    def _restart(self) -> None:
+        self.stop()
+        self._start()
 
-        R8: a crash is an error of these jobs, which other workers then try, and never a fitness.
+    def _replace_child(self) -> tuple[Result, ...]:
+        """Replace a child that is gone; return errors for the jobs that it was scoring, if it was fresh.
+
+        R8: a crash is an error of these jobs, which other workers then try, and never a fitness. If the child was not
+        fresh, the new one scores them first.
         """
         assert self._child is not None  # it has just sent its last event
         if self._given_up_at == math.inf:
@@ -269,17 +288,38 @@ class Slot:
         self._child.close(LOOK_INTERVAL)
         ended_by = "it closed its pipe and ran on" if status is None else self._last_error or describe_exit(status)
         reason = self._kill_reason or ended_by
+        running = self.running if self.ready else []  # before it was ready it ran nothing
+        log.warning("slot %d ended (%s)%s; starting another", self.number, reason, _describe_jobs(running))
+        if not self.ready and is_host_failure(reason):
+            self._count_starved_start(reason)
+            return ()
         if not self.ready:
             self._count_failed_start(reason)
-        lost = self._groups.popleft().jobs if self.ready and self._groups else []  # before it was ready it ran nothing
-        log.warning("slot %d ended (%s)%s; starting another", self.number, reason, _describe_lost_jobs(lost))
+        if running and self._groups[0].number > 1:
+            self._start()  # with the same jobs
+            return ()
+        if running:
+            self._groups.popleft()
         self._start_after_pause()
-        return tuple(Result(job.digest, None, steps // len(lost), 0.0, describe_crash(reason), None) for job in lost)
+        error = describe_crash(reason)
+        return tuple(Result(job.digest, None, steps // len(running), 0.0, error, None) for job in running)
 
     def _count_failed_start(self, reason: str) -> None:
         self._failed_starts += 1
         if self._failed_starts >= FAILED_STARTS:
-            raise DreamfleetError(f"a slot cannot start: {reason}; `dreamfleet doctor` looks for the cause")
+            raise _cannot_start(reason)
+
+    def _count_starved_start(self, reason: str) -> None:
+        """Try again after a growing pause: a host may be short of memory or processes for minutes.
+
+        R20: after some starts the heartbeats do not list its jobs any longer, so other slots get them.
+        """
+        self._starved_starts += 1
+        if self._starved_starts >= STARVED_STARTS:
+            raise _cannot_start(reason)
+        if self._starved_starts >= FAILED_STARTS:
+            self._groups.clear()
+        self._clear_child(min(START_RETRY_DELAY * 2.0 ** (self._starved_starts - 1), MAX_STARVED_DELAY))
 
     def _start_after_pause(self) -> None:
         """Start a child: at once after the first useless one in a row, then after growing pauses."""
@@ -304,7 +344,7 @@ class Slot:
         self._sent = 0
         number, child_number, events = self.number, self._child_number, self._events
         try:
-            if self._failed_starts:
+            if self._failed_starts or self._starved_starts:
                 self._restore_bundle()
             self._child = ChildProcess(
                 self._spec,
@@ -312,14 +352,13 @@ class Slot:
                 self._allowed_tasks,
                 lambda message: events.put(("slot", SlotEvent(number, child_number, message))),
             )
-        except BundleError as error:
-            self._count_failed_start(str(error))
-            self._clear_child(START_RETRY_DELAY)
-            return
-        except (OSError, RuntimeError) as error:  # no descriptor, process, thread or memory left, no place for a file
-            self._count_failed_start(f"{error}; {REMEDY}")
+        except (BundleError, OSError, RuntimeError, MemoryError) as error:
             log.warning("slot %d cannot start a process yet: %s", number, error)
-            self._clear_child(START_RETRY_DELAY)
+            if is_hosts_fault(error):  # no descriptor, process, thread or memory left, no place for a file
+                self._count_starved_start(f"{error}; {REMEDY}")
+            else:
+                self._count_failed_start(str(error) if isinstance(error, BundleError) else f"{error}; {REMEDY}")
+                self._clear_child(START_RETRY_DELAY)
             return
         self._child.show(self._is_watched)
         self._reset_progress()
@@ -329,8 +368,12 @@ class Slot:
                 self.submit(wanted)
 
 
-def _describe_lost_jobs(jobs: list[Job]) -> str:
-    """Which jobs a crash has ended."""
+def _cannot_start(reason: str) -> DreamfleetError:
+    return DreamfleetError(f"a slot cannot start: {reason}; `dreamfleet doctor` looks for the cause")
+
+
+def _describe_jobs(jobs: list[Job]) -> str:
+    """Which jobs failed, in words."""
     if not jobs:
         return ""
     first, more = jobs[0], f" and {len(jobs) - 1} more" if len(jobs) > 1 else ""

@@ -46,9 +46,12 @@ class Harness:
         self.wait_ready()
         made = job(number, spec=self.spec)
         self.slot.submit([(replace(made, stall=stall) if stall else made, vector)])
+        return self.results()[0]
+
+    def results(self):
         while not (results := self.take()):
             pass
-        return results[0]
+        return results
 
 
 @pytest.fixture
@@ -133,6 +136,52 @@ def test_a_childs_end_is_its_jobs_error(harness, task, error):
     slot = harness(task)
     assert slot.score(stall=1.0).error == error
     slot.wait_ready()
+
+
+@pytest.mark.parametrize("poison", rough_tasks.POISONS)
+def test_a_poisoned_child_fails_no_job(harness, monkeypatch, poison):
+    monkeypatch.setenv(rough_tasks.POISON, poison)
+    slot = harness(rough_tasks.Poisoned)
+    assert slot.score(0).fitness is not None
+    pid = slot.slot.pid
+    assert slot.score(1, stall=1.0).fitness is not None
+    assert slot.slot.pid != pid
+
+
+def test_only_the_failed_jobs_of_a_group_are_repeated_and_before_what_waited(harness):
+    slot = harness(rough_tasks.PoisonedBatch)
+    assert slot.score(0).fitness is not None
+    jobs = [job(number, spec=slot.spec) for number in range(1, 6)]
+    digests = [each.digest for each in jobs]
+    for group in (jobs[:3], jobs[3:]):
+        slot.slot.submit([(each, VECTOR) for each in group])
+    assert [(each.digest, each.fitness) for each in slot.results()] == [(digest, 1.0) for digest in digests[:2]]
+    assert not slot.slot.ready
+    assert slot.slot.running == jobs[2:3]
+    assert slot.slot.waiting == jobs[3:]
+    assert slot.slot.wanted_digests == set(digests[2:])
+    for digest in digests[2:]:
+        assert [(each.digest, each.fitness) for each in slot.results()] == [(digest, 1.0)]
+
+
+def test_a_failed_job_that_is_not_wanted_is_not_repeated(harness):
+    slot = harness(rough_tasks.PoisonedBatch)
+    assert slot.score(0).fitness is not None
+    jobs = [job(number, spec=slot.spec) for number in range(1, 3)]
+    slot.slot.submit([(each, VECTOR) for each in jobs])
+    slot.slot.abandon(jobs[1].digest)
+    assert [each.digest for each in slot.results()] == [jobs[0].digest]
+    assert slot.slot.running == []
+    assert slot.score(3).fitness is not None
+
+
+def test_the_failures_of_a_fresh_childs_first_group_are_reported_at_once(harness):
+    slot = harness(tasks.EXPLODING)
+    slot.wait_ready()
+    pid = slot.slot.pid
+    slot.slot.submit([(job(number, spec=slot.spec), VECTOR) for number in range(2)])
+    assert [each.fitness for each in slot.results()] == [None, None]
+    assert slot.slot.pid == pid
 
 
 def test_a_copy_of_the_child_does_not_answer(harness, left):

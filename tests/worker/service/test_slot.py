@@ -20,7 +20,14 @@ import pytest
 from dreamfleet.common.artifacts.bundle import hash_file
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.worker.service.slot import FAILED_STARTS, MAX_START_DELAY, START_LIMIT, START_RETRY_DELAY, Slot
+from dreamfleet.worker.service.slot import (
+    FAILED_STARTS,
+    MAX_STARVED_DELAY,
+    MAX_START_DELAY,
+    START_LIMIT,
+    STARVED_STARTS,
+    Slot,
+)
 from tests.support import tasks
 from tests.support.bundles import write_random_bundle
 from tests.support.processes import DEADLINE, environment
@@ -46,6 +53,10 @@ class Harness:
         self.events = queue.SimpleQueue()
         self.slot = Slot(0, self.spec, bundle, self.events, tasks.ALL, memory_limit, **more)
 
+    def pass_time(self):
+        """The longest pause before a start, in no time."""
+        self.slot.check(monotonic() + MAX_STARVED_DELAY + 1.0, 0.0)
+
     def wait_ready(self):
         while not self.slot.ready:
             self.take()
@@ -53,8 +64,8 @@ class Harness:
     def take(self):
         """The slot's next event, handled; a child that waits to be started is."""
         self.slot.check(monotonic(), 0.0)
-        while self.slot.pid == 0:
-            self.slot.check(monotonic(), 0.0)
+        if self.slot.pid == 0:
+            self.pass_time()
         return self.slot.handle(self.events.get(timeout=DEADLINE)[1])
 
     def result(self):
@@ -128,15 +139,18 @@ def test_a_failed_collection_is_an_error_without_a_file(harness):
 @pytest.mark.parametrize(
     ("task", "error"), [(tasks.RAISING, "RuntimeError: the road has ended"), (tasks.NAN, "ValueError: the episode's")]
 )
-def test_an_exception_is_the_jobs_error_and_the_child_lives_on(harness, task, error):
+def test_an_exception_in_a_fresh_child_is_the_jobs_error(harness, task, error):
     slot = harness(task)
-    pid = None
-    for _ in range(2):
+    slot.wait_ready()
+    first = slot.slot.pid
+    pids = []
+    for _ in range(3):
         result = slot.score()
         assert result.fitness is None
         assert result.error.startswith(error)
-        assert slot.slot.pid == (pid or slot.slot.pid)
-        pid = slot.slot.pid
+        pids.append(slot.slot.pid)
+    assert pids[0] == first, "a failure in a fresh child replaces no child"
+    assert len(set(pids)) == 3
 
 
 def test_a_crash_costs_one_job_and_another_child_takes_its_place(harness):
@@ -280,21 +294,21 @@ def test_a_slot_retries_without_descriptors_and_then_names_the_cause(harness, ra
     resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
     try:
         slot = harness(tasks.TOY)
-        now = monotonic()
-        slot.slot.check(now + START_RETRY_DELAY / 2, 0.0)
-        slot.slot.check(now + 2 * START_RETRY_DELAY, 0.0)
+        for _ in range(STARVED_STARTS - 2):
+            slot.pass_time()
         assert slot.slot.pid == 0
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-    slot.slot.check(now + 4 * START_RETRY_DELAY, 0.0)
+    slot.pass_time()
     assert slot.score().fitness is not None
     resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
     try:
         os.kill(slot.slot.pid, signal.SIGKILL)
         slot.slot.handle(slot.gone())
-        slot.slot.check(monotonic() + 2 * START_RETRY_DELAY, 0.0)
+        for _ in range(STARVED_STARTS - 2):
+            slot.pass_time()
         with pytest.raises(DreamfleetError, match=r"cannot start: .*Too many open files; .*--slots"):
-            slot.slot.check(monotonic() + 4 * START_RETRY_DELAY, 0.0)
+            slot.pass_time()
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
@@ -310,6 +324,45 @@ def test_children_that_end_without_a_result_are_replaced_after_growing_pauses(ha
         assert (slot.slot.pid == 0) == (number > 0)
         slot.slot.check(monotonic() + MAX_START_DELAY, 0.0)
     assert slot.score().fitness is not None
+
+
+def kill_as_it_starts(slot, times):
+    """Have so many starts fail as the kernel does when memory is short; the pauses after them."""
+    pauses = []
+    for _ in range(times):
+        slot.pass_time()
+        os.kill(slot.slot.pid, signal.SIGKILL)
+        slot.slot.handle(slot.gone())
+        pauses.append(slot.slot._start_at - monotonic())
+    return pauses
+
+
+def test_a_short_host_is_tried_for_ten_minutes(harness):
+    slot = harness(tasks.TOY)
+    pauses = kill_as_it_starts(slot, STARVED_STARTS - 1)
+    assert pauses == pytest.approx([2, 4, 8, 16, 32, *[60] * 9], abs=1.0)
+    slot.pass_time()
+    assert slot.score().fitness is not None
+    os.kill(slot.slot.pid, signal.SIGKILL)
+    slot.slot.handle(slot.gone())
+    kill_as_it_starts(slot, STARVED_STARTS - 1)
+    with pytest.raises(DreamfleetError, match=f"a slot cannot start: {OUT_OF_MEMORY}"):
+        kill_as_it_starts(slot, 1)
+
+
+def test_a_host_that_stays_short_gives_its_jobs_back(harness):
+    slot = harness(tasks.SLOW_TOY)
+    slot.wait_ready()
+    for number in (0, 1):
+        slot.slot.submit([(job(number, spec=slot.spec), VECTOR)])
+    os.kill(slot.slot.pid, signal.SIGKILL)
+    assert slot.result().error == OUT_OF_MEMORY
+    kill_as_it_starts(slot, FAILED_STARTS - 1)
+    assert [each.digest for each in slot.slot.running] == [job(1, spec=slot.spec).digest]
+    kill_as_it_starts(slot, 1)
+    assert slot.slot.running == []
+    slot.pass_time()
+    assert slot.score(2).fitness is not None
 
 
 def test_the_time_limit_of_a_start_grows_after_a_failure(harness):
