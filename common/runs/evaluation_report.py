@@ -116,7 +116,7 @@ def check_seed_range(first_seed: int, episodes: int) -> None:
 
 def _check_episodes(report: EvaluationReport) -> None:
     """`ValueError` for duplicate seeds and scores out of range."""
-    seeds = [each.seed for each in (*report.drives, *report.failed)]
+    seeds = [*(each.seed for each in report.drives), *(each.seed for each in report.failed)]
     if len(set(seeds)) < len(seeds):
         raise ValueError("a seed occurs twice")
     if not all(abs(each.score) <= LARGEST_FITNESS for each in report.drives):  # false for NaN too

@@ -20,9 +20,8 @@ from dreamfleet.common.protocol.result_bounds import rejection_reason
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.common.runs.evaluation_report import EvaluationReport
 from dreamfleet.worker.scoring.agents import Agent
-from dreamfleet.worker.service.failure_cause import describe_exception
+from dreamfleet.worker.scoring.failure_cause import describe_exception
 from dreamfleet.worker.tools.agent_evaluator import AgentEvaluator
-
 
 Episode = EpisodeResult | FailedEpisode
 
