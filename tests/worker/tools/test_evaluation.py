@@ -78,7 +78,10 @@ def test_an_episode_that_fails_is_reported_and_the_others_go_on(processes, contr
         assert f"an episode failed: seed {each.seed}, ArithmeticError: the world of" in err
     plain = json.loads((tmp_path / "toy.json").read_text())
     assert plain["mean"] == pytest.approx(np.mean([each["score"] for each in plain["drives"]]))
-    assert (plain["n"], [each["seed"] for each in plain["failed"]]) == (30 - failed, [each.seed for each in report.failed])
+    assert (plain["n"], [each["seed"] for each in plain["failed"]]) == (
+        30 - failed,
+        [each.seed for each in report.failed],
+    )
     code, out, err = processes.call("reproduce", tmp_path / "toy.json", "--bundle", random_bundle.path, "--jobs", jobs)
     assert (code, f"the same {30 - failed} scores" in out) == (0, True), err
 
