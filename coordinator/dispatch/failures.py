@@ -18,18 +18,22 @@ HOST_ATTEMPTS = 10  # that a host's shortage ends, over about eight minutes: no 
 LONGEST_PAUSE = 120.0  # seconds between two attempts
 
 
+def host_of(worker: str) -> str:
+    """A worker's name without its life: attempts on one host are less independent than on two."""
+    return worker.partition("/")[0]
+
+
 @dataclass(frozen=True)
 class Attempt:
-    """One failed attempt: on which worker, of which class, and the error that it sent."""
+    """One failed attempt: on which worker, and the error that it sent."""
 
     worker: str
-    host_class: str
     error: str
 
     @property
     def host(self) -> str:
-        """The worker's name without its life: attempts on one host are less independent than on two."""
-        return self.worker.partition("/")[0]
+        """The name of its host."""
+        return host_of(self.worker)
 
 
 @dataclass(frozen=True)
@@ -74,11 +78,11 @@ class JobFailure:
 def is_lasting(attempts: Sequence[Attempt], working: Collection[str], untried_hosts: bool) -> bool:
     """Whether the failure follows from the parameters and the seed, so that every host would fail.
 
-    R8: it takes two attempts with one cause, or three with any, on hosts of a class that has scored jobs of this run
-    (`working`), and on two hosts where there is a second one (`untried_hosts`: some host has not tried it yet). A
+    R8: it takes two attempts with one cause, or three with any, on hosts that have scored jobs of this run (`working`,
+    by name), and on two hosts where there is a second one (`untried_hosts`: some host has not tried it yet). A
     shortage of the host (memory, disk, processes) counts only after ten attempts.
     """
-    able = [each for each in attempts if each.host_class in working]
+    able = [each for each in attempts if each.host in working]
     own = [each for each in able if not is_host_failure(each.error)]
     if len(able) - len(own) >= HOST_ATTEMPTS:
         return True

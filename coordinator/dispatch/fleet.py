@@ -16,7 +16,7 @@ from dreamfleet.common.monitoring.status import EventKind
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.messages import MAX_SLOTS, Heartbeat, Result, Verdict, VerdictWord
 from dreamfleet.coordinator.dispatch.event_log import EventLog
-from dreamfleet.coordinator.dispatch.failures import JobFailure
+from dreamfleet.coordinator.dispatch.failures import JobFailure, host_of
 from dreamfleet.coordinator.dispatch.host_stats import HostRecords
 from dreamfleet.coordinator.dispatch.member import DepartedWorkers, DispatchGroup, Lease, Member, MemberState, SentBatch
 from dreamfleet.coordinator.dispatch.packing import BatchContent, OutgoingBatch, pack
@@ -55,7 +55,7 @@ class Fleet:
         self.dropped: Counter[str] = Counter()  # results and reports that were not accepted, by reason
         self.event_log = EventLog()
         self.notes: list[str] = []  # lines for a log; its writer clears them
-        self.working_classes: set[str] = set()  # of hosts that scored jobs of this run
+        self.working_hosts: set[str] = set()  # names of those that scored jobs of this run
         self.drain_background = False  # only evaluations and kept rollouts are left to wait for
         self.paused = False
         self.single_job = False  # a slot scores one job at a time, even of a task whose slots score several at once
@@ -74,8 +74,8 @@ class Fleet:
 
     def find_lasting_failures(self) -> list[JobFailure]:
         """The wanted jobs that fail wherever they are scored."""
-        hosts = {name.partition("/")[0] for name, member in self.members.items() if member.takes_jobs}
-        return self.jobs.find_lasting_failures(self.working_classes, hosts)
+        hosts = {host_of(name) for name, member in self.members.items() if member.takes_jobs}
+        return self.jobs.find_lasting_failures(self.working_hosts, hosts)
 
     def add_worker(self, identity: str, slots: int, fingerprint: str, now: float) -> int:
         """Welcome a worker as a guest; return the numbering of its batches.
@@ -330,10 +330,9 @@ class Fleet:
             self.dropped["result of a job that was not given"] += 1
             return "refused", None
         if result.fitness is None:
-            member = self.members.get(identity)
-            self.jobs.record_failure(identity, result, self._now, "" if member is None else member.host_class)
+            self.jobs.record_failure(identity, result, self._now)
             self.counts["errors"] += 1
-            if member is not None:
+            if member := self.members.get(identity):
                 self._drop_lease(member, result.digest, counted=True)
             return "refused", None
         pending = self.jobs.accept(result)

@@ -199,13 +199,13 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         self._background_held -= pending.is_background and not pending.holders
         return not pending.holders
 
-    def record_failure(self, worker: str, result: Result, now: float, host_class: str = "") -> None:
+    def record_failure(self, worker: str, result: Result, now: float) -> None:
         """Note the error that a worker sent for a wanted job.
 
         R8: an error is no fitness; it decides who is given the job next and when, and whether the job has failed.
         """
         pending = self._failing[result.digest] = self._pending[result.digest]
-        pending.attempts.append(Attempt(worker, host_class, result.error or "no fitness and no reason"))
+        pending.attempts.append(Attempt(worker, result.error or "no fitness and no reason"))
         del pending.attempts[:-MAX_FAILED]
         pending.order, self._next_order = self._next_order, self._next_order + 1
         if pause := pause_before_retry(len(pending.attempts)):
@@ -254,9 +254,9 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         return [pending.failure for pending in self._failing.values()]
 
     def find_lasting_failures(self, working: Collection[str], hosts: Collection[str]) -> list[JobFailure]:
-        """The jobs that fail wherever they are scored; `working` are classes of hosts that scored jobs of this run.
+        """The jobs that fail wherever they are scored; `working` are the hosts that scored jobs of this run.
 
-        `hosts` are the names of all hosts that take jobs.
+        `hosts` are all that take jobs.
         """
         found = []
         for pending in self._failing.values():
@@ -270,12 +270,12 @@ class PendingJobs(Mapping[bytes, PendingJob]):
 
         R8: two workers, or three attempts on the only one, show that the job itself or every host is at fault. With
         `working`, `find_lasting_failures` judges where such a host has tried, and the run does not pause while a job
-        that never failed is open: it may show that a class works.
+        that never failed is open: it may show that a host works.
         """
         if working is not None and len(self._failing) < len(self._pending):
             return None
         for pending in self._failing.values():
-            if working is not None and any(each.host_class in working for each in pending.attempts):
+            if working is not None and any(each.host in working for each in pending.attempts):
                 continue
             workers = {each.worker for each in pending.attempts}
             if len(workers) > 1 or len(pending.attempts) >= MAX_ATTEMPTS:

@@ -53,18 +53,23 @@ class Finalist:
 class Confirmation:
     """One confirmation: each round has about `episodes` episodes, shared by the finalists that are left.
 
-    `closed` is the number of closed generations of the run.
+    `closed` is the number of closed generations of the run. A round of which more than the share `failure_limit` of
+    the episodes failed is not closed.
     """
 
-    def __init__(self, spec: TaskSpec, episodes: int, finalists: Sequence[Finalist], closed: int) -> None:
+    def __init__(
+        self, spec: TaskSpec, episodes: int, finalists: Sequence[Finalist], closed: int, failure_limit: float = 1.0
+    ) -> None:
         self.outcome: StoredConfirmation | None = None  # at the end
         self.failed = False  # each of the last episodes failed: there is no score to report
+        self._failure_limit = failure_limit
         self._spec = spec
         self._episodes = episodes
         self._closed = closed
         self._remaining = list(finalists)
         self._next = CHOOSING_OFFSET  # the first track of the next choosing round
-        self._digests: list[bytes] = []  # of the open round, finalist by finalist
+        self._work: list[Work] = []  # of the open round, finalist by finalist
+        self._digests: list[bytes] = []  # of its jobs
         self._scores: dict[bytes, float] = {}
 
     @property
@@ -94,10 +99,27 @@ class Confirmation:
         """Whether scores of the open round are missing."""
         return len(self._scores) < len(self._digests)
 
+    @property
+    def failed_count(self) -> int:
+        """Episodes of the open round that failed for good."""
+        return sum(map(isnan, self._scores.values()))
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether too many episodes of the open round failed."""
+        return self.failed_count > self._failure_limit * len(self._digests)
+
+    def retry_failed(self) -> list[Work]:
+        """Want the failed episodes of the open round again; their jobs."""
+        failed = {digest for digest, score in self._scores.items() if isnan(score)}
+        for digest in failed:
+            del self._scores[digest]
+        return [each for each in self._work if each.job.digest in failed]
+
     def advance(self, known: FindScores) -> list[Work]:
         """Close a complete round and open the next one; return its missing jobs, none once there is an outcome."""
         missing: list[Work] = []
-        while not self._is_over and not missing:
+        while not self._is_over and not missing and not self.has_failed:
             if self._digests:
                 self._close()
             if not self._is_over:
@@ -124,6 +146,7 @@ class Confirmation:
             for each in self._remaining
             for job in make_work(self._spec, "evaluate", each.generation, 0, each.vector, seeds, first=first)
         ]
+        self._work = work
         self._digests = [each.job.digest for each in work]
         self._scores = dict(known(self._digests))
         return [each for each in work if each.job.digest not in self._scores]

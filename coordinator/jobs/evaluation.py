@@ -8,6 +8,7 @@ from __future__ import annotations
 from bisect import bisect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from math import isnan
 
 import numpy as np
 
@@ -41,6 +42,11 @@ class OpenEvaluation:
     evaluation: Evaluation
     digests: list[bytes]
     scores: dict[bytes, float]
+
+    @property
+    def failed(self) -> set[bytes]:
+        """Digests of the episodes that failed for good."""
+        return {digest for digest, score in self.scores.items() if isnan(score)}
 
 
 @dataclass(frozen=True)
@@ -95,10 +101,30 @@ class Evaluations:
             self._open[generation].scores[digest] = score
         return waiting
 
-    def finish(self, generation: int) -> FinishedEvaluation | None:
-        """Close an evaluation whose scores are complete; `None` while some are missing."""
+    def find_excessive(self, limit: float) -> tuple[int, int, int] | None:
+        """An open evaluation of which more than this share of the episodes failed: generation, failed, episodes."""
+        for generation, each in self._open.items():
+            if len(each.failed) > limit * len(each.digests):
+                return generation, len(each.failed), len(each.digests)
+        return None
+
+    def retry_failed(self, spec: TaskSpec) -> list[Work]:
+        """Want the failed episodes of the open evaluations again; their jobs, each once."""
+        work = {}
+        for each in self._open.values():
+            failed = each.failed
+            work.update({job.job.digest: job for job in each.evaluation.work(spec) if job.job.digest in failed})
+            for digest in failed:
+                del each.scores[digest]
+        return list(work.values())
+
+    def finish(self, generation: int, limit: float = 1.0) -> FinishedEvaluation | None:
+        """Close an evaluation whose scores are complete; `None` while some are missing.
+
+        Also if more than the share `limit` of the episodes failed: then they may have to be tried again.
+        """
         each = self._open[generation]
-        if len(each.scores) < len(each.digests):
+        if len(each.scores) < len(each.digests) or len(each.failed) > limit * len(each.digests):
             return None
         every = np.array([each.scores[digest] for digest in each.digests])
         scores = every[np.isfinite(every)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -123,6 +123,15 @@ class Generation:
             self._scores[place] = fitness
             self._steps[place] = 0 if number else steps
         return self._open_second_half()
+
+    def recall(self, results: Mapping[bytes, tuple[float, int]]) -> None:
+        """Record results of an earlier life, fitness and steps by digest, NaN for an episode that failed for good.
+
+        The first half goes first: with racing, what failed in the second half must not count at the barrier.
+        """
+        known = (digest for digest in self._places if digest in results)
+        for digest in sorted(known, key=lambda digest: min(episode for _, episode in self._places[digest])):
+            self.record(digest, *results[digest])
 
     def fitness(self) -> NDArray[np.float64]:
         """The fitness of each candidate, `(population,)`: the mean of its own episodes, NaN where one failed.

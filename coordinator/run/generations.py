@@ -32,7 +32,7 @@ class Generations:
         self.history = history
         self.scoring_params: ScoringParams  # of the open generation
         self.last: CandidateScores | None = None  # of the last closed generation
-        self.redrawn = 0  # candidates of the open generation that were drawn anew
+        self.redrawn: set[int] = set()  # candidates of the open generation that were drawn anew
         self.seconds = 0.0  # for which the restored generation could be scored before
         self._rounds = 0  # in which candidates were drawn anew
         self._journal = journal
@@ -76,7 +76,7 @@ class Generations:
         for indices in stored.redrawn:
             population[list(indices)] = self._strategy.redraw(indices)
         self.seconds = stored.seconds
-        self.redrawn = sum(map(len, stored.redrawn))
+        self.redrawn = {index for indices in stored.redrawn for index in indices}
         self._rounds = len(stored.redrawn)
         vectors = tuple(vector_bytes(x) for x in population)
         if vectors != stored.vectors:
@@ -99,7 +99,7 @@ class Generations:
             training_seed(self._settings.seed, number, episode) for episode in range(scoring_params.stage.episodes)
         ]
         self._journal.open_generation(number, state, sigma, seeds, vectors)
-        self.redrawn = self._rounds = 0
+        self.redrawn, self._rounds = set(), 0
         return self._generation(number, vectors, seeds, scoring_params)
 
     def close(self, generation: Generation, seconds: float) -> StoredGeneration:
@@ -118,7 +118,7 @@ class Generations:
             sigma=self._strategy.sigma,
             steps=generation.steps,
             seconds=seconds,
-            failed=len(generation.failed) + self.redrawn,
+            failed=len(self.redrawn.union(generation.failed)),
         )
         self._strategy.tell(np.where(np.isfinite(fitness), fitness, np.nextafter(found.min(), -np.inf)))
         self._journal.close_generation(closed, fitness)
@@ -126,17 +126,22 @@ class Generations:
         self.last = generation.candidate_scores()
         return closed
 
+    @property
+    def can_redraw(self) -> bool:
+        """Whether failed candidates of the open generation may be drawn anew once more."""
+        return self._settings.on_failure == "redraw" and self._rounds < MAX_REDRAWS
+
     def redraw(self, generation: Generation) -> Generation | None:
         """Draw the failed candidates anew; `None` if none failed, or if that was tried often enough.
 
         Call it when all others are scored: then the draw does not depend on the order of arrival.
         """
-        if not (indices := generation.failed) or self._rounds >= MAX_REDRAWS:
+        if not (indices := generation.failed) or not self.can_redraw:
             return None
         vectors = [vector_bytes(x) for x in self._strategy.redraw(indices)]
         self._journal.redraw(generation.number, indices, vectors)
         self._rounds += 1
-        self.redrawn += len(indices)
+        self.redrawn.update(indices)
         return self.reload(generation.number)
 
     def reload(self, number: int) -> Generation:
@@ -153,8 +158,7 @@ class Generations:
 
     def _recall(self, stored: StoredOpenGeneration, scoring_params: ScoringParams) -> Generation:
         generation = self._generation(stored.number, stored.vectors, stored.seeds, scoring_params)
-        for digest, (fitness, steps) in self._journal.results_of("score", stored.number).items():
-            generation.record(digest, fitness, steps)
+        generation.recall(self._journal.results_of("score", stored.number))
         return generation
 
     def _generation(

@@ -21,7 +21,7 @@ from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, Stor
 from dreamfleet.common.runs.run_folder import ENDING
 from dreamfleet.common.runs.scoring_params import ScheduleState
 from dreamfleet.common.runs.stages import longest_horizon
-from dreamfleet.coordinator.dispatch.failures import JobFailure, shorten
+from dreamfleet.coordinator.dispatch.failures import JobFailure, host_of, shorten
 from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.jobs.history import History
@@ -66,14 +66,16 @@ class Run:
         closed, evaluations = journal.read_closed()
         self.history = History(closed)
         self._agenda = ScheduleState(settings)
-        self.background_jobs = BackgroundJobs(journal, settings, self.uid, self.history, evaluations, self._agenda)
+        self.background_jobs = BackgroundJobs(
+            journal, settings, self.uid, self.history, evaluations, self._agenda, network.failure_limit
+        )
         evaluated = self.background_jobs.evaluations.finished
         self.generations = Generations(journal, settings, self._agenda, self.history, evaluated)
         self.failure_limit = network.failure_limit
-        self._forgiven = 0  # candidates of the open generation that were drawn anew before the last `resume`
+        self._forgiven: set[int] = set()  # candidates that were drawn anew before the last `resume`
         self.generation = self.generations.begin()
         self.work_clock = WorkClock(now, self.generations.seconds)  # of the open generation
-        self.fleet.working_classes.update(each.host_class for each in self.classes.largest)
+        self.fleet.working_hosts.update(map(host_of, journal.workers()))
         if self.incarnation > 1:  # the last incarnation may have sent the next generation's jobs before it was durable
             self.fleet.jobs.previous_epoch_until = self.generation.number + 1
         self._begin(now)
@@ -127,7 +129,7 @@ class Run:
         """Journal an accepted result, then count it for the generation or the background job that wants it."""
         self._journal.add_result(work.job, result, worker, fingerprint, self.incarnation, host_class)
         self.admission.adopt_class(host_class, fingerprint)
-        self.fleet.working_classes.add(host_class)
+        self.fleet.working_hosts.add(host_of(worker))
         assert result.fitness is not None
         self._count(work.job, result.fitness, result.steps)
 
@@ -152,8 +154,10 @@ class Run:
             return False
         self._settle_failures()
         while self.ended is None and self.paused is None and self.generation.complete and not self._is_waiting:
-            if self._redraws and (redrawn := self.generations.redraw(self.generation)) is not None:
+            if (redrawn := self.generations.redraw(self.generation)) is not None:
                 self._replace_generation(redrawn)
+            elif self.generation.all_failed:
+                break
             else:
                 self._close(now)
         self.fleet.drain_background = self._is_waiting
@@ -212,27 +216,47 @@ class Run:
         self.paused = None
         self.fleet.paused = self.stalled is not None
         self.fleet.jobs.clear_failures()
-        self._forgiven = self.generations.redrawn
+        self._forgiven = set(self.generations.redrawn)
+        self.fleet.jobs.offer(self.background_jobs.retry_failed())
         if self.generation.failed:
             self._journal.drop_failures(self.generation.number)
             self._replace_generation(self.generations.reload(self.generation.number))
 
     def _settle_failures(self) -> None:
         """Make lasting failures facts of the run (R8), and pause it where too many candidates or all hosts fail."""
-        working = None if self.settings.on_failure == "pause" else self.fleet.working_classes
+        working = None if self.settings.on_failure == "pause" else self.fleet.working_hosts
         if working is not None:
             for lasting in self.fleet.find_lasting_failures():
                 self._record_failure(lasting)
         if self.paused is not None:
             return
-        generation, failed = self.generation, len(self.generation.failed) + self.generations.redrawn - self._forgiven
-        if generation.all_failed or failed > self.failure_limit * generation.population:
-            self.pause(
-                f"{failed} of {plural(generation.population, 'candidate')} failed in generation {generation.number}; "
-                "`dreamfleet resume` tries them again, and --failure-limit 1 at the next start lets the run go on"
-            )
+        if (why := self._too_many_failures()) is not None:
+            self.pause(why)
         elif (failure := self.fleet.jobs.find_pausing_failure(working)) is not None:
             self.pause(f"{failure}; `dreamfleet resume` tries it again")
+
+    def _too_many_failures(self) -> str | None:
+        """Why so many failures pause the run, with the remedy; `None` if they do not."""
+        generation, limit = self.generation, self.failure_limit
+        failed = len((self.generations.redrawn - self._forgiven).union(generation.failed))
+        again = "`dreamfleet resume` tries them again"
+        if failed > limit * generation.population:
+            return (
+                f"{failed} of {plural(generation.population, 'candidate')} failed in generation {generation.number} "
+                f"(`dreamfleet runs story` lists why); {again}, and a greater --failure-limit at the next start lets "
+                "the run go on"
+            )
+        if generation.all_failed and not self.generations.can_redraw:
+            return (
+                f"all candidates failed in generation {generation.number}, so that none can be ranked (`dreamfleet "
+                f"runs story` lists why); mend the task, then {again}; or fork the run with another --sigma0"
+            )
+        if (what := self.background_jobs.too_many_failed) is not None:
+            return (
+                f"{what} (`dreamfleet runs story` lists why); {again}, and a greater --failure-limit at the next "
+                "start lets the run go on"
+            )
+        return None
 
     def _record_failure(self, failure: JobFailure) -> None:
         """Journal that a job's episode fails wherever it is scored; it is wanted no more."""
@@ -248,11 +272,6 @@ class Run:
         """Score the open generation as it is now."""
         self.generation = generation
         self.fleet.jobs.offer(generation.missing)
-
-    @property
-    def _redraws(self) -> bool:
-        """Whether failed candidates are drawn anew."""
-        return self.settings.on_failure == "redraw"
 
     def take_notes(self) -> list[str]:
         """What happened since the last call, for the log; the journal keeps it too."""
@@ -305,7 +324,7 @@ class Run:
         reason = self._stop_reason(generation)
         self.fleet.jobs.offer(self.background_jobs.schedule(closed.number, mean, now, last=reason is not None))
         self._note_stage_changes(generation)
-        self.generation, self._forgiven = generation, 0
+        self.generation, self._forgiven = generation, set()
         self.work_clock.restart()
         self._prepare_fleet(generation)
         if reason:
@@ -353,12 +372,13 @@ class Run:
 
     def _finish(self) -> None:
         """Once a limit is reached and no background job is left: confirm the reported mean, then end the run."""
-        if self._ending is None or self.background_jobs.in_progress or self.ended is not None:
+        waiting = self.background_jobs.in_progress or self.background_jobs.too_many_failed is not None
+        if self._ending is None or waiting or self.ended is not None:
             return
         if work := self.background_jobs.confirm():
             self.fleet.notes.append(self.background_jobs.round_description)
             self.fleet.jobs.offer(work)
-        else:
+        elif self.background_jobs.too_many_failed is None:
             self._end()
 
     def _begin_ending(self, reason: str) -> None:

@@ -257,6 +257,10 @@ class Journal(JournalConnection):
             evaluation.generation, evaluation.vector, evaluation.episodes,
         )  # fmt: skip
 
+    def drop_failures_of(self, digests: Sequence[bytes]) -> None:
+        """Forget the failures of these jobs, so that they are scored again."""
+        self._write_all("DELETE FROM failure WHERE digest = ?", [(digest,) for digest in digests])
+
     def finish_evaluation(self, generation: int, found: StoredEvaluation | None, failed: int) -> None:
         """Write what an evaluation gave: `None` if each of its episodes `failed`."""
         mean, std = (None, None) if found is None else (found.mean, found.std)
@@ -304,6 +308,10 @@ class Journal(JournalConnection):
         """Every closed generation and finished evaluation, oldest first."""
         with RunFolder(self.path.parent) as folder:
             return folder.history(), folder.evaluations()
+
+    def workers(self) -> list[str]:
+        """The workers that have scored jobs of the run."""
+        return [str(worker) for (worker,) in self._read("SELECT DISTINCT worker FROM result")]
 
     def results_of(self, kind: str, generation: int) -> dict[bytes, tuple[float, int]]:
         """Fitness and steps of a generation's accepted results, by digest; NaN for what failed for good."""

@@ -161,6 +161,7 @@ def commands(port=0):
         yield "live", "--controller", run, "--generation", "3", "--out", "pictures", "--seconds", "0.1"
         yield "collect", "--data", "new", "--from-run", run
         yield "runs", "show", run
+        yield "runs", "story", run
         yield "runs", "receipt", run
         yield "runs", "plot", run, "--out", "a.png"
         yield "runs", "export", run, "--csv", "--out", f"csv-{run}"

@@ -32,7 +32,7 @@ def check_coordinator(fleet: Fleet) -> None:
     for digest, each in jobs.items():
         holders = each.holders
         _require(each.in_queue == (digest in named), "a job and the queue disagree on whether it is queued")
-        _require(bool(holders) or digest in named, "a wanted job is neither held nor queued")
+        _require(bool(holders) or digest in named or each.retry_at > 0, "a wanted job is neither held nor queued")
         _require(len(holders) <= MAX_HOLDERS, "a job has more copies than two")
         for holder in holders:
             _require(holder in members, "a job is held by no member")

@@ -40,6 +40,7 @@ def simulated_surroundings(disk_of: Any) -> Iterator[None]:
         enter(patch.object(rollout_collection, "atomic_write", lambda path: disk_of().atomic_write(path)))
         enter(patch.object(ControllerWriter, "save", lambda self, **_: None))
         enter(patch.object(evolution, "build_optimiser", lambda name, search: Strategy(search)))
+        enter(patch.object(evolution, "check_memory", lambda *_: None))
         yield
 
 

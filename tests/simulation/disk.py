@@ -96,6 +96,21 @@ class MemoryJournal:
         """No rule hangs on it."""
         return Effort()
 
+    @property
+    def has_writes(self) -> bool:
+        """No rule hangs on the time of a generation, which is written with them."""
+        return False
+
+    def set_seconds(self, generation: int, seconds: float) -> None:
+        """No rule hangs on it."""
+
+    def add_event(self, text: str) -> None:
+        """No rule hangs on it."""
+
+    def workers(self) -> list[str]:
+        """Only lasting failures hang on it, and a simulated run pauses instead."""
+        return []
+
     def drop_excessive(self, horizon: int) -> int:
         """No older version wrote here."""
         return 0
@@ -126,11 +141,24 @@ class MemoryJournal:
     def schedule_evaluation(self, evaluation: Evaluation) -> None:
         self._insert("evaluation", evaluation.generation, (evaluation, None))
 
-    def finish_evaluation(self, generation: int, mean: float, std: float) -> None:
-        self._witness.evaluated(generation, mean, std)
+    def finish_evaluation(self, generation: int, found: StoredEvaluation | None, failed: int) -> None:
+        if found is None or failed:
+            raise Violation("raised", "a simulated run pauses where an episode fails")
+        self._witness.evaluated(generation, found.mean, found.std)
         evaluation, _ = self._tables["evaluation"][generation]
-        finished = StoredEvaluation(generation, evaluation.episodes, mean, std)
-        self._put("evaluation", generation, (evaluation, finished))
+        self._put("evaluation", generation, (evaluation, found))
+
+    def add_failure(self, job: Job, error: str, workers: Sequence[str], attempts: int) -> None:
+        raise Violation("raised", "a simulated run pauses where an episode fails")
+
+    def drop_failures(self, generation: int) -> None:
+        """There are none."""
+
+    def drop_failures_of(self, digests: Sequence[bytes]) -> None:
+        """There are none."""
+
+    def redraw(self, generation: int, indices: Sequence[int], vectors: Sequence[bytes]) -> None:
+        raise Violation("raised", "a simulated run pauses where an episode fails")
 
     def schedule_collection(self, collection: RolloutCollection) -> None:
         self._insert("collection", collection.generation, collection)

@@ -5,12 +5,12 @@ import pytest
 from dreamfleet.coordinator.dispatch.failures import LONGEST_PAUSE, Attempt, is_lasting, pause_before_retry
 
 A, B, OTHER_A = "a/00000001", "b/00000001", "a/00000002"
-WORKS = {"scored"}
+WORKS = {"a", "b"}  # hosts that have scored
 SHORTAGE = "host: killed by SIGKILL"
 
 
-def attempts(*rows, host_class="scored"):
-    return [Attempt(worker, host_class, error) for worker, error in rows]
+def attempts(*rows):
+    return [Attempt(worker, error) for worker, error in rows]
 
 
 @pytest.mark.parametrize(
@@ -33,10 +33,10 @@ def test_two_equal_failures_on_two_hosts_where_there_are_two_show_that_the_episo
     assert is_lasting(attempts(*rows), WORKS, untried) is lasting
 
 
-def test_a_host_whose_class_has_scored_nothing_proves_nothing():
-    rows = [(A, "ImportError: libGL"), (B, "ImportError: libGL")]
-    assert not is_lasting(attempts(*rows, host_class="new"), WORKS, False)
-    assert not is_lasting(attempts(*rows * 9, host_class=""), WORKS, False)
+def test_a_host_that_has_scored_nothing_proves_nothing():
+    rows = [("new/1", "ImportError: libGL"), ("newer/1", "ImportError: libGL")]
+    assert not is_lasting(attempts(*rows * 9), WORKS, False)
+    assert not is_lasting(attempts(*rows, (A, "ImportError: libGL")), WORKS, False)
 
 
 def test_attempts_wait_longer_and_longer():

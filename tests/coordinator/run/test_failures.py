@@ -20,8 +20,8 @@ class Failing(Bench):
 
     host_class = "0123456789abcdef"
 
-    def __init__(self, *args, fails, host_errors=(), **kwargs):
-        self.fails, self.host_errors = fails, list(host_errors)
+    def __init__(self, *args, fails, host_errors=(), limit=0.5, **kwargs):
+        self.fails, self.host_errors, self.failure_limit = fails, list(host_errors), limit
         self.hosts = [A, B]
         super().__init__(*args, generations=GENERATIONS, **kwargs)
 
@@ -107,14 +107,14 @@ def test_the_bits_are_the_same_on_any_fleet_and_through_restarts(failing, tmp_pa
     def fails(job):
         return (job.vector[0] + job.seeds[0]) % 256 < 40
 
-    whole = failing("whole", settings=settings, fails=fails).story()
+    whole = failing("whole", settings=settings, fails=fails, limit=1.0).story()
     assert sum(each.failed for each in whole[0])
-    lone = Failing(tmp_path / "lone" / "night", random_bundle.path, settings, fails=fails)
+    lone = Failing(tmp_path / "lone" / "night", random_bundle.path, settings, fails=fails, limit=1.0)
     lone.hosts = [A]
     lone.run.fleet.handle_departure(B, lone.now)
     lone.serve()
     assert lone.story() == whole
-    killed = Failing(tmp_path / "killed" / "night", random_bundle.path, settings, fails=fails)
+    killed = Failing(tmp_path / "killed" / "night", random_bundle.path, settings, fails=fails, limit=1.0)
     while not killed.run.ended:
         killed.serve(stop=lambda run: run.fleet.counts["accepted"] + run.fleet.counts["errors"] > 12)
         if not killed.run.ended:
@@ -163,6 +163,81 @@ def test_more_failures_than_the_limit_pause_the_run_and_resume_scores_these_cand
     bench.journal.close()
 
 
+def test_all_candidates_failing_is_a_pause_that_says_so_whatever_the_limit(tmp_path, random_bundle):
+    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate >= 0)
+    bench.run.failure_limit = 1.0
+    bench.run.fleet.working_hosts = {"a", "b"}
+    bench.serve()
+    assert bench.run.paused.startswith("all candidates failed in generation 0")
+    bench.fails = lambda job: False
+    bench.run.resume()
+    bench.serve()
+    assert bench.run.ended
+    bench.journal.close()
+
+
+def test_redraws_count_each_candidate_once_and_go_on_where_all_failed(tmp_path, random_bundle):
+    settings = replace(SETTINGS, on_failure="redraw")
+    first = []
+
+    def fails(job):
+        first.append(job.digest) if len(first) < 12 and job.digest not in first else None
+        return job.digest in first
+
+    bench = Failing(tmp_path / "night", random_bundle.path, settings, fails=fails)
+    bench.run.failure_limit = 1.0
+    bench.run.fleet.working_hosts = {"a", "b"}
+    bench.serve()
+    assert bench.run.ended
+    assert bench.run.history.rows[0].failed <= 6
+    bench.journal.close()
+
+
+def test_racing_with_failures_is_the_same_through_restarts(failing, tmp_path, random_bundle):
+    settings = replace(SETTINGS, racing=True, episodes=4, population=8)
+    fails = by_vector(0.1)
+    whole = failing("whole", settings=settings, fails=fails).story()
+    killed = Failing(tmp_path / "killed" / "night", random_bundle.path, settings, fails=fails)
+    while not killed.run.ended:
+        killed.serve(stop=lambda run: run.fleet.counts["accepted"] + run.fleet.counts["errors"] > 14)
+        if not killed.run.ended:
+            killed.restart()
+    assert killed.story() == whole
+    killed.journal.close()
+
+
+def test_a_host_that_never_scored_condemns_nobody(tmp_path, random_bundle):
+    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: False)
+    healthy, bench.answer_one = bench.answer_one, None
+    bench.answer_one = lambda name, job: (
+        healthy(name, job)
+        if name == A
+        else bench.deliver(name, Result(job.digest, None, 0, 0.1, "ValueError: sick", None))
+    )
+    bench.serve()
+    assert bench.run.ended
+    assert sum(each.failed for each in bench.run.history.rows) == 0
+    bench.journal.close()
+
+
+def test_an_evaluation_of_which_most_episodes_failed_pauses_and_resume_drives_these_again(tmp_path, random_bundle):
+    settings = replace(SETTINGS, evaluate_every=1, evaluation_episodes=3, confirm_episodes=4)
+    for name, part in (("evaluation", 0), ("confirmation", 20_000)):
+        bench = Failing(tmp_path / name / "night", random_bundle.path, settings, fails=None)
+        bench.fails = lambda job, part=part: job.kind == "evaluate" and job.episode >= part
+        bench.serve()
+        assert f"of the {name}" in bench.run.paused
+        bench.restart()
+        bench.serve()
+        assert f"of the {name}" in bench.run.paused, "a restart alone changes nothing"
+        bench.fails = lambda job: False
+        bench.run.resume()
+        bench.serve()
+        assert bench.run.ended
+        assert bench.run.confirmed.failed == 0
+        bench.journal.close()
+
+
 def test_a_shortage_of_the_host_is_no_failure_of_the_candidate(failing):
     whole = failing("whole", fails=lambda job: False).story()
     short = failing("short", fails=lambda job: False, host_errors=["host: killed by SIGKILL"] * 9)
@@ -177,7 +252,7 @@ def test_an_evaluation_counts_its_scored_episodes_and_one_without_any_ends(faili
     assert [(each.episodes, each.failed) for each in evaluations] == [(2, 1)] * GENERATIONS
     assert confirmed.episodes + confirmed.failed == 4
     assert confirmed.failed
-    none = failing("none", settings=settings, fails=lambda job: job.kind == "evaluate")
+    none = failing("none", settings=settings, fails=lambda job: job.kind == "evaluate", limit=1.0)
     assert none.run.ended
     assert none.story()[3:] == ([], None)
 

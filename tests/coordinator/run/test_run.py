@@ -40,6 +40,7 @@ class Bench:
     """A run in a folder; a test delivers its messages and moves its clock."""
 
     strict = False
+    failure_limit = 0.5
     host_class = None  # of both workers; `None`: they report no class
 
     def __init__(self, path, bundle, settings=SETTINGS, generations=1):
@@ -50,7 +51,7 @@ class Bench:
         self.begin()
 
     def begin(self):
-        network = NetworkConfig(beat=1.0, strict=self.strict)
+        network = NetworkConfig(beat=1.0, strict=self.strict, failure_limit=self.failure_limit)
         self.run = Run(self.journal, self.settings, self.limits, network, self.now)
         self.worker_protocol = WorkerProtocol(self.run, "night", "n", Intervals(1.0, 1.0))
         self.run.advance(self.now)

@@ -9,7 +9,7 @@ import pytest
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.runs.lookup import find_controller
-from dreamfleet.common.runs.records import RunSettings, StoredGeneration
+from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_paths import CONTROLLER, run_paths
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.work import vector_bytes
@@ -40,7 +40,7 @@ def runs_dir(tmp_path, random_bundle):
         closed = StoredGeneration(number, number, 1.0, number + 1, 0.0, 0.1, 20, 1.0)
         journal.close_generation(closed, np.array([0.0, 1.0]))
         journal.schedule_evaluation(Evaluation(number, vectors[0], 2))
-        journal.finish_evaluation(number, 100.0 * number, 5.0)
+        journal.finish_evaluation(number, StoredEvaluation(number, 4, 100.0 * number, 5.0), 0)
     journal.commit()
     journal.close()
     return tmp_path / "runs"
