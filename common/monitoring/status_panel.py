@@ -167,7 +167,11 @@ def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
     resent = f", {plural(waste.resent_batches, 'batch', 'batches')} sent again" if waste.resent_batches else ""
     yield 4, "waste", f"{waste.share:.1%}, {plural(waste.reissued, 'job')} issued again{resent}"
     if failed := status.failed + status.generation.failed:
-        yield 2, "failed", f"{plural(failed, 'candidate')}, {status.generation.failed} of this generation"
+        yield (
+            2,
+            "failed",
+            f"{plural(failed, 'candidate')}, {status.generation.failed} of this generation; `runs story` lists why",
+        )
     if status.throughput.seconds is not None and status.elapsed is not None:
         worked = status.throughput.seconds + status.generation.seconds
         yield 6, "time", f"{format_duration(worked)} of work in {format_duration(status.elapsed)}"

@@ -6,8 +6,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean, median
 
+from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.printable import join_some, plural
 from dreamfleet.common.runs.standard_error import sample_std, standard_error
 from dreamfleet.common.serialization.validation import Count
+
+MAX_NAMED = 3  # failed episodes in a text
 
 
 @dataclass(frozen=True)
@@ -23,8 +27,21 @@ class EpisodeResult:
 
 
 @dataclass(frozen=True)
+class FailedEpisode:
+    """An episode without a score."""
+
+    seed: Count
+    error: str  # one line
+
+    def __str__(self) -> str:
+        return f"seed {self.seed}, {self.error}"
+
+
+@dataclass(frozen=True)
 class EpisodeResults:
-    """The episodes of one controller, in the order of their seeds; at least one.
+    """The episodes of one controller, in the order of their seeds; at least one has a score.
+
+    All statistics are over the episodes with a score.
 
     >>> from dreamfleet import evaluate, find_controller
     >>> results = evaluate(find_controller("cartpole"), episodes=4, first_seed=1, jobs=1)  # a run of yours
@@ -35,11 +52,26 @@ class EpisodeResults:
     """
 
     drives: tuple[EpisodeResult, ...]
+    failed: tuple[FailedEpisode, ...] = ()
 
     @classmethod
-    def of(cls, drives: Iterable[EpisodeResult]) -> EpisodeResults:
-        """From results in any order."""
-        return cls(tuple(sorted(drives, key=lambda each: each.seed)))
+    def of(cls, episodes: Iterable[EpisodeResult | FailedEpisode]) -> EpisodeResults:
+        """From episodes in any order; `DreamfleetError` if none has a score."""
+        ordered = sorted(episodes, key=lambda each: each.seed)
+        failed = tuple(each for each in ordered if isinstance(each, FailedEpisode))
+        found = cls(tuple(each for each in ordered if isinstance(each, EpisodeResult)), failed)
+        if not found.drives:
+            raise DreamfleetError(f"no episode has a score: {found.failure_text}")
+        return found
+
+    @property
+    def failure_text(self) -> str:
+        """How many episodes failed, and the first ones with their errors; empty if none failed."""
+        if not self.failed:
+            return ""
+        total = len(self.drives) + len(self.failed)
+        named = join_some([str(each) for each in self.failed], MAX_NAMED)
+        return f"{len(self.drives)} of {plural(total, 'episode')}, {len(self.failed)} failed: {named}"
 
     @property
     def seeds(self) -> tuple[int, ...]:

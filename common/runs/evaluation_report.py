@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import read_text
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS
-from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
+from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.serialization.optional_fields import OPTIONAL
 from dreamfleet.common.serialization.validation import Length, MalformedError, Seconds, from_plain_lenient
@@ -38,11 +38,13 @@ class EvaluationReport:
     judge: str = "gymnasium"
     #: mean score from which gymnasium calls the environment solved; `None` if it names none
     threshold: float | None = field(default=None, metadata=OPTIONAL)
+    #: episodes without a score; every statistic leaves them out
+    failed: Annotated[tuple[FailedEpisode, ...], Length(0, MAX_EPISODES)] = field(default=(), metadata=OPTIONAL)
 
     @cached_property
     def results(self) -> EpisodeResults:
         """The episodes with their statistics."""
-        return EpisodeResults(self.drives)
+        return EpisodeResults(self.drives, self.failed)
 
     def to_json(self) -> str:
         """One line of JSON: the statistics, then all fields."""
@@ -51,7 +53,9 @@ class EvaluationReport:
     @property
     def description(self) -> str:
         """A text for display: the score, figures on driving, the threshold and the controller."""
+        failures = self.results.failure_text
         lines = (
+            failures and f"{failures}; all figures are over the episodes with a score",
             _describe_score(self.results),
             _describe_driving(self.results),
             self._describe_threshold,
@@ -65,6 +69,8 @@ class EvaluationReport:
         if self.threshold is None:
             return ""
         beyond, count = self.results.mean - self.threshold, len(self.drives)
+        if beyond >= 0 and count >= MIN_EPISODES_TO_SOLVE and self.failed:
+            return f"{beyond:.1f} above gymnasium's threshold of {self.threshold:g} without the failed episodes"
         if beyond >= 0 and count >= MIN_EPISODES_TO_SOLVE:
             return f"solved: gymnasium's threshold is a mean of {self.threshold:g}"
         few = "" if count >= MIN_EPISODES_TO_SOLVE else f", on fewer than {MIN_EPISODES_TO_SOLVE} seeds"
@@ -94,7 +100,7 @@ def read_evaluation_report(path: Path) -> EvaluationReport:
     """Read a file that `evaluate --out` wrote; `UsageError` for anything else."""
     try:
         found = from_plain_lenient(EvaluationReport, json.loads(read_text(path, MAX_BYTES)))
-        _check_drives(found.drives)
+        _check_episodes(found)
         return found
     except FileNotFoundError:
         raise UsageError(f"no report at {path}: `dreamfleet evaluate --out {path}` writes one") from None
@@ -108,11 +114,12 @@ def check_seed_range(first_seed: int, episodes: int) -> None:
         raise UsageError(f"--episodes must be at most {MAX_EPISODES}, and seeds below {MAX_SEED}")
 
 
-def _check_drives(drives: tuple[EpisodeResult, ...]) -> None:
+def _check_episodes(report: EvaluationReport) -> None:
     """`ValueError` for duplicate seeds and scores out of range."""
-    if len({each.seed for each in drives}) < len(drives):
+    seeds = [*(each.seed for each in report.drives), *(each.seed for each in report.failed)]
+    if len(set(seeds)) < len(seeds):
         raise ValueError("a seed occurs twice")
-    if not all(abs(each.score) <= LARGEST_FITNESS for each in drives):  # false for NaN too
+    if not all(abs(each.score) <= LARGEST_FITNESS for each in report.drives):  # false for NaN too
         raise ValueError(f"a score is beyond ±{LARGEST_FITNESS:g}")
 
 

@@ -97,7 +97,7 @@ def results_query(class_column: str) -> str:
     """The results of one kind, generation and candidate, by episode."""
     return (
         "SELECT kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, fingerprint, "  # noqa: S608
-        f"{class_column} FROM result WHERE kind = ? AND generation = ? AND candidate = ? ORDER BY episode"
+        f"{class_column}, hex(digest) FROM result WHERE kind = ? AND generation = ? AND candidate = ? ORDER BY episode"
     )
 
 

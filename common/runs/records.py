@@ -134,6 +134,7 @@ class StoredResult:
     worker: str
     fingerprint: str
     host_class: str  # of the worker's host
+    digest: str  # of its job, hexadecimal: another one if the candidate was drawn anew since
 
 
 @dataclass(frozen=True)
@@ -158,6 +159,7 @@ class StoredFailure:
     workers: str  # where it was tried, comma-separated
     attempts: int
     happened: float  # seconds since 1970
+    digest: str  # of its job, hexadecimal
 
 
 @dataclass(frozen=True)

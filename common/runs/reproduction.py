@@ -34,8 +34,9 @@ class Reproduction:
 
     @property
     def differing_seeds(self) -> tuple[int, ...]:
-        """The seeds whose score or number of steps differs."""
-        return tuple(one.seed for one, other in self.pairs if (one.score, one.steps) != (other.score, other.steps))
+        """The seeds whose score or number of steps differs, or which fail now."""
+        differing = {one.seed for one, other in self.pairs if (one.score, one.steps) != (other.score, other.steps)}
+        return tuple(sorted(differing | {each.seed for each in self.repeated.failed}))
 
     @property
     def difference(self) -> PairedDifference:
@@ -46,13 +47,19 @@ class Reproduction:
     def is_reproduced(self) -> bool:
         """Whether the record is reproduced."""
         return not self.differing_seeds or (
-            not self.same_fingerprint and len(self.pairs) > 1 and not self.difference.is_significant
+            not self.repeated.failed
+            and not self.same_fingerprint
+            and len(self.pairs) > 1
+            and not self.difference.is_significant
         )
 
     @property
     def description(self) -> str:
         """A text for display."""
         name, count, mean = self.recorded.name, len(self.pairs), self.repeated.results.mean
+        if self.repeated.failed:
+            failed = self.repeated.results.failure_text
+            return f"{name}: NOT reproduced: {failed}; all had a score when they were recorded"
         if not self.differing_seeds:
             host = "" if self.same_fingerprint else ", though this host is of another fingerprint"
             return f"{name}: reproduced: the same {count} scores to the bit, mean {mean:.1f}{host}"

@@ -177,9 +177,9 @@ class RunFolder:
         return rows[0][0] if rows else None
 
     def results(self, generation: int, number: int, kind: str = "score") -> list[StoredResult]:
-        """A candidate's accepted results, by episode."""
-        rows = self._journal.rows("siiiififsss", results_query(self._class_column), kind, generation, number)
-        return [StoredResult(*(*row[:-1], row[-1] or class_from_fingerprint(row[-2]))) for row in rows]
+        """A candidate's accepted results, by episode; also those of a vector that was discarded and drawn anew."""
+        rows = self._journal.rows("siiiififssss", results_query(self._class_column), kind, generation, number)
+        return [StoredResult(*(*row[:-2], row[-2] or class_from_fingerprint(row[-3]), row[-1])) for row in rows]
 
     def candidates(self) -> list[StoredCandidate]:
         """Every candidate by generation and number."""
@@ -254,10 +254,10 @@ class RunFolder:
         if not self._has_failures:
             return []
         query = (
-            "SELECT kind, generation, candidate, episode, seed, error, workers, attempts, happened FROM failure "
-            "ORDER BY happened, generation, candidate, episode"
+            "SELECT kind, generation, candidate, episode, seed, error, workers, attempts, happened, hex(digest) "
+            "FROM failure ORDER BY happened, generation, candidate, episode"
         )
-        return [StoredFailure(*row) for row in self._journal.rows("siiiissif", query)]
+        return [StoredFailure(*row) for row in self._journal.rows("siiiissifs", query)]
 
     def confirmation(self) -> StoredConfirmation | None:
         """The confirmed score of the reported mean; `None` if that mean is not confirmed."""

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.evaluation_report import EvaluationReport, read_evaluation_report
 from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.common.runs.standard_error import format_with_error
@@ -40,7 +41,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _line(path: Path, found: EvaluationReport) -> str:
     score = format_with_error(found.results.mean, found.results.error)
-    return f"{path}: {found.name}, {score} on {len(found.drives)} seeds"
+    failed = f", and {len(found.failed)} failed" if found.failed else ""
+    return f"{path}: {found.name}, {score} on {plural(len(found.drives), 'seed')}{failed}"
 
 
 def _warn(first: Path, base: EvaluationReport, path: Path, other: EvaluationReport) -> None:

@@ -16,12 +16,13 @@ from dreamfleet.worker.tasks.api import Continuous, Score, Task, World
 MODULE = "tests.support.tasks"
 (
     TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC, EXPLODING, ENDLESS,
-    CHATTY, PAINTED, ROUNDED, SECOND_TOY,
+    CHATTY, PAINTED, ROUNDED, SECOND_TOY, BRITTLE, FRAGILE,
 ) = (
     f"{MODULE}:{name}"
     for name in (
         "Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Silent", "Judged", "Counted", "Heavy", "Optimistic",
-        "Exploding", "Endless", "Chatty", "Painted", "Rounded", "SecondToy",
+        "Exploding", "Endless", "Chatty", "Painted", "Rounded", "SecondToy", "Brittle",
+        "Fragile",
     )
 )  # fmt: skip
 ALL = TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC, PAINTED
@@ -103,7 +104,7 @@ class Rounded(Toy):
 class Brittle(Toy):
     """A tenth of the episodes raises, by parameters and seed."""
 
-    name = f"{MODULE}:Brittle"
+    name = BRITTLE
 
     def make_environment(self, assignment):
         return BrittleEnvironment()
@@ -114,6 +115,22 @@ class BrittleEnvironment(ToyEnvironment):
         if self._left == 7 and hashlib.sha256(action.tobytes() + self._target.tobytes()).digest()[0] < 26:
             raise ArithmeticError(f"the world of {id(self)} is brittle")
         return super().step(action)
+
+
+class Fragile(Toy):
+    """The episode of seed 6 takes its process with it."""
+
+    name = FRAGILE
+
+    def make_environment(self, assignment):
+        return FragileEnvironment()
+
+
+class FragileEnvironment(ToyEnvironment):
+    def reset(self, *, seed=None, options=None):
+        if seed == 6:
+            os._exit(1)
+        return super().reset(seed=seed, options=options)
 
 
 class Raising(Toy):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from dreamfleet.common.protocol.messages import Job
-from dreamfleet.worker.service.failure_cause import describe_exception, encodable
+from dreamfleet.worker.scoring.failure_cause import describe_exception, encodable
 
 MAX_TRACE = 8000  # characters of a traceback that are kept, from its end, where the cause stands
 MAX_KINDS = 100  # kinds of failures that are logged at most

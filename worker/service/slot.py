@@ -16,9 +16,9 @@ from dreamfleet.common.errors import BundleError, DreamfleetError
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol.failures import is_host_failure
 from dreamfleet.common.protocol.messages import Job, Result, TaskSpec
+from dreamfleet.worker.scoring.failure_cause import describe_crash, describe_exit, is_hosts_fault
 from dreamfleet.worker.service.child import ChildReady
 from dreamfleet.worker.service.child_process import EXIT_GRACE, ChildMessage, ChildProcess
-from dreamfleet.worker.service.failure_cause import describe_crash, describe_exit, is_hosts_fault
 from dreamfleet.worker.service.failure_log import ScoringFailure
 from dreamfleet.worker.service.frame_sampler import SampledFrame
 from dreamfleet.worker.service.job_group import GroupDone, JobGroup, JobWithVector

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import gymnasium
@@ -10,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.worker.dream.parallel_dream import ParallelDream, ParallelDreamConfig, can_dream
+from dreamfleet.worker.scoring.failure_cause import describe_exception
 from dreamfleet.worker.tasks.api import World
 from dreamfleet.worker.tools.canvas import (
     AWAKE,
@@ -98,7 +101,30 @@ class FramePainter:
         self, action: Any, step: int, score: float, pictures: ModelPictures | None, layout: FrameLayout | None
     ) -> None:
         """Draw the frame of a step."""
-        picture: Any = self._environment.render()
+        picture = self._picture()
         if self._canvas is None:
             self._canvas = Canvas(self._seed, layout or plain_layout(picture), self._world.action_names)
         self._on_frame(self._canvas.draw(DriveFrame(picture, np.atleast_1d(np.asarray(action)), step, score, pictures)))
+
+    def _picture(self) -> NDArray[np.uint8]:
+        """The environment's picture `(height, width, 3)`; `UsageError` if it draws none."""
+        found: Any = None
+        with suppress(NotImplementedError):  # gymnasium's default `render`
+            found = self._environment.render()
+        if np.ndim(found) != 3:
+            raise UsageError(
+                f"this environment ({type(self._environment.unwrapped).__name__}) draws no pictures: its `render` must "
+                "return an array (height, width, 3) in the render mode rgb_array"
+            )
+        return np.asarray(found)
+
+
+@contextmanager
+def episode_errors(seed: int) -> Iterator[None]:
+    """Turn what a simulator raises into a `DreamfleetError` that names the seed."""
+    try:
+        yield
+    except DreamfleetError:
+        raise
+    except (Exception, SystemExit) as error:  # a simulator may raise anything
+        raise DreamfleetError(f"the episode of seed {seed} failed: {describe_exception(error)}") from error

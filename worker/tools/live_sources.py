@@ -13,7 +13,7 @@ from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
 from dreamfleet.worker.scoring.agents import Agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tools.canvas import Frame
-from dreamfleet.worker.tools.drive_frames import FilmedPolicy, FramePainter, WorldModelView
+from dreamfleet.worker.tools.drive_frames import FilmedPolicy, FramePainter, WorldModelView, episode_errors
 from dreamfleet.worker.tools.live_view import CaptionedFrame, LiveCanvas
 
 Driver = tuple[Agent, dict[str, Any]]
@@ -45,7 +45,8 @@ def driven_frames(
         agent, facts = driver()
         environment = agent.make_evaluation_environment("rgb_array")
         try:
-            yield from _episode(agent, facts, environment, replace(dreaming, seed=track), rate)
+            with episode_errors(track):
+                yield from _episode(agent, facts, environment, replace(dreaming, seed=track), rate)
         finally:
             environment.close()
 

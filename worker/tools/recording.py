@@ -10,7 +10,7 @@ from dreamfleet.common.host.stop_signals import Stop, never_stop
 from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
 from dreamfleet.worker.scoring.agents import Agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
-from dreamfleet.worker.tools.drive_frames import FilmedPolicy, FramePainter, WorldModelView
+from dreamfleet.worker.tools.drive_frames import FilmedPolicy, FramePainter, WorldModelView, episode_errors
 from dreamfleet.worker.tools.video import Video
 
 
@@ -29,7 +29,7 @@ def record(
     config, bundle = dreaming or ParallelDreamConfig(seed=seed), agent.bundle
     model_view = None if bundle is None else WorldModelView(bundle, policy, agent.parameters, config)
     score = 0.0
-    with Video(out, agent.world.frames_per_second) as video:
+    with episode_errors(seed), Video(out, agent.world.frames_per_second) as video:
         painter = FramePainter(environment, agent.world, seed, video.add)
         for moment in run_episode(environment, FilmedPolicy(policy, painter, model_view), EpisodeConfig(seed, steps)):
             score += moment.reward

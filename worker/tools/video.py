@@ -32,6 +32,8 @@ class Video:
         if self._stream is not None:
             self._container.mux(self._stream.encode())
         self._container.close()
+        if self._stream is None:
+            self._out.unlink(missing_ok=True)  # no picture came
 
     def add(self, picture: NDArray[np.uint8]) -> None:
         """Add a picture `(height, width, 3)` with even sides, of the same size as the first."""

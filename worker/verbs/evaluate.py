@@ -14,9 +14,9 @@ from dreamfleet.common.host.resource_limits import pin_thread_pools, usable_core
 from dreamfleet.common.runs.seeds import TEST
 
 if TYPE_CHECKING:
-    from dreamfleet.common.runs.episode_results import EpisodeResult
     from dreamfleet.common.runs.evaluation_report import EvaluationReport
     from dreamfleet.worker.scoring.agents import Agent
+    from dreamfleet.worker.tools.evaluation import Episode
 
 SUMMARY = "judge a controller on unseen seeds, in gymnasium's own unmodified environment"
 EXTRAS = ("worker",)
@@ -64,12 +64,16 @@ def run(args: argparse.Namespace) -> int:
 
 
 def judge(name: str, agent: Agent, seeds: tuple[int, ...], jobs: int) -> EvaluationReport:
-    """Drive one whole episode per seed, with a progress bar."""
+    """Drive one whole episode per seed, with a progress bar and a line on stderr for each that fails."""
     from dreamfleet.common.cli.progress import progress_bar
+    from dreamfleet.common.runs.episode_results import EpisodeResult
     from dreamfleet.worker.tools.evaluation import run_evaluation
 
-    def move(drives: list[EpisodeResult]) -> None:
-        bar.update(len(drives), f"mean {sum(each.score for each in drives) / len(drives):.1f}")
+    def move(episodes: list[Episode]) -> None:
+        scores = [each.score for each in episodes if isinstance(each, EpisodeResult)]
+        bar.update(len(episodes), f"mean {sum(scores) / len(scores):.1f}" if scores else "")
+        if not isinstance(last := episodes[-1], EpisodeResult):
+            print(f"an episode failed: {last}", file=sys.stderr)
 
     with progress_bar("evaluate", len(seeds), "episodes") as bar:
         return run_evaluation(name, agent, seeds, jobs, move)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.common.printable import one_line
 
 if TYPE_CHECKING:
     from dreamfleet.worker.tools.replay import ReplayedEpisode
@@ -50,21 +51,34 @@ def run(args: argparse.Namespace) -> int:
     unchecked = agree.count(None)
     if args.json:
         same = all(each.same for each in episodes)
-        mean = float(np.mean([each.replayed for each in episodes]))
+        fitness = [each.replayed for each in episodes if each.replayed is not None]
+        mean = float(np.mean(fitness)) if len(fitness) == len(episodes) else None
         rows = [vars(each) for each in episodes]
         print(json.dumps({"identical": same, "unchecked": unchecked, "fitness": mean, "stored_fitness": stored_fitness,
                           "episodes": rows}))  # fmt: skip
     else:
         for each in episodes:
-            print(f"episode {each.episode}  seed {each.seed}  stored {each.stored!r}  replayed {each.replayed!r}  "
-                  f"{_describe_match(each, args.tolerance)}")  # fmt: skip
+            print(f"episode {each.episode}  seed {each.seed}  {_describe(each, args.tolerance)}")
     if varying := sum(not each.deterministic for each in episodes):
         print(f"{varying} of {len(episodes)} episodes were driven in an environment that is not deterministic: their "
               "bits are not the same again anywhere; --tolerance N compares them", file=sys.stderr)  # fmt: skip
+    elif blocked := sum(not each.attempted for each in episodes):
+        print(f"{blocked} of {len(episodes)} episodes crashed or hung their process and were not driven again",
+              file=sys.stderr)  # fmt: skip
     elif unchecked:
         print(f"{unchecked} of {len(episodes)} episodes were scored by hosts of another class: whether they are right "
               "cannot be checked here to the bit; --tolerance N compares them", file=sys.stderr)  # fmt: skip
     return 0 if False not in agree and True in agree else 1
+
+
+def _describe(each: ReplayedEpisode, tolerance: float | None) -> str:
+    if not each.failure and not each.error:
+        return f"stored {each.stored!r}  replayed {each.replayed!r}  {_describe_match(each, tolerance)}"
+    then = f"failed then ({one_line(each.failure)})" if each.failure else f"stored {each.stored!r}"
+    if not each.attempted:
+        return f"{then}  not driven again, as it would end or block this program"
+    now = f"fails now ({one_line(each.error)})" if each.error else f"replayed {each.replayed!r}"
+    return f"{then}  {now}  {'same cause' if each.same else _describe_match(each, tolerance)}"
 
 
 def _describe_match(each: ReplayedEpisode, tolerance: float | None) -> str:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.cli import command_line
-from dreamfleet.common.errors import UsageError
-from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
+from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.common.runs.evaluation_report import EvaluationReport, read_evaluation_report
 from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.common.runs.reproduction import Reproduction
@@ -83,10 +83,39 @@ def test_a_report_round_trips_with_its_statistics(tmp_path):
 
 def test_a_report_without_newer_fields_is_read(tmp_path):
     plain = json.loads(JUDGEMENT.to_json())
-    del plain["threshold"]
+    del plain["threshold"], plain["failed"]
     path = tmp_path / "older.json"
     path.write_text(json.dumps(plain))
     assert read_evaluation_report(path) == JUDGEMENT
+
+
+BROKEN = FailedEpisode(10_007, "ValueError: no road")
+
+
+def test_failed_episodes_count_in_no_figure_and_round_trip(tmp_path):
+    found = EpisodeResults.of([BROKEN, *DRIVES])
+    assert (found.mean, found.seeds, found.failed) == (670.0, (10_000, 10_001, 10_002), (BROKEN,))
+    report = replace(JUDGEMENT, failed=(BROKEN,))
+    assert report.description.startswith("3 of 4 episodes, 1 failed: seed 10007, ValueError: no road; all figures are")
+    (tmp_path / "report.json").write_text(report.to_json())
+    assert read_evaluation_report(tmp_path / "report.json") == report
+    with pytest.raises(DreamfleetError, match="no episode has a score: 0 of 1 episode, 1 failed: seed 10007, Value"):
+        EpisodeResults.of([BROKEN])
+
+
+def test_a_controller_that_failed_on_a_seed_has_not_solved_its_environment():
+    report = scored(*[900] * 100, threshold=890.0, failed=(FailedEpisode(1, "ValueError: no road"),))
+    assert "10.0 above gymnasium's threshold of 890 without the failed episodes" in report.description
+    assert "solved" not in report.description
+
+
+def test_an_episode_that_fails_now_is_not_reproduced():
+    for changes in ({}, ELSEWHERE):
+        found = Reproduction(
+            scored(100, 500, 900), scored(100, 500, failed=(FailedEpisode(10_002, "E: x"),), **changes)
+        )
+        assert (found.is_reproduced, found.differing_seeds) == (False, (10_002,))
+        assert "NOT reproduced: 2 of 3 episodes, 1 failed: seed 10002, E: x" in found.description
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"drives": []}', JUDGEMENT.to_json().replace("910.0", '"910"')])

@@ -7,6 +7,7 @@ import pytest
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import BundleError, ControllerError, DreamfleetError, UsageError
 from dreamfleet.common.host.fingerprint import fingerprint
+from dreamfleet.common.runs.episode_results import EpisodeResults
 from dreamfleet.common.runs.evaluation_report import read_evaluation_report
 from dreamfleet.common.runs.lookup import find_bundle_of
 from dreamfleet.worker.scoring import episode
@@ -51,12 +52,54 @@ def test_scores_are_those_of_the_evaluation_environment(controller, random_bundl
     [
         ("moon", UsageError, "unknown task 'moon'"),
         (tasks.CRASHING, DreamfleetError, "crashed"),
-        (tasks.RAISING, RuntimeError, "road has ended"),
+        (tasks.RAISING, DreamfleetError, "0 of 3 episodes, 3 failed: seed 10000, RuntimeError: the road has ended"),
     ],
 )
 def test_an_error_in_a_process_ends_the_evaluation_with_the_reason(controller, random_bundle, task, error, says):
     with pytest.raises(error, match=says):
-        list(evaluate(make_agent(controller(task), random_bundle), SEEDS, 2))
+        EpisodeResults.of(evaluate(make_agent(controller(task), random_bundle), SEEDS, 2))
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_an_episode_that_fails_is_reported_and_the_others_go_on(processes, controller, random_bundle, tmp_path, jobs):
+    controller(tasks.BRITTLE).save(tmp_path / "toy.npz")
+    evaluation = (
+        "evaluate", "--controller", tmp_path / "toy.npz", "--bundle", random_bundle.path, "--episodes", 30, "--jobs",
+        jobs, "--out", tmp_path / "toy.json",
+    )  # fmt: skip
+    code, out, err = processes.call(*evaluation)
+    report = read_evaluation_report(tmp_path / "toy.json")
+    failed = len(report.failed)
+    assert (code, 0 < failed < 30, len(report.drives) + failed) == (0, True, 30), err
+    assert f"{30 - failed} of 30 episodes, {failed} failed: seed {report.failed[0].seed}, ArithmeticError: the" in out
+    assert "over the episodes with a score" in out
+    assert "Traceback" not in err
+    for each in report.failed:
+        assert f"an episode failed: seed {each.seed}, ArithmeticError: the world of" in err
+    plain = json.loads((tmp_path / "toy.json").read_text())
+    assert plain["mean"] == pytest.approx(np.mean([each["score"] for each in plain["drives"]]))
+    assert (plain["n"], [each["seed"] for each in plain["failed"]]) == (
+        30 - failed,
+        [each.seed for each in report.failed],
+    )
+    code, out, err = processes.call("reproduce", tmp_path / "toy.json", "--bundle", random_bundle.path, "--jobs", jobs)
+    assert (code, f"the same {30 - failed} scores" in out) == (0, True), err
+
+
+def test_an_evaluation_without_any_score_ends_with_one_line(processes, controller, random_bundle, tmp_path):
+    controller(tasks.NAN).save(tmp_path / "toy.npz")
+    code, out, err = processes.call(
+        "evaluate", "--controller", tmp_path / "toy.npz", "--bundle", random_bundle.path, "--episodes", 5, "--jobs", 1
+    )
+    assert (code, out, "Traceback" in err) == (1, "", False)
+    assert "no episode has a score: 0 of 5 episodes, 5 failed: seed 10000, ValueError: " in err
+    assert "and 2 more" in err
+
+
+def test_a_crash_costs_only_its_own_episode(controller, random_bundle):
+    found = EpisodeResults.of(evaluate(make_agent(controller(tasks.FRAGILE), random_bundle), tuple(range(8)), 2))
+    assert [each.seed for each in found.failed] == [6]
+    assert len(found.drives) == 7
 
 
 def test_a_world_model_is_found_beside_its_controller_or_by_name(controller, random_bundle):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, write_bundle
-from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.worker.scoring import episode
 from dreamfleet.worker.scoring.agents import make_agent
@@ -70,6 +70,25 @@ def test_a_bundle_without_a_dream_is_recorded_with_two_pictures(controller, rand
     with av.open(str(tmp_path / "drive.mp4")) as container:
         stream = container.streams.video[0]
         assert (stream.width, stream.height) == AWAKE.size
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("Dark", "this environment (Dark) draws no pictures"),
+        ("Blank", "this environment (Blank) draws no pictures"),
+        ("Raising", "the episode of seed 10000 failed: ZeroDivisionError: no light"),
+    ],
+)
+def test_an_environment_that_cannot_be_filmed_ends_with_one_line(processes, tmp_path, monkeypatch, name, says):
+    monkeypatch.setenv("DREAMFLEET_TRUST", "tests")
+    task = f"gym:tests.support.dark_environments:{name}-v0"
+    Controller(ControllerShape(4, 2), np.zeros(10, np.float32), task, "").save(tmp_path / "dark.npz")
+    for verb in ("record", "live"):
+        out = tmp_path / f"{verb}.mp4"
+        code, _, err = processes.call(verb, "--controller", tmp_path / "dark.npz", "--out", out)
+        assert (code > 0, says in err, "Traceback" in err) == (True, True, False), err
+        assert not out.exists()
 
 
 def test_another_task_or_an_impossible_place_is_refused(controller, random_bundle, tmp_path):

@@ -4,6 +4,7 @@ from contextlib import closing
 
 import pytest
 
+from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_paths import JOURNAL
 from tests.support import tasks
 
@@ -46,3 +47,76 @@ def test_results_of_another_host_class_are_counted_and_optionally_compared(proce
     code, out, err = processes.call(*replay, "--tolerance", 1)
     assert (code, out.count("within 1, of class there"), err) == (0, 1, "")
     assert processes.call(*replay, "--tolerance", 0.25)[0] == 1
+
+
+@pytest.fixture
+def brittle_run(processes, random_bundle):
+    def run(on_failure):
+        coordinator = processes.coordinator(
+            "--bundle", random_bundle.path, "--task", tasks.BRITTLE, "--population", 12, "--episodes", 3,
+            "--generations", 1, "--evaluate-every", 0, "--seed", 7, "--on-failure", on_failure, "--failure-limit", 1,
+        )  # fmt: skip
+        processes.worker("--task", tasks.BRITTLE, "--exit-when-done")
+        assert coordinator.finish()[0] == 0
+        return processes.runs / "test"
+
+    return run
+
+
+def change_failures(folder, error):
+    with closing(sqlite3.connect(folder / JOURNAL)) as connection, connection:
+        connection.execute("UPDATE failure SET error = ?", (error,))
+    connection.close()
+
+
+def test_a_candidate_that_failed_is_driven_again_and_its_cause_compared(processes, brittle_run):
+    folder = brittle_run("worst")
+    with RunFolder(folder) as run:
+        place = run.failures()[0]
+        failed = sum((each.generation, each.candidate) == (0, place.candidate) for each in run.failures())
+    replay = ("replay", "test", "--runs-dir", processes.runs, "--candidate", f"0/{place.candidate}")
+    code, out, err = processes.call(*replay)
+    assert (code, out.count("same cause"), "DIFFERS" in out) == (0, failed, False), err
+    assert "failed then (ArithmeticError: the world of" in out
+    assert "fails now (ArithmeticError: the world of" in out
+    found = json.loads(processes.call(*replay, "--json")[1])
+    assert (found["identical"], found["fitness"], found["stored_fitness"]) == (True, None, None)
+    change_failures(folder, "ValueError: another cause")
+    code, out, err = processes.call(*replay)
+    assert (code, out.count("DIFFERS")) == (1, failed), err
+    change_failures(folder, "slot crashed (killed by SIGSEGV)")
+    code, out, err = processes.call(*replay)
+    assert (out.count("not driven again"), "DIFFERS" in out, "Traceback" in err) == (failed, False, False)
+    assert "crashed or hung their process" in err
+
+
+def test_a_candidate_that_scored_and_now_fails_differs(processes, brittle_run):
+    folder = brittle_run("worst")
+    with RunFolder(folder) as run:
+        place = run.failures()[0]
+    with closing(sqlite3.connect(folder / JOURNAL)) as connection, connection:
+        connection.execute(
+            "INSERT INTO result (digest, kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, "
+            "fingerprint, incarnation, host_class) SELECT f.digest, f.kind, f.generation, f.candidate, f.episode, "
+            "f.seed, -1.0, 10, 0.1, r.worker, r.fingerprint, r.incarnation, r.host_class FROM failure f, result r "
+            "WHERE f.candidate = ? LIMIT 1",
+            (place.candidate,),
+        )
+        connection.execute("DELETE FROM failure")
+    connection.close()
+    code, out, err = processes.call(
+        "replay", "test", "--runs-dir", processes.runs, "--candidate", f"0/{place.candidate}"
+    )
+    assert (code, "stored -1.0  fails now (ArithmeticError" in out, "DIFFERS" in out) == (1, True, True), err
+    assert "Traceback" not in err
+
+
+def test_a_candidate_that_was_drawn_anew_is_compared_with_its_final_vector_alone(processes, brittle_run):
+    with RunFolder(brittle_run("redraw")) as run:
+        numbers = {each.candidate for each in run.failures()}
+        stored = {number: len(run.results(0, number)) for number in numbers}
+    number = max(stored, key=stored.__getitem__)
+    assert stored[number] > 3, "choose another seed"
+    replay = ("replay", "test", "--runs-dir", processes.runs, "--candidate", f"0/{number}")
+    code, out, err = processes.call(*replay)
+    assert (code, out.count("same bits"), len(out.splitlines())) == (0, 3, 3), (out, err)

@@ -6,7 +6,7 @@ import signal
 import numpy as np
 import pytest
 
-from dreamfleet.worker.service.failure_cause import (
+from dreamfleet.worker.scoring.failure_cause import (
     MAX_TEXT,
     describe_crash,
     describe_exception,

@@ -14,6 +14,7 @@ from dreamfleet.common.protocol.failures import HOST_PREFIX
 
 MAX_TEXT = 500  # characters of an error's text
 MAX_CAUSES = 10  # causes of causes that are looked at
+CRASH = "slot crashed"
 NO_ROOM = (
     errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EMFILE, errno.ENFILE, errno.EAGAIN, errno.ENOMEM,
 )  # fmt: skip
@@ -58,7 +59,12 @@ def describe_exit(status: int) -> str:
 
 def describe_crash(reason: str) -> str:
     """The error of the jobs that a child took with it; `reason` is of `describe_exit` or why it was killed."""
-    return reason if reason.startswith(HOST_PREFIX) else f"slot crashed ({reason})"
+    return reason if reason.startswith(HOST_PREFIX) else f"{CRASH} ({reason})"
+
+
+def is_crash(error: str) -> bool:
+    """Whether the child died of the episode or was killed, so that the program that drives it again would too."""
+    return error.startswith((CRASH, HOST_PREFIX))
 
 
 def encodable(text: str) -> str:
