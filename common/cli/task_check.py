@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import json
-import os
-import queue
-import signal
-import subprocess
 import sys
-import tempfile
-import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import IO, Any
+from time import monotonic
+from typing import Any
 
-from dreamfleet.common.host.processes import parent_death_command
+from dreamfleet.common.cli.trial_process import TrialError, TrialProcess
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.protocol.tasks import Description
+from dreamfleet.common.serialization.optional_fields import OPTIONAL
+from dreamfleet.common.serialization.validation import from_plain
 
 CHILD = "dreamfleet.worker.scoring.task_check"
 STEP_LIMIT = 120.0  # seconds of one step of a trial, such as a reset; as long as a worker's child may take to start
 SECOND_TRIAL_LIMIT = 20.0  # seconds of the first trial's episode from which on there is no second trial
-MAX_FAULT_CHARS = 300  # of what a crashed child printed last
+TRIAL_LIMIT = 3600.0  # seconds of a whole trial, which may normalise observations in 20 episodes
+MAX_ANSWERS = 200  # of one trial; a sound one gives about a dozen
 REMEDY = "draw all randomness from self.np_random, which reset(seed=...) seeds, and keep nothing from earlier episodes"
 
 
@@ -29,13 +27,21 @@ REMEDY = "draw all randomness from self.np_random, which reset(seed=...) seeds, 
 class TaskTrial:
     """What one child process reports."""
 
-    description: dict[str, Any] = field(default_factory=dict)
+    description: Description | None = None
     fault: str = ""  # why the task cannot be scored; empty: it can
-    warnings: list[str] = field(default_factory=list)
+    warnings: tuple[str, ...] = ()
     first: str = ""  # digest of the first observation
     episode: str = ""  # digest of the probe episode; empty: the task has none
     repeated: str = ""  # of the same episode, driven once more; empty: it was not
     seconds: float = 0.0  # that the first episode took
+
+
+@dataclass
+class TrialAnswer:
+    """What one line of a child says: the step that begins, or what was found so far."""
+
+    step: str | None = field(default=None, metadata=OPTIONAL)  # empty: it normalises
+    report: TaskTrial | None = field(default=None, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True)
@@ -66,8 +72,7 @@ def try_task(name: str, options: Mapping[str, Any], limit: float = STEP_LIMIT) -
         if second.fault:
             warnings.append(f"a second trial failed: {second.fault}")
         compared, varies = True, _find_difference(first, second)
-    description = {**first.description, "packages": tuple(first.description["packages"])}
-    return TaskReport(Description(**description), "", tuple(warnings), compared, varies)
+    return TaskReport(first.description, "", tuple(warnings), compared, varies)
 
 
 def _find_difference(first: TaskTrial, second: TaskTrial) -> str:
@@ -82,58 +87,35 @@ def _find_difference(first: TaskTrial, second: TaskTrial) -> str:
 
 def _run_trial(request: Mapping[str, Any], limit: float) -> TaskTrial:
     """Run one child and return its last report; without one the fault says what it was doing as it hung or crashed."""
-    lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-    name, step, trial = request["task"], "loading it", None
-    with tempfile.TemporaryFile() as printed:
-        child = subprocess.Popen(  # noqa: S603 - our own interpreter and module
-            [*parent_death_command(), sys.executable, "-P", "-m", CHILD],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=printed, text=True, start_new_session=True,
-        )  # fmt: skip
-        reader = threading.Thread(
-            target=_read, args=(child, json.dumps({**request, "path": sys.path}), lines), daemon=True
-        )
-        reader.start()
+    name, step, failure = request["task"], "loading it", ""
+    trial: TaskTrial | None = None
+    until = monotonic() + TRIAL_LIMIT
+    with TrialProcess(CHILD, json.dumps({**request, "path": sys.path})) as child:
         try:
-            while (line := lines.get(timeout=limit if step else None)) is not None:
-                answer = json.loads(line)
-                if "report" in answer:
-                    trial = TaskTrial(**answer["report"])
-                step = answer.get("step", step)
-            failure = "" if child.wait() == 0 else f"{step or 'normalising'} {_describe_end(child, printed)}"
-        except queue.Empty:
-            failure = f"{step} took longer than {limit:g} s"
-        finally:
-            if child.poll() is None:
-                os.killpg(child.pid, signal.SIGKILL)  # with a simulator that it may have started
-            child.wait()
-            reader.join()
-            for each in (child.stdin, child.stdout):
-                assert each is not None
-                each.close()
-    if trial is None:
+            for _ in range(MAX_ANSWERS):
+                left = until - monotonic()
+                line = child.read_line(min(limit, left) if step else left)
+                if line is None:
+                    break
+                answer = _parse(line)
+                trial = answer.report or trial
+                step = step if answer.step is None else answer.step
+            else:
+                raise TrialError("wrote to the pipe of this check")
+            failure = child.describe_failure()
+        except TrialError as error:
+            failure = str(error)
+    failure = failure and f"{one_line(step) or 'normalising'} {failure}"
+    if trial is None or (trial.description is None and not trial.fault):
         return TaskTrial(fault=f"{name} cannot be scored: {failure or 'the trial ended without a report'}")
-    trial.warnings += [failure] if failure else []
+    trial.fault = one_line(trial.fault)
+    trial.warnings = tuple(one_line(each) for each in (*trial.warnings, failure) if each)
     return trial
 
 
-def _read(child: subprocess.Popen[str], request: str, lines: queue.SimpleQueue[str | None]) -> None:
-    assert child.stdin is not None
-    assert child.stdout is not None
+def _parse(line: bytes) -> TrialAnswer:
+    """A line of a child; `TrialError` if it is malformed, because environments can write to all its pipes."""
     try:
-        child.stdin.write(request)
-        child.stdin.close()
-        for line in child.stdout:
-            lines.put(line)
-    except (OSError, ValueError):
-        pass  # the child is gone
-    finally:
-        lines.put(None)
-
-
-def _describe_end(child: subprocess.Popen[str], printed: IO[bytes]) -> str:
-    """How the child ended without a report, and what it printed last."""
-    code = child.wait()
-    how = f"crashed ({signal.Signals(-code).name})" if code < 0 else f"ended the process (exit code {code})"
-    printed.seek(0)
-    words = [text for line in printed.read().decode(errors="replace").splitlines() if (text := one_line(line))]
-    return f"{how}: {words[-1][:MAX_FAULT_CHARS]}" if words else how
+        return from_plain(TrialAnswer, json.loads(line))
+    except (ValueError, RecursionError) as error:
+        raise TrialError(f"wrote to the pipe of this check, or describes its task with wrong types: {error}") from error

@@ -5,11 +5,71 @@ import random
 import signal
 import sys
 import time
+from contextlib import suppress
+from pathlib import Path
 
 import gymnasium
 import numpy as np
 
 ODD = "gym:tests.support.environments:Odd-v0"
+DAEMON_FILE = "DAEMON_FILE"  # an environment variable
+
+
+def _leave_daemon():
+    """A process that leaves the session and keeps all pipes; its id goes to the file that `DAEMON_FILE` names."""
+    reads, writes = os.pipe()
+    if os.fork() == 0:
+        os.setsid()
+        Path(os.environ[DAEMON_FILE]).write_text(str(os.getpid()))
+        os.close(reads)
+        os.close(writes)
+        time.sleep(3600)
+        os._exit(0)
+    os.close(writes)
+    os.read(reads, 1)  # until the file is written
+    os.close(reads)
+
+
+def _leave_daemon_and_raise():
+    _leave_daemon()
+    raise RuntimeError("no licence")
+
+
+def _leave_daemon_and_hang():
+    _leave_daemon()
+    time.sleep(3600)
+
+
+def _close_and_hang():
+    os.closerange(3, 256)
+    time.sleep(3600)
+
+
+def _write_to_all(text, times=1):
+    for descriptor in range(3, 64):
+        with suppress(OSError):
+            for _ in range(times):
+                os.write(descriptor, text)
+
+
+def _print_without_end():
+    while True:
+        os.write(2, b"x" * 65_536)
+
+
+_DEEDS = {
+    "daemon": _leave_daemon,
+    "daemon and raise": _leave_daemon_and_raise,
+    "daemon and hang": _leave_daemon_and_hang,
+    "close and hang": _close_and_hang,
+    "big line": lambda: _write_to_all(b"z" * 65_536, 1000),
+    "line": lambda: _write_to_all(b"zzz\n"),
+    "bytes": lambda: _write_to_all(b"\xff\xfe\n"),
+    "nested": lambda: _write_to_all(b'{"report":' + b"[" * 50_000 + b"\n"),
+    "null report": lambda: _write_to_all(b'{"report": {"description": 5}}\n'),
+    "steps": lambda: _write_to_all(b'{"step": "another"}\n', 1000),
+    "flood": _print_without_end,
+}  # what an environment does as it is made
 
 
 class Odd(gymnasium.Env):
@@ -21,6 +81,8 @@ class Odd(gymnasium.Env):
         self._steps = 0  # of all episodes
         if fault == "noisy":
             print("a simulator greets")  # noqa: T201
+        if fault in _DEEDS:
+            _DEEDS[fault]()
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)

@@ -13,7 +13,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
@@ -127,29 +127,26 @@ def run_trial(
 
     checked, drive = _prepare(name, description, announce)
     began = monotonic()
-    trial = TaskTrial(_plain(description), episode=drive(), first=_digest(checked.first), warnings=checked.warnings)
+    trial = TaskTrial(description, episode=drive(), first=_digest(checked.first))
     trial.seconds = monotonic() - began
     if thorough and trial.episode and trial.seconds < REPEAT_LIMIT:
         trial.repeated = drive()
     if thorough and options.get("normalise"):
         announce("")
-        trial.description = _plain(describe_task(name, options))
+        trial.description = describe_task(name, options)
     if thorough:
-        trial.warnings += _describe_pictures(name, checked.environment)
+        checked.warnings += _describe_pictures(name, checked.environment)
         if checked.reset_seconds >= SLOW_RESET:
-            trial.warnings.append(f"a reset took {checked.reset_seconds:.0f} s, so gymnasium's checker was left out")
+            checked.warnings.append(f"a reset took {checked.reset_seconds:.0f} s, so gymnasium's checker was left out")
+    trial.warnings = tuple(checked.warnings)
     yield trial
     if thorough and checked.reset_seconds < SLOW_RESET:
         announce("gymnasium's checker")
-        trial.warnings += _check_by_gymnasium(checked.environment)
+        trial.warnings = (*checked.warnings, *_check_by_gymnasium(checked.environment))
         yield trial
     announce("close()")
     with suppress(Exception):
         checked.environment.close()
-
-
-def _plain(description: Description) -> dict[str, Any]:
-    return {each.name: getattr(description, each.name) for each in fields(Description)}
 
 
 def _prepare(
@@ -232,20 +229,20 @@ def main() -> None:
         step = name
         print(json.dumps({"step": name}), file=out, flush=True)
 
-    def report(found: dict[str, Any]) -> None:
-        print(json.dumps({"report": found}, default=int), file=out, flush=True)
+    def report(found: TaskTrial) -> None:
+        print(json.dumps({"report": asdict(found)}, default=int), file=out, flush=True)
 
     name = request["task"]
     try:
         for trial in run_trial(name, request["options"], announce, thorough=request["thorough"]):
-            report(asdict(trial))
+            report(trial)
     except DreamfleetError as error:
-        report({"fault": str(error) if isinstance(error, UsageError) else f"{name}: {error}"})
+        report(TaskTrial(fault=one_line(str(error) if isinstance(error, UsageError) else f"{name}: {error}")))
     except FaultError as error:
-        report({"fault": f"{name} cannot be scored: {error}"})
+        report(TaskTrial(fault=f"{name} cannot be scored: {error}"))
     except (Exception, SystemExit) as error:  # environments may raise anything
         what = one_line(f"{type(error).__name__}: {error}")
-        report({"fault": f"{name} cannot be scored: {step} raised {what}; {MEND}"})
+        report(TaskTrial(fault=f"{name} cannot be scored: {step} raised {what}; {MEND}"))
     os._exit(0)  # what the environment left running must not keep it
 
 

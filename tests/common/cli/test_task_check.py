@@ -1,11 +1,19 @@
 """Trials of real environments, each with one fault, in real child processes."""
 
+import os
 import re
+import select
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from time import monotonic, sleep
 
 import pytest
 
 from dreamfleet.common.cli.task_check import try_task
-from tests.support.environments import ODD
+from tests.support.environments import DAEMON_FILE, ODD
+from tests.support.processes import DEADLINE, environment
 
 
 def trial(fault, name=ODD, **options):
@@ -78,3 +86,66 @@ def test_pictures_are_hinted_at():
     found = try_task("gym:CarRacing-v3", {})
     assert found.fault == ""
     assert "task car-racing drives this track on a world model" in found.warnings[0]
+
+
+linux = pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="Linux")
+
+
+def has_ended(pid):
+    """Whether the process ends soon; a zombie has ended."""
+    try:
+        pidfd = os.pidfd_open(pid)
+    except ProcessLookupError:
+        return True
+    ended = bool(select.select([pidfd], [], [], DEADLINE)[0])
+    os.close(pidfd)
+    return ended
+
+
+@linux
+@pytest.mark.parametrize(("fault", "says"), [("daemon", ""), ("daemon and raise", "RuntimeError: no licence")])
+def test_a_daemon_that_keeps_the_pipes_ends_and_changes_no_finding(fault, says, tmp_path, monkeypatch):
+    monkeypatch.setenv(DAEMON_FILE, str(tmp_path / "pid"))
+    found = trial(fault)
+    assert says in found.fault
+    assert bool(found.fault) == bool(says)
+    assert (found.varies, found.compared) == ("", not says)
+    assert has_ended(int((tmp_path / "pid").read_text()))
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [
+        ("close and hang", "making it closed the pipe of this check"),
+        ("big line", "making it wrote to the pipe of this check more than 16 MiB"),
+        ("line", "making it wrote to the pipe of this check, or"),
+        ("bytes", "making it wrote to the pipe of this check, or"),
+        ("nested", "making it wrote to the pipe of this check, or"),
+        ("null report", "making it wrote to the pipe of this check, or"),
+        ("steps", "another wrote to the pipe of this check"),
+        ("flood", "making it printed more than 16 MiB"),
+    ],
+)
+def test_an_environment_that_spoils_the_pipes_is_one_line(fault, says):
+    found = trial(fault)
+    assert found.fault.startswith(f"{ODD} cannot be scored: {says}")
+    assert "\n" not in found.fault
+
+
+@linux
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_verb_with_all_that_the_environment_left(number, tmp_path):
+    file: Path = tmp_path / "pid"
+    verb = subprocess.Popen(
+        [sys.executable, "-m", "dreamfleet", "tasks", ODD, "--environment", 'fault="daemon and hang"'],
+        env={**environment(tmp_path), DAEMON_FILE: str(file)}, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+    until = monotonic() + DEADLINE
+    while not (file.exists() and file.read_text()) and verb.poll() is None and monotonic() < until:
+        sleep(0.01)
+    daemon = int(file.read_text())
+    verb.send_signal(number)
+    printed, _ = verb.communicate(timeout=DEADLINE)
+    assert verb.returncode != 0
+    assert b"Traceback" not in printed
+    assert has_ended(daemon)

@@ -1,0 +1,132 @@
+"""The child process of a trial, whose environment may do anything: each wait for it ends, and nothing outlives it."""
+
+from __future__ import annotations
+
+import os
+import selectors
+import signal
+import subprocess
+import sys
+import tempfile
+from contextlib import suppress
+from time import monotonic
+from typing import IO
+
+from dreamfleet.common.host.descendants import Descendants
+from dreamfleet.common.host.processes import parent_death_command
+from dreamfleet.common.printable import one_line
+
+LOOK_INTERVAL = 0.1  # seconds between two looks whether the child runs: a process that it left may hold its pipes
+EXIT_GRACE = 10.0  # seconds that the child may take to exit after it closed its pipe
+KILL_GRACE = 2.0  # seconds to wait for the end of a killed child: its host may block it
+CHUNK = 65_536  # bytes
+MAX_BYTES = 16 * 2**20  # that a trial may print, and that it may answer
+KEPT_BYTES = 65_536  # of what it printed last
+MAX_FAULT_CHARS = 300  # of what a crashed child printed last
+
+
+class TrialError(Exception):
+    """The trial was ended; the text says what its environment did."""
+
+
+class TrialProcess:
+    """A module that reads its request from stdin, writes lines to stdout, and prints to stderr. Use it in a `with`."""
+
+    def __init__(self, module: str, request: str) -> None:
+        self._descendants = Descendants()
+        self._lines: list[bytes] = []  # unread, the next one last
+        self._begun = bytearray()  # a line without its end
+        self._printed = bytearray()
+        self._sizes = [0, 0]  # bytes that it answered and printed
+        with tempfile.TemporaryFile() as stdin, self._descendants.starting():
+            stdin.write(request.encode())
+            stdin.seek(0)
+            self._child = subprocess.Popen(  # noqa: S603 - our own interpreter and module
+                [*parent_death_command(), sys.executable, "-P", "-m", module],
+                stdin=stdin, stdout=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=0, start_new_session=True,
+            )  # fmt: skip
+        self._selector = selectors.DefaultSelector()
+
+    def __enter__(self) -> TrialProcess:
+        self._descendants.add_session(self._child.pid)
+        for number, pipe in enumerate(self._pipes()):
+            os.set_blocking(pipe.fileno(), False)
+            self._selector.register(pipe, selectors.EVENT_READ, number)
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._kill()
+        self._descendants.forget()
+        self._selector.close()
+        for pipe in self._pipes():
+            pipe.close()
+
+    def read_line(self, seconds: float) -> bytes | None:
+        """The next line of stdout, or `None` if the child ended; `TrialError` after `seconds` or too much output."""
+        until, late = monotonic() + seconds, f"took longer than {seconds:.4g} s"
+        is_closed = False
+        while not self._lines:
+            has_ended = self._child.poll() is not None
+            if has_ended:
+                self._descendants.kill()  # then its pipes hold only what was written before
+            ready = self._selector.select(0 if has_ended else LOOK_INTERVAL)
+            for key, _ in ready:
+                self._read(key)
+            if has_ended and not ready:
+                return None
+            if not is_closed and self._answers_ended():
+                is_closed, limit = True, monotonic() + EXIT_GRACE
+                if limit < until:
+                    until, late = limit, "closed the pipe of this check"
+            if monotonic() > until:
+                raise TrialError(late)
+        return self._lines.pop()
+
+    def describe_failure(self) -> str:
+        """How the ended child failed and what it printed last; empty if it did not fail."""
+        code = self._child.returncode
+        if code == 0:
+            return ""
+        how = f"crashed ({_signal_name(-code)})" if code < 0 else f"ended the process (exit code {code})"
+        lines = self._printed.decode(errors="replace").splitlines()
+        words = [text for line in lines if (text := one_line(line))]
+        return f"{how}: {words[-1][:MAX_FAULT_CHARS]}" if words else how
+
+    def _pipes(self) -> tuple[IO[bytes], IO[bytes]]:
+        assert self._child.stdout is not None
+        assert self._child.stderr is not None
+        return self._child.stdout, self._child.stderr
+
+    def _answers_ended(self) -> bool:
+        return all(key.data != 0 for key in self._selector.get_map().values())
+
+    def _read(self, key: selectors.SelectorKey) -> None:
+        chunk = os.read(key.fd, CHUNK)
+        self._sizes[key.data] += len(chunk)
+        if self._sizes[key.data] > MAX_BYTES:
+            deed = "printed" if key.data else "wrote to the pipe of this check"
+            raise TrialError(f"{deed} more than {MAX_BYTES >> 20} MiB")
+        if not chunk:
+            self._selector.unregister(key.fileobj)
+        elif key.data:
+            self._printed += chunk
+            del self._printed[:-KEPT_BYTES]
+        else:
+            self._begun += chunk
+            if b"\n" in chunk:
+                *lines, self._begun = self._begun.split(b"\n")
+                self._lines[:0] = [bytes(line) for line in reversed(lines)]
+
+    def _kill(self) -> None:
+        with suppress(OSError):
+            self._child.kill()
+        self._descendants.kill()
+        with suppress(subprocess.TimeoutExpired):
+            self._child.wait(KILL_GRACE)
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:  # a real-time signal
+        return f"signal {number}"
