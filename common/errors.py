@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from errno import EDQUOT, ENOSPC
+from errno import EACCES, EDQUOT, EISDIR, ENOSPC, EPERM, EROFS
 
 
 class DreamfleetError(Exception):
@@ -52,8 +52,17 @@ class NotWritableNowError(JournalError):
 
 def write_error(path: object, error: OSError) -> JournalError:
     """The error for a file of a run that cannot be written."""
-    kind = NotWritableNowError if error.errno in (ENOSPC, EDQUOT) else JournalError
-    return kind(f"cannot write {path}: {error.strerror}; make room")
+    what = f"cannot write {path}: {error.strerror or error}"
+    if is_disk_full(error):
+        return NotWritableNowError(f"{what}; make room")
+    remedies = {EISDIR: "; remove it", EACCES: "; make it writable", EPERM: "; make it writable",
+                EROFS: "; make it writable"}  # fmt: skip
+    return JournalError(what + remedies.get(error.errno or 0, ""))
+
+
+def is_disk_full(error: OSError) -> bool:
+    """Whether room on the disk, or in somebody's share of it, is what is missing."""
+    return error.errno in (ENOSPC, EDQUOT)
 
 
 class InternalError(DreamfleetError):

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from dreamfleet.common.errors import DatasetError, DreamfleetError, UsageError
+from dreamfleet.common.errors import DatasetError, DreamfleetError, UsageError, is_disk_full
 from dreamfleet.common.files.regular_files import check_replaceable, is_folder
 
 
@@ -41,7 +41,8 @@ def reporting_write_errors(path: Path, flag: str = "--out") -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise DreamfleetError(f"cannot write {path}: {error.strerror}; make room or choose another {flag}") from error
+        remedy = "make room or choose" if is_disk_full(error) else "choose"
+        raise DreamfleetError(f"cannot write {path}: {error.strerror}; {remedy} another {flag}") from error
 
 
 @contextmanager

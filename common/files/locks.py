@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, BinaryIO
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
+from dreamfleet.common.files.regular_files import open_append
 
 
 @contextmanager
@@ -22,11 +24,22 @@ def folder_lock(lock: Path, who: str, flag: str = "--data") -> Iterator[None]:
     folder = lock.parent
     with reporting_unwritable_folder(folder, f"choose another {flag}"):
         folder.mkdir(parents=True, exist_ok=True)
-        file = lock.open("w")
+        file = open_lock(lock)
     with file:
         if not try_lock(file):
             raise UsageError(f"another {who} works in {folder}: stop it first")
         yield
+
+
+def open_lock(path: Path) -> BinaryIO:
+    """Open or create a lock file, whose content stays; `UsageError` for a link, a folder, a pipe or a device."""
+    try:
+        return open_append(path)
+    except OSError as error:
+        if error.errno not in (errno.ELOOP, errno.EISDIR, errno.EINVAL, errno.ENXIO):
+            raise
+        why = "it is a symbolic link" if error.errno == errno.ELOOP else error.strerror
+        raise UsageError(f"{path} cannot be the lock file: {why}; remove it") from error
 
 
 def try_lock(file: IO[Any] | int, retry_pauses: Sequence[float] = ()) -> bool:

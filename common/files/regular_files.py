@@ -8,9 +8,25 @@ import stat
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from io import BufferedReader
+from io import BufferedReader, FileIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+
+class _Readable(FileIO):
+    """A file that never has nothing to read yet: some in /proc call themselves regular, and wait like a pipe."""
+
+    def readinto(self, buffer: Any, /) -> int:
+        found = super().readinto(buffer)
+        if found is None:
+            raise OSError(errno.EINVAL, "it is not a regular file")
+        return found
+
+    def readall(self) -> bytes:
+        found = super().readall()
+        if found is None:
+            raise OSError(errno.EINVAL, "it is not a regular file")
+        return found
 
 
 @contextmanager
@@ -28,7 +44,8 @@ def open_regular(path: Path, max_bytes: int = sys.maxsize) -> Iterator[BufferedR
     except OSError:
         os.close(number)
         raise
-    with open(number, "rb") as file:  # noqa: PTH123 - a descriptor
+    raw: Any = _Readable(number)
+    with BufferedReader(raw) as file:
         yield file
 
 

@@ -246,7 +246,7 @@ class RunFolder:
         """What happened to the run, oldest first: workers that came and went, pauses, failures, lives."""
         if not self._has_failures:
             return []
-        query = "SELECT happened, incarnation, text FROM event ORDER BY number"
+        query = "SELECT happened, incarnation, substr(text, 1, 1000) FROM event ORDER BY number"
         return [StoredEvent(*row) for row in self._journal.rows("fis", query)]
 
     def failures(self) -> list[StoredFailure]:
@@ -254,8 +254,8 @@ class RunFolder:
         if not self._has_failures:
             return []
         query = (
-            "SELECT kind, generation, candidate, episode, seed, error, workers, attempts, happened, hex(digest) "
-            "FROM failure ORDER BY happened, generation, candidate, episode"
+            "SELECT kind, generation, candidate, episode, seed, substr(error, 1, 1000), substr(workers, 1, 1000), "
+            "attempts, happened, hex(digest) FROM failure ORDER BY happened, generation, candidate, episode"
         )
         return [StoredFailure(*row) for row in self._journal.rows("siiiissifs", query)]
 

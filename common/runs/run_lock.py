@@ -9,7 +9,8 @@ from pathlib import Path
 
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
-from dreamfleet.common.files.locks import is_locked_exclusively, try_lock
+from dreamfleet.common.files.locks import is_locked_exclusively, open_lock, try_lock
+from dreamfleet.common.files.regular_files import open_regular
 
 LOCK = "lock"
 RETRY_PAUSES = (0.01, 0.05)  # seconds; `is_run_locked` holds the lock for an instant
@@ -24,7 +25,7 @@ def run_lock(path: Path) -> Iterator[None]:
     """
     with ExitStack() as stack:
         with reporting_unwritable_folder(path, "choose another --runs-dir", JournalError):
-            file = stack.enter_context((path / LOCK).open("w"))
+            file = stack.enter_context(open_lock(path / LOCK))
             folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
             stack.callback(os.close, folder)
             _lock_or_raise(file.fileno(), path)
@@ -35,7 +36,7 @@ def run_lock(path: Path) -> Iterator[None]:
 
 def is_run_locked(path: Path) -> bool:
     """Whether a process of this host holds the lock of the run in the folder `path`. Writes nothing."""
-    with suppress(OSError), (path / LOCK).open("rb") as file:
+    with suppress(OSError), open_regular(path / LOCK) as file:
         return is_locked_exclusively(file)
     return False
 

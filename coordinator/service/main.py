@@ -91,7 +91,7 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
         try:
             return service.serve(lambda: Run(journal, settings, request.limits, request.network, monotonic()))
         except JournalError as error:
-            if not isinstance(error.__cause__, (OSError, sqlite3.OperationalError)):
+            if not isinstance(error.__cause__, (OSError, sqlite3.OperationalError)) or not journal.is_whole:
                 raise
             raise JournalError(f"{error}; it goes on with: {request.resume_command()}") from error
         except ConnectionFailedError as error:

@@ -15,7 +15,7 @@ from typing import Any
 
 import zenoh
 
-from dreamfleet.common.errors import DreamfleetError, RefusedError
+from dreamfleet.common.errors import DreamfleetError, JournalError, RefusedError
 from dreamfleet.common.host.error_counter import ErrorCounter
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import CountingDecoder, encode, encode_json, encoding
@@ -90,10 +90,13 @@ class Service:
             declared = self._start(session, make_run(), last)
             try:
                 self._loop(session)
+                self._shut_down(session, declared)
+            except JournalError:
+                self._file_watch.check(monotonic(), at_once=True)  # what was done to the files may be rescued
+                raise
             except RefusedError:  # another coordinator of this name continues; nothing of the run is lost
                 self._run.leave()
                 raise
-            self._shut_down(session, declared)
         return self._run
 
     def _start(self, session: zenoh.Session, run: Run, stack: ExitStack) -> list[Any]:

@@ -18,13 +18,14 @@ import re
 import select
 import shutil
 import signal
+import stat
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 MARK = "dreamfleet-host "
 TICK = 0.1  # seconds between polls
@@ -131,7 +132,7 @@ class HostFolder:
         """Hold the folder's lock, which every command that changes it takes; create the folder if needed."""
         while True:
             self._create()
-            with (self.root / "lock").open("w") as lock:
+            with self._open_lock() as lock:
                 self._acquire(lock.fileno())
                 held = False
                 with suppress(FileNotFoundError):  # the last holder may have removed the folder
@@ -160,6 +161,21 @@ class HostFolder:
         self.root.mkdir(parents=True, exist_ok=True)
         if missing or not (self.root / CREATED).exists():
             (self.root / CREATED).write_text(json.dumps([str(each) for each in missing]))
+
+    def _open_lock(self) -> BinaryIO:
+        """Open or create the lock file, whose content stays."""
+        path = self.root / "lock"
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        try:
+            file = open(os.open(path, flags, 0o666), "r+b", buffering=0)  # noqa: SIM115 - the caller closes it
+        except OSError as error:
+            if error.errno not in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
+                raise
+            raise FailedError(f"{path} is not a regular file: remove it") from error
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            file.close()
+            raise FailedError(f"{path} is not a regular file: remove it")
+        return file
 
     def _acquire(self, lock: int) -> None:
         said = False

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.files.atomic_write import fsync_path
-from dreamfleet.common.files.locks import try_lock
+from dreamfleet.common.files.locks import open_lock, try_lock
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, ROLLOUTS
@@ -51,7 +51,7 @@ def _backup_lock(target: Path) -> Iterator[None]:
     target.parent.mkdir(parents=True, exist_ok=True)
     path = target.with_name(f".{target.name}.lock")
     while True:
-        with path.open("w") as lock:
+        with open_lock(path) as lock:
             if not try_lock(lock):
                 raise UsageError(f"another backup into {target} is at work: wait for it")
             if not path.exists() or not os.path.samestat(os.fstat(lock.fileno()), path.stat()):

@@ -41,6 +41,7 @@ class FileWatch:
         self._folder_identity = file_identity(self._folder)
         self._own_files: dict[str, Identity | None] = {JOURNAL: file_identity(journal.path)}
         self._next = float("-inf")
+        self._leaving = False
 
     @property
     def command(self) -> str:
@@ -53,7 +54,7 @@ class FileWatch:
 
     def check(self, now: float, *, at_once: bool = False) -> None:
         """Compare; `JournalError` says what was rescued, and how to go on."""
-        if now < self._next and not at_once:
+        if self._leaving or (now < self._next and not at_once):
             return
         self._next = now + CHECK_INTERVAL
         for path in sqlite_side_files(self._journal.path)[:2]:  # they come with the first write
@@ -63,6 +64,7 @@ class FileWatch:
             file_identity(self._folder) != self._folder_identity
             or not self._has_own_files(self._folder)
             or self._journal.is_overwritten
+            or self._journal.is_log_cut
         ):
             self._rescue_and_leave()
         self._journal.check_incarnation()
@@ -73,10 +75,13 @@ class FileWatch:
         return all(own is None or file_identity(folder / name) == own for name, own in self._own_files.items())
 
     def _rescue_and_leave(self) -> None:
+        self._leaving = True
         time.sleep(SETTLE)
-        self._journal.commit()
+        cut = self._journal.is_log_cut
+        if not cut:
+            self._journal.commit()
         folder = self._find_folder()
-        if folder is not None and folder != self._folder and self._has_own_files(folder):
+        if not cut and folder is not None and folder != self._folder and self._has_own_files(folder):
             raise JournalError(
                 f"the run's folder was moved to {folder} while it was served: nothing is lost; go on with: "
                 f"{self._resume_command(folder)}"
@@ -100,8 +105,8 @@ class FileWatch:
             except (OSError, DreamfleetError) as error:
                 failures.append(str(error))
         return (
-            f"{self._journal.path} was removed or replaced while it was served, and what it held could not be rescued: "
-            f"{'; '.join(failures)}"
+            f"{self._journal.path} or its write-ahead log was removed, replaced or truncated while it was served, and "
+            f"what it held could not be rescued: {'; '.join(dict.fromkeys(failures))}"
         )
 
     def _rescue_places(self, folder: Path | None) -> Iterator[Callable[[], str]]:
@@ -132,15 +137,19 @@ class FileWatch:
             )
         copy.replace(target)
         return (
-            f"{target} or its write-ahead log was removed or overwritten while it was served: rescued to the last "
-            f"result as {target}; go on with: {self._resume_command(folder)}"
+            f"{target} or its write-ahead log was removed, overwritten or truncated while it was served: rescued to "
+            f"the last result as {target}; go on with: {self._resume_command(folder)}"
         )
 
     def _rescue_beside(self, parent: Path) -> str:
         """Into a folder of its own, as another run: its own is gone."""
         folder = free_path(parent / f"{self._folder.name[:50]}-{RESCUED}")
         folder.mkdir(mode=0o700, parents=True)
-        self._journal.save_copy(folder / JOURNAL)
+        try:
+            self._journal.save_copy(folder / JOURNAL)
+        except BaseException:
+            folder.rmdir()
+            raise
         if self._bundle is not None:
             self._bundle.restore_into(folder)
         return (

@@ -26,6 +26,9 @@ class JournalConnection:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._stamp: tuple[int, int] | None = None  # of the file, as the last commit left it
+        self._log_size = 0  # of the write-ahead log, as the last commit left it
+        self._is_log_cut = False
+        self._committed: int | None = None  # the latest generation on disk
         self._opened: int | None = None  # the latest generation
         self._writes: list[tuple[str, list[tuple[Any, ...]]]] = []  # a statement, and a row for each time it runs
         self._uncommitted: list[tuple[str, list[tuple[Any, ...]]]] = []  # those that ran since the last commit
@@ -53,15 +56,41 @@ class JournalConnection:
         if self._stamp in (None, file_stamp(self.path)):
             return False
         self._stamp = file_stamp(self.path)
-        where = f"file:{self.path.absolute()}?mode=ro"  # what lies there, and not what this connection remembers
+        return self._check_files() != ("ok", self._opened)
+
+    @property
+    def is_log_cut(self) -> bool:
+        """Whether somebody truncated the write-ahead log and lost commits; this connection only lets it grow.
+
+        Another program's checkpoint may empty the log, once the journal's own file holds everything.
+        """
+        size = self._current_log_size()
+        if not self._is_log_cut and size is not None and size < self._log_size:
+            self._is_log_cut = size > 0 or self._check_files() != ("ok", self._committed)
+            self._log_size = size
+        return self._is_log_cut
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the files on disk can be read, all of them."""
+        return self._check_files()[0] == "ok"
+
+    def _check_files(self) -> tuple[str, int | None]:
+        """What `check_database` finds in the files, and not in what this connection remembers."""
+        where = f"{self.path.absolute().as_uri()}?mode=ro"
         try:
             with closing(sqlite3.connect(where, uri=True)) as reader:
-                return check_database(reader) != ("ok", self._opened)
-        except sqlite3.Error:
-            return True
+                return check_database(reader)
+        except sqlite3.Error as error:
+            return str(error), None
+
+    def _current_log_size(self) -> int | None:
+        found = file_stamp(sqlite_side_files(self.path)[0])
+        return None if found is None else found[1]
 
     def save_copy(self, path: Path) -> None:
-        """Write all that is committed into a new file, checked, whole or not at all."""
+        """Write all that was written so far into a new file, checked, whole or not at all."""
+        self._flush()
         aside = path.with_name(f".{path.name}.part")
         try:
             with journal_errors(path):
@@ -76,12 +105,18 @@ class JournalConnection:
                 left.unlink(missing_ok=True)
 
     def commit(self) -> None:
-        """Make everything written so far durable; after `NotWritableNowError` it may be called again."""
+        """Make everything written so far durable; after `NotWritableNowError` it may be called again.
+
+        `JournalError` if the write-ahead log was truncated: a commit would leave a hole in it, which reads as zeros.
+        """
+        if self.is_log_cut:
+            raise JournalError(f"the write-ahead log of {self.path} was truncated while it was served")
         own = self._stamp in (None, file_stamp(self.path))
         self.flush()
         with self._kept_writes(), journal_errors(self.path):
             self._connection.commit()
         self._uncommitted = []
+        self._committed, self._log_size = self._opened, self._current_log_size() or 0
         if own:  # else somebody wrote there since the last commit, which `is_overwritten` looks into
             self._stamp = file_stamp(self.path)
 

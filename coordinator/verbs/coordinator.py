@@ -178,6 +178,7 @@ def _report(
 ) -> None:  # fmt: skip
     from dreamfleet.common.monitoring.eta import format_duration
     from dreamfleet.common.runs.records import describe_score, with_error
+    from dreamfleet.common.runs.run_folder import open_run
     from dreamfleet.common.runs.run_paths import CONTROLLER
     from dreamfleet.common.runs.times import elapsed_seconds
 
@@ -195,6 +196,8 @@ def _report(
     judged = run.confirmed or run.best
     score = f"; {describe_score(judged)}" if judged else ""
     if run.ended is None:
+        with open_run(request.runs_dir, request.name) as stored:
+            stored.history()  # `JournalError`: what cannot be read cannot be continued
         text = f"left run {request.name} open{score}; continue it with: {again}"
     else:
         where = f"; controller: {controller}" if controller else "; it has no controller yet"

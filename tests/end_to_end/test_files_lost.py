@@ -1,5 +1,7 @@
 """A live run whose files are removed, replaced or moved: nothing is lost, it says so soon, and it can be continued."""
 
+import errno
+import os
 import shutil
 import signal
 import sqlite3
@@ -8,6 +10,7 @@ from contextlib import closing
 
 import pytest
 
+from dreamfleet.common.errors import write_error
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
 from tests.support.processes import DEADLINE, environment, free_port
@@ -128,6 +131,7 @@ def test_a_controller_whose_name_is_a_folder_is_a_clear_error(processes, live):
     coordinator.popen.send_signal(signal.SIGTERM)
     assert coordinator.finish()[0] == 1
     assert "controller.npz" in coordinator.lines[-1]
+    assert "make room" not in coordinator.lines[-1]
     assert "Traceback" not in "".join(coordinator.lines)
     (folder / "controller.npz").rmdir()
     generations = closed(coordinator)
@@ -145,3 +149,28 @@ def test_a_lock_that_is_removed_by_hand_lets_nobody_in(processes, live):
     assert code != 0
     assert "held by a live coordinator" in err
     coordinator.wait_for("generation")
+
+
+def test_a_log_that_is_truncated_is_rescued_before_anything_is_written_over_it(processes, live):
+    coordinator, folder = live
+    os.truncate(folder / "journal.sqlite-wal", 0)
+    said = said_of(coordinator)
+    assert "truncated while it was served: rescued to the last result" in said
+    goes_on(processes, coordinator, said)
+
+
+def test_a_log_that_a_checkpoint_of_others_empties_is_no_reason_to_leave(processes, live):
+    coordinator, folder = live
+    with closing(sqlite3.connect(folder / "journal.sqlite", timeout=30)) as other:
+        assert other.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()[0] == 0
+    generations = closed(coordinator)
+    coordinator.wait_for(": mean", times=generations + 2)
+    assert coordinator.popen.poll() is None
+
+
+@pytest.mark.parametrize("kind", ["folder", "other"])
+def test_a_controller_that_cannot_be_written_is_not_a_full_disk(kind):
+    code = {"folder": errno.EISDIR, "other": errno.EIO}[kind]
+    error = write_error("controller.npz", OSError(code, os.strerror(code)))
+    assert "make room" not in str(error)
+    assert "make room" in str(write_error("controller.npz", OSError(errno.ENOSPC, "No space left on device")))

@@ -1,3 +1,4 @@
+import os
 import sqlite3
 
 import numpy as np
@@ -191,3 +192,26 @@ def test_a_second_life_in_one_journal_is_noticed_by_the_first(journal, folder):
     other.close()
     with pytest.raises(JournalError, match="another coordinator serves"):
         journal.check_incarnation()
+
+
+def test_a_truncated_log_is_noticed_and_copied_from_memory(journal, folder, tmp_path):
+    fill(journal)
+    os.truncate(folder / "journal.sqlite-wal", 0)
+    journal.set_fact("later", "1")
+    with pytest.raises(JournalError, match="was truncated"):
+        journal.commit()
+    journal.save_copy(tmp_path / "journal.sqlite")
+    with RunFolder(tmp_path) as copy:
+        assert len(copy.history()) == 1
+        assert copy.fact("later") == "1"
+
+
+def test_huge_texts_are_read_in_part(journal, folder):
+    journal.begin_incarnation()
+    journal.add_event("x" * 10_000_000)
+    fill(journal)
+    journal.add_failure(Generation(1, SPEC, VECTORS, [8]).work[0].job, "y" * 10_000_000, ["w"], 3)
+    journal.commit()
+    with RunFolder(folder) as run:
+        assert [len(each.text) for each in run.events()] == [1000]
+        assert [len(each.error) for each in run.failures()] == [1000]
