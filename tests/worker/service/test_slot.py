@@ -22,8 +22,8 @@ from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.service.slot import (
     FAILED_STARTS,
-    MAX_STARVED_DELAY,
     MAX_START_DELAY,
+    MAX_STARVED_DELAY,
     START_LIMIT,
     STARVED_STARTS,
     Slot,
