@@ -104,11 +104,6 @@ class Hand:
         batch = self.next(ResultBatch, lambda batch: of.digest in _digests(batch))
         return next(each for each in batch.results if each.digest == of.digest)
 
-    def failure(self):
-        """Wait for the next result that is an error."""
-        batch = self.next(ResultBatch, lambda batch: any(each.error for each in batch.results))
-        return next(each for each in batch.results if each.error)
-
     def results(self, *of):
         """Wait for the results of these jobs; digests of all results received."""
         missing, came = {job.digest for job in of}, set()
