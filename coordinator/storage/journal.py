@@ -144,7 +144,7 @@ class Journal(JournalConnection):
         self.set_fact("incarnation", str(number))
         self.commit()
         self._incarnation = number
-        self._opened = self._read_row("SELECT max(number) FROM generation")[0]
+        self._opened = self._committed = self._read_row("SELECT max(number) FROM generation")[0]
         return number
 
     def open_generation(

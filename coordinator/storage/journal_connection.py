@@ -89,13 +89,14 @@ class JournalConnection:
         return None if found is None else found[1]
 
     def save_copy(self, path: Path) -> None:
-        """Write all that was written so far into a new file, checked, whole or not at all."""
-        self._flush()
+        """Write all that is committed into a new file, checked, whole or not at all."""
+        with suppress(sqlite3.Error):
+            self._connection.rollback()  # SQLite copies no database inside a transaction
         aside = path.with_name(f".{path.name}.part")
         try:
             with journal_errors(path):
                 found = copy_database(self._connection, aside)
-            if found != ("ok", self._opened):
+            if found != ("ok", self._committed):
                 raise JournalError("the data of the open connection is not whole: restore the folder from a copy")
             fsync_path(aside)
             aside.replace(path)
