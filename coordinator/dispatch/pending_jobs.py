@@ -269,18 +269,24 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         """A job that failed so often that the run must pause; `None` if there is none.
 
         R8: two workers, or three attempts on the only one, show that the job itself or every host is at fault. With
-        `working`, `find_lasting_failures` judges where such a host has tried, and the run does not pause while a job
-        that never failed is open: it may show that a host works.
+        `working`, `find_lasting_failures` judges where such a host has tried. Else all open jobs count together, once
+        each has failed: before that, one may show that a host works.
         """
-        if working is not None and len(self._failing) < len(self._pending):
+        if working is None:
+            judged = [[each] for each in self._failing.values()]
+        elif len(self._failing) < len(self._pending) or self._has_worked(working):
             return None
-        for pending in self._failing.values():
-            if working is not None and any(each.host in working for each in pending.attempts):
-                continue
-            workers = {each.worker for each in pending.attempts}
-            if len(workers) > 1 or len(pending.attempts) >= MAX_ATTEMPTS:
-                return pending.failure
+        else:
+            judged = [list(self._failing.values())]
+        for group in judged:
+            workers = {attempt.worker for each in group for attempt in each.attempts}
+            if len(workers) > 1 or sum(len(each.attempts) for each in group) >= MAX_ATTEMPTS:
+                return max(group, key=lambda each: len(each.attempts)).failure
         return None
+
+    def _has_worked(self, working: Collection[str]) -> bool:
+        """Whether a host that has scored jobs of this run is among those where open jobs failed."""
+        return any(attempt.host in working for each in self._failing.values() for attempt in each.attempts)
 
     def clear_failures(self) -> None:
         """Forget all failures, so that each job may be tried anew."""

@@ -89,6 +89,7 @@ class Slot:
         self._progress = (0, 0.0)  # steps, and when they last grew; before the child is ready, when it was started
         self._child_number = 0
         self._failed_starts = self._starved_starts = 0  # in a row; the host is at fault for the starved ones
+        self._was_ready = False  # whether any child was
         self._useless_children = 0  # children in a row that ended without a finished group
         self._start_at = 0.0
         self._child: ChildProcess | None = None  # `None` until `_start_at`
@@ -198,6 +199,7 @@ class Slot:
         if isinstance(event.message, ChildReady):
             self.ready, self.drawn_by = True, truncate(event.message.drawn_by, MAX_NAME_LENGTH) or "-"
             self._failed_starts = self._starved_starts = 0
+            self._was_ready = True
             self._reset_progress()
         elif isinstance(event.message, GroupDone):
             running = self._groups[0].number if self._groups else None  # a forked copy of the child may answer again
@@ -312,10 +314,11 @@ class Slot:
     def _count_starved_start(self, reason: str) -> None:
         """Try again after a growing pause: a host may be short of memory or processes for minutes.
 
-        R20: after some starts the heartbeats do not list its jobs any longer, so other slots get them.
+        A slot that was never ready ends soon: its host has too little for it. R20: after some starts the heartbeats do
+        not list its jobs any longer, so other slots get them.
         """
         self._starved_starts += 1
-        if self._starved_starts >= STARVED_STARTS:
+        if self._starved_starts >= (STARVED_STARTS if self._was_ready else FAILED_STARTS):
             raise _cannot_start(reason)
         if self._starved_starts >= FAILED_STARTS:
             self._groups.clear()

@@ -294,7 +294,7 @@ def test_a_slot_retries_without_descriptors_and_then_names_the_cause(harness, ra
     resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
     try:
         slot = harness(tasks.TOY)
-        for _ in range(STARVED_STARTS - 2):
+        for _ in range(FAILED_STARTS - 2):
             slot.pass_time()
         assert slot.slot.pid == 0
     finally:
@@ -339,6 +339,12 @@ def kill_as_it_starts(slot, times):
 
 def test_a_short_host_is_tried_for_ten_minutes(harness):
     slot = harness(tasks.TOY)
+    with pytest.raises(DreamfleetError, match=f"a slot cannot start: {OUT_OF_MEMORY}"):
+        kill_as_it_starts(slot, FAILED_STARTS)  # it was never ready
+    slot = harness(tasks.TOY)
+    assert slot.score().fitness is not None
+    os.kill(slot.slot.pid, signal.SIGKILL)
+    slot.slot.handle(slot.gone())
     pauses = kill_as_it_starts(slot, STARVED_STARTS - 1)
     assert pauses == pytest.approx([2, 4, 8, 16, 32, *[60] * 9], abs=1.0)
     slot.pass_time()
