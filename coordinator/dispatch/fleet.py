@@ -72,6 +72,15 @@ class Fleet:
         self.event_log.add(self._now, "failed", failure.history[-1].worker, digest)
         self.withdraw([digest])
 
+    def find_pausing_failure(self, *, is_judged: bool) -> JobFailure | None:
+        """A failure that must pause the run; where failures are judged, only while no host is here that has scored."""
+        if not is_judged:
+            return self.jobs.find_pausing_failure()
+        working = (name for name, member in self.members.items() if member.takes_jobs)
+        if any(host_of(name) in self.working_hosts for name in working):
+            return None
+        return self.jobs.find_pausing_failure(together=True)
+
     def find_lasting_failures(self) -> list[JobFailure]:
         """The wanted jobs that fail wherever they are scored."""
         hosts = {host_of(name) for name, member in self.members.items() if member.takes_jobs}

@@ -265,28 +265,22 @@ class PendingJobs(Mapping[bytes, PendingJob]):
                 found.append(pending.failure)
         return found
 
-    def find_pausing_failure(self, working: Collection[str] | None = None) -> JobFailure | None:
+    def find_pausing_failure(self, *, together: bool = False) -> JobFailure | None:
         """A job that failed so often that the run must pause; `None` if there is none.
 
-        R8: two workers, or three attempts on the only one, show that the job itself or every host is at fault. With
-        `working`, `find_lasting_failures` judges where such a host has tried. Else all open jobs count together, once
-        each has failed: before that, one may show that a host works.
+        R8: two workers, or three attempts on the only one, show that the job itself or every host is at fault. Counted
+        `together`, all open jobs must have failed: before that, one may show that a host works.
         """
-        if working is None:
-            judged = [[each] for each in self._failing.values()]
-        elif len(self._failing) < len(self._pending) or self._has_worked(working):
-            return None
+        failing = list(self._failing.values())
+        if together:
+            groups = [failing] if failing and len(failing) == len(self._pending) else []
         else:
-            judged = [list(self._failing.values())]
-        for group in judged:
+            groups = [[each] for each in failing]
+        for group in groups:
             workers = {attempt.worker for each in group for attempt in each.attempts}
             if len(workers) > 1 or sum(len(each.attempts) for each in group) >= MAX_ATTEMPTS:
                 return max(group, key=lambda each: len(each.attempts)).failure
         return None
-
-    def _has_worked(self, working: Collection[str]) -> bool:
-        """Whether a host that has scored jobs of this run is among those where open jobs failed."""
-        return any(attempt.host in working for each in self._failing.values() for attempt in each.attempts)
 
     def clear_failures(self) -> None:
         """Forget all failures, so that each job may be tried anew."""

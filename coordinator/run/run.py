@@ -234,15 +234,15 @@ class Run:
 
     def _settle_failures(self) -> None:
         """Make lasting failures facts of the run (R8), and pause it where too many candidates or all hosts fail."""
-        working = None if self.settings.on_failure == "pause" else self.fleet.working_hosts
-        if working is not None:
+        is_judged = self.settings.on_failure != "pause"
+        if is_judged:
             for lasting in self.fleet.find_lasting_failures():
                 self._record_failure(lasting)
         if self.paused is not None:
             return
         if (why := self._too_many_failures()) is not None:
             self.pause(why)
-        elif (failure := self.fleet.jobs.find_pausing_failure(working)) is not None:
+        elif (failure := self.fleet.find_pausing_failure(is_judged=is_judged)) is not None:
             self.pause(f"{failure}; `dreamfleet resume` tries it again")
 
     def _too_many_failures(self) -> str | None:
