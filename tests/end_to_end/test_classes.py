@@ -98,7 +98,7 @@ def test_a_strict_run_refuses_another_class_and_stays_strict_when_resumed(proces
     resumed = *GO_ON, "--runs-dir", processes.runs
     coordinator = processes.start(*resumed)
     odd = own(processes, inside=ODD)
-    assert "--no-strict" in odd.wait_for("classes differ")
+    assert "classes differ" in odd.wait_for("--no-strict")
     coordinator.wait_for("classes differ")
     coordinator.end()
     coordinator = processes.start(*resumed, "--no-strict")

@@ -33,7 +33,8 @@ def outcome(processes, name):
 
 def evolve(processes, name, workers, *settings):
     coordinator = processes.coordinator(*settings, name=name)
-    working = [processes.worker("--run", name, "--name", f"w{number}") for number in range(workers)]
+    task = settings[settings.index("--task") + 1]
+    working = [processes.worker("--run", name, "--name", f"w{number}", "--task", task) for number in range(workers)]
     code, _ = coordinator.finish(1200)
     assert code == 0, "".join(coordinator.lines)
     for each in working:
@@ -154,7 +155,7 @@ def test_a_run_in_an_environment_that_is_not_deterministic_promises_no_bits(proc
         "--task", ODD, "--environment", "fault=noise", "--population", 4, "--generations", 2, "--evaluate-every", 0
     )
     assert "is not deterministic, so no fitness can be recomputed to the bit" in "".join(coordinator.lines)
-    processes.worker("--exit-when-done")
+    processes.worker("--task", ODD, "--exit-when-done")
     assert coordinator.finish()[0] == 0
     code, out, err = processes.call("runs", "show", "test", "--runs-dir", processes.runs)
     assert (code, "not deterministic: 100.0% of results cannot be recomputed to the bit" in out) == (0, True), err
