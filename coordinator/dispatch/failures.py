@@ -1,20 +1,15 @@
-"""Failures of jobs, and what they prove: a broken host, or an episode that fails wherever it is scored. Pure."""
+"""Failures of jobs, attempt by attempt, and the pause before the next one. Pure."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from dreamfleet.common.printable import truncate
-from dreamfleet.common.protocol.failures import failure_cause, is_host_failure
 from dreamfleet.coordinator.jobs.work import Work
 
 LONGEST_ERROR = 300  # characters of a worker's error that are shown
 MAX_NAMED = 4  # workers that a failure names
-EQUAL_ATTEMPTS = 2  # that fail for one cause show that the episode fails
-ANY_ATTEMPTS = 3  # that fail for several causes show it too
-HOST_ATTEMPTS = 10  # that a host's shortage ends, over about eight minutes: no host has what the episode needs
 LONGEST_PAUSE = 120.0  # seconds between two attempts
 
 
@@ -73,23 +68,6 @@ class JobFailure:
         parts = [f"{name} ({_times(attempts[name])}): {shorten(errors[name])}" for name in names[:MAX_NAMED]]
         more = [f"and {len(names) - MAX_NAMED} more"] if len(names) > MAX_NAMED else []
         return f"{self.subject} failed {where}: {'; '.join(parts + more)}"
-
-
-def is_lasting(attempts: Sequence[Attempt], working: Collection[str], untried_hosts: bool) -> bool:
-    """Whether the failure follows from the parameters and the seed, so that every host would fail.
-
-    R8: it takes two attempts with one cause, or three with any, on hosts that have scored jobs of this run (`working`,
-    by name), and on two hosts where there is a second one (`untried_hosts`: some host has not tried it yet). A
-    shortage of the host (memory, disk, processes) counts only after ten attempts.
-    """
-    able = [each for each in attempts if each.host in working]
-    own = [each for each in able if not is_host_failure(each.error)]
-    if len(able) - len(own) >= HOST_ATTEMPTS:
-        return True
-    if untried_hosts and len({each.host for each in own}) < 2:
-        return False
-    most = max(Counter(failure_cause(each.error) for each in own).values(), default=0)
-    return most >= EQUAL_ATTEMPTS or len(own) >= ANY_ATTEMPTS
 
 
 def pause_before_retry(attempts: int) -> float:

@@ -16,7 +16,8 @@ from dreamfleet.common.monitoring.status import EventKind
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.messages import MAX_SLOTS, Heartbeat, Result, Verdict, VerdictWord
 from dreamfleet.coordinator.dispatch.event_log import EventLog
-from dreamfleet.coordinator.dispatch.failures import JobFailure, host_of
+from dreamfleet.coordinator.dispatch.failure_judge import FailureJudge
+from dreamfleet.coordinator.dispatch.failures import JobFailure
 from dreamfleet.coordinator.dispatch.host_stats import HostRecords
 from dreamfleet.coordinator.dispatch.member import DepartedWorkers, DispatchGroup, Lease, Member, MemberState, SentBatch
 from dreamfleet.coordinator.dispatch.packing import BatchContent, OutgoingBatch, pack
@@ -55,7 +56,7 @@ class Fleet:
         self.dropped: Counter[str] = Counter()  # results and reports that were not accepted, by reason
         self.event_log = EventLog()
         self.notes: list[str] = []  # lines for a log; its writer clears them
-        self.working_hosts: set[str] = set()  # names of those that scored jobs of this run
+        self.failure_judge = FailureJudge(self.jobs, self.members)
         self.drain_background = False  # only evaluations and kept rollouts are left to wait for
         self.paused = False
         self.single_job = False  # a slot scores one job at a time, even of a task whose slots score several at once
@@ -71,20 +72,6 @@ class Fleet:
         digest = failure.work.job.digest
         self.event_log.add(self._now, "failed", failure.history[-1].worker, digest)
         self.withdraw([digest])
-
-    def find_pausing_failure(self, *, is_judged: bool) -> JobFailure | None:
-        """A failure that must pause the run; where failures are judged, only while no host is here that has scored."""
-        if not is_judged:
-            return self.jobs.find_pausing_failure()
-        working = (name for name, member in self.members.items() if member.takes_jobs)
-        if any(host_of(name) in self.working_hosts for name in working):
-            return None
-        return self.jobs.find_pausing_failure(together=True)
-
-    def find_lasting_failures(self) -> list[JobFailure]:
-        """The wanted jobs that fail wherever they are scored."""
-        hosts = {host_of(name) for name, member in self.members.items() if member.takes_jobs}
-        return self.jobs.find_lasting_failures(self.working_hosts, hosts)
 
     def add_worker(self, identity: str, slots: int, fingerprint: str, now: float) -> int:
         """Welcome a worker as a guest; return the numbering of its batches.

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from enum import Enum, auto
 
 from dreamfleet.common.protocol.messages import TAG_BYTES, Kind, Result
 from dreamfleet.coordinator.dispatch.deficit_round_robin import DeficitCounter
-from dreamfleet.coordinator.dispatch.failures import Attempt, JobFailure, is_lasting, pause_before_retry
+from dreamfleet.coordinator.dispatch.failures import Attempt, JobFailure, pause_before_retry
 from dreamfleet.coordinator.jobs.work import Work
 
 MAX_FAILED = 64  # failed attempts of a job that are remembered
-MAX_ATTEMPTS = 3  # of a failing job on one worker, where there is no other
 MAX_HOLDERS = 2  # workers that a job is leased to at a time
 
 
@@ -252,35 +251,6 @@ class PendingJobs(Mapping[bytes, PendingJob]):
     def failures(self) -> list[JobFailure]:
         """Wanted jobs that failed somewhere."""
         return [pending.failure for pending in self._failing.values()]
-
-    def find_lasting_failures(self, working: Collection[str], hosts: Collection[str]) -> list[JobFailure]:
-        """The jobs that fail wherever they are scored; `working` are the hosts that scored jobs of this run.
-
-        `hosts` are all that take jobs.
-        """
-        found = []
-        for pending in self._failing.values():
-            untried = bool(set(hosts) - {each.host for each in pending.attempts})
-            if is_lasting(pending.attempts, working, untried):
-                found.append(pending.failure)
-        return found
-
-    def find_pausing_failure(self, *, together: bool = False) -> JobFailure | None:
-        """A job that failed so often that the run must pause; `None` if there is none.
-
-        R8: two workers, or three attempts on the only one, show that the job itself or every host is at fault. Counted
-        `together`, all open jobs must have failed: before that, one may show that a host works.
-        """
-        failing = list(self._failing.values())
-        if together:
-            groups = [failing] if failing and len(failing) == len(self._pending) else []
-        else:
-            groups = [[each] for each in failing]
-        for group in groups:
-            workers = {attempt.worker for each in group for attempt in each.attempts}
-            if len(workers) > 1 or sum(len(each.attempts) for each in group) >= MAX_ATTEMPTS:
-                return max(group, key=lambda each: len(each.attempts)).failure
-        return None
 
     def clear_failures(self) -> None:
         """Forget all failures, so that each job may be tried anew."""

@@ -21,6 +21,7 @@ from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, Stor
 from dreamfleet.common.runs.run_folder import ENDING
 from dreamfleet.common.runs.scoring_params import ScheduleState
 from dreamfleet.common.runs.stages import longest_horizon
+from dreamfleet.common.runs.times import elapsed_seconds
 from dreamfleet.coordinator.dispatch.failures import JobFailure, host_of, shorten
 from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.jobs.generation import Generation
@@ -33,6 +34,7 @@ from dreamfleet.coordinator.run.work_clock import WorkClock
 from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 
+REMEDY = "`dreamfleet resume` tries them again; a greater --failure-limit at the next start accepts more failures"
 WRITE_RETRY = 2.0  # seconds until a full disk or a locked journal is tried again
 
 
@@ -75,7 +77,7 @@ class Run:
         self._forgiven: set[int] = set()  # candidates that were drawn anew before the last `resume`
         self.generation = self.generations.begin()
         self.work_clock = WorkClock(now, self.generations.seconds)  # of the open generation
-        self.fleet.working_hosts.update(map(host_of, journal.workers()))
+        self.fleet.failure_judge.working_hosts.update(map(host_of, journal.workers()))
         if self.incarnation > 1:  # the last incarnation may have sent the next generation's jobs before it was durable
             self.fleet.jobs.previous_epoch_until = self.generation.number + 1
         self._begin(now)
@@ -98,11 +100,8 @@ class Run:
     @property
     def elapsed(self) -> float | None:
         """Wall-clock seconds since the run began; `None` if a clock was set so that they cannot be right."""
-        try:
-            seconds = (datetime.now(UTC) - datetime.fromisoformat(self.created)).total_seconds()
-        except (ValueError, TypeError):  # an old or damaged journal
-            return None
-        return round(seconds, 1) if 0 <= seconds <= MAX_SECONDS else None
+        seconds = elapsed_seconds(self.created, datetime.now(UTC).isoformat())
+        return None if seconds is None else round(min(seconds, MAX_SECONDS), 1)
 
     @property
     def classes(self) -> HostClasses:
@@ -129,7 +128,7 @@ class Run:
         """Journal an accepted result, then count it for the generation or the background job that wants it."""
         self._journal.add_result(work.job, result, worker, fingerprint, self.incarnation, host_class)
         self.admission.adopt_class(host_class, fingerprint)
-        self.fleet.working_hosts.add(host_of(worker))
+        self.fleet.failure_judge.working_hosts.add(host_of(worker))
         assert result.fitness is not None
         self._count(work.job, result.fitness, result.steps)
 
@@ -234,46 +233,33 @@ class Run:
 
     def _settle_failures(self) -> None:
         """Make lasting failures facts of the run (R8), and pause it where too many candidates or all hosts fail."""
-        is_judged = self.settings.on_failure != "pause"
+        judge, is_judged = self.fleet.failure_judge, self.settings.on_failure != "pause"
         if is_judged:
-            for lasting in self.fleet.find_lasting_failures():
+            for lasting in judge.find_lasting():
                 self._record_failure(lasting)
         if self.paused is not None:
             return
         if (why := self._too_many_failures()) is not None:
-            self.pause(why)
-        elif (failure := self.fleet.find_pausing_failure(is_judged=is_judged)) is not None:
+            self.pause(f"{why} (`dreamfleet runs story` lists why); {REMEDY}")
+        elif (failure := judge.find_broken_fleet() if is_judged else judge.find_pausing()) is not None:
             self.pause(f"{failure}; `dreamfleet resume` tries it again")
 
     def _too_many_failures(self) -> str | None:
-        """Why so many failures pause the run, with the remedy; `None` if they do not."""
-        generation, limit = self.generation, self.failure_limit
+        """What failed so often that the run pauses, in words; `None` if nothing did."""
+        generation, size = self.generation, self.generation.population
         failed = len((self.generations.redrawn - self._forgiven).union(generation.failed))
-        again = "`dreamfleet resume` tries them again"
-        if failed > limit * generation.population:
-            return (
-                f"{failed} of {plural(generation.population, 'candidate')} failed in generation {generation.number} "
-                f"(`dreamfleet runs story` lists why); {again}, and a greater --failure-limit at the next start lets "
-                "the run go on"
-            )
+        if failed > self.failure_limit * size:
+            return f"{failed} of {plural(size, 'candidate')} failed in generation {generation.number}"
         if generation.all_failed and not self.generations.can_redraw:
-            return (
-                f"all candidates failed in generation {generation.number}, so that none can be ranked (`dreamfleet "
-                f"runs story` lists why); mend the task, then {again}; or fork the run with another --sigma0"
-            )
-        if (what := self.background_jobs.too_many_failed) is not None:
-            return (
-                f"{what} (`dreamfleet runs story` lists why); {again}, and a greater --failure-limit at the next "
-                "start lets the run go on"
-            )
-        return None
+            return f"all candidates failed in generation {generation.number}, so that none can be ranked"
+        return self.background_jobs.too_many_failed
 
     def _record_failure(self, failure: JobFailure) -> None:
         """Journal that a job's episode fails wherever it is scored; it is wanted no more."""
         job = failure.work.job
         self.fleet.give_up(failure)
         self._journal.add_failure(job, shorten(failure.history[-1].error), list(failure.attempts), len(failure.history))
-        self.fleet.notes.append(f"{failure}; it has failed for good")
+        self.fleet.notes.append(f"{failure}; it counts as failed")
         self._count(job, nan, 0)
         if job.kind == "score":
             self.fleet.withdraw(self.generation.unwanted)

@@ -242,7 +242,7 @@ class AnyOrder(RuleBasedStateMachine):
             self.journal[result.digest] = result.fitness
             if work.job.kind == "score":
                 self.generation.record(result.digest, result.fitness, result.steps)
-        if self.fleet.jobs.find_pausing_failure():
+        if self.fleet.failure_judge.find_pausing():
             self.fleet.jobs.clear_failures()
         if self.generation.complete and self.number < GENERATIONS:
             self.close()

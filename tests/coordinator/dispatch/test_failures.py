@@ -2,7 +2,8 @@
 
 import pytest
 
-from dreamfleet.coordinator.dispatch.failures import LONGEST_PAUSE, Attempt, is_lasting, pause_before_retry
+from dreamfleet.coordinator.dispatch.failure_judge import is_lasting
+from dreamfleet.coordinator.dispatch.failures import LONGEST_PAUSE, Attempt, pause_before_retry
 
 A, B, OTHER_A = "a/00000001", "b/00000001", "a/00000002"
 WORKS = {"a", "b"}  # hosts that have scored
@@ -30,13 +31,13 @@ def attempts(*rows):
     ],
 )
 def test_two_equal_failures_on_two_hosts_where_there_are_two_show_that_the_episode_fails(rows, untried, lasting):
-    assert is_lasting(attempts(*rows), WORKS, untried) is lasting
+    assert is_lasting(attempts(*rows), WORKS, {"c"} if untried else ()) is lasting
 
 
 def test_a_host_that_has_scored_nothing_proves_nothing():
     rows = [("new/1", "ImportError: libGL"), ("newer/1", "ImportError: libGL")]
-    assert not is_lasting(attempts(*rows * 9), WORKS, False)
-    assert not is_lasting(attempts(*rows, (A, "ImportError: libGL")), WORKS, False)
+    assert not is_lasting(attempts(*rows * 9), WORKS, ())
+    assert not is_lasting(attempts(*rows, (A, "ImportError: libGL")), WORKS, ())
 
 
 def test_attempts_wait_longer_and_longer():

@@ -307,9 +307,9 @@ def test_an_error_is_no_fitness_and_another_worker_tries():
     (digest,) = digests(fleet.dispatch(0.0), A)
     assert fleet.handle_result(A, result(digest, error="boom"), 0.1) == ("refused", None)
     assert digests(fleet.dispatch(0.1), B) == [digest]
-    assert fleet.jobs.find_pausing_failure() is None
+    assert fleet.failure_judge.find_pausing() is None
     fleet.handle_result(B, result(digest, error="boom"), 0.2)
-    errors = fleet.jobs.find_pausing_failure().errors
+    errors = fleet.failure_judge.find_pausing().errors
     assert errors == {A: "boom", B: "boom"}
 
 
@@ -317,10 +317,10 @@ def test_the_only_worker_tries_a_failed_job_again_but_not_for_ever():
     fleet = fleet_of(A, jobs=1)
     for attempt in range(3):
         fleet.tick(attempt)  # the third attempt waits for a second
-        assert fleet.jobs.find_pausing_failure() is None
+        assert fleet.failure_judge.find_pausing() is None
         (digest,) = digests(fleet.dispatch(attempt), A)
         fleet.handle_result(A, result(digest, error="boom"), attempt)
-    assert fleet.jobs.find_pausing_failure().errors == {A: "boom"}
+    assert fleet.failure_judge.find_pausing().errors == {A: "boom"}
 
 
 def test_a_failed_job_waits_for_another_worker_that_is_busy():

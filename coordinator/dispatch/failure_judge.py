@@ -1,0 +1,74 @@
+"""What failed attempts prove: a broken host, or an episode that fails wherever it is scored. Pure."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+
+from dreamfleet.common.protocol.failures import failure_cause, is_host_failure
+from dreamfleet.coordinator.dispatch.failures import Attempt, JobFailure, host_of
+from dreamfleet.coordinator.dispatch.member import Member
+from dreamfleet.coordinator.dispatch.pending_jobs import PendingJobs
+
+EQUAL_ATTEMPTS = 2  # that fail for one cause show that the episode fails
+ANY_ATTEMPTS = 3  # that fail for several causes show it too
+HOST_ATTEMPTS = 10  # that a host's shortage ends, over about eight minutes: no host has what the episode needs
+PAUSING_ATTEMPTS = 3  # on the only worker
+
+
+class FailureJudge:
+    """Judges the failures of `jobs`; `members` are the workers that are here."""
+
+    def __init__(self, jobs: PendingJobs, members: Mapping[str, Member]) -> None:
+        self.working_hosts: set[str] = set()  # names of those that scored jobs of this run
+        self._jobs = jobs
+        self._members = members
+
+    def find_lasting(self) -> list[JobFailure]:
+        """The wanted jobs that fail wherever they are scored."""
+        hosts = self._present_hosts()
+        return [each for each in self._jobs.failures if is_lasting(each.history, self.working_hosts, hosts)]
+
+    def find_pausing(self) -> JobFailure | None:
+        """A job that failed so often that the run must pause; `None` if there is none.
+
+        R8: two workers, or three attempts on the only one, show that the job itself or every host is at fault.
+        """
+        return next((each for each in self._jobs.failures if _is_pausing([each])), None)
+
+    def find_broken_fleet(self) -> JobFailure | None:
+        """The job that failed most often, if no host that is here has ever scored, and all open jobs have failed.
+
+        R8: before that, a host that works may still show itself.
+        """
+        failures = self._jobs.failures
+        if len(failures) < len(self._jobs) or self._present_hosts() & self.working_hosts or not _is_pausing(failures):
+            return None
+        return max(failures, key=lambda each: len(each.history))
+
+    def _present_hosts(self) -> set[str]:
+        """The names of the hosts that take jobs."""
+        return {host_of(name) for name, member in self._members.items() if member.takes_jobs}
+
+
+def is_lasting(attempts: Sequence[Attempt], working: Collection[str], present: Collection[str]) -> bool:
+    """Whether the failure follows from the parameters and the seed, so that every host would fail.
+
+    R8: it takes two attempts with one cause, or three with any, on hosts that have scored jobs of this run (`working`,
+    by name), and on two hosts while a host that is `present` has not tried it yet. A shortage of the host (memory,
+    disk, processes) counts only after ten attempts.
+    """
+    able = [each for each in attempts if each.host in working]
+    own = [each for each in able if not is_host_failure(each.error)]
+    if len(able) - len(own) >= HOST_ATTEMPTS:
+        return True
+    is_untried = bool(set(present) - {each.host for each in attempts})
+    if is_untried and len({each.host for each in own}) < 2:
+        return False
+    most = max(Counter(failure_cause(each.error) for each in own).values(), default=0)
+    return most >= EQUAL_ATTEMPTS or len(own) >= ANY_ATTEMPTS
+
+
+def _is_pausing(failures: Sequence[JobFailure]) -> bool:
+    attempts = [attempt for each in failures for attempt in each.history]
+    return len({each.worker for each in attempts}) > 1 or len(attempts) >= PAUSING_ATTEMPTS
