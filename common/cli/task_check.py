@@ -1,4 +1,4 @@
-"""The check of a task that needs no world model, before a run begins in it: two trials, each in a child process."""
+"""The check of a task that needs no world model, before a run begins in it: two dry runs, each in a child process."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from dataclasses import dataclass, field
 from time import monotonic
 from typing import Any
 
-from dreamfleet.common.cli.trial_process import TrialError, TrialProcess
+from dreamfleet.common.cli.dry_run_process import DryRunError, DryRunProcess
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.protocol.tasks import Description
 from dreamfleet.common.serialization.optional_fields import OPTIONAL
 from dreamfleet.common.serialization.validation import from_plain
 
 CHILD = "dreamfleet.worker.scoring.task_check"
-STEP_LIMIT = 120.0  # seconds of one step of a trial, such as a reset; as long as a worker's child may take to start
-SECOND_TRIAL_LIMIT = 20.0  # seconds of the first trial's episode from which on there is no second trial
-TRIAL_LIMIT = 3600.0  # seconds of a whole trial, which may normalise observations in 20 episodes
-MAX_ANSWERS = 200  # of one trial; a sound one gives about a dozen
+STEP_LIMIT = 120.0  # seconds of one step of a dry run, such as a reset; as long as a worker's child may take to start
+SECOND_RUN_LIMIT = 20.0  # seconds of the first dry run's episode from which on there is no second dry run
+DRY_RUN_LIMIT = 3600.0  # seconds of a whole dry run, which may normalise observations in 20 episodes
+MAX_ANSWERS = 200  # of one dry run; a sound one gives about a dozen
 REMEDY = "draw all randomness from self.np_random, which reset(seed=...) seeds, and keep nothing from earlier episodes"
 
 
 @dataclass
-class TaskTrial:
+class DryRunReport:
     """What one child process reports."""
 
     description: Description | None = None
@@ -37,11 +37,11 @@ class TaskTrial:
 
 
 @dataclass
-class TrialAnswer:
+class DryRunAnswer:
     """What one line of a child says: the step that begins, or what was found so far."""
 
     step: str | None = field(default=None, metadata=OPTIONAL)  # empty: it normalises
-    report: TaskTrial | None = field(default=None, metadata=OPTIONAL)
+    report: DryRunReport | None = field(default=None, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True)
@@ -60,22 +60,22 @@ def try_task(name: str, options: Mapping[str, Any], limit: float = STEP_LIMIT) -
 
     No step may take longer than `limit` seconds. `options` are those that the task describes itself by.
     """
-    first = _run_trial({"task": name, "options": options, "thorough": True}, limit)
+    first = _dry_run({"task": name, "options": options, "thorough": True}, limit)
     if first.fault:
         return TaskReport(fault=first.fault)
     warnings, varies, compared = list(first.warnings), "", False
-    if not first.episode or first.seconds > SECOND_TRIAL_LIMIT:
+    if not first.episode or first.seconds > SECOND_RUN_LIMIT:
         why = "its first steps take too long" if first.episode else "the task has no probe episode"
         warnings.append(f"whether equal seeds give equal episodes was not checked: {why}")
     else:
-        second = _run_trial({"task": name, "options": options, "thorough": False}, limit)
+        second = _dry_run({"task": name, "options": options, "thorough": False}, limit)
         if second.fault:
-            warnings.append(f"a second trial failed: {second.fault}")
+            warnings.append(f"a second dry run failed: {second.fault}")
         compared, varies = True, _find_difference(first, second)
     return TaskReport(first.description, "", tuple(warnings), compared, varies)
 
 
-def _find_difference(first: TaskTrial, second: TaskTrial) -> str:
+def _find_difference(first: DryRunReport, second: DryRunReport) -> str:
     if second.first and first.first != second.first:
         return f"two resets with one seed give different first observations: {REMEDY}"
     if first.repeated and first.repeated != first.episode:
@@ -85,12 +85,12 @@ def _find_difference(first: TaskTrial, second: TaskTrial) -> str:
     return ""
 
 
-def _run_trial(request: Mapping[str, Any], limit: float) -> TaskTrial:
+def _dry_run(request: Mapping[str, Any], limit: float) -> DryRunReport:
     """Run one child and return its last report; without one the fault says what it was doing as it hung or crashed."""
     name, step, failure = request["task"], "loading it", ""
-    trial: TaskTrial | None = None
-    until = monotonic() + TRIAL_LIMIT
-    with TrialProcess(CHILD, json.dumps({**request, "path": sys.path})) as child:
+    report: DryRunReport | None = None
+    until = monotonic() + DRY_RUN_LIMIT
+    with DryRunProcess(CHILD, json.dumps({**request, "path": sys.path})) as child:
         try:
             for _ in range(MAX_ANSWERS):
                 left = until - monotonic()
@@ -98,24 +98,25 @@ def _run_trial(request: Mapping[str, Any], limit: float) -> TaskTrial:
                 if line is None:
                     break
                 answer = _parse(line)
-                trial = answer.report or trial
+                report = answer.report or report
                 step = step if answer.step is None else answer.step
             else:
-                raise TrialError("wrote to the pipe of this check")
+                raise DryRunError("wrote to the pipe of this check")
             failure = child.describe_failure()
-        except TrialError as error:
+        except DryRunError as error:
             failure = str(error)
     failure = failure and f"{one_line(step) or 'normalising'} {failure}"
-    if trial is None or (trial.description is None and not trial.fault):
-        return TaskTrial(fault=f"{name} cannot be scored: {failure or 'the trial ended without a report'}")
-    trial.fault = one_line(trial.fault)
-    trial.warnings = tuple(one_line(each) for each in (*trial.warnings, failure) if each)
-    return trial
+    if report is None or (report.description is None and not report.fault):
+        return DryRunReport(fault=f"{name} cannot be scored: {failure or 'the dry run ended without a report'}")
+    report.fault = one_line(report.fault)
+    report.warnings = tuple(one_line(each) for each in (*report.warnings, failure) if each)
+    return report
 
 
-def _parse(line: bytes) -> TrialAnswer:
-    """A line of a child; `TrialError` if it is malformed, because environments can write to all its pipes."""
+def _parse(line: bytes) -> DryRunAnswer:
+    """A line of a child; `DryRunError` if it is malformed, because environments can write to all its pipes."""
     try:
-        return from_plain(TrialAnswer, json.loads(line))
+        return from_plain(DryRunAnswer, json.loads(line))
     except (ValueError, RecursionError) as error:
-        raise TrialError(f"wrote to the pipe of this check, or describes its task with wrong types: {error}") from error
+        what = "wrote to the pipe of this check, or describes its task with wrong types"
+        raise DryRunError(f"{what}: {error}") from error

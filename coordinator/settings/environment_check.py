@@ -23,7 +23,7 @@ def check_environment(config: RunConfig, *, strict: bool) -> RunConfig:
         if task not in (CAR_RACING, DREAM):
             log.info("%s is not checked here, as its runs need a world model: workers name what fails", task)
         return config
-    log.info("checking %s: trials in child processes make, reset and step it", task)
+    log.info("checking %s: dry runs in child processes make, reset and step it", task)
     found = try_task(task, config.description_options())
     if found.fault:
         raise UsageError(found.fault)

@@ -1,4 +1,4 @@
-"""A trial of a task before a run begins in it: its environment is made, reset and stepped. Called as a process.
+"""A dry run of a task before a run begins in it: its environment is made, reset and stepped. Called as a process.
 
 `common/cli/task_check.py` starts it, because an environment may hang or crash. It reads a request from stdin and writes
 lines of JSON: a step's name before each step, to which a limit applies, and reports, of which the last counts.
@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, field
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
-from dreamfleet.common.cli.task_check import TaskTrial
+from dreamfleet.common.cli.task_check import DryRunReport
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.printable import one_line
@@ -113,9 +113,9 @@ def _describe(value: Any) -> str:
     return f"an array of shape {shape}" if shape else f"a value of type {type(value).__name__}"
 
 
-def run_trial(
+def dry_run(
     name: str, options: Mapping[str, Any], announce: Callable[[str], None], *, thorough: bool
-) -> Iterator[TaskTrial]:
+) -> Iterator[DryRunReport]:
     """Describe the task, drive its probe episode, and yield what was found.
 
     `thorough`: drive the episode twice and normalise, then yield again with what gymnasium's checker says.
@@ -127,23 +127,23 @@ def run_trial(
 
     checked, drive = _prepare(name, description, announce)
     began = monotonic()
-    trial = TaskTrial(description, episode=drive(), first=_digest(checked.first))
-    trial.seconds = monotonic() - began
-    if thorough and trial.episode and trial.seconds < REPEAT_LIMIT:
-        trial.repeated = drive()
+    report = DryRunReport(description, episode=drive(), first=_digest(checked.first))
+    report.seconds = monotonic() - began
+    if thorough and report.episode and report.seconds < REPEAT_LIMIT:
+        report.repeated = drive()
     if thorough and options.get("normalise"):
         announce("")
-        trial.description = describe_task(name, options)
+        report.description = describe_task(name, options)
     if thorough:
         checked.warnings += _describe_pictures(name, checked.environment)
         if checked.reset_seconds >= SLOW_RESET:
             checked.warnings.append(f"a reset took {checked.reset_seconds:.0f} s, so gymnasium's checker was left out")
-    trial.warnings = tuple(checked.warnings)
-    yield trial
+    report.warnings = tuple(checked.warnings)
+    yield report
     if thorough and checked.reset_seconds < SLOW_RESET:
         announce("gymnasium's checker")
-        trial.warnings = (*checked.warnings, *_check_by_gymnasium(checked.environment))
-        yield trial
+        report.warnings = (*checked.warnings, *_check_by_gymnasium(checked.environment))
+        yield report
     announce("close()")
     with suppress(Exception):
         checked.environment.close()
@@ -229,20 +229,20 @@ def main() -> None:
         step = name
         print(json.dumps({"step": name}), file=out, flush=True)
 
-    def report(found: TaskTrial) -> None:
+    def send(found: DryRunReport) -> None:
         print(json.dumps({"report": asdict(found)}, default=int), file=out, flush=True)
 
     name = request["task"]
     try:
-        for trial in run_trial(name, request["options"], announce, thorough=request["thorough"]):
-            report(trial)
+        for found in dry_run(name, request["options"], announce, thorough=request["thorough"]):
+            send(found)
     except DreamfleetError as error:
-        report(TaskTrial(fault=one_line(str(error) if isinstance(error, UsageError) else f"{name}: {error}")))
+        send(DryRunReport(fault=one_line(str(error) if isinstance(error, UsageError) else f"{name}: {error}")))
     except FaultError as error:
-        report(TaskTrial(fault=f"{name} cannot be scored: {error}"))
+        send(DryRunReport(fault=f"{name} cannot be scored: {error}"))
     except (Exception, SystemExit) as error:  # environments may raise anything
         what = one_line(f"{type(error).__name__}: {error}")
-        report(TaskTrial(fault=f"{name} cannot be scored: {step} raised {what}; {MEND}"))
+        send(DryRunReport(fault=f"{name} cannot be scored: {step} raised {what}; {MEND}"))
     os._exit(0)  # what the environment left running must not keep it
 
 

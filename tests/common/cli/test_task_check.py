@@ -1,4 +1,4 @@
-"""Trials of real environments, each with one fault, in real child processes."""
+"""Dry runs of real environments, each with one fault, in real child processes."""
 
 import os
 import re
@@ -16,7 +16,7 @@ from tests.support.environments import DAEMON_FILE, ODD
 from tests.support.processes import DEADLINE, environment
 
 
-def trial(fault, name=ODD, **options):
+def dry_run(fault, name=ODD, **options):
     limit = options.pop("limit", 300)
     return try_task(name, {"environment": {"fault": fault}, **options}, limit)
 
@@ -37,7 +37,7 @@ def trial(fault, name=ODD, **options):
     ],
 )
 def test_a_fault_is_one_line_that_says_what_the_environment_did(fault, says):
-    found = trial(fault)
+    found = dry_run(fault)
     assert found.description is None
     assert found.fault.startswith(f"{ODD} cannot be scored: ")
     assert "\n" not in found.fault
@@ -45,11 +45,11 @@ def test_a_fault_is_one_line_that_says_what_the_environment_did(fault, says):
 
 
 def test_the_old_api_is_found_without_gymnasiums_wrappers_too():
-    assert "its step returns 4 values" in trial("old step", ODD.replace("Odd-", "OddEndless-")).fault
+    assert "its step returns 4 values" in dry_run("old step", ODD.replace("Odd-", "OddEndless-")).fault
 
 
 def test_a_hang_ends_at_the_limit():
-    assert trial("hang", limit=20).fault.endswith("cannot be scored: reset(seed=0) took longer than 20 s")
+    assert dry_run("hang", limit=20).fault.endswith("cannot be scored: reset(seed=0) took longer than 20 s")
 
 
 @pytest.mark.parametrize(
@@ -62,22 +62,22 @@ def test_a_hang_ends_at_the_limit():
     ],
 )
 def test_what_differs_between_equal_episodes_is_named_with_the_remedy(fault, says):
-    found = trial(fault)
+    found = dry_run(fault)
     assert (found.fault, found.compared) == ("", True)
     assert says in found.varies
     assert "self.np_random" in found.varies
 
 
 def test_a_sound_environment_is_described_without_a_word():
-    found = trial("noisy", normalise=True, seed=2**40)
+    found = dry_run("noisy", normalise=True, seed=2**40)
     assert (found.fault, found.warnings, found.compared, found.varies) == ("", (), True, "")
     assert (found.description.observations, found.description.outputs) == (2, 2)
     assert '"normal"' in found.description.options
 
 
 def test_gymnasiums_checker_only_warns():
-    assert any("not within the observation space" in text for text in trial("outside").warnings)
-    found = trial("checker")  # the process is gone, and what was found before counts
+    assert any("not within the observation space" in text for text in dry_run("outside").warnings)
+    found = dry_run("checker")  # the process is gone, and what was found before counts
     assert (found.fault, found.varies) == ("", "")
     assert found.warnings == ("gymnasium's checker ended the process (exit code 4)",)
 
@@ -106,7 +106,7 @@ def has_ended(pid):
 @pytest.mark.parametrize(("fault", "says"), [("daemon", ""), ("daemon and raise", "RuntimeError: no licence")])
 def test_a_daemon_that_keeps_the_pipes_ends_and_changes_no_finding(fault, says, tmp_path, monkeypatch):
     monkeypatch.setenv(DAEMON_FILE, str(tmp_path / "pid"))
-    found = trial(fault)
+    found = dry_run(fault)
     assert says in found.fault
     assert bool(found.fault) == bool(says)
     assert (found.varies, found.compared) == ("", not says)
@@ -127,7 +127,7 @@ def test_a_daemon_that_keeps_the_pipes_ends_and_changes_no_finding(fault, says, 
     ],
 )
 def test_an_environment_that_spoils_the_pipes_is_one_line(fault, says):
-    found = trial(fault)
+    found = dry_run(fault)
     assert found.fault.startswith(f"{ODD} cannot be scored: {says}")
     assert "\n" not in found.fault
 

@@ -1,4 +1,4 @@
-"""The child process of a trial, whose environment may do anything: each wait for it ends, and nothing outlives it."""
+"""The child process of a dry run, whose environment may do anything: each wait for it ends, and nothing outlives it."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ LOOK_INTERVAL = 0.1  # seconds between two looks whether the child runs: a proce
 EXIT_GRACE = 10.0  # seconds that the child may take to exit after it closed its pipe
 KILL_GRACE = 2.0  # seconds to wait for the end of a killed child: its host may block it
 CHUNK = 65_536  # bytes
-MAX_BYTES = 16 * 2**20  # that a trial may print, and that it may answer
+MAX_BYTES = 16 * 2**20  # that a dry run may print, and that it may answer
 KEPT_BYTES = 65_536  # of what it printed last
 MAX_FAULT_CHARS = 300  # of what a crashed child printed last
 
 
-class TrialError(Exception):
-    """The trial was ended; the text says what its environment did."""
+class DryRunError(Exception):
+    """The dry run was ended; the text says what its environment did."""
 
 
-class TrialProcess:
+class DryRunProcess:
     """A module that reads its request from stdin, writes lines to stdout, and prints to stderr. Use it in a `with`."""
 
     def __init__(self, module: str, request: str) -> None:
@@ -47,7 +47,7 @@ class TrialProcess:
             )  # fmt: skip
         self._selector = selectors.DefaultSelector()
 
-    def __enter__(self) -> TrialProcess:
+    def __enter__(self) -> DryRunProcess:
         self._descendants.add_session(self._child.pid)
         for number, pipe in enumerate(self._pipes()):
             os.set_blocking(pipe.fileno(), False)
@@ -62,7 +62,7 @@ class TrialProcess:
             pipe.close()
 
     def read_line(self, seconds: float) -> bytes | None:
-        """The next line of stdout, or `None` if the child ended; `TrialError` after `seconds` or too much output."""
+        """The next line of stdout, or `None` if the child ended; `DryRunError` after `seconds` or too much output."""
         until, late = monotonic() + seconds, f"took longer than {seconds:.4g} s"
         is_closed = False
         while not self._lines:
@@ -79,7 +79,7 @@ class TrialProcess:
                 if limit < until:
                     until, late = limit, "closed the pipe of this check"
             if monotonic() > until:
-                raise TrialError(late)
+                raise DryRunError(late)
         return self._lines.pop()
 
     def describe_failure(self) -> str:
@@ -105,7 +105,7 @@ class TrialProcess:
         self._sizes[key.data] += len(chunk)
         if self._sizes[key.data] > MAX_BYTES:
             deed = "printed" if key.data else "wrote to the pipe of this check"
-            raise TrialError(f"{deed} more than {MAX_BYTES >> 20} MiB")
+            raise DryRunError(f"{deed} more than {MAX_BYTES >> 20} MiB")
         if not chunk:
             self._selector.unregister(key.fileobj)
         elif key.data:
