@@ -241,7 +241,12 @@ class Run:
             return
         if (why := self._too_many_failures()) is not None:
             self.pause(f"{why} (`dreamfleet runs story` lists why); {REMEDY}")
-        elif (failure := judge.find_broken_fleet() if is_judged else judge.find_pausing()) is not None:
+        elif is_judged and (failure := judge.find_broken_fleet()) is not None:
+            self.pause(
+                f"no host that is here has ever scored, and every open job failed, such as {failure}; "
+                "`dreamfleet resume` tries them again"
+            )
+        elif not is_judged and (failure := judge.find_pausing()) is not None:
             self.pause(f"{failure}; `dreamfleet resume` tries it again")
 
     def _too_many_failures(self) -> str | None:
