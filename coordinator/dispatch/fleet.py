@@ -263,6 +263,11 @@ class Fleet:
         return any(member.takes_jobs for member in self.members.values())
 
     @property
+    def has_workers(self) -> bool:
+        """Whether any worker is present, also one that replaces its scoring processes and takes no job."""
+        return any(member.state is MemberState.PRESENT for member in self.members.values())
+
+    @property
     def lease_count(self) -> int:
         """Leases of all workers, copies included."""
         return sum(len(member.leases) for member in self.members.values())

@@ -143,7 +143,7 @@ class Run:
         """Let time pass: departed workers, silent workers, stalled uploads, and the generation's own time."""
         self._now = now
         self.fleet.tick(now)
-        self.work_clock.tick(now, is_working=not self.fleet.paused and self.fleet.takes_jobs)
+        self.work_clock.tick(now, is_working=not self.fleet.paused and self.fleet.has_workers)
         self.background_jobs.rollout_collections.uploads.tick(now)
 
     def advance(self, now: float) -> bool:

@@ -6,7 +6,7 @@ LONGEST_TICK = 2.0  # seconds between ticks; a longer gap means that this proces
 
 
 class WorkClock:
-    """Counts the seconds in which a run could work: it was not paused, and some worker took jobs."""
+    """Counts the seconds in which a run could work: it was not paused, and some worker was present."""
 
     def __init__(self, now: float, seconds: float = 0.0) -> None:
         """`now` is the monotonic clock's, `seconds` what earlier lives of the coordinator counted."""

@@ -293,3 +293,19 @@ def test_time_without_workers_or_paused_is_no_time_of_the_run(tmp_path, random_b
     bench.restart()
     assert bench.run.work_clock.seconds == pytest.approx(spent), "the open generation's time outlives its coordinator"
     bench.journal.close()
+
+
+def test_a_host_that_replaces_its_scoring_process_counts_as_here(tmp_path, random_bundle):
+    """Its heartbeats name no capacity meanwhile."""
+    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate == 0)
+    bench.hosts = [A]
+    bench.run.fleet.handle_departure(B, bench.now)
+    bench.serve(stop=lambda run: run.generation.done >= 10 or run.fleet.jobs.failures)
+    bench.run.fleet.members[A].capacity = 0
+    bench.run.advance(bench.now)
+    assert bench.run.paused is None
+    worked = bench.run.work_clock.seconds
+    bench.now += 1.0
+    bench.run.tick(bench.now)
+    assert bench.run.work_clock.seconds > worked
+    bench.journal.close()
