@@ -258,11 +258,6 @@ class Fleet:
         return sends
 
     @property
-    def takes_jobs(self) -> bool:
-        """Whether any worker can be given jobs."""
-        return any(member.takes_jobs for member in self.members.values())
-
-    @property
     def has_workers(self) -> bool:
         """Whether any worker is present, also one that replaces its scoring processes and takes no job."""
         return any(member.state is MemberState.PRESENT for member in self.members.values())

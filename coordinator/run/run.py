@@ -120,7 +120,7 @@ class Run:
             return "ended"
         if self.paused is not None or self.stalled is not None:
             return "paused"
-        if not self.fleet.takes_jobs:
+        if not self.fleet.has_workers:
             return "waiting for workers"
         return "evaluating" if self.fleet.drain_background else "running"
 
