@@ -101,13 +101,17 @@ def test_status_is_json_that_zenoh_cli_reads_too(processes, settings):
     assert "mean fitness by generation" in out
 
 
-def test_a_job_that_fails_on_two_workers_pauses_the_run_and_says_why(processes, settings):
-    coordinator = processes.coordinator(*settings, "--task", tasks.RAISING, "--generations", 2)
+@pytest.mark.parametrize(
+    ("on_failure", "why"), [("worst", "every open job failed"), ("pause", "failed on two workers")]
+)
+def test_failures_on_all_workers_pause_the_run_and_say_why(processes, settings, on_failure, why):
+    flags = "--task", tasks.RAISING, "--generations", 2, "--on-failure", on_failure
+    coordinator = processes.coordinator(*settings, *flags)
     for name in ("one", "two"):
         processes.worker("--task", tasks.RAISING, "--name", name)
     while (status := processes.status())["state"] != "paused":
         assert status["generation"]["episodes_done"] == 0
-    assert "failed on two workers" in status["why"]
+    assert why in status["why"]
     assert "the road has ended" in status["why"]
     assert coordinator.popen.poll() is None
 
