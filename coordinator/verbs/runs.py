@@ -150,7 +150,8 @@ def show_run(args: argparse.Namespace) -> int:
     lines = [_generation_row(each, judged.get(each.number)) for each in shown]
     if len(shown) < len(history):
         print(f"the last {LAST_GENERATIONS} of {len(history)} generations; --json has all")
-    print_rows(lines, right=tuple(lines[0]) if lines else (), drop_order=("seconds", "worst", "steps", "std", "sigma"))
+    least = ("seconds", "worst", "steps", "std", "sigma") + (() if any(each.failed for each in history) else ("failed",))
+    print_rows(lines, right=tuple(lines[0]) if lines else (), drop_order=least)
     return 0
 
 
@@ -173,7 +174,7 @@ def _prefix_names(name: str, parts: dict[str, object]) -> dict[str, object]:
 def _generation_row(each: StoredGeneration, evaluated: float | None) -> dict[str, object]:
     return {
         "generation": each.number, "mean": f"{each.mean:.1f}", "std": f"{each.std:.1f}", "best": f"{each.best:.1f}",
-        "worst": f"{each.worst:.1f}", "sigma": f"{each.sigma:.4f}", "steps": each.steps,
+        "worst": f"{each.worst:.1f}", "sigma": f"{each.sigma:.4f}", "failed": each.failed or "", "steps": each.steps,
         "seconds": f"{each.seconds:.1f}", "evaluated": "" if evaluated is None else f"{evaluated:.1f}",
     }  # fmt: skip
 

@@ -10,7 +10,7 @@ import signal
 from contextlib import suppress
 
 from dreamfleet.common.printable import one_line
-from dreamfleet.common.protocol.failures import HOST_PREFIX
+from dreamfleet.common.protocol.failures import HOST_PREFIX, is_host_failure
 
 MAX_TEXT = 500  # characters of an error's text
 MAX_CAUSES = 10  # causes of causes that are looked at
@@ -59,12 +59,12 @@ def describe_exit(status: int) -> str:
 
 def describe_crash(reason: str) -> str:
     """The error of the jobs that a child took with it; `reason` is of `describe_exit` or why it was killed."""
-    return reason if reason.startswith(HOST_PREFIX) else f"{CRASH} ({reason})"
+    return reason if is_host_failure(reason) else f"{CRASH} ({reason})"
 
 
 def is_crash(error: str) -> bool:
     """Whether the child died of the episode or was killed, so that the program that drives it again would too."""
-    return error.startswith((CRASH, HOST_PREFIX))
+    return error.startswith(CRASH) or is_host_failure(error)
 
 
 def encodable(text: str) -> str:
