@@ -132,10 +132,12 @@ def _world(run: RunFolder) -> str:
 
 def _facts(run: RunFolder, data: RunData, total: Effort) -> Facts:
     settings, best = data.settings, best_evaluation(data.evaluations)
+    failed = sum(each.failed for each in data.history)
     facts = [
         ("task", settings.task.task),
         ("begun", format_time(run.created)),
         ("generations", f"{len(data.history):,}"),
+        *([("failed candidates", f"{failed:,}")] if failed else []),
         ("population", f"{settings.population} candidates x {plural(settings.episodes, 'episode')}"),
         ("horizon", f"{settings.task.horizon:,} steps"),
         ("optimiser", f"{describe_optimiser(settings)}, first step size {settings.sigma0:g}"),
@@ -152,5 +154,5 @@ def _facts(run: RunFolder, data: RunData, total: Effort) -> Facts:
 def _generation_row(each: StoredGeneration) -> dict[str, Any]:
     return {
         "generation": each.number, "mean": each.mean, "std": each.std, "best": each.best, "worst": each.worst,
-        "sigma": each.sigma, "steps": each.steps, "seconds": each.seconds,
+        "sigma": each.sigma, "failed": each.failed or None, "steps": each.steps, "seconds": each.seconds,
     }  # fmt: skip

@@ -55,7 +55,6 @@ class Run:
         self.uid = journal.fact("uid") or ""
         self.created = journal.fact("created") or ""  # ISO 8601, UTC
         self.incarnation = journal.begin_incarnation()
-        journal.add_event(f"incarnation {self.incarnation} begins")
         self._notes: list[str] = []  # that are in the journal and not in the log
         self._journal = journal
         self._unpublished: list[StoredGeneration] = []
@@ -203,7 +202,7 @@ class Run:
     def leave(self) -> None:
         """Make everything durable and write the reported controller before the coordinator exits."""
         self._journal_notes()
-        self._journal.add_event("the coordinator leaves")
+        self._journal.end_incarnation()
         self._journal.set_seconds(self.generation.number, self.work_clock.seconds)
         self._journal.commit()
         self.background_jobs.report.save(at_once=True)

@@ -43,6 +43,7 @@ from dreamfleet.coordinator.storage.journal_file import (
 sqlite3.register_adapter(Checkpoint, Checkpoint.packed)  # when it is written, not while workers wait
 
 MAX_EVENTS = 10_000  # R26: strangers and failing hosts cause some
+LEAVES = "the coordinator leaves"  # the last event of an incarnation that was not killed
 MOST_VARIABLES = 500  # of one SQL statement
 FINGERPRINT, HOST_CLASS = "fingerprint", "host_class"  # the facts' names
 
@@ -141,11 +142,18 @@ class Journal(JournalConnection):
     def begin_incarnation(self) -> int:
         """Number of this life of the coordinator, from 1; durable before anything is published."""
         number = int(self.fact("incarnation") or 0) + 1
-        self.set_fact("incarnation", str(number))
-        self.commit()
+        last = self._read_row("SELECT text FROM event ORDER BY number DESC LIMIT 1")
+        killed = "; the last one was killed, crashed or could not write" if last not in (None, (LEAVES,)) else ""
         self._incarnation = number
+        self.set_fact("incarnation", str(number))
+        self.add_event(f"incarnation {number} begins{killed}")
+        self.commit()
         self._opened = self._committed = self._read_row("SELECT max(number) FROM generation")[0]
         return number
+
+    def end_incarnation(self) -> None:
+        """Write that the coordinator leaves by itself."""
+        self.add_event(LEAVES)
 
     def open_generation(
         self, number: int, state: Checkpoint, sigma: float, seeds: Sequence[int], vectors: Sequence[bytes]

@@ -150,7 +150,9 @@ def show_run(args: argparse.Namespace) -> int:
     lines = [_generation_row(each, judged.get(each.number)) for each in shown]
     if len(shown) < len(history):
         print(f"the last {LAST_GENERATIONS} of {len(history)} generations; --json has all")
-    least = ("seconds", "worst", "steps", "std", "sigma") + (() if any(each.failed for each in history) else ("failed",))
+    least = ("seconds", "worst", "steps", "std", "sigma") + (
+        () if any(each.failed for each in history) else ("failed",)
+    )
     print_rows(lines, right=tuple(lines[0]) if lines else (), drop_order=least)
     return 0
 

@@ -124,6 +124,9 @@ class MemoryJournal:
         self.commit()
         return number
 
+    def end_incarnation(self) -> None:
+        """No rule hangs on it."""
+
     def open_generation(self, number: int, state: Any, sigma: float, seeds: Sequence[int], vectors: Any) -> None:
         self._witness.opened(number, tuple(vectors))
         self._insert("generation", number, {"state": state, "seeds": tuple(seeds), "vectors": tuple(vectors)})

@@ -150,24 +150,29 @@ const tile = () => {
 
 const CELLS = [[400, 9], [120, 14], [64, 22], [32, 30], [12, 40], [-1, 56]]; // of more candidates than this, so wide
 
-// A cell a candidate: it fills with its episodes, and its colour says how it does among the others.
+// A cell a candidate: it fills with its episodes, and its colour says how it does among the others. No episode is wanted of
+// a candidate that failed: its cell is crossed out.
 const fillPopulation = ({ candidates, evaluation }) => {
   const { generation, total, done, wanted, fitness } = candidates;
   const known = fitness.filter((each) => each !== null);
   const [low, high] = [Math.min(...known), Math.max(...known)];
-  const finished = done.filter((each, index) => each >= wanted[index]).length;
+  const failed = wanted.filter((each) => each === 0).length;
+  const finished = done.filter((each, index) => each >= wanted[index]).length - failed;
   const rest = total > done.length ? `, the first ${done.length} are shown` : "";
   const open = total > 0;
-  say(page["population-text"], open ? `Generation ${generation}: ${finished} of ${total} candidates are scored${rest}.` : "No generation is open.");
+  say(page["population-text"], open ? `Generation ${generation}: ${finished} of ${total} candidates are scored${failed ? `, ${failed} failed` : ""}${rest}.` : "No generation is open.");
   page.cells.style.setProperty("--cell", `${CELLS.find(([least]) => total > least)[1]}px`);
   fill(page.cells, done, () => make("div", "", { class: "cell" }), (cell, episodes, index) => {
     const value = fitness[index];
     const share = value === null ? 0 : high > low ? (value - low) / (high - low) : 1;
     const key = `${episodes}/${wanted[index]}/${value === null ? "" : share.toFixed(2)}`;
-    const text = `candidate ${generation}/${index}: ${episodes} of ${wanted[index]} episodes${value === null ? "" : `, fitness ${number(value)}`}`;
+    const lost = wanted[index] === 0;
+    const scored = `${episodes} of ${wanted[index]} episodes${value === null ? "" : `, fitness ${number(value)}`}`;
+    const text = `candidate ${generation}/${index}: ${lost ? "failed" : scored}`;
     if (cell.described !== text) cell.title = cell.described = text;
     if (cell.key === key) return;
     cell.key = key;
+    cell.classList.toggle("failed", lost);
     cell.style.setProperty("--done", wanted[index] ? `${(100 * episodes) / wanted[index]}%` : "0%");
     cell.style.setProperty("--fill", value === null ? "var(--line-strong)" : shade(share));
   });

@@ -162,7 +162,7 @@ const generationRow = (each) => {
   const row = make("tr");
   const texts = [
     number(each.generation, 0), number(each.mean), number(each.std), number(each.best), number(each.worst),
-    each.sigma.toPrecision(4), number(each.steps, 0), number(each.seconds),
+    each.sigma.toPrecision(4), each.failed ? number(each.failed, 0) : "", number(each.steps, 0), number(each.seconds),
   ];
   row.append(...texts.map((text) => make("td", text, { class: "n" })));
   return row;

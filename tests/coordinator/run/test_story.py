@@ -34,6 +34,7 @@ def test_comings_failures_pauses_and_lives_are_kept_in_order(bench):
     bench.now += 1
     bench.run.tick(bench.now)
     found = texts(bench)
+    assert "killed" not in "".join(text for _, text in found)
     expected = [
         (1, "incarnation 1 begins"), (1, "joined"), (1, "paused: by hand"), (1, "resumed"),
         (1, "the coordinator leaves"),
@@ -43,6 +44,11 @@ def test_comings_failures_pauses_and_lives_are_kept_in_order(bench):
     places = [next(i for i, (life, text) in enumerate(found) if life == number and part in text)
               for number, part in expected]  # fmt: skip
     assert places == sorted(places), "\n".join(map(str, found))
+
+
+def test_an_incarnation_that_did_not_leave_by_itself_is_named(bench):
+    bench.restart()
+    assert (2, "incarnation 2 begins; the last one was killed, crashed or could not write") in texts(bench)
 
 
 def test_the_journal_keeps_the_last_events_only(bench):
