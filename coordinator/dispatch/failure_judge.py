@@ -14,6 +14,8 @@ EQUAL_ATTEMPTS = 2  # that fail for one cause show that the episode fails
 ANY_ATTEMPTS = 3  # that fail for several causes show it too
 HOST_ATTEMPTS = 10  # that a host's shortage ends, over about eight minutes: no host has what the episode needs
 PAUSING_ATTEMPTS = 3  # on the only worker
+MAX_CAUSES = 20  # that are told of: a simulator may invent names without end
+ENOUGH_JOBS = 10  # of which none could be scored show that no host can
 
 
 class FailureJudge:
@@ -21,13 +23,26 @@ class FailureJudge:
 
     def __init__(self, jobs: PendingJobs, members: Mapping[str, Member]) -> None:
         self.working_hosts: set[str] = set()  # names of those that scored jobs of this run
+        self._causes: set[str] = set()  # that were seen
         self._jobs = jobs
         self._members = members
+
+    def is_new_cause(self, failure: JobFailure) -> bool:
+        """Whether a job's last attempt failed for a cause that was not seen before; of the first causes only."""
+        cause = failure_cause(failure.history[-1].error)
+        is_new = cause not in self._causes and len(self._causes) < MAX_CAUSES
+        if is_new:
+            self._causes.add(cause)
+        return is_new
 
     def find_lasting(self) -> list[JobFailure]:
         """The wanted jobs that fail wherever they are scored."""
         hosts = self._present_hosts()
-        return [each for each in self._jobs.failures if is_lasting(each.history, self.working_hosts, hosts)]
+        return [
+            each
+            for each in self._jobs.failures
+            if not self._jobs[each.work.job.digest].is_proof and is_lasting(each.history, self.working_hosts, hosts)
+        ]
 
     def find_pausing(self) -> JobFailure | None:
         """A job that failed so often that the run must pause; `None` if there is none.
@@ -36,13 +51,18 @@ class FailureJudge:
         """
         return next((each for each in self._jobs.failures if _is_pausing([each])), None)
 
-    def find_broken_fleet(self) -> JobFailure | None:
-        """The job that failed most often, if no host that is here has ever scored, and all open jobs have failed.
+    def find_broken_fleet(self, *, at_once: bool) -> JobFailure | None:
+        """The job that failed most often, if all hosts that are here have failed and none of them has ever scored.
 
-        R8: before that, a host that works may still show itself.
+        R8: all open jobs must have failed, or with `at_once` ten of them while the run has no score from anywhere.
+        Before that, a host that works may still show itself.
         """
-        failures = self._jobs.failures
-        if len(failures) < len(self._jobs) or self._present_hosts() & self.working_hosts or not _is_pausing(failures):
+        failures, hosts = self._jobs.failures, self._present_hosts()
+        tried = {attempt.host for each in failures for attempt in each.history}
+        if not hosts or not hosts <= tried or hosts & self.working_hosts or not _is_pausing(failures):
+            return None
+        is_early = at_once and not self.working_hosts and len(failures) >= ENOUGH_JOBS
+        if not is_early and len(failures) < len(self._jobs):
             return None
         return max(failures, key=lambda each: len(each.history))
 

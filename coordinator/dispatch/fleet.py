@@ -17,7 +17,7 @@ from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.messages import MAX_SLOTS, Heartbeat, Result, Verdict, VerdictWord
 from dreamfleet.coordinator.dispatch.event_log import EventLog
 from dreamfleet.coordinator.dispatch.failure_judge import FailureJudge
-from dreamfleet.coordinator.dispatch.failures import JobFailure
+from dreamfleet.coordinator.dispatch.failures import JobFailure, host_of
 from dreamfleet.coordinator.dispatch.host_stats import HostRecords
 from dreamfleet.coordinator.dispatch.member import DepartedWorkers, DispatchGroup, Lease, Member, MemberState, SentBatch
 from dreamfleet.coordinator.dispatch.packing import BatchContent, OutgoingBatch, pack
@@ -326,8 +326,7 @@ class Fleet:
             self.dropped["result of a job that was not given"] += 1
             return "refused", None
         if result.fitness is None:
-            self.jobs.record_failure(identity, result, self._now)
-            self.counts["errors"] += 1
+            self._record_failure(identity, result)
             if member := self.members.get(identity):
                 self._drop_lease(member, result.digest, counted=True)
             return "refused", None
@@ -335,7 +334,16 @@ class Fleet:
         self.counts["discarded_steps"] += pending.steps_lost_to(identity, result.steps)
         pending.holders.discard(identity)
         self._cancel(result.digest, pending)
-        return "accepted", pending.work
+        self.failure_judge.working_hosts.add(host_of(identity))
+        return ("duplicate", None) if pending.is_proof else ("accepted", pending.work)
+
+    def _record_failure(self, identity: str, result: Result) -> None:
+        """Record a failed attempt; people are told of the first one of each cause."""
+        self.jobs.record_failure(identity, result, self._now)
+        self.counts["errors"] += 1
+        failure = self.jobs[result.digest].failure
+        if self.failure_judge.is_new_cause(failure):
+            self.notes.append(f"{failure}; it is tried again")
 
     def _cancel(self, digest: bytes, pending: PendingJob) -> None:
         """End all leases of a job that is wanted no more.

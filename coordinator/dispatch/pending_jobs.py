@@ -35,6 +35,7 @@ class PendingJob:
     given_to: set[str] = field(default_factory=set)  # workers that hold it or held it
     overrun_by: set[str] = field(default_factory=set)  # workers that reported more steps than it can have
     attempts: list[Attempt] = field(default_factory=list)  # the failed ones
+    is_proof: bool = False  # it was scored before: who scores it again shows that a host can score
     retry_at: float = 0.0  # seconds of the monotonic clock before which it is not tried again
     # Worker that lost its lease -> environment steps it had made; `None`: it had finished.
     lost_steps: dict[str, int | None] = field(default_factory=dict)
@@ -138,10 +139,22 @@ class PendingJobs(Mapping[bytes, PendingJob]):
             digest = each.job.digest
             if digest in self._pending or digest in self._accepted:
                 continue
-            self._pending[digest] = PendingJob(each, self._next_order)
-            self._tags[digest[:TAG_BYTES]] = digest
-            self._next_order += 1
-            self.enqueue(digest)
+            self._add(PendingJob(each, self._next_order))
+
+    def _add(self, pending: PendingJob) -> None:
+        digest = pending.work.job.digest
+        self._pending[digest] = pending
+        self._tags[digest[:TAG_BYTES]] = digest
+        self._next_order += 1
+        self.enqueue(digest)
+
+    def offer_proof(self, work: Work) -> bool:
+        """Want a job again that was scored before; `False` if it is wanted already."""
+        digest = work.job.digest
+        if digest in self._pending:
+            return False
+        self._add(PendingJob(work, self._next_order, is_proof=True))
+        return True
 
     def begin_generation(self, generation: int) -> None:
         """Forget the accepted jobs of generations before the last one.

@@ -53,16 +53,12 @@ class Finalist:
 class Confirmation:
     """One confirmation: each round has about `episodes` episodes, shared by the finalists that are left.
 
-    `closed` is the number of closed generations of the run. A round of which more than the share `failure_limit` of
-    the episodes failed is not closed.
+    `closed` is the number of closed generations of the run.
     """
 
-    def __init__(
-        self, spec: TaskSpec, episodes: int, finalists: Sequence[Finalist], closed: int, failure_limit: float = 1.0
-    ) -> None:
+    def __init__(self, spec: TaskSpec, episodes: int, finalists: Sequence[Finalist], closed: int) -> None:
         self.outcome: StoredConfirmation | None = None  # at the end
         self.failed = False  # each of the last episodes failed: there is no score to report
-        self._failure_limit = failure_limit
         self._spec = spec
         self._episodes = episodes
         self._closed = closed
@@ -99,16 +95,6 @@ class Confirmation:
         """Whether scores of the open round are missing."""
         return len(self._scores) < len(self._digests)
 
-    @property
-    def failed_count(self) -> int:
-        """Episodes of the open round that failed for good."""
-        return sum(map(isnan, self._scores.values()))
-
-    @property
-    def has_failed(self) -> bool:
-        """Whether too many episodes of the open round failed."""
-        return self.failed_count > self._failure_limit * len(self._digests)
-
     def retry_failed(self) -> list[Work]:
         """Want the failed episodes of the open round again; their jobs."""
         failed = {digest for digest, score in self._scores.items() if isnan(score)}
@@ -119,7 +105,7 @@ class Confirmation:
     def advance(self, known: FindScores) -> list[Work]:
         """Close a complete round and open the next one; return its missing jobs, none once there is an outcome."""
         missing: list[Work] = []
-        while not self._is_over and not missing and not self.has_failed:
+        while not self._is_over and not missing:
             if self._digests:
                 self._close()
             if not self._is_over:

@@ -101,13 +101,6 @@ class Evaluations:
             self._open[generation].scores[digest] = score
         return waiting
 
-    def find_excessive(self, limit: float) -> tuple[int, int, int] | None:
-        """An open evaluation of which more than this share of the episodes failed: generation, failed, episodes."""
-        for generation, each in self._open.items():
-            if len(each.failed) > limit * len(each.digests):
-                return generation, len(each.failed), len(each.digests)
-        return None
-
     def retry_failed(self, spec: TaskSpec) -> list[Work]:
         """Want the failed episodes of the open evaluations again; their jobs, each once."""
         work = {}
@@ -118,13 +111,10 @@ class Evaluations:
                 del each.scores[digest]
         return list(work.values())
 
-    def finish(self, generation: int, limit: float = 1.0) -> FinishedEvaluation | None:
-        """Close an evaluation whose scores are complete; `None` while some are missing.
-
-        Also if more than the share `limit` of the episodes failed: then they may have to be tried again.
-        """
+    def finish(self, generation: int) -> FinishedEvaluation | None:
+        """Close an evaluation whose scores are complete; `None` while some are missing."""
         each = self._open[generation]
-        if len(each.scores) < len(each.digests) or len(each.failed) > limit * len(each.digests):
+        if len(each.scores) < len(each.digests):
             return None
         every = np.array([each.scores[digest] for digest in each.digests])
         scores = every[np.isfinite(every)]

@@ -74,6 +74,17 @@ class Generation:
         return len(self._failed)
 
     @property
+    def episodes(self) -> int:
+        """How many episodes each candidate has."""
+        return self._scores.shape[1]
+
+    def find_scored(self) -> Work | None:
+        """A job that has a score; `None` if there is none."""
+        return next(
+            (each for each in self.work if np.isfinite(self._scores[each.job.candidate, each.job.episode])), None
+        )
+
+    @property
     def failed(self) -> list[int]:
         """The candidates that failed."""
         return [int(each) for each in np.flatnonzero(self._failed)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from math import isnan, nan
 
-from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.messages import Job
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation
 from dreamfleet.common.runs.run_folder import CONFIRMED
@@ -26,12 +25,9 @@ class BackgroundJobs:
 
     def __init__(
         self, journal: Journal, settings: RunSettings, run_uid: str, history: History,
-        evaluations: Iterable[StoredEvaluation], agenda: ScheduleState, failure_limit: float,
+        evaluations: Iterable[StoredEvaluation], agenda: ScheduleState,
     ) -> None:  # fmt: skip
-        """`agenda` knows the scoring parameters of each generation when it closes.
-
-        An evaluation or round of which more than the share `failure_limit` of the episodes failed is not closed.
-        """
+        """`agenda` knows the scoring parameters of each generation when it closes."""
         folder = journal.path.parent
         self.evaluations = Evaluations(evaluations)
         self.rollout_collections = RolloutCollections(folder)
@@ -43,7 +39,6 @@ class BackgroundJobs:
         self._settings = settings
         self._history = history
         self._agenda = agenda
-        self._failure_limit = failure_limit
         self._confirmation: Confirmation | None = None  # while the run is ending
         text = journal.fact(CONFIRMED)
         self._confirmed = None if text is None else StoredConfirmation.from_json(text)
@@ -53,17 +48,6 @@ class BackgroundJobs:
         """Whether any evaluation, collection or round of the confirmation is unfinished."""
         confirming = self._confirmation is not None and self._confirmation.in_progress
         return bool(self.evaluations.open_count or self.rollout_collections.missing_count or confirming)
-
-    @property
-    def too_many_failed(self) -> str | None:
-        """What failed in too many episodes to be closed, in words; `None` if nothing did."""
-        if (found := self.evaluations.find_excessive(self._failure_limit)) is not None:
-            generation, failed, total = found
-            return f"{failed} of {plural(total, 'episode')} of the evaluation of generation {generation}'s mean failed"
-        if self._confirmation is not None and self._confirmation.has_failed:
-            failed, (_, total) = self._confirmation.failed_count, self._confirmation.progress
-            return f"{failed} of {plural(total, 'episode')} of the confirmation failed"
-        return None
 
     def retry_failed(self) -> list[Work]:
         """Forget the failed episodes of what is open, in the journal too; their jobs."""
@@ -151,7 +135,7 @@ class BackgroundJobs:
             episodes, finalists = self._settings.confirm_episodes, self._journal.finalists(FINALISTS)
             if not (episodes and finalists):
                 return []
-            self._confirmation = Confirmation(self._settings.task, episodes, finalists, closed, self._failure_limit)
+            self._confirmation = Confirmation(self._settings.task, episodes, finalists, closed)
         work = self._confirmation.advance(self._journal.fitness_of)
         if self._confirmation.failed:
             return []
@@ -180,7 +164,7 @@ class BackgroundJobs:
         return work
 
     def _finish(self, generation: int) -> None:
-        found = self.evaluations.finish(generation, self._failure_limit)
+        found = self.evaluations.finish(generation)
         if found is None:
             return
         self._journal.finish_evaluation(generation, found.found, found.failed)

@@ -14,12 +14,14 @@ from dreamfleet.common.runs.seeds import training_seed
 from dreamfleet.common.runs.stages import Stage, stages_of
 from dreamfleet.coordinator.jobs.generation import CandidateScores, Generation
 from dreamfleet.coordinator.jobs.history import History
-from dreamfleet.coordinator.jobs.work import vector_bytes
+from dreamfleet.coordinator.jobs.work import Work, vector_bytes
 from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
 from dreamfleet.coordinator.settings.start import SUBSPACE_FACT, stored_start_mean, stored_subspace
 from dreamfleet.coordinator.storage.journal import Journal, StoredOpenGeneration
 
-MAX_REDRAWS = 3  # rounds in a generation; who fails after them ranks last
+MAX_REDRAWS = 3  # rounds in a generation; what fails after them ranks last
+MAX_RESEEDS = 3  # times that a generation gets other seeds
+RECENT = 5  # generations, the open one included, whose failures `--failure-limit` counts
 
 
 class Generations:
@@ -32,9 +34,12 @@ class Generations:
         self.history = history
         self.scoring_params: ScoringParams  # of the open generation
         self.last: CandidateScores | None = None  # of the last closed generation
-        self.redrawn: set[int] = set()  # candidates of the open generation that were drawn anew
+        # Candidates of the open generation that failed before they were drawn anew or got other seeds.
+        self.redrawn: set[int] = set()
         self.seconds = 0.0  # for which the restored generation could be scored before
         self._rounds = 0  # in which candidates were drawn anew
+        self._reseeds = 0  # times that the open generation got other seeds
+        self._scored_before: Work | None = None  # a job of the last generation that has a score
         self._journal = journal
         self._settings = settings
         self._agenda = agenda
@@ -78,6 +83,8 @@ class Generations:
         self.seconds = stored.seconds
         self.redrawn = {index for indices in stored.redrawn for index in indices}
         self._rounds = len(stored.redrawn)
+        if (reseeds := self._count_reseeds(stored)) is not None:
+            self._reseeds, self.redrawn = reseeds, set(range(len(stored.vectors)))
         vectors = tuple(vector_bytes(x) for x in population)
         if vectors != stored.vectors:
             raise JournalError(
@@ -85,7 +92,8 @@ class Generations:
                 "journal holds; use the host and package versions that wrote it"
             )
         if before is not None and earlier is not None:
-            self.last = self._recall(before, earlier).candidate_scores()
+            closed = self._recall(before, earlier)
+            self.last, self._scored_before = closed.candidate_scores(), closed.find_scored()
         return self._recall(stored, self.scoring_params)
 
     def open(self, number: int) -> Generation:
@@ -95,11 +103,9 @@ class Generations:
             self._strategy = self._search(scoring_params.stage, self._strategy.mean)
         state, sigma = self._strategy.state(), self._strategy.sigma
         vectors = [vector_bytes(x) for x in self._strategy.ask()]
-        seeds = [
-            training_seed(self._settings.seed, number, episode) for episode in range(scoring_params.stage.episodes)
-        ]
+        seeds = self._seeds(number, scoring_params.stage.episodes)
         self._journal.open_generation(number, state, sigma, seeds, vectors)
-        self.redrawn, self._rounds = set(), 0
+        self.redrawn, self._rounds, self._reseeds = set(), 0, 0
         return self._generation(number, vectors, seeds, scoring_params)
 
     def close(self, generation: Generation, seconds: float) -> StoredGeneration:
@@ -123,26 +129,53 @@ class Generations:
         self._strategy.tell(np.where(np.isfinite(fitness), fitness, np.nextafter(found.min(), -np.inf)))
         self._journal.close_generation(closed, fitness)
         self.history.append(closed)
-        self.last = generation.candidate_scores()
+        self.last, self._scored_before = generation.candidate_scores(), generation.find_scored()
         return closed
 
+    def can_try_again(self, generation: Generation) -> bool:
+        """Whether `try_again` would change the generation as its failures are now."""
+        reseed = generation.all_failed and self._reseeds < MAX_RESEEDS
+        return reseed or (bool(generation.failed) and self._can_redraw)
+
     @property
-    def can_redraw(self) -> bool:
-        """Whether failed candidates of the open generation may be drawn anew once more."""
+    def _can_redraw(self) -> bool:
         return self._settings.on_failure == "redraw" and self._rounds < MAX_REDRAWS
 
-    def redraw(self, generation: Generation) -> Generation | None:
-        """Draw the failed candidates anew; `None` if none failed, or if that was tried often enough.
+    def try_again(self, generation: Generation) -> str | None:
+        """Change the complete, open generation in the journal because of its failures; what changed, in words.
 
-        Call it when all others are scored: then the draw does not depend on the order of arrival.
+        R8: if all candidates failed, the generation gets other seeds. Else, with `redraw`, the failed ones are drawn
+        anew. `None` if neither is to be done, or if it was done often enough. All others are scored, so the change does
+        not depend on the order of arrival. `reload` returns the changed generation.
         """
-        if not (indices := generation.failed) or not self.can_redraw:
+        number, indices = generation.number, generation.failed
+        if generation.all_failed and self._reseeds < MAX_RESEEDS:
+            self._reseeds += 1
+            self._journal.set_seeds(number, self._seeds(number, generation.episodes, self._reseeds))
+            found = f"all candidates failed in generation {number}: it gets other seeds"
+        elif indices and self._can_redraw:
+            self._rounds += 1
+            self._journal.redraw(number, indices, [vector_bytes(x) for x in self._strategy.redraw(indices)])
+            names = f"candidate {indices[0]}" if len(indices) == 1 else f"candidates {', '.join(map(str, indices))}"
+            found = f"{names} of generation {number} failed and {'is' if len(indices) == 1 else 'are'} drawn anew"
+        else:
             return None
-        vectors = [vector_bytes(x) for x in self._strategy.redraw(indices)]
-        self._journal.redraw(generation.number, indices, vectors)
-        self._rounds += 1
         self.redrawn.update(indices)
-        return self.reload(generation.number)
+        return found
+
+    def count_recent_failures(self, generation: Generation, since: int) -> tuple[int, range]:
+        """Failed candidates of the open generation and those before it, and the generations that were counted.
+
+        They are at most `RECENT` generations of one stage, from `since` on.
+        """
+        first = max(since, self.scoring_params.begun.since, generation.number - RECENT + 1)
+        counted = range(first, generation.number + 1)
+        opened = len(self.redrawn.union(generation.failed)) if counted else 0
+        return sum(each.failed for each in self.history.rows[first:]) + opened, counted
+
+    def find_scored(self, generation: Generation) -> Work | None:
+        """A job of the open generation or the last one that has a score; `None` if there is none."""
+        return generation.find_scored() or self._scored_before
 
     def reload(self, number: int) -> Generation:
         """The open generation as the journal has it."""
@@ -155,6 +188,22 @@ class Generations:
 
     def _search(self, stage: Stage, start: NDArray[np.float64] | None) -> Evolution:
         return Evolution(EvolutionConfig.of(self._settings, stage, self._subspace), start)
+
+    def _seeds(self, number: int, episodes: int, reseeds: int = 0) -> list[int]:
+        """The seeds of a generation that got other ones so many times: those that follow."""
+        first = reseeds * episodes
+        return [training_seed(self._settings.seed, number, each) for each in range(first, first + episodes)]
+
+    def _count_reseeds(self, stored: StoredOpenGeneration) -> int | None:
+        """How many times a restored generation got other seeds; `None` if it never did."""
+        return next(
+            (
+                each
+                for each in range(1, MAX_RESEEDS + 1)
+                if list(stored.seeds) == self._seeds(stored.number, len(stored.seeds), each)
+            ),
+            None,
+        )
 
     def _recall(self, stored: StoredOpenGeneration, scoring_params: ScoringParams) -> Generation:
         generation = self._generation(stored.number, stored.vectors, stored.seeds, scoring_params)

@@ -34,7 +34,8 @@ from dreamfleet.coordinator.run.work_clock import WorkClock
 from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 
-REMEDY = "`dreamfleet resume` tries them again; a greater --failure-limit at the next start accepts more failures"
+REMEDY = "`dreamfleet resume` tries them again and goes on, however many fail in this generation"
+LIMIT_FROM = "limit_from"  # the fact that names the first generation whose failures count for `failure_limit`
 WRITE_RETRY = 2.0  # seconds until a full disk or a locked journal is tried again
 
 
@@ -67,14 +68,12 @@ class Run:
         closed, evaluations = journal.read_closed()
         self.history = History(closed)
         self._agenda = ScheduleState(settings)
-        self.background_jobs = BackgroundJobs(
-            journal, settings, self.uid, self.history, evaluations, self._agenda, network.failure_limit
-        )
+        self.background_jobs = BackgroundJobs(journal, settings, self.uid, self.history, evaluations, self._agenda)
         evaluated = self.background_jobs.evaluations.finished
         self.generations = Generations(journal, settings, self._agenda, self.history, evaluated)
         self.failure_limit = network.failure_limit
-        self._forgiven: set[int] = set()  # candidates that were drawn anew before the last `resume`
         self.generation = self.generations.begin()
+        self._limit_from = int(journal.fact(LIMIT_FROM) or 0)
         self.work_clock = WorkClock(now, self.generations.seconds)  # of the open generation
         self.fleet.failure_judge.working_hosts.update(map(host_of, journal.workers()))
         if self.incarnation > 1:  # the last incarnation may have sent the next generation's jobs before it was durable
@@ -127,7 +126,6 @@ class Run:
         """Journal an accepted result, then count it for the generation or the background job that wants it."""
         self._journal.add_result(work.job, result, worker, fingerprint, self.incarnation, host_class)
         self.admission.adopt_class(host_class, fingerprint)
-        self.fleet.failure_judge.working_hosts.add(host_of(worker))
         assert result.fitness is not None
         self._count(work.job, result.fitness, result.steps)
 
@@ -152,8 +150,9 @@ class Run:
             return False
         self._settle_failures()
         while self.ended is None and self.paused is None and self.generation.complete and not self._is_waiting:
-            if (redrawn := self.generations.redraw(self.generation)) is not None:
-                self._replace_generation(redrawn)
+            if (note := self.generations.try_again(self.generation)) is not None:
+                self.fleet.notes.append(note)
+                self._replace_generation(self.generations.reload(self.generation.number))
             elif self.generation.all_failed:
                 break
             else:
@@ -224,7 +223,8 @@ class Run:
         self.paused = None
         self.fleet.paused = self.stalled is not None
         self.fleet.jobs.clear_failures()
-        self._forgiven = set(self.generations.redrawn)
+        self._limit_from = self.generation.number + 1
+        self._journal.set_fact(LIMIT_FROM, str(self._limit_from))
         self.fleet.jobs.offer(self.background_jobs.retry_failed())
         if self.generation.failed:
             self._journal.drop_failures(self.generation.number)
@@ -239,24 +239,32 @@ class Run:
         if self.paused is not None:
             return
         if (why := self._too_many_failures()) is not None:
-            self.pause(f"{why} (`dreamfleet runs story` lists why); {REMEDY}")
-        elif is_judged and (failure := judge.find_broken_fleet()) is not None:
-            self.pause(
-                f"no host that is here has ever scored, and every open job failed, such as {failure}; "
-                "`dreamfleet resume` tries them again"
-            )
+            self.pause(f"{why} (`dreamfleet runs story` lists why)")
+        elif is_judged and (failure := judge.find_broken_fleet(at_once=self.failure_limit < 1)) is not None:
+            proof = self.generations.find_scored(self.generation)
+            if proof is None or not self.fleet.jobs.offer_proof(proof):
+                self.pause(
+                    f"no host that is here has ever scored, and every job that it tried failed, such as {failure}; "
+                    "`dreamfleet resume` tries them again"
+                )
         elif not is_judged and (failure := judge.find_pausing()) is not None:
             self.pause(f"{failure}; `dreamfleet resume` tries it again")
 
     def _too_many_failures(self) -> str | None:
         """What failed so often that the run pauses, in words; `None` if nothing did."""
-        generation, size = self.generation, self.generation.population
-        failed = len((self.generations.redrawn - self._forgiven).union(generation.failed))
-        if failed > self.failure_limit * size:
-            return f"{failed} of {plural(size, 'candidate')} failed in generation {generation.number}"
-        if generation.all_failed and not self.generations.can_redraw:
-            return f"all candidates failed in generation {generation.number}, so that none can be ranked"
-        return self.background_jobs.too_many_failed
+        generation = self.generation
+        failed, counted = self.generations.count_recent_failures(generation, self._limit_from)
+        total = len(counted) * generation.population
+        if failed > self.failure_limit * total:
+            first, last = counted[0], counted[-1]
+            where = f"generation {last}" if first == last else f"generations {first} to {last}"
+            return f"{failed} of {plural(total, 'candidate')} failed in {where}; {REMEDY}"
+        if generation.all_failed and not self.generations.can_try_again(generation):
+            return (
+                f"all candidates failed in generation {generation.number} on each set of seeds, so that none can be "
+                "ranked; `dreamfleet resume` tries them again, `dreamfleet fork` begins another run at the mean"
+            )
+        return None
 
     def _record_failure(self, failure: JobFailure) -> None:
         """Journal that a job's episode fails wherever it is scored; it is wanted no more."""
@@ -324,7 +332,7 @@ class Run:
         reason = self._stop_reason(generation)
         self.fleet.jobs.offer(self.background_jobs.schedule(closed.number, mean, now, last=reason is not None))
         self._note_stage_changes(generation)
-        self.generation, self._forgiven = generation, set()
+        self.generation = generation
         self.work_clock.restart()
         self._prepare_fleet(generation)
         if reason:
@@ -372,13 +380,12 @@ class Run:
 
     def _finish(self) -> None:
         """Once a limit is reached and no background job is left: confirm the reported mean, then end the run."""
-        waiting = self.background_jobs.in_progress or self.background_jobs.too_many_failed is not None
-        if self._ending is None or waiting or self.ended is not None:
+        if self._ending is None or self.background_jobs.in_progress or self.ended is not None:
             return
         if work := self.background_jobs.confirm():
             self.fleet.notes.append(self.background_jobs.round_description)
             self.fleet.jobs.offer(work)
-        elif self.background_jobs.too_many_failed is None:
+        else:
             self._end()
 
     def _begin_ending(self, reason: str) -> None:

@@ -382,7 +382,7 @@ class NetworkConfig:
         0.25, "share of a busy fleet's time for evaluations, 0 to 0.9; 0: only idle slots"
     )  # the search needs the rest
     failure_limit: Annotated[float, Between(0.0, 1.0)] = option(
-        0.5, "pause when more than this share of a generation's candidates failed, 0 to 1"
+        0.5, "pause when more than this share of the last five generations' candidates failed, 0 to 1"
     )
     strict: bool = option(
         False,

@@ -186,6 +186,10 @@ class Journal(JournalConnection):
         """Write for how long the open generation could be scored so far."""
         self._write("UPDATE generation SET seconds = ? WHERE number = ?", seconds, generation)
 
+    def set_seeds(self, generation: int, seeds: Sequence[int]) -> None:
+        """Write other seeds of the open generation."""
+        self._write("UPDATE generation SET seeds = ? WHERE number = ?", json.dumps(list(seeds)), generation)
+
     def redraw(self, generation: int, indices: Sequence[int], vectors: Sequence[bytes]) -> None:
         """Write the new vectors of candidates that failed; the old ones are kept by round."""
         (rounds,) = self._read_row("SELECT count(DISTINCT round) FROM redraw WHERE generation = ?", generation)

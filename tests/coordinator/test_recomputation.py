@@ -63,15 +63,20 @@ class Recomputed:
                     "SELECT generation, vector, mean, std FROM evaluation ORDER BY generation"
                 )
             }
+            self.events = [text for (text,) in journal.execute("SELECT text FROM event")]
+            drawn = {number: set(json.loads(seeds)) for number, seeds, *_ in self.generations}  # the last ones
             self.results = {}
             for kind, generation, candidate, episode, seed, fitness, steps in journal.execute(
                 "SELECT kind, generation, candidate, episode, seed, fitness, steps FROM result"
             ):
-                self.results.setdefault((kind, generation, candidate), {})[episode] = seed, fitness, steps
+                if kind != "score" or seed in drawn[generation]:
+                    self.results.setdefault((kind, generation, candidate), {})[episode] = seed, fitness, steps
             self.failed = {}
-            for kind, generation, candidate, episode in journal.execute(
-                "SELECT kind, generation, candidate, episode FROM failure"
+            for kind, generation, candidate, episode, seed in journal.execute(
+                "SELECT kind, generation, candidate, episode, seed FROM failure"
             ):
+                if kind == "score" and seed not in drawn[generation]:
+                    continue
                 self.failed.setdefault((kind, generation, candidate), set()).add(episode)
         self.settings = json.loads(self.facts["settings"])
 
@@ -271,10 +276,13 @@ def test_a_run_is_what_its_journal_comes_to(processes, random_bundle, kind):
 
 @pytest.mark.slow
 def test_a_run_with_failures_is_what_its_journal_comes_to(processes, random_bundle):
-    answer = started(processes, "brittle", random_bundle, "--evaluation-episodes", 9, task=BRITTLE)
+    answer = started(
+        processes, "brittle", random_bundle, "--evaluation-episodes", 9, "--failure-limit", 1, task=BRITTLE
+    )
     found = Recomputed(processes.runs / "brittle" / "journal.sqlite")
     kinds = {kind for kind, _, _ in found.failed}
     assert kinds == {"score", "evaluate"}, "choose another seed"
+    assert any("it gets other seeds" in each for each in found.events), "choose another seed"
     check_search(found)
     check_scores(processes, "brittle", found, answer)
     check_status(processes, "brittle", found)

@@ -163,6 +163,9 @@ class MemoryJournal:
     def drop_failures_of(self, digests: Sequence[bytes]) -> None:
         """There are none."""
 
+    def set_seeds(self, generation: int, seeds: Sequence[int]) -> None:
+        """A simulated run pauses at a failure instead."""
+
     def redraw(self, generation: int, indices: Sequence[int], vectors: Sequence[bytes]) -> None:
         raise Violation("raised", "a simulated run pauses where an episode fails")
 

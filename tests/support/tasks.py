@@ -102,7 +102,7 @@ class Rounded(Toy):
 
 
 class Brittle(Toy):
-    """A tenth of the episodes raises, by parameters and seed."""
+    """A tenth of the episodes raises by parameters and seed; one seed in 20 raises for all parameters."""
 
     name = BRITTLE
 
@@ -111,8 +111,13 @@ class Brittle(Toy):
 
 
 class BrittleEnvironment(ToyEnvironment):
+    def reset(self, *, seed=None, options=None):
+        self._is_barred = seed is not None and seed % 20 == 1
+        return super().reset(seed=seed, options=options)
+
     def step(self, action):
-        if self._left == 7 and hashlib.sha256(action.tobytes() + self._target.tobytes()).digest()[0] < 26:
+        word = hashlib.sha256(action.tobytes() + self._target.tobytes()).digest()[0]
+        if self._left == 7 and (self._is_barred or word < 26):
             raise ArithmeticError(f"the world of {id(self)} is brittle")
         return super().step(action)
 

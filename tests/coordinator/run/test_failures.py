@@ -1,5 +1,6 @@
 """Candidates whose episodes fail wherever they are scored."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,12 +8,14 @@ import pytest
 
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.seeds import training_seed
 from dreamfleet.coordinator.settings.config import LimitsConfig
 from tests.coordinator.run.test_run import SETTINGS as TWO
 from tests.coordinator.run.test_run import A, B, Bench
 
 SETTINGS = replace(TWO, population=6, episodes=2, collect_every=0, on_failure="worst")
 GENERATIONS = 3
+NEW = "new/1"
 
 
 class Failing(Bench):
@@ -176,6 +179,53 @@ def test_all_candidates_failing_is_a_pause_that_says_so_whatever_the_limit(tmp_p
     bench.journal.close()
 
 
+def test_one_generation_with_many_failures_does_not_pause_a_run_that_had_few(failing):
+    bench = failing("night", fails=lambda job: job.kind == "score" and job.generation == 2 and job.candidate > 1)
+    assert bench.run.ended
+    assert [each.failed for each in bench.run.history.rows] == [0, 0, 4]
+
+
+def test_after_resume_the_same_failures_do_not_pause_the_generation_again(tmp_path, random_bundle):
+    bench = Failing(
+        tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate > 1 - job.generation
+    )
+    bench.serve()
+    assert "failed in generation 0" in bench.run.paused
+    bench.run.resume()
+    bench.serve()
+    assert "failed in generation 1" in bench.run.paused
+    assert bench.run.history.rows[0].failed == 4
+    bench.journal.close()
+
+
+@pytest.mark.parametrize("on_failure", ["worst", "redraw"])
+def test_a_seed_on_which_all_candidates_fail_is_replaced_with_the_same_bits_through_restarts(
+    failing, tmp_path, random_bundle, on_failure
+):
+    settings = replace(SETTINGS, on_failure=on_failure)
+    bad = {training_seed(settings.seed, 1, each) for each in (0, 1, 3)}  # so it takes two other sets of seeds
+
+    def fails(job):
+        return job.seeds[0] in bad
+
+    bench = failing("whole", settings=settings, fails=fails)
+    whole = bench.story()
+    assert bench.run.ended
+    assert [each.failed for each in whole[0]] == [0, 6, 0]
+    with RunFolder(bench.path) as folder:
+        texts = [each.text for each in folder.events()]
+        assert texts.count("all candidates failed in generation 1: it gets other seeds") == 2
+    (seeds,) = bench.journal._connection.execute("SELECT seeds FROM generation WHERE number = 1").fetchone()
+    assert json.loads(seeds) == [training_seed(settings.seed, 1, each) for each in (4, 5)]
+    killed = Failing(tmp_path / "killed" / "night", random_bundle.path, settings, fails=fails)
+    while not killed.run.ended:
+        killed.serve(stop=lambda run: run.fleet.counts["accepted"] + run.fleet.counts["errors"] > 26)
+        if not killed.run.ended:
+            killed.restart()
+    assert killed.story() == whole
+    killed.journal.close()
+
+
 def test_redraws_count_each_candidate_once_and_go_on_where_all_failed(tmp_path, random_bundle):
     settings = replace(SETTINGS, on_failure="redraw")
     first = []
@@ -220,21 +270,63 @@ def test_a_host_that_never_scored_condemns_nobody(tmp_path, random_bundle):
     bench.journal.close()
 
 
-def test_an_evaluation_of_which_most_episodes_failed_pauses_and_resume_drives_these_again(tmp_path, random_bundle):
-    settings = replace(SETTINGS, evaluate_every=1, evaluation_episodes=3, confirm_episodes=4)
-    for name, part in (("evaluation", 0), ("confirmation", 20_000)):
-        bench = Failing(tmp_path / name / "night", random_bundle.path, settings, fails=None)
-        bench.fails = lambda job, part=part: job.kind == "evaluate" and job.episode >= part
+@pytest.fixture
+def left(tmp_path, random_bundle):
+    """A run whose only host is gone; all open jobs failed on it once."""
+    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate < 2)
+    bench.hosts = [A]
+    bench.run.fleet.handle_departure(B, bench.now)
+    answer = bench.answer_one
+    bench.answer_one = lambda name, job: bench.run.fleet.jobs[job.digest].attempts or answer(name, job)
+    bench.serve(stop=lambda run: len(run.fleet.jobs.failures) == len(run.fleet.jobs) == 4)
+    bench.answer_one = answer
+    bench.run.fleet.handle_departure(A, bench.now)
+    yield bench
+    bench.journal.close()
+
+
+def replace_host(bench):
+    bench.now += 1.0
+    bench.run.tick(bench.now)
+    bench.hosts = [NEW]
+    bench.run.admission.admit(bench.request(NEW), bench.now)
+    bench.serve()
+
+
+def test_a_run_without_hosts_waits_for_them_though_every_open_job_failed(left):
+    for _ in range(3):
+        left.run.advance(left.now)
+        assert left.run.paused is None
+        left.now += 1.0
+        left.run.tick(left.now)
+    assert left.run.state == "waiting for workers"
+
+
+def test_a_new_host_proves_itself_on_a_job_that_was_scored_before(left):
+    """Only jobs that fail are open when it comes: nothing else would show that it can score."""
+    replace_host(left)
+    assert left.run.ended
+    assert [each.failed for each in left.run.history.rows] == [2] * GENERATIONS
+    assert left.run.fleet.counts["duplicate"] == 1
+
+
+def test_a_new_host_that_fails_the_proof_pauses_the_run(left):
+    left.fails = lambda job: True
+    replace_host(left)
+    assert "no host that is here has ever scored" in left.run.paused
+    assert left.run.generation.failed == []
+
+
+def test_a_run_that_nobody_can_score_pauses_before_every_job_was_tried(tmp_path, random_bundle):
+    settings = replace(SETTINGS, population=40)
+    for limit, tried in ((0.5, 10), (1.0, 80)):
+        bench = Failing(
+            tmp_path / str(tried) / "night", random_bundle.path, settings, fails=lambda job: True, limit=limit
+        )
         bench.serve()
-        assert f"of the {name}" in bench.run.paused
-        bench.restart()
-        bench.serve()
-        assert f"of the {name}" in bench.run.paused, "a restart alone changes nothing"
-        bench.fails = lambda job: False
-        bench.run.resume()
-        bench.serve()
-        assert bench.run.ended
-        assert bench.run.confirmed.failed == 0
+        assert "no host that is here has ever scored" in bench.run.paused
+        assert (len(bench.run.fleet.jobs.failures) < 80) == (tried < 80)
+        assert sum("it is tried again" in each for each in bench.run.take_notes()) == 1
         bench.journal.close()
 
 
