@@ -31,6 +31,7 @@ from dreamfleet.common.runs.records import (
     StoredConfirmation,
     StoredEvaluation,
     StoredGeneration,
+    count_episodes,
     format_mean,
 )
 from dreamfleet.common.runs.stages import describe_steps
@@ -227,7 +228,7 @@ def _describe_optimiser(settings: RunSettings) -> str:
 def _describe_evaluation(each: StoredEvaluation | StoredConfirmation | None) -> str:
     if each is None:
         return "-"
-    seeds = plural(each.episodes, "fresh seed" if isinstance(each, StoredConfirmation) else "seed")
+    seeds = count_episodes(each, "fresh seed" if isinstance(each, StoredConfirmation) else "seed")
     return f"{format_mean(each)} on {seeds} (generation {each.generation})"
 
 
@@ -239,7 +240,7 @@ def _describe_reported(status: Status) -> str:
 
 def _describe_failure(failure: FailureStatus) -> str:
     worker, error = next(iter(failure.errors.items()), ("a worker", "no reason was given"))
-    return f"candidate {failure.candidate} failed on {worker}: {error}; it is tried again"
+    return f"{failure.subject}, failed on {worker}: {error}; it is tried again"
 
 
 def _progress_lines(status: Status, width: int) -> Iterator[Text]:
@@ -266,7 +267,11 @@ def _candidate_lines(status: Status, population: Population, width: int, lines: 
     done, wanted = episodes.episodes_done, episodes.episodes
     if population.generation != status.generation.number:
         done, wanted = sum(population.done), sum(population.wanted)
-    parts = [f"{done:,}/{wanted:,} episodes"]
+    failed = sum(each.has_failed for each in population.candidates)
+    if failed == population.total:
+        parts = ["all candidates failed"]
+    else:
+        parts = [f"{done:,}/{wanted:,} episodes", *([f"{failed} failed (x)"] if failed else [])]
     if found:
         values = [each.fitness or 0.0 for each in found]
         parts.append(f"so far {min(values):.0f} to {max(values):.0f}")

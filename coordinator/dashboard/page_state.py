@@ -12,7 +12,13 @@ from dreamfleet.common.monitoring.status import Population, Status, WorkerStatus
 from dreamfleet.common.printable import plural, printable
 from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.effort import format_steps
-from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs.records import (
+    RunSettings,
+    StoredConfirmation,
+    StoredEvaluation,
+    StoredGeneration,
+    count_episodes,
+)
 from dreamfleet.common.runs.run_paths import resume_command
 from dreamfleet.common.runs.stages import describe_steps
 from dreamfleet.common.runs.standard_error import format_with_error
@@ -128,7 +134,7 @@ def _reported_caption(reported: StoredEvaluation | StoredConfirmation | None) ->
     if reported is None:
         return "no evaluation yet"
     kind = "confirmed" if isinstance(reported, StoredConfirmation) else "provisional"
-    return f"{kind}, generation {reported.generation}, {reported.episodes} episodes"
+    return f"{kind}, generation {reported.generation}, {count_episodes(reported)}"
 
 
 def _candidates(parts: Sequence[Population], status: Status) -> dict[str, Any]:
@@ -198,7 +204,7 @@ def _problems(status: Status) -> list[str]:
     for failure in status.failures:
         for worker, error in failure.errors.items():
             times = failure.attempts.get(worker, 1)
-            found.append(f"candidate {failure.candidate} failed on {worker} ({times}x): {error}")
+            found.append(f"{failure.subject}, failed on {worker} ({times}x): {error}")
     return [printable(each) for each in found]
 
 
