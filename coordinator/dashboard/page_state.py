@@ -78,8 +78,8 @@ def _lost_sentence(look: RunSnapshot) -> str:
         ("dreamfleet coordinator --resume", look.status.run) if look.folder is None else (resume_command(look.folder),)
     )
     return (
-        "nobody answers for it: its coordinator was killed, or the network is cut. The page goes on once it is back; "
-        f"after a kill: {printable(' '.join(words))}, with {rest}"
+        "nobody answers for it: its coordinator was killed, or the network is cut. The page goes on once it is back. "
+        f"After a kill, continue it: {printable(' '.join(words))}, with {rest}"
     )
 
 
