@@ -236,7 +236,7 @@ def _describe_evaluating(status: Status) -> str:
 def _describe_waiting(status: Status) -> str:
     if status.refused:
         name, why = next(iter(status.refused.items()))
-        return f"waiting for workers; {name} cannot join: {why}"
+        return f"waiting for workers; {name} was refused: {why}"
     known = status.workers.known
     if not known and not status.throughput.environment_steps:
         return "waiting for workers: none has joined yet"

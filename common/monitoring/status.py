@@ -262,6 +262,11 @@ class Status:
         """Whether the run ended or its coordinator leaves it open."""
         return self.state in FINAL_STATES
 
+    @property
+    def refusals(self) -> list[str]:
+        """A sentence on each worker that was refused, as long as the run goes on."""
+        return [] if self.is_over else [f"worker {name} was refused: {why}" for name, why in self.refused.items()]
+
 
 def read_status(document: dict[str, Any]) -> Status:
     """Parse a `status` reply; fields of later versions are ignored.

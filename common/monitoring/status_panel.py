@@ -119,6 +119,9 @@ def _blocks(status: Status, width: int, worker_flags: str) -> Iterator[Block]:
     yield _text_block(0, Text(printable(describe_state(status)), style=state), width, min_lines=2)
     if status.failures and not status.why:
         yield _text_block(1, Text(printable(_describe_failure(status.failures[0])), style="red"), width, min_lines=1)
+    if status.worker_list:  # else they stand in its place
+        for each in status.refusals:
+            yield _text_block(1, Text(printable(each), style="yellow"), width, min_lines=1)
     if not status.is_over:
         yield _text_block(2, Text(printable(estimate_eta(status).description)), width, min_lines=1)
     if progress := list(_progress_lines(status, width)):
@@ -327,11 +330,10 @@ def _workers_block(status: Status, width: int, worker_flags: str) -> Block:
         roster = WorkerTable(status.worker_list, status.workers.known)
         height = roster.height(width)
         return Block(6, min(3, height), min(8, height), height, lambda given: roster.lines(width, given))
-    messages = [f"worker {name} cannot join: {why}" for name, why in status.refused.items()]
     task = status.settings.task.task
     task_flag = f" --task {task}" if is_unregistered(task) else ""
     none = "no worker is present" if status.throughput.environment_steps else "no workers yet"
-    messages = messages or [
+    messages = status.refusals or [
         f"{none}; start one with",
         f"dreamfleet worker --run {status.run} {worker_flags}{task_flag}",
     ]

@@ -200,7 +200,7 @@ def _waste(status: Status) -> Facts:
 
 def _problems(status: Status) -> list[str]:
     """Problems that may need action."""
-    found = [f"worker {name} cannot join: {why}" for name, why in status.refused.items()]
+    found = status.refusals
     for failure in status.failures:
         for worker, error in failure.errors.items():
             times = failure.attempts.get(worker, 1)

@@ -147,6 +147,13 @@ def test_a_failure_is_named_by_what_it_scores():
     )
 
 
+def test_a_refused_worker_is_told_beside_those_that_are_here():
+    refused = dataclasses.replace(STATUS, refused={"vm": "no gymnasium"})
+    assert "worker vm was refused: no gymnasium" in drawn(refused, 80)
+    assert "worker vm was refused: no gymnasium" in drawn(dataclasses.replace(refused, worker_list=()), 80)
+    assert "refused" not in drawn(dataclasses.replace(refused, state="ended", why="stopped"), 80)
+
+
 def test_failed_episodes_of_an_evaluation_are_told():
     evaluated = dataclasses.replace(STATUS.best, failed=1)
     assert "on 16 seeds; 1 more episode failed (generation 4)" in drawn(

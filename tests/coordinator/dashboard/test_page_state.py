@@ -50,6 +50,12 @@ def test_a_lost_run_with_its_journal_here_shows_the_whole_command():
     assert f"--resume {STATUS.run}, with --runs-dir and --join" in page_state(look(101.0))["sentence"]
 
 
+def test_a_refused_worker_is_told_as_long_as_the_run_goes_on():
+    refused = {"vm": "no gymnasium"}
+    assert page_state(look(refused=refused, failures=()))["troubles"] == ["worker vm was refused: no gymnasium"]
+    assert page_state(look(refused=refused, failures=(), state="ended"))["troubles"] == []
+
+
 def test_failures_and_failed_episodes_are_named():
     failure = FailureStatus("4/0", "evaluate", (20003,), {"host-a": "no road"}, {"host-a": 2})
     document = page_state(look(failures=(failure,), best=replace(STATUS.best, failed=1)))
