@@ -52,7 +52,8 @@ class Eta:
         if self.pace is not None:
             parts.append(f"{format_duration(self.pace)} a generation")
         if self.seconds is not None:
-            parts.append(f"about {format_duration(self.seconds)} to go" if self.seconds >= 1 else "about to end")
+            near = "less than a second to go" if self.seconds > 0 and self.limit else "about to end"
+            parts.append(f"about {format_duration(self.seconds)} to go" if self.seconds >= 1 else near)
         elif self.limit is not None:
             parts += [f"about {format_duration(self.limit)} to its limit"] if self.limit >= 1 else []
             parts.append(f"then {plural(self.closing, 'episode')} of evaluation")
@@ -89,8 +90,10 @@ def summarise_status(status: Status) -> str:
     workers, slots = plural(status.workers.present, "worker"), plural(status.slots, "slot")
     lost = f", {status.workers.lost} lost" if status.workers.lost else ""
     lost += f", {status.workers.left} left" if status.workers.left else ""
+    failed = status.failed + opened.failed
+    failures = f", {plural(failed, 'failed candidate')}" if failed else ""
     return (
-        f"{status.state}, generation {opened.number} ({opened.episodes_done}/{opened.episodes} episodes), {score}, "
+        f"{_summarise_progress(status)}{failures}, {score}, "
         f"{status.throughput.steps_per_second:,.0f} steps/s, {workers} with {slots}{lost}, "
         f"{estimate_eta(status).description}"
     )
@@ -204,8 +207,21 @@ def _format_minutes(value: float) -> str:
     return f"{value:,.0f}" if value >= 10 or value == int(value) else f"{value:.1f}"
 
 
+def _summarise_progress(status: Status) -> str:
+    """The state, and the generation that is scored in it; near the run's end none is."""
+    if status.state == "evaluating":
+        return _describe_evaluating(status)
+    if _is_limit_reached(status):
+        return status.state
+    opened = status.generation
+    episodes = f"{opened.episodes_done}/{opened.episodes} episodes" if opened.episodes else "all candidates failed"
+    return f"{status.state}, generation {opened.number} ({episodes})"
+
+
 def _describe_running(status: Status) -> str:
     open_one = status.generation
+    if not open_one.episodes:
+        return f"generation {open_one.number}: all candidates failed"
     return f"generation {open_one.number}: {open_one.episodes_done:,} of {open_one.episodes:,} episodes"
 
 
@@ -220,7 +236,7 @@ def _describe_evaluating(status: Status) -> str:
 def _describe_waiting(status: Status) -> str:
     if status.refused:
         name, why = next(iter(status.refused.items()))
-        return f"waiting for workers; {name} cannot join: {why}"
+        return f"waiting for workers; {name} was refused: {why}"
     known = status.workers.known
     if not known and not status.throughput.environment_steps:
         return "waiting for workers: none has joined yet"

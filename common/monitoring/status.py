@@ -10,6 +10,7 @@ import json
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
+from dreamfleet.common.protocol.failures import describe_job
 from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, HostClass
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
@@ -79,6 +80,11 @@ class Candidate:
     done: int
     wanted: int
     fitness: float | None  # `None` before the first episode
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether an episode failed for good, so that none is wanted any more."""
+        return self.wanted == 0
 
 
 @dataclass(frozen=True)
@@ -195,6 +201,12 @@ class FailureStatus:
     errors: dict[str, str]  # the last error of each worker
     attempts: dict[str, int]  # failures of each worker
 
+    @property
+    def subject(self) -> str:
+        """What the job scores, in words, with its seeds."""
+        generation, _, index = self.candidate.partition("/")
+        return describe_job(self.kind, generation, index, self.seeds)
+
 
 @dataclass(frozen=True)
 class Status:
@@ -249,6 +261,11 @@ class Status:
     def is_over(self) -> bool:
         """Whether the run ended or its coordinator leaves it open."""
         return self.state in FINAL_STATES
+
+    @property
+    def refusals(self) -> list[str]:
+        """A sentence on each worker that was refused, as long as the run goes on."""
+        return [] if self.is_over else [f"worker {name} was refused: {why}" for name, why in self.refused.items()]
 
 
 def read_status(document: dict[str, Any]) -> Status:

@@ -31,6 +31,7 @@ from dreamfleet.common.runs.records import (
     StoredConfirmation,
     StoredEvaluation,
     StoredGeneration,
+    count_episodes,
     format_mean,
 )
 from dreamfleet.common.runs.stages import describe_steps
@@ -118,6 +119,9 @@ def _blocks(status: Status, width: int, worker_flags: str) -> Iterator[Block]:
     yield _text_block(0, Text(printable(describe_state(status)), style=state), width, min_lines=2)
     if status.failures and not status.why:
         yield _text_block(1, Text(printable(_describe_failure(status.failures[0])), style="red"), width, min_lines=1)
+    if status.worker_list:  # else they stand in its place
+        for each in status.refusals:
+            yield _text_block(1, Text(printable(each), style="yellow"), width, min_lines=1)
     if not status.is_over:
         yield _text_block(2, Text(printable(estimate_eta(status).description)), width, min_lines=1)
     if progress := list(_progress_lines(status, width)):
@@ -227,7 +231,7 @@ def _describe_optimiser(settings: RunSettings) -> str:
 def _describe_evaluation(each: StoredEvaluation | StoredConfirmation | None) -> str:
     if each is None:
         return "-"
-    seeds = plural(each.episodes, "fresh seed" if isinstance(each, StoredConfirmation) else "seed")
+    seeds = count_episodes(each, "fresh seed" if isinstance(each, StoredConfirmation) else "seed")
     return f"{format_mean(each)} on {seeds} (generation {each.generation})"
 
 
@@ -239,7 +243,7 @@ def _describe_reported(status: Status) -> str:
 
 def _describe_failure(failure: FailureStatus) -> str:
     worker, error = next(iter(failure.errors.items()), ("a worker", "no reason was given"))
-    return f"candidate {failure.candidate} failed on {worker}: {error}; it is tried again"
+    return f"{failure.subject}, failed on {worker}: {error}; it is tried again"
 
 
 def _progress_lines(status: Status, width: int) -> Iterator[Text]:
@@ -266,7 +270,11 @@ def _candidate_lines(status: Status, population: Population, width: int, lines: 
     done, wanted = episodes.episodes_done, episodes.episodes
     if population.generation != status.generation.number:
         done, wanted = sum(population.done), sum(population.wanted)
-    parts = [f"{done:,}/{wanted:,} episodes"]
+    failed = sum(each.has_failed for each in population.candidates)
+    if failed == population.total:
+        parts = ["all candidates failed"]
+    else:
+        parts = [f"{done:,}/{wanted:,} episodes", *([f"{failed} failed (x)"] if failed else [])]
     if found:
         values = [each.fitness or 0.0 for each in found]
         parts.append(f"so far {min(values):.0f} to {max(values):.0f}")
@@ -322,11 +330,10 @@ def _workers_block(status: Status, width: int, worker_flags: str) -> Block:
         roster = WorkerTable(status.worker_list, status.workers.known)
         height = roster.height(width)
         return Block(6, min(3, height), min(8, height), height, lambda given: roster.lines(width, given))
-    messages = [f"worker {name} cannot join: {why}" for name, why in status.refused.items()]
     task = status.settings.task.task
     task_flag = f" --task {task}" if is_unregistered(task) else ""
     none = "no worker is present" if status.throughput.environment_steps else "no workers yet"
-    messages = messages or [
+    messages = status.refusals or [
         f"{none}; start one with",
         f"dreamfleet worker --run {status.run} {worker_flags}{task_flag}",
     ]

@@ -10,7 +10,7 @@ from rich.text import Text
 from dreamfleet.common.monitoring.status import Candidate, Population
 
 EIGHTHS = " ▁▂▃▄▅▆▇█"
-WAITING = "·"
+WAITING, FAILED = "·", "x"
 
 
 def bar_chart(values: Sequence[float], rows: int) -> list[str]:
@@ -30,7 +30,7 @@ def share_bar(share: float, width: int) -> str:
 def candidate_grid(population: Population, width: int, lines: int) -> list[Text]:
     """A cell for each candidate, or for several if there are too many; the best one so far is highlighted.
 
-    At most `lines` lines of at most `width` columns.
+    A cell whose candidates all failed has its own sign. At most `lines` lines of at most `width` columns.
     """
     found = population.candidates
     group_size = max(1, ceil(len(found) / (width * lines)))
@@ -54,6 +54,8 @@ def _fitness(each: Candidate) -> float:
 
 def _cell(group: Sequence[Candidate], best: Candidate | None) -> tuple[str, str]:
     done, wanted = sum(each.done for each in group), sum(each.wanted for each in group)
+    if all(each.has_failed for each in group):
+        return FAILED, "red"
     if not done:
         return WAITING, "dim"
     if best in group:

@@ -1,6 +1,8 @@
-"""What a worker's error says: its cause, and whether the host is at fault rather than the job."""
+"""What failed, in words, and what a worker's error says: its cause, and whether the host is at fault."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 HOST_PREFIX = "host: "
 
@@ -21,3 +23,18 @@ def is_host_failure(error: str) -> bool:
     True
     """
     return error.startswith(HOST_PREFIX)
+
+
+def describe_job(kind: str, generation: int | str, candidate: int | str, seeds: Sequence[int]) -> str:
+    """What a job scores, in words, with its seeds.
+
+    >>> describe_job("score", 7, 2, (1048576,))
+    'candidate 7/2, seed 1048576'
+    >>> describe_job("evaluate", 7, 0, (20003,))
+    "the evaluation of generation 7's mean, seed 20003"
+    """
+    words = {
+        "evaluate": f"the evaluation of generation {generation}'s mean",
+        "collect": f"a kept rollout of generation {generation}'s mean",
+    }
+    return f"{words.get(kind, f'candidate {generation}/{candidate}')}, seed {', '.join(map(str, seeds))}"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
@@ -92,10 +93,18 @@ def load_task(name: str) -> Any:
 
 def _task_class(module: Any, name: str) -> Any:
     """A task's class in a module; `TypeError` for anything else, as the name may come from an untrusted file."""
+    if not hasattr(module, name) and _names_environment(name):
+        written = f"{GYM}:{module.__name__}:{name}"
+        raise AttributeError(f"{module.__name__} has no class {name}; write {written} if that is its environment")
     found = getattr(module, name)
     if not isinstance(found, type):
         raise TypeError(f"{name} of {module.__name__} is not a task: it is not a class")
     return found
+
+
+def _names_environment(name: str) -> bool:
+    """Whether a name looks like one of gymnasium's environments, or a module that was imported registered it."""
+    return bool(_ENVIRONMENT.search(name)) or name in getattr(sys.modules.get("gymnasium"), "registry", ())
 
 
 def is_self_describing(name: str) -> bool:
@@ -108,6 +117,8 @@ def is_self_describing(name: str) -> bool:
     try:
         return callable(getattr(load_task(name), "describe", None))
     except UsageError as error:
+        if isinstance(error.__cause__, (AttributeError, TypeError)):
+            raise  # its module is here
         raise UsageError(f"{error}; if only workers have it, name its world model with --bundle") from error
 
 

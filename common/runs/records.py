@@ -273,12 +273,20 @@ def describe_score(found: StoredEvaluation | StoredConfirmation | None) -> str:
         return "the last mean; it was not evaluated"
     score = f"generation {found.generation}'s mean scored {format_mean(found)}"
     score += " (standard error)" if found.error is not None else ""
-    failed = f"; {plural(found.failed, 'more episode')} failed" if found.failed else ""
     if isinstance(found, StoredConfirmation):
-        seeds = plural(found.episodes, "fresh validation seed")
-        return f"{score} on {seeds}{failed}; confirmed: they took no part in its choice"
-    seeds = plural(found.episodes, "validation seed")
-    return f"{score} on {seeds}{failed}; provisional: it is the best of all looks so far"
+        seeds = count_episodes(found, "fresh validation seed")
+        return f"{score} on {seeds}; confirmed: they took no part in its choice"
+    return f"{score} on {count_episodes(found, 'validation seed')}; provisional: it is the best of all looks so far"
+
+
+def count_episodes(found: StoredEvaluation | StoredConfirmation, noun: str = "episode") -> str:
+    """The number of episodes that a score is the mean of, each called `noun`, and of those that failed.
+
+    >>> count_episodes(StoredEvaluation(4, 19, -3.6, 2.5, failed=1), "seed")
+    '19 seeds; 1 more episode failed'
+    """
+    failed = f"; {plural(found.failed, 'more episode')} failed" if found.failed else ""
+    return f"{plural(found.episodes, noun)}{failed}"
 
 
 def format_mean(found: StoredEvaluation | StoredConfirmation) -> str:

@@ -12,7 +12,13 @@ from dreamfleet.common.monitoring.status import Population, Status, WorkerStatus
 from dreamfleet.common.printable import plural, printable
 from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.effort import format_steps
-from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs.records import (
+    RunSettings,
+    StoredConfirmation,
+    StoredEvaluation,
+    StoredGeneration,
+    count_episodes,
+)
 from dreamfleet.common.runs.run_paths import resume_command
 from dreamfleet.common.runs.stages import describe_steps
 from dreamfleet.common.runs.standard_error import format_with_error
@@ -72,8 +78,8 @@ def _lost_sentence(look: RunSnapshot) -> str:
         ("dreamfleet coordinator --resume", look.status.run) if look.folder is None else (resume_command(look.folder),)
     )
     return (
-        "nobody answers for it: its coordinator was killed, or the network is cut. The page goes on once it is back; "
-        f"after a kill: {printable(' '.join(words))}, with {rest}"
+        "nobody answers for it: its coordinator was killed, or the network is cut. The page goes on once it is back. "
+        f"After a kill, continue it: {printable(' '.join(words))}, with {rest}"
     )
 
 
@@ -128,7 +134,7 @@ def _reported_caption(reported: StoredEvaluation | StoredConfirmation | None) ->
     if reported is None:
         return "no evaluation yet"
     kind = "confirmed" if isinstance(reported, StoredConfirmation) else "provisional"
-    return f"{kind}, generation {reported.generation}, {reported.episodes} episodes"
+    return f"{kind}, generation {reported.generation}, {count_episodes(reported)}"
 
 
 def _candidates(parts: Sequence[Population], status: Status) -> dict[str, Any]:
@@ -194,11 +200,11 @@ def _waste(status: Status) -> Facts:
 
 def _problems(status: Status) -> list[str]:
     """Problems that may need action."""
-    found = [f"worker {name} cannot join: {why}" for name, why in status.refused.items()]
+    found = status.refusals
     for failure in status.failures:
         for worker, error in failure.errors.items():
             times = failure.attempts.get(worker, 1)
-            found.append(f"candidate {failure.candidate} failed on {worker} ({times}x): {error}")
+            found.append(f"{failure.subject}, failed on {worker} ({times}x): {error}")
     return [printable(each) for each in found]
 
 

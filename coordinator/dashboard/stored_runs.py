@@ -17,6 +17,7 @@ from dreamfleet.common.runs.records import (
     RunSettings,
     StoredGeneration,
     best_evaluation,
+    count_episodes,
     describe_score,
     expand_task_options,
 )
@@ -144,9 +145,10 @@ def _facts(run: RunFolder, data: RunData, total: Effort) -> Facts:
         ("seed", str(settings.seed)),
         ("spent", total.description),
         ("hosts", run.classes.description),
-        ("best evaluation", NONE if best is None else f"{format_score(best)}, generation {best.generation}"),
+        ("best evaluation", NONE if best is None else
+         f"{format_score(best)} on {count_episodes(best, 'seed')}, generation {best.generation}"),
         ("confirmed", NONE if data.confirmed is None else
-         f"{format_score(data.confirmed)} on {data.confirmed.episodes} fresh seeds"),
+         f"{format_score(data.confirmed)} on {count_episodes(data.confirmed, 'fresh seed')}"),
     ]  # fmt: skip
     return [(name, printable(value)) for name, value in facts]
 

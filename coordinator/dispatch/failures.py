@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import dataclass
 
 from dreamfleet.common.printable import truncate
+from dreamfleet.common.protocol.failures import describe_job
 from dreamfleet.coordinator.jobs.work import Work
 
 LONGEST_ERROR = 300  # characters of a worker's error that are shown
@@ -52,12 +53,7 @@ class JobFailure:
     def subject(self) -> str:
         """What the job scores, in words."""
         job = self.work.job
-        words = {
-            "score": f"candidate {job.generation}/{job.candidate}",
-            "evaluate": f"the evaluation of generation {job.generation}'s mean",
-            "collect": f"a kept rollout of generation {job.generation}'s mean",
-        }
-        return f"{words[job.kind]}, seed {', '.join(map(str, job.seeds))},"
+        return f"{describe_job(job.kind, job.generation, job.candidate, job.seeds)},"
 
     def __str__(self) -> str:
         """One sentence for people: what failed, on which workers, how often, and why."""

@@ -69,9 +69,7 @@ class Fleet:
 
     def give_up(self, failure: JobFailure) -> None:
         """Withdraw a job whose episode fails wherever it is scored."""
-        digest = failure.work.job.digest
-        self.event_log.add(self._now, "failed", failure.history[-1].worker, digest)
-        self.withdraw([digest])
+        self.withdraw([failure.work.job.digest])
 
     def add_worker(self, identity: str, slots: int, fingerprint: str, now: float) -> int:
         """Welcome a worker as a guest; return the numbering of its batches.
@@ -160,7 +158,8 @@ class Fleet:
         if lease is not None and work is not None:
             self._speculation.record_duration(now - lease.group.given_at, is_background=lease.is_background)
         if member is not None or verdict == "accepted":
-            self.event_log.add(now, verdict, identity, result.digest)
+            failed = given is not None and result.fitness is None
+            self.event_log.add(now, "failed" if failed else verdict, identity, result.digest)
         if member is not None:
             member.leases.pop(result.digest, None)
             member.verdicts.append(Verdict(result.digest, verdict))

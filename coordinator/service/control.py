@@ -27,7 +27,7 @@ class Control:
         self._beat = beat
         self._stop = stop
         self._verbs: dict[str, Callable[[], None]] = {
-            "pause": lambda: run.pause("by hand"),
+            "pause": lambda: self._pause("by hand"),
             "resume": self._resume,
             "drain": self._drain,
             "stop": stop,
@@ -80,16 +80,22 @@ class Control:
         return _empty_batches(each for each in self._run.fleet.members.values()
                               if each.leaves_with_run and each.gone_since is None)  # fmt: skip
 
+    def _pause(self, why: str) -> None:
+        """Pause the run; an earlier reason is kept behind `why`."""
+        before = self._run.paused
+        if before is None or not before.startswith(why):
+            self._run.pause(why if before is None else f"{why}; before: {before}")
+
     def _resume(self) -> None:
         self._draining = False
         self._run.resume()
 
     def _drain(self) -> None:
         self._draining = True
-        self._run.pause("draining")
+        self._pause("draining")
 
     def _disband(self) -> None:
-        self._run.pause("ending with its workers")
+        self._pause("ending with its workers")
         self._disbanding_since = self._now
 
 

@@ -16,7 +16,7 @@ from typing import Any
 from dreamfleet.common.monitoring.eta import estimate_eta, summarise_status
 from dreamfleet.common.monitoring.status import Status
 from dreamfleet.common.protocol.tasks import is_unregistered
-from dreamfleet.common.runs.records import StoredGeneration, format_mean, with_error
+from dreamfleet.common.runs.records import StoredGeneration, count_episodes, format_mean, with_error
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, Credentials, describe_time_left
 from dreamfleet.common.transport.network import Network, is_loopback
 from dreamfleet.coordinator.run.run import Run
@@ -64,9 +64,10 @@ class RunLog:
         evaluations = self._run.background_jobs.evaluations
         if len(evaluations) > self._evaluations_logged:
             for each in islice(evaluations.finished.values(), self._evaluations_logged, None):  # as they finished
-                log.info("evaluation of generation %d's mean: %s%s, %d episodes",
+                log.info("evaluation of generation %d's mean: %s%s, %s",
                          each.generation, format_mean(each), "" if each.error is None else " (standard error)",
-                         each.episodes, extra={"facts": {"event": "evaluation", **with_error(each)}})  # fmt: skip
+                         count_episodes(each),
+                         extra={"facts": {"event": "evaluation", **with_error(each)}})  # fmt: skip
             self._evaluations_logged = len(evaluations)
 
     def write_notes(self) -> None:
@@ -119,7 +120,7 @@ def summary(status: Status) -> tuple[str, dict[str, Any]]:
         "event": "summary", "state": status.state, "generation": status.generation.number,
         "steps_per_second": status.throughput.steps_per_second, "best": None if best is None else best.mean,
         "best_error": None if best is None else best.error, "workers": status.workers.present, "slots": status.slots,
-        "eta_seconds": estimate_eta(status).seconds,
+        "eta_seconds": estimate_eta(status).seconds, "failed": status.failed + status.generation.failed,
     }  # fmt: skip
     return summarise_status(status), facts
 

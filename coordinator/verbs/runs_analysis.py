@@ -16,7 +16,7 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, open_output
 from dreamfleet.common.printable import format_setting, printable_lines
-from dreamfleet.common.runs.records import format_mean, with_error
+from dreamfleet.common.runs.records import count_episodes, format_mean, with_error
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.standard_error import format_with_error
 
@@ -80,7 +80,7 @@ def _run_row(side: ComparedRun) -> dict[str, object]:
         "task": side.settings.task.task,
         "spent": side.total.description,
         "last evaluation": None if last is None else format_with_error(last.score, last.error),
-        "confirmed": None if confirmed is None else f"{format_mean(confirmed)} on {confirmed.episodes} seeds",
+        "confirmed": None if confirmed is None else f"{format_mean(confirmed)} on {count_episodes(confirmed, 'seed')}",
     }  # fmt: skip
 
 

@@ -103,6 +103,19 @@ def test_pictures_come_with_their_facts_while_somebody_sees_them(browser, proces
 
 
 @pytest.mark.slow
+def test_a_task_without_pictures_takes_no_room_for_them(browser, processes, random_bundle):
+    processes.coordinator("--bundle", random_bundle.path, "--population", 3, "--episodes", 1, "--evaluate-every", 0,
+                          "--task", tasks.SLOW_TOY, "--generations", 1000)  # fmt: skip
+    processes.worker("--task", tasks.SLOW_TOY, "--name", "alpha")
+    with dashboard(processes) as started, tab(browser) as page:
+        page.goto(started.address)
+        page.wait_for_selector("[data-part=view]:not([hidden])").scroll_into_view_if_needed()
+        say(page, "This task shows no picture.")
+        assert facts(page)["worker"].startswith("alpha/")
+        assert page.locator("[data-part=view]").bounding_box()["height"] < 300
+
+
+@pytest.mark.slow
 def test_a_worker_a_mean_and_an_earlier_generations_are_chosen_and_what_is_gone_is_said(browser, processes, run):
     with dashboard(processes, "--views", 1) as started, \
             tab(browser, viewport={"width": 390, "height": 844}, reduced_motion="reduce") as page:  # fmt: skip

@@ -108,10 +108,10 @@ class GymTask(Task):
             raise UsageError(f"{self._id} lacks a package on this host: {error}") from error
         except (gymnasium.error.Error, ModuleNotFoundError) as error:
             module, colon, _ = self._id.rpartition(":")
-            remedy = f"an environment of another package is written {GYM}:its_module:Its-v0"
-            if colon:
-                remedy = f"install the package of {module} on this host, or name its folder in PYTHONPATH"
-            raise UsageError(f"gymnasium makes no environment {self._id!r} here ({error}); {remedy}") from error
+            remedy = "" if colon else f"; an environment of another package is written {GYM}:its_module:Its-v0"
+            if colon and isinstance(error, ModuleNotFoundError):
+                remedy = f"; install the package of {module} on this host, or name its folder in PYTHONPATH"
+            raise UsageError(f"gymnasium makes no environment {self._id!r} here ({error}){remedy}") from error
         except TypeError as error:
             raise UsageError(f"{self._id} takes no such arguments: {error}") from error
         except (Exception, SystemExit) as error:  # environments may raise anything

@@ -6,6 +6,7 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from dreamfleet.common.protocol.failures import describe_job
 from dreamfleet.common.protocol.messages import Job
 from dreamfleet.worker.scoring.failure_cause import describe_exception, encodable
 
@@ -66,4 +67,4 @@ def _describe_jobs(jobs: Sequence[Job]) -> str:
         return "as a slot started"
     job = jobs[0]
     more = f", or one of {len(jobs) - 1} jobs scored with it" if len(jobs) > 1 else ""
-    return f"{job.kind} in generation {job.generation}, candidate {job.candidate}, seed {job.seeds[0]}{more}"
+    return f"{describe_job(job.kind, job.generation, job.candidate, job.seeds)}{more}"

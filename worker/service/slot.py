@@ -14,7 +14,7 @@ from typing import Any
 
 from dreamfleet.common.errors import BundleError, DreamfleetError
 from dreamfleet.common.printable import truncate
-from dreamfleet.common.protocol.failures import is_host_failure
+from dreamfleet.common.protocol.failures import describe_job, is_host_failure
 from dreamfleet.common.protocol.messages import Job, Result, TaskSpec
 from dreamfleet.worker.scoring.failure_cause import describe_crash, describe_exit, is_hosts_fault
 from dreamfleet.worker.service.child import ChildReady
@@ -380,4 +380,4 @@ def _describe_jobs(jobs: list[Job]) -> str:
     if not jobs:
         return ""
     first, more = jobs[0], f" and {len(jobs) - 1} more" if len(jobs) > 1 else ""
-    return f" in generation {first.generation}, candidate {first.candidate}, seed {first.seeds[0]}{more}"
+    return f" at {describe_job(first.kind, first.generation, first.candidate, first.seeds)}{more}"

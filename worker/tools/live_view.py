@@ -88,7 +88,8 @@ class LiveCanvas(Board):
         else:
             self._text("this task shows no picture", (EDGE, EDGE), self._small, FAINT)
         self._draw_words(live)
-        return CaptionedFrame(pixels(self._surface), frame_facts(self._run, live))
+        is_drawn = dream is not None or live.picture is not None
+        return CaptionedFrame(pixels(self._surface), {**frame_facts(self._run, live), "drawn": is_drawn})
 
     def _draw_model(self, seen: Frame | None, dream: DecodedDream) -> None:
         """Draw observation and decoded latent side by side; without an observation, the decoded latent alone."""

@@ -106,11 +106,11 @@ const fillAbsent = (frame, wanted) => {
 // What there is to do about a run that nobody serves: go on with what lies here, look at its result, or begin one.
 const ways = (frame, run, runs) => {
   const stored = run ? runs.find((each) => each.run === run && !each.damaged) : latestOf(runs.filter((each) => each.again));
-  const past = make("a", "or look at past runs", { href: "#/runs" });
-  if (!stored) return ["A command that starts one: ", make("code", `dreamfleet coordinator --run ${run || "NAME"} --listen ${frame.address.split(",")[0]}`), " ", past];
+  const past = make("a", "past runs", { href: "#/runs" });
+  if (!stored) return ["Start one: ", make("code", `dreamfleet coordinator --run ${run || "NAME"} --listen ${frame.address.split(",")[0]}`), ". Or look at ", past, "."];
   const link = make("a", stored.run, { href: runLink(stored.run) });
-  if (!stored.again) return [`Run `, link, ` lies here, ${stored.state}; `, past];
-  return ["Run ", link, " was left open here. A command that goes on with it, with --join where it had one: ", make("code", stored.again), " ", past];
+  if (!stored.again) return [`Run `, link, ` lies here, ${stored.state}. Or look at `, past, "."];
+  return ["Run ", link, " was left open here. Continue it: ", make("code", stored.again), ". If it had a join file, add ", make("code", "--join FILE"), ". Or look at ", past, "."];
 };
 
 const latestOf = (runs) => runs.reduce((one, other) => (one && one.created > other.created ? one : other), undefined);

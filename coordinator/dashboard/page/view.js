@@ -3,6 +3,7 @@
 import { facts, make, say } from "./dom.js";
 
 const MEASURED = 3000; // milliseconds over which a speed is measured
+const NONE = "This task shows no picture."; // in place of a picture; the figures follow
 const KINDS = { score: "a candidate", evaluate: "the mean, in reality", collect: "the mean, to be kept" };
 
 let page = null; // the parts, once they stand
@@ -135,20 +136,26 @@ const end = (text) => {
 };
 
 const showText = (text) => {
-  page["view-picture"].classList.toggle("stale", over);
+  const picture = page["view-picture"];
+  picture.classList.toggle("stale", over);
+  picture.parentElement.classList.toggle("bare", picture.hidden && (over || paused || text === NONE));
   page["view-again"].hidden = !over;
   say(page["view-text"], text);
 };
 
 const draw = ({ facts: named, jpeg }) => {
   const picture = page["view-picture"];
+  facts(page["view-facts"], rows(named));
+  if (named.drawn === false) {
+    picture.hidden = true;
+    return showText(NONE);
+  }
   picture.src = `data:image/jpeg;base64,${jpeg}`;
   if (picture.hidden) {
     picture.hidden = false;
     picture.alt = `${page["view-whom"].selectedOptions[0].textContent}: what it sees, beside what the world model decodes and the dream that goes on; the figures follow`;
     showText("");
   }
-  facts(page["view-facts"], rows(named));
 };
 
 const rows = ({ worker, kind, generation, candidate, seed, step, score }) => {

@@ -16,7 +16,7 @@ def status(limits=(), seconds=None, gone=0.0, **changes):
     return dataclasses.replace(
         STATUS, limits={"generations": 0, "steps": 0, "minutes": 0.0, "target": None, "parted": 0, **dict(limits)},
         recent=recent, throughput=Throughput(1000.0, changes.pop("steps", 448_000), seconds),
-        generation=GenerationStatus(7, 3, 8, gone, 0.09, None), **changes,
+        **{"generation": GenerationStatus(7, 3, 8, gone, 0.09, None), **changes},
     )  # fmt: skip
 
 
@@ -79,6 +79,11 @@ def test_an_older_coordinators_evaluations_in_progress_count():
     assert estimate_eta(status({"minutes": 1.0}, seconds=66.0)).description.endswith("about to end")
 
 
+def test_a_run_whose_limit_is_not_reached_is_not_about_to_end():
+    quick = estimate_eta(status({"generations": 12}, paces=(0.1,)))
+    assert quick.description.endswith("0.1 s a generation, less than a second to go")
+
+
 def test_after_losing_workers_the_remaining_speed_counts():
     slowed = with_speed(status({"generations": 10}, gone=99.0), candidates=0.5)  # 5 of 8 episodes are left
     assert estimate_eta(slowed).seconds == 10 + 16 + 16
@@ -119,6 +124,10 @@ def test_unknown_limits_are_ignored(strange):
     ("changes", "said"),
     [
         ({}, "generation 7: 3 of 8 episodes"),
+        (
+            {"generation": dataclasses.replace(STATUS.generation, episodes_done=0, episodes=0)},
+            "generation 7: all candidates failed",
+        ),
         ({"state": "paused", "why": "asked for"}, "paused: asked for"),
         ({"state": "evaluating", "evaluating": EpisodeProgress(3, 16)}, "waiting for an evaluation: 3 of 16 episodes"),
         (
@@ -140,7 +149,7 @@ def test_unknown_limits_are_ignored(strange):
         ),
         (
             {"state": "waiting for workers", "refused": {"old-host": "no AVX2"}},
-            "waiting for workers; old-host cannot join: no AVX2",
+            "waiting for workers; old-host was refused: no AVX2",
         ),
         (
             {"state": "left"},

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from rich.cells import cell_len
 from rich.console import Console
 
-from dreamfleet.common.monitoring.status import Population, StageStatus, WorkerCount
+from dreamfleet.common.monitoring.status import FailureStatus, Population, StageStatus, WorkerCount
 from dreamfleet.common.monitoring.status_panel import Block, RunPanel, allocate_lines, panel_lines
 from dreamfleet.common.monitoring.terminal_charts import bar_chart, candidate_grid
 from dreamfleet.common.monitoring.worker_table import WorkerTable, find_slowest
@@ -124,6 +124,41 @@ def test_candidates_are_cells_and_the_best_is_highlighted():
     assert line.spans[-1].style == "bold yellow"
     many = Population(7, 0, 300, (4,) * 150 + (0,) * 150, (4,) * 300, (None,) * 300)
     assert [len(each) for each in candidate_grid(many, 76, 2)] == [76, 74]
+
+
+def test_a_failed_candidate_is_no_waiting_one():
+    some = Population(7, 0, 4, (2, 0, 0, 1), (2, 0, 2, 2), (1.0, None, None, 2.0))
+    (line,) = candidate_grid(some, 80, 1)
+    assert line.plain == "█x·▄"
+    assert line.spans[1].style == "red"
+    assert "generation 7     3/8 episodes, 1 failed (x), so far 1 to 2" in drawn(
+        dataclasses.replace(STATUS, population=some), 100
+    )
+    none = Population(7, 0, 3, (0, 0, 0), (0, 0, 0), (None, None, None))
+    assert "generation 7     all candidates failed" in drawn(dataclasses.replace(STATUS, population=none), 100)
+
+
+def test_a_failure_is_named_by_what_it_scores():
+    failure = FailureStatus("4/0", "evaluate", (20003,), {"host-a": "ValueError: no road"}, {"host-a": 1})
+    text = drawn(dataclasses.replace(STATUS, failures=(failure,)), 120)
+    assert "the evaluation of generation 4's mean, seed 20003, failed on host-a: ValueError: no road;" in text
+    assert "candidate 4/0, seed 20003, failed" in drawn(
+        dataclasses.replace(STATUS, failures=(dataclasses.replace(failure, kind="score"),)), 120
+    )
+
+
+def test_a_refused_worker_is_told_beside_those_that_are_here():
+    refused = dataclasses.replace(STATUS, refused={"vm": "no gymnasium"})
+    assert "worker vm was refused: no gymnasium" in drawn(refused, 80)
+    assert "worker vm was refused: no gymnasium" in drawn(dataclasses.replace(refused, worker_list=()), 80)
+    assert "refused" not in drawn(dataclasses.replace(refused, state="ended", why="stopped"), 80)
+
+
+def test_failed_episodes_of_an_evaluation_are_told():
+    evaluated = dataclasses.replace(STATUS.best, failed=1)
+    assert "on 16 seeds; 1 more episode failed (generation 4)" in drawn(
+        dataclasses.replace(STATUS, evaluation=evaluated), 100
+    )
 
 
 def test_a_curve_has_the_given_height():

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from dreamfleet.common.monitoring.status import WorkerCount
+from dreamfleet.common.monitoring.status import FailureStatus, WorkerCount
 from dreamfleet.coordinator.dashboard.page_state import RunSnapshot, page_state
 from tests.support.samples import STATUS
 
@@ -48,6 +48,20 @@ def test_a_lost_run_with_its_journal_here_shows_the_whole_command():
         in (page_state(look(101.0, Path("/data/runs") / STATUS.run))["sentence"])
     )
     assert f"--resume {STATUS.run}, with --runs-dir and --join" in page_state(look(101.0))["sentence"]
+
+
+def test_a_refused_worker_is_told_as_long_as_the_run_goes_on():
+    refused = {"vm": "no gymnasium"}
+    assert page_state(look(refused=refused, failures=()))["troubles"] == ["worker vm was refused: no gymnasium"]
+    assert page_state(look(refused=refused, failures=(), state="ended"))["troubles"] == []
+
+
+def test_failures_and_failed_episodes_are_named():
+    failure = FailureStatus("4/0", "evaluate", (20003,), {"host-a": "no road"}, {"host-a": 2})
+    document = page_state(look(failures=(failure,), best=replace(STATUS.best, failed=1)))
+    assert document["troubles"] == ["the evaluation of generation 4's mean, seed 20003, failed on host-a (2x): no road"]
+    reported = next(each for each in document["tiles"] if each["name"] == "reported")
+    assert reported["beneath"] == "provisional, generation 4, 16 episodes; 1 more episode failed"
 
 
 def test_a_worker_that_left_is_shown_with_its_reason_and_is_not_counted_as_silent():

@@ -37,6 +37,16 @@ def test_a_known_verb_is_obeyed_and_one_that_ends_the_coordinator_names_the_comm
     assert (bench.obey("stop").again, bench.stopped) == (AGAIN, True)
 
 
+def test_a_pause_by_hand_does_not_hide_why_the_run_was_paused(bench):
+    bench.run.pause("4 of 6 candidates failed")
+    for _ in range(2):
+        assert bench.obey("pause").accepted
+        assert bench.run.paused == "by hand; before: 4 of 6 candidates failed"
+    bench.obey("resume")
+    bench.obey("pause")
+    assert bench.run.paused == "by hand"
+
+
 def test_an_unknown_verb_and_one_for_several_runs_change_nothing(bench):
     unknown, wild = bench.obey("halt"), bench.control.obey(keys.control("*", "stop"), AGAIN, bench.now)
     assert not unknown.accepted

@@ -4,7 +4,7 @@ import dataclasses
 import socket
 from datetime import UTC, datetime, timedelta
 
-from dreamfleet.common.monitoring.status import Throughput
+from dreamfleet.common.monitoring.status import EpisodeProgress, Throughput
 from dreamfleet.common.security.credentials import Credentials
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.service.run_log import summary, worker_command
@@ -20,6 +20,19 @@ def test_the_summary_shows_generation_score_speed_workers_and_time_left():
     )
     assert (facts["event"], facts["generation"], facts["workers"]) == ("summary", 7, 1)
     assert "nothing evaluated yet" in summary(dataclasses.replace(STATUS, best=None))[0]
+
+
+def test_the_summary_counts_failed_candidates():
+    opened = dataclasses.replace(STATUS.generation, failed=1)
+    text, facts = summary(dataclasses.replace(STATUS, failed=2, generation=opened))
+    assert text.startswith("running, generation 7 (3/8 episodes), 3 failed candidates, best mean")
+    assert facts["failed"] == 3
+
+
+def test_no_generation_is_named_once_a_limit_is_reached():
+    confirming = dataclasses.replace(STATUS, state="evaluating", ending=True, confirming=EpisodeProgress(3, 16))
+    assert summary(confirming)[0].startswith("confirming its result: 3 of 16 episodes, best mean")
+    assert summary(dataclasses.replace(STATUS, state="paused", ending=True))[0].startswith("paused, best mean")
 
 
 def test_the_worker_command_names_an_address_that_other_hosts_reach():

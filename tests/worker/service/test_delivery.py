@@ -122,9 +122,7 @@ def test_a_failing_task_logs_its_traceback_once_with_its_job(stage, said, cached
     hand.send(1, *jobs)
     hand.results(*jobs)
     logged = wait_for(said, "the road has ended")
-    assert logged.startswith(
-        f"task {tasks.RAISING}: RuntimeError: the road has ended (score in generation 7, candidate 2"
-    )
+    assert logged.startswith(f"task {tasks.RAISING}: RuntimeError: the road has ended (candidate 7/2, ")
     assert f"seed {jobs[0].seeds[0]})" in logged
     assert 'raise RuntimeError("the road has ended")' in logged
     assert not [line for line in drained(said) if "Traceback" in line]
@@ -135,4 +133,12 @@ def test_a_crash_names_its_job(stage, said, cached):
     stage.worker()
     hand.ready()
     hand.send(1, hand.job())
-    assert f"in generation 7, candidate 2, seed {hand.job().seeds[0]}; starting" in wait_for(said, "slot 0 ended")
+    assert f"at candidate 7/2, seed {hand.job().seeds[0]}; starting" in wait_for(said, "slot 0 ended")
+
+
+def test_a_crash_in_an_evaluation_names_no_candidate(stage, said, cached):
+    hand = stage.hand(tasks.CRASHING)
+    stage.worker()
+    hand.ready()
+    hand.send(1, hand.job(kind="evaluate"))
+    assert "at the evaluation of generation 7's mean, seed" in wait_for(said, "slot 0 ended")

@@ -21,7 +21,7 @@ def test_a_failure_is_logged_with_its_task_its_job_and_its_traceback():
     logged = FailureLog().format_if_new(raised(RuntimeError("the road has ended")), "moon", [job()])
     first, *trace = logged.splitlines()
     assert first.startswith("task moon: RuntimeError: the road has ended (")
-    assert "generation 7, candidate 2, seed 1048576)" in first
+    assert "(candidate 7/2, seed 1048576)" in first
     assert trace[0].startswith("Traceback")
     assert trace[-1] == "RuntimeError: the road has ended"
 

@@ -8,6 +8,7 @@ from dreamfleet.common.artifacts.bundle import BundleManifest, write_bundle
 from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.errors import BundleError, ControllerError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.protocol.tasks import describe_task, is_self_describing
 from dreamfleet.worker.car_racing.preprocessing import BOX, RAW
 from dreamfleet.worker.scoring.episode import run_episode, score
 from dreamfleet.worker.scoring.scorer import Scorer
@@ -36,6 +37,22 @@ def test_a_task_is_found_by_its_reference():
 def test_an_unknown_task_is_an_error_that_says_which_there_are(name, says):
     with pytest.raises(UsageError, match=says):
         find_task(name)
+
+
+@pytest.mark.parametrize("name", ["Field-v0", "FieldOfThisTest"])
+def test_a_name_of_an_environment_without_its_family_is_offered_with_it(name, monkeypatch):
+    monkeypatch.setitem(gymnasium.registry, "FieldOfThisTest", None)
+    with pytest.raises(UsageError, match=f"write gym:tests.support.tasks:{name} if") as refused:
+        is_self_describing(f"tests.support.tasks:{name}")
+    assert "--bundle" not in str(refused.value), "its module is here"
+    with pytest.raises(UsageError, match=f"write gym:tests.support.tasks:{name} if"):
+        find_task(f"tests.support.tasks:{name}")
+
+
+def test_only_a_missing_module_is_to_be_installed():
+    with pytest.raises(UsageError, match="makes no environment") as refused:
+        describe_task("gym:tests.support.tasks:Fields-v0", {})
+    assert "install" not in str(refused.value)
 
 
 @pytest.mark.parametrize("task", ["car-racing", "dream"])

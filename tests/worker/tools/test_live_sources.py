@@ -77,7 +77,7 @@ def test_the_viewer_decodes_a_workers_frame_and_continues_it_as_a_dream(random_b
     assert shown.picture.shape == (*SIZE[::-1], 3)
     assert shown.facts == {
         "run": "night", "worker": "host-a/0a1b2c3d", "kind": "score", "generation": 7, "candidate": 2, "seed": 2**20,
-        "step": 9, "score": live.frame.reward,
+        "step": 9, "score": live.frame.reward, "drawn": True,
     }  # fmt: skip
     assert (live.picture is None) == (task == "dream")
 
@@ -89,6 +89,11 @@ def test_a_frame_of_another_world_model_is_shown_without_the_model(random_bundle
     live = live_frame_of(random_bundle, "car-racing", **({"packed": False} if "picture" in more else {}), **more)
     canvas = LiveCanvas("n" * 63, ("steer", "gas", "brake"), LiveDreamer(random_bundle, 1.0))
     assert canvas.draw(live).picture.shape == (*SIZE[::-1], 3)
+
+
+def test_a_frame_without_picture_and_model_says_that_nothing_is_drawn(random_bundle):
+    live = live_frame_of(random_bundle, "car-racing", packed=False, picture=b"")
+    assert not LiveCanvas("night").draw(live).facts["drawn"]
 
 
 def driver(bundle):
