@@ -68,7 +68,7 @@ def describe_loss(reason: int | str) -> str:
 
 
 def is_crash(error: str) -> bool:
-    """Whether the child died of the episode or was killed, so that the program that drives it again would too."""
+    """Whether the child died of the episode or was killed, so that the process that drives it again would too."""
     return error.startswith(CRASH) or is_host_failure(error)
 
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Attempt:
+class ReplayAttempt:
     """What an episode came to now: its fitness, or an error; neither: it was not driven."""
 
     episode: int
@@ -64,7 +64,7 @@ class ReplayedEpisode:
 
     @property
     def attempted(self) -> bool:
-        """Whether it was driven again; an episode that would end or block this program is not."""
+        """Whether it was driven again; an episode that would end or block its process is not."""
         return self.replayed is not None or bool(self.error)
 
     def agrees(self, tolerance: float | None) -> bool | None:
@@ -101,7 +101,7 @@ def replay(run: RunFolder, generation: int, candidate: int, stall: float = STALL
     driven = _drive_all(own, run.bundle_path if own.bundle else None, items, stall)
     here = {*(each.host_class for each in driven.values()), class_from_fingerprint(fingerprint(run.settings.packages))}
     for each in stored:
-        now = driven.get(each.episode, Attempt(each.episode))
+        now = driven.get(each.episode, ReplayAttempt(each.episode))
         if isinstance(each, StoredFailure):
             # R8: a failure for good was independent of the host.
             fitness, host_class, comparable = None, "", True
@@ -132,11 +132,11 @@ def _stored_episodes(
     return sorted(filter(is_final, stored), key=lambda each: each.episode)
 
 
-def _drive_all(spec: TaskSpec, bundle: Path | None, items: Sequence[Item], stall: float) -> dict[int, Attempt]:
+def _drive_all(spec: TaskSpec, bundle: Path | None, items: Sequence[Item], stall: float) -> dict[int, ReplayAttempt]:
     """Drive the episodes one after another in a child process; the attempts by episode."""
 
-    def lose(item: Item, reason: int | str) -> Attempt:
-        return Attempt(item[0], error=describe_loss(reason))
+    def lose(item: Item, reason: int | str) -> ReplayAttempt:
+        return ReplayAttempt(item[0], error=describe_loss(reason))
 
     pin_thread_pools()
     arguments = os.getpid(), spec, bundle
@@ -160,7 +160,7 @@ class _Replayer:
         cls.spec, cls.bundle = spec, bundle
 
     @classmethod
-    def drive(cls, item: Item) -> Attempt:
+    def drive(cls, item: Item) -> ReplayAttempt:
         """Drive one episode; `DreamfleetError` if the task cannot be scored here."""
         from dreamfleet.worker.scoring.scorer import Scorer
 
@@ -171,6 +171,6 @@ class _Replayer:
         count_step()
         try:
             score = cls.scorer.score("score", parameters, seed, count_step, spec=spec)
-            return Attempt(episode, host_class, score.fitness)
+            return ReplayAttempt(episode, host_class, score.fitness)
         except (Exception, SystemExit) as error:  # a simulator may raise anything
-            return Attempt(episode, host_class, error=describe_exception(error))
+            return ReplayAttempt(episode, host_class, error=describe_exception(error))
