@@ -78,6 +78,7 @@ def test_a_bundle_without_a_dream_is_recorded_with_two_pictures(controller, rand
         ("Dark", "this environment (Dark) draws no pictures"),
         ("Blank", "this environment (Blank) draws no pictures"),
         ("Raising", "the episode of seed 10000 failed: ZeroDivisionError: no light"),
+        ("Plain", "this environment (tests.support.dark_environments:Plain-v0) draws no pictures"),
     ],
 )
 def test_an_environment_that_cannot_be_filmed_ends_with_one_line(processes, tmp_path, monkeypatch, name, says):
@@ -87,8 +88,22 @@ def test_an_environment_that_cannot_be_filmed_ends_with_one_line(processes, tmp_
     for verb in ("record", "live"):
         out = tmp_path / f"{verb}.mp4"
         code, _, err = processes.call(verb, "--controller", tmp_path / "dark.npz", "--out", out)
-        assert (code > 0, says in err, "Traceback" in err) == (True, True, False), err
-        assert not out.exists()
+        assert (code > 0, says in err, "Traceback" in err, "\x1b" in err) == (True, True, False, False), err
+        assert list(tmp_path.glob("*.mp4*")) == list(tmp_path.glob(".*")) == []
+
+
+def test_an_episode_that_fails_leaves_no_video_and_the_one_that_is_there(processes, tmp_path, monkeypatch):
+    monkeypatch.setenv("DREAMFLEET_TRUST", "tests")
+    task = "gym:tests.support.dark_environments:Breaking-v0"
+    Controller(ControllerShape(4, 2), np.zeros(10, np.float32), task, "").save(tmp_path / "breaking.npz")
+    (tmp_path / "videos").mkdir()
+    (tmp_path / "videos" / "drive-10001.mp4").write_text("earlier")
+    code, _, err = processes.call(
+        "record", "--controller", tmp_path / "breaking.npz", "--seed", 10_001, 10_000, "--out",
+        tmp_path / "videos" / "drive.mp4",
+    )  # fmt: skip
+    assert (code, "the episode of seed 10001 failed: ZeroDivisionError: no road" in err) == (1, True), err
+    assert {each.name: each.read_text() for each in (tmp_path / "videos").iterdir()} == {"drive-10001.mp4": "earlier"}
 
 
 def test_another_task_or_an_impossible_place_is_refused(controller, random_bundle, tmp_path):
