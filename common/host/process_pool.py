@@ -38,17 +38,19 @@ def _raise_broken(_item: object, reason: int | str) -> NoReturn:
 def map_in_processes(
     count: int, start: Callable[..., None], arguments: tuple[Any, ...], work: Callable[[Item], Answer],
     items: Sequence[Item], on_loss: Callable[[Item, int | str], Answer] = _raise_broken, stall: float = 0.0,
+    on_look: Callable[[int], None] = lambda _steps: None,
 ) -> Generator[Answer, None, None]:  # fmt: skip
     """Yield `work(item)` of each item as it ends, in `count` spawned processes that begin with `start(*arguments)`.
 
     A process that ends early costs its item, and another takes its place. `on_loss` makes that item's answer; it gets
     the exit status, or why the process was killed. Without it, `BrokenProcessPool` ends the work. With `stall`, a
     process is killed that does not call `count_step` for so many seconds, or for `START_LIMIT` before its first step.
+    About once in `LOOK_INTERVAL`, `on_look` gets the steps so far of the processes that work.
 
     When closed early, it waits until what runs is done; after any other exception it ends the processes at once.
     """
     idle = [_Process[Item, Answer](start, arguments, work, stall) for _ in range(min(count, len(items)))]
-    pool = _Pool(deque(items), idle, on_loss)
+    pool = _Pool(deque(items), idle, on_loss, on_look)
     processes = tuple(idle)
     try:
         try:
@@ -74,7 +76,7 @@ class _Process(Generic[Item, Answer]):
         self, start: Callable[..., None], arguments: tuple[Any, ...], work: Callable[[Item], Answer], stall: float
     ) -> None:
         self._start, self._arguments, self._work, self._stall = start, arguments, work, stall
-        self._steps: Any = get_context("spawn").Value("Q", 0, lock=False)
+        self._counter: Any = get_context("spawn").Value("Q", 0, lock=False)
         self._executor: ProcessPoolExecutor | None = None
         self._process: Any = None
         self._descendants, self._watch = Descendants(), StallWatch()
@@ -84,13 +86,18 @@ class _Process(Generic[Item, Answer]):
         """Whether it runs."""
         return self._process is not None and self._process.is_alive()
 
+    @property
+    def steps(self) -> int:
+        """Steps that it counted since it was started."""
+        return int(self._counter.value)
+
     def submit(self, item: Item) -> Future[Answer]:
         """Begin the work on an item; start the process if there is none."""
         self._watch.restart()
         if self._executor is not None:
             return self._executor.submit(self._work, item)
-        self._steps.value, others = 0, set(active_children())
-        arguments = (self._steps, self._start, self._arguments)
+        self._counter.value, others = 0, set(active_children())
+        arguments = (self._counter, self._start, self._arguments)
         self._executor = ProcessPoolExecutor(1, get_context("spawn"), _begin, arguments)
         with signals_blocked(), self._descendants.starting():
             future = self._executor.submit(self._work, item)
@@ -101,13 +108,12 @@ class _Process(Generic[Item, Answer]):
         """Why it is of no use any longer, as `on_loss` gets it; `gap` is for how long this host was suspended."""
         if not self.is_alive:
             return self.lose()
-        steps = self._steps.value
-        quiet = self._watch.quiet_seconds(steps, monotonic(), gap)
-        limit = self._stall if steps else max(self._stall, START_LIMIT)
+        quiet = self._watch.quiet_seconds(self.steps, monotonic(), gap)
+        limit = self._stall if self.steps else max(self._stall, START_LIMIT)
         if not self._stall or quiet <= limit:
             return None
         self.kill()
-        return describe_stall(limit) if steps else describe_slow_start(limit)
+        return describe_stall(limit) if self.steps else describe_slow_start(limit)
 
     def lose(self) -> int | str:
         """Give it up, after it ended or closed its pipe; return its exit status, or what it did instead."""
@@ -137,9 +143,10 @@ class _Pool(Generic[Item, Answer]):
     """Hands items to processes and collects the answers."""
 
     def __init__(
-        self, waiting: deque[Item], idle: list[_Process[Item, Answer]], on_loss: Callable[[Item, int | str], Answer]
-    ) -> None:
-        self.waiting, self._idle, self._on_loss = waiting, idle, on_loss
+        self, waiting: deque[Item], idle: list[_Process[Item, Answer]], on_loss: Callable[[Item, int | str], Answer],
+        on_look: Callable[[int], None],
+    ) -> None:  # fmt: skip
+        self.waiting, self._idle, self._on_loss, self._on_look = waiting, idle, on_loss, on_look
         self._running: dict[Future[Answer], tuple[_Process[Item, Answer], Item]] = {}
 
     def answers(self) -> Iterator[Answer]:
@@ -150,6 +157,7 @@ class _Pool(Generic[Item, Answer]):
                 process, item = self._idle.pop(0), self.waiting.popleft()
                 self._running[process.submit(item)] = process, item
             wait(self._running, LOOK_INTERVAL, FIRST_COMPLETED)
+            self._on_look(sum(process.steps for process, _ in self._running.values()))
             gap, looked_at = max(0.0, monotonic() - looked_at - LOOK_INTERVAL), monotonic()
             for future, (process, item) in list(self._running.items()):
                 if future.done():
