@@ -12,7 +12,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import read_text
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
-from dreamfleet.common.runs.standard_error import format_with_error
+from dreamfleet.common.runs.standard_error import format_with_error, score_digits
 from dreamfleet.common.serialization.optional_fields import OPTIONAL
 from dreamfleet.common.serialization.validation import Length, MalformedError, Seconds, from_plain_lenient
 
@@ -124,12 +124,16 @@ def _check_episodes(report: EvaluationReport) -> None:
 
 
 def _describe_score(found: EpisodeResults) -> str:
-    if found.std is None:
-        return f"{found.mean:.1f} on one seed; judged by gymnasium's own environment"
     score = format_with_error(found.mean, found.error)
+    if found.std is None:
+        return f"{score} on one seed; judged by gymnasium's own environment"
+    digits = score_digits(found.mean, found.error)
+    worst, best, median, std = (
+        format_with_error(each, None, digits) for each in (found.worst, found.best, found.median, found.std)
+    )
     return (
-        f"{score} (standard error) on {len(found.drives)} seeds, {found.worst:.0f} to {found.best:.0f}, "
-        f"median {found.median:.0f}, standard deviation {found.std:.1f}; judged by gymnasium's own environment"
+        f"{score} (standard error) on {len(found.drives)} seeds, {worst} to {best}, median {median}, standard "
+        f"deviation {std}; judged by gymnasium's own environment"
     )
 
 

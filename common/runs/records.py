@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from typing import Annotated, Any, Literal
@@ -260,6 +260,17 @@ def expand_task_options(settings: Mapping[str, Any]) -> dict[str, Any]:
     if task.get("controller") == settings.get("controller"):
         task.pop("controller", None)
     return {**settings, "task": task}
+
+
+def count_failed(history: Iterable[StoredGeneration]) -> int:
+    """Candidates of closed generations that failed and have no fitness."""
+    return sum(each.failed for each in history)
+
+
+def describe_failed(settings: RunSettings, history: Sequence[StoredGeneration]) -> str:
+    """How many candidates failed, and what became of them."""
+    policy = f"--on-failure {settings.on_failure}"
+    return f"{count_failed(history)} in {plural(len(history), 'closed generation')}, by {policy}"
 
 
 def with_error(found: StoredEvaluation | StoredConfirmation) -> dict[str, Any]:

@@ -45,7 +45,13 @@ def resume_command(folder: Path, join: object = None, access_dir: Path | None = 
     joined = () if join is None else ("--join", join)
     access = () if join is None or access_dir is None else ("--access-dir", access_dir)
     words = ("--resume", folder.name, "--runs-dir", folder.parent, *joined, *access)
-    return shell_command("coordinator", *words, *(("--trust", *trust) if trust else ()))
+    return shell_command("coordinator", *words, *trust_flag(trust))
+
+
+def trust_flag(modules: Iterable[str]) -> tuple[str, ...]:
+    """The flag that has a command trust these modules, each once; none without a module."""
+    named = tuple(dict.fromkeys(filter(None, modules)))
+    return ("--trust", *named) if named else ()
 
 
 def check_movable(folder: Path) -> None:

@@ -4,28 +4,47 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import asdict
 from typing import Any
 
+from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.errors import BundleError
 from dreamfleet.common.monitoring.eta import format_duration
 from dreamfleet.common.printable import plural
-from dreamfleet.common.runs.records import RunSettings, best_evaluation, describe_score
+from dreamfleet.common.protocol.tasks import module_of
+from dreamfleet.common.runs.records import (
+    RunSettings,
+    StoredConfirmation,
+    StoredEvaluation,
+    best_evaluation,
+    count_failed,
+    describe_failed,
+    describe_score,
+)
 from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.run_paths import trust_flag
 from dreamfleet.common.runs.run_provenance import RunProvenance, read_run_provenance, read_run_settings
 from dreamfleet.common.runs.seeds import TRAINING_FIRST
 from dreamfleet.common.runs.stages import begun_stages, describe_stages
 from dreamfleet.common.runs.times import parse_time
 from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.coordinator.settings.start import total_effort
 
 
 def citation_facts(run: RunFolder) -> dict[str, Any]:
     """The run and its provenance as JSON values; `ControllerError` before the run has a controller."""
     controller = Controller.load(run.controller_path)
     receipt, settings = read_run_provenance(controller), read_run_settings(controller)
+    score, spent = _reported(run), total_effort(run)
     return {
         "run": run.name, "run_uid": run.uid, "created": run.created, "ended": run.ended,
         "ended_at": run.ended_at, "lasted_seconds": run.duration_seconds,
-        "controller": controller.sha256, "bundle": settings.task.bundle or None, "score": _score(run),
+        "controller": controller.sha256, "bundle": settings.task.bundle or None,
+        "score": describe_score(score), "failed_episodes": score.failed if score else 0,
+        "failed_candidates": count_failed(run.history()), "on_failure": settings.on_failure,
+        "spent": {**asdict(spent), "core_hours": spent.core_hours},
         "settings": to_dict(settings), "receipt": to_dict(receipt), "commands": _commands(run),
     }  # fmt: skip
 
@@ -58,7 +77,7 @@ def _rows(
     yield "run", f"`{run.uid}`, begun {since}, {state}"
     yield "controller", f"SHA-256 `{controller.sha256}` of its parameters"
     yield "world model", f"SHA-256 `{spec.bundle}`" if spec.bundle else "none"
-    yield "score", _score(run)
+    yield "score", describe_score(_reported(run))
     warm = "" if spec.temperature is None else f", temperature {spec.temperature:g}"
     generations = plural(receipt.generations, "generation")
     if settings.stages:  # each has a horizon, a population and more of its own
@@ -70,7 +89,9 @@ def _rows(
         yield "task", f"{spec.task}, {spec.horizon} steps{warm}, version {spec.version}"
         size = f"population {settings.population} x {plural(settings.episodes, 'episode')}, sigma0 {settings.sigma0:g}"
         yield "search", f"{settings.optimiser}, {settings.covariance}, {size}, {generations}"
-    yield "spent", receipt.total.description
+    yield "failed candidates", describe_failed(settings, run.history())
+    so_far = "" if run.ended else "; so far, with the results of the open generation"
+    yield "spent", f"{total_effort(run).description}{so_far}"
     yield "seed", f"{settings.seed}; training seeds follow from it, from {TRAINING_FIRST} up"
     for what, (first, count) in (receipt.seeds or {}).items():
         yield f"seeds of the {what}", f"{first} to {first + count - 1}"
@@ -87,22 +108,35 @@ def _rows(
         yield "coordinator", ", ".join(f"{name} {version}" for name, version in receipt.versions.items())
 
 
-def _score(run: RunFolder) -> str:
-    return describe_score(run.confirmation() or best_evaluation(run.evaluations()))
+def _reported(run: RunFolder) -> StoredConfirmation | StoredEvaluation | None:
+    return run.confirmation() or best_evaluation(run.evaluations())
 
 
 def _commands(run: RunFolder) -> dict[str, str]:
     """Commands that check the run, keyed by what they show."""
-    last = max((each.number for each in run.history()), default=0)
+    last, classes = max((each.number for each in run.history()), default=0), run.classes
     beside, controller = ("--runs-dir", str(run.path.parent)), str(run.controller_path)
+    one, whole = "to the bit, on any host of its class", "to the bit"
+    if classes.mixed:
+        whole = "not to the bit: hosts of several classes scored"
+    if classes.varying:
+        one = whole = "not to the bit: the environment is not deterministic"
+    modules = _task_modules(run)
+    trust, trust_all = trust_flag(modules), trust_flag([*modules, module_of(run.settings.optimiser)])
     words = {
-        "one candidate's fitness again, to the bit, on any host of its class": (
-            "replay", run.name, "--candidate", f"{last}/0", *beside,
-        ),
-        "the whole run again, to the bit": ("repeat", run.name, *beside),
-        "its score on unseen seeds": ("evaluate", "--controller", controller, "--episodes", "100"),
-    }  # fmt: skip
+        f"one candidate's fitness again, {one}": ("replay", run.name, "--candidate", f"{last}/0", *beside, *trust),
+        f"the whole run again, {whole}": ("repeat", run.name, *beside, *trust_all),
+        "its score on unseen seeds": ("evaluate", "--controller", controller, "--episodes", "100", *trust),
+    }
     return {why: shlex.join(("dreamfleet", *each)) for why, each in words.items()}
+
+
+def _task_modules(run: RunFolder) -> list[str]:
+    """The modules of the run's task and of its world model's task, which its commands import."""
+    tasks = [run.spec.task]
+    with suppress(BundleError):  # then the commands say what is wrong with it
+        tasks += [Bundle.open(run.bundle_path, run.spec.bundle).manifest.task] if run.spec.bundle else []
+    return [module_of(each) for each in tasks]
 
 
 def _bibtex(run: RunFolder, controller: Controller, receipt: RunProvenance) -> list[str]:

@@ -20,6 +20,7 @@ from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.effort import Effort, format_steps
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import begun_stages, describe_steps, join_distinct
+from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.coordinator.analysis.learning import LearningCurve, PublishedScore
 
 TITLE = 90  # characters in a line of the title
@@ -101,9 +102,10 @@ def _draw_curve(axes: Any, curve: LearningCurve, colour: str, spent: Callable[[E
     if reported is not None:
         ends = [spent(reported.effort), spent(last.effort)], [reported.score, last.score]
         axes.plot(*ends, ":", color=colour, linewidth=1)
+    score = format_with_error(last.score, last.error)
     axes.errorbar(
         spent(last.effort), last.score, error_bars([last]), fmt="*", color=colour, markersize=13, capsize=3,
-        markeredgecolor="black", label=f"{curve.name}, confirmed on fresh seeds: {last.score:.0f}",
+        markeredgecolor="black", label=f"{curve.name}, confirmed on fresh seeds: {score}",
     )  # fmt: skip
 
 

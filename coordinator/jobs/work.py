@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.host.stall_watch import STALL_SECONDS
 from dreamfleet.common.protocol.messages import Job, Kind, TaskSpec
-
-STALL_SECONDS = 30.0  # without a step, after which a worker gives a job up
 
 
 @dataclass(frozen=True)

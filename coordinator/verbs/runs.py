@@ -18,7 +18,15 @@ from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.files.regular_files import is_folder, path_exists
 from dreamfleet.common.monitoring.eta import format_duration
 from dreamfleet.common.printable import format_setting
-from dreamfleet.common.runs.records import RunSettings, StoredGeneration, best_evaluation, describe_score, with_error
+from dreamfleet.common.runs.records import (
+    RunSettings,
+    StoredGeneration,
+    best_evaluation,
+    count_failed,
+    describe_failed,
+    describe_score,
+    with_error,
+)
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.common.runs.run_paths import ARCHIVE as ARCHIVE_FOLDER
@@ -124,6 +132,7 @@ def show_run(args: argparse.Namespace) -> int:
             "ended_at": stored.ended_at,
             "lasted_seconds": duration_seconds,
             "fingerprint": stored.fingerprint,
+            "failed_candidates": count_failed(history),
         }
         classes = stored.classes
     begun = begun_stages(settings, history, evaluations) if settings.stages else ()
@@ -138,6 +147,7 @@ def show_run(args: argparse.Namespace) -> int:
     del facts["lasted_seconds"]
     if duration_seconds is not None:
         facts["ended_at"] = f"{facts['ended_at']}, {format_duration(duration_seconds)} after it began"
+    facts["failed_candidates"] = describe_failed(settings, history)
     facts["hosts"] = classes.description
     facts |= {f"class {name}": hosts for name, hosts in classes.rows}
     facts["reported"] = describe_score(confirmed or best_evaluation(evaluations))

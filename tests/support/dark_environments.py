@@ -1,6 +1,11 @@
 """Environments of gymnasium that cannot be filmed."""
 
+import os
+import time
+from typing import ClassVar
+
 import gymnasium
+import numpy as np
 from gymnasium.envs.classic_control import CartPoleEnv
 
 
@@ -20,5 +25,69 @@ class Raising(CartPoleEnv):
         raise ZeroDivisionError("no light")
 
 
-for each in (Dark, Blank, Raising):
+class Plain(gymnasium.Env):
+    """Knows nothing of render modes."""
+
+    observation_space, action_space = CartPoleEnv().observation_space, CartPoleEnv().action_space
+
+    def __init__(self):
+        pass
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), 1.0, False, False, {}
+
+
+class Breaking(CartPoleEnv):
+    """Draws pictures, and fails later."""
+
+    steps = 0
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps > 3:
+            raise ZeroDivisionError("no road")
+        return super().step(action)
+
+
+class Leaving(Breaking):
+    """Draws pictures, and ends its process later."""
+
+    def step(self, action):
+        try:
+            return super().step(action)
+        except ZeroDivisionError:
+            os._exit(3)
+
+
+class Stuck(Breaking):
+    """Draws pictures, and hangs later."""
+
+    def step(self, action):
+        try:
+            return super().step(action)
+        except ZeroDivisionError:
+            time.sleep(600)
+
+
+class Slow(Plain):
+    """Draws pictures, without end."""
+
+    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 50}
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+
+    def step(self, action):
+        time.sleep(0.02)
+        return super().step(action)
+
+    def render(self):
+        return np.zeros((64, 64, 3), np.uint8)
+
+
+for each in (Dark, Blank, Raising, Plain, Breaking, Leaving, Stuck, Slow):
     gymnasium.register(f"{each.__name__}-v0", entry_point=each)

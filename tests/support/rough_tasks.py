@@ -17,6 +17,7 @@ from tests.support.tasks import Toy, ToyEnvironment
 
 MODULE = "tests.support.rough_tasks"
 FOLDER = "DREAMFLEET_TEST_LEFT"  # where processes that are left behind write their ids
+HALT, EXIT = "DREAMFLEET_TEST_HALT", "DREAMFLEET_TEST_EXIT"  # the seeds with which `Halting` misbehaves
 SLEEP = (
     "import os, pathlib, signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); "
     f"pathlib.Path(os.environ.get('{FOLDER}', '/nowhere'), str(os.getpid())).touch(); time.sleep(600)"
@@ -34,6 +35,28 @@ class Rough(Toy):
 
     def make_environment(self, assignment):
         return RoughEnvironment(self.misbehave)
+
+
+class Halting(Toy):
+    """The second step of the seeds in `$DREAMFLEET_TEST_HALT` never ends; those in `..._EXIT` end their process."""
+
+    probe_steps = 0
+
+    def make_environment(self, assignment):
+        return HaltingEnvironment()
+
+
+class HaltingEnvironment(ToyEnvironment):
+    def reset(self, *, seed=None, options=None):
+        self._seed = str(seed)
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        if self._left < 10 and self._seed in os.environ.get(HALT, "").split(","):
+            time.sleep(600)
+        if self._left < 10 and self._seed in os.environ.get(EXIT, "").split(","):
+            os._exit(3)
+        return super().step(action)
 
 
 class RoughEnvironment(ToyEnvironment):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from collections.abc import Mapping
 from importlib.metadata import packages_distributions
 from typing import Any
@@ -61,9 +62,22 @@ class GymTask(Task):
     def make_evaluation_environment(
         self, assignment: Assignment, render_mode: str | None = None
     ) -> gymnasium.Env[Any, Any]:
-        """The same environment."""
+        """The same environment; `UsageError` if it has no render modes and pictures are wanted."""
         arguments = dict(assignment.spec.option("environment", {}))
-        return self._make(arguments if render_mode is None else {**arguments, "render_mode": render_mode})
+        if render_mode is None:
+            return self._make(arguments)
+        try:
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", ".*render_mode")  # gymnasium's: the error says it
+                return self._make({**arguments, "render_mode": render_mode})
+        except UsageError as error:
+            if not isinstance(error.__cause__, TypeError):
+                raise
+            self._make(arguments).close()  # without pictures it is sound
+            raise UsageError(
+                f"this environment ({self._id}) draws no pictures: it must take `render_mode`, and its `render` must "
+                f"return an array (height, width, 3) in the render mode {render_mode}"
+            ) from error
 
     def make_watched_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any] | None:
         """The environment with pictures; `None` outside of gymnasium, where `render` might change scores."""

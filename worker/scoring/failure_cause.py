@@ -62,8 +62,13 @@ def describe_crash(reason: str) -> str:
     return reason if is_host_failure(reason) else f"{CRASH} ({reason})"
 
 
+def describe_loss(reason: int | str) -> str:
+    """The error of the episode that a process of a pool was lost with; `reason` as `map_in_processes` gives it."""
+    return describe_crash(reason if isinstance(reason, str) else describe_exit(reason))
+
+
 def is_crash(error: str) -> bool:
-    """Whether the child died of the episode or was killed, so that the program that drives it again would too."""
+    """Whether the child died of the episode or was killed, so that the process that drives it again would too."""
     return error.startswith(CRASH) or is_host_failure(error)
 
 

@@ -13,6 +13,7 @@ from time import monotonic
 from typing import Any
 
 from dreamfleet.common.errors import BundleError, DreamfleetError
+from dreamfleet.common.host.stall_watch import START_LIMIT, StallWatch, describe_slow_start, describe_stall
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol.failures import describe_job, is_host_failure
 from dreamfleet.common.protocol.messages import Job, Result, TaskSpec
@@ -31,7 +32,6 @@ MAX_STARVED_DELAY = 60.0  # the longest of these pauses
 MAX_NAME_LENGTH = 100  # characters of `drawn_by`
 REMEDY = "give it fewer --slots, or this host more room (ulimit -n, ulimit -u, memory, the disk of temporary files)"
 MAX_START_DELAY = 30.0  # the longest pause before a new child, where children end one after another without a result
-START_LIMIT = 120.0  # seconds that a child may take to load task and world model; doubled with each failed start
 LOOK_INTERVAL = 0.5  # seconds between two looks whether the child still runs
 SHORT_GROUP = 0.25  # seconds; after a group that was shorter, a second group is queued in the child
 MAX_PIPELINED_BYTES = 64 * 1024  # bytes of vectors that a pipe accepts while its child is busy
@@ -86,7 +86,7 @@ class Slot:
         self._restore_bundle = restore_bundle
         self._groups: deque[JobGroup] = deque()
         self._groups_are_short = False  # whether the last one was
-        self._progress = (0, 0.0)  # steps, and when they last grew; before the child is ready, when it was started
+        self._watch = StallWatch()  # before the child is ready, it counts from the start
         self._child_number = 0
         self._failed_starts = self._starved_starts = 0  # in a row; the host is at fault for the starved ones
         self._was_ready = False  # whether any child was
@@ -142,7 +142,7 @@ class Slot:
         group = JobGroup(self._sent, work)
         self._groups.append(group)
         if len(self._groups) == 1:
-            self._reset_progress()
+            self._watch.restart()
         if not self._child.send(group.number, group.work):
             self._kill("it read no job")
 
@@ -168,17 +168,13 @@ class Slot:
             if now >= self._start_at:
                 self._start()
             return
-        steps, since = self._progress
-        since += gap
+        quiet = self._watch.quiet_seconds(self.steps, now, gap)
         if not self.ready:
             limit = START_LIMIT * 2**self._failed_starts
-            self._kill_after(limit, now - since, f"not ready after {limit:g} s")
+            self._kill_after(limit, quiet, describe_slow_start(limit))
         elif self._groups:
-            if self.steps != steps:
-                since = now
             limit = max(job.stall for job in self.running)
-            self._kill_after(limit, now - since, f"no step for {limit:g} s")
-        self._progress = (self.steps, since)
+            self._kill_after(limit, quiet, describe_stall(limit))
         self._check_exit(now)
 
     def abandon(self, digest: bytes) -> None:
@@ -200,7 +196,7 @@ class Slot:
             self.ready, self.drawn_by = True, truncate(event.message.drawn_by, MAX_NAME_LENGTH) or "-"
             self._failed_starts = self._starved_starts = 0
             self._was_ready = True
-            self._reset_progress()
+            self._watch.restart()
         elif isinstance(event.message, GroupDone):
             running = self._groups[0].number if self._groups else None  # a forked copy of the child may answer again
             return self._finish_group(event.message) if event.message.group == running else ()
@@ -221,9 +217,6 @@ class Slot:
         self._child_number += 1
         if self._child is not None:
             self._child.close(seconds)
-
-    def _reset_progress(self) -> None:
-        self._progress = (0, monotonic())
 
     def _kill_after(self, limit: float, quiet: float, why: str) -> None:
         """Kill a child that has been quiet for longer than `limit` seconds; 0: never."""
@@ -260,7 +253,7 @@ class Slot:
             and bool(done.results)
             and sum(each.seconds for each in done.results) < SHORT_GROUP
         )
-        self._reset_progress()
+        self._watch.restart()
         failed = {each.digest for each in done.results if each.fitness is None}
         if failed and group.number > 1:
             group.work = [work for work in group.work if work[0].digest in failed]
@@ -364,7 +357,7 @@ class Slot:
                 self._clear_child(START_RETRY_DELAY)
             return
         self._child.show(self._is_watched)
-        self._reset_progress()
+        self._watch.restart()
         waiting, self._groups = self._groups, deque()
         for group in waiting:
             if wanted := [work for work in group.work if work[0].digest not in group.unwanted]:

@@ -21,13 +21,14 @@ class AgentEvaluator:
         self._environment, self._policies = agent.make_evaluation_environment(), agent.make_policies()
         self._truth = agent.truth
 
-    def drive(self, seed: int) -> EpisodeResult:
-        """Drive one whole episode. The statistics do not change its score."""
+    def drive(self, seed: int, on_step: Callable[[int], None] = lambda _steps: None) -> EpisodeResult:
+        """Drive one whole episode; `on_step` gets the number of each step. The statistics do not change its score."""
         truth, episode_config = self._truth, EpisodeConfig(seed, self._world.horizon)
         watch = DriveStatistics(self._world, None if truth is None else lambda: truth(self._environment))
         driven = score(
-            self._environment, self._policies(seed), self._parameters, episode_config, on_transition=watch.on_transition
-        )
+            self._environment, self._policies(seed), self._parameters, episode_config, on_step,
+            on_transition=watch.on_transition,
+        )  # fmt: skip
         return watch.drive(seed, driven)
 
     def close(self) -> None:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from time import perf_counter
 from typing import ClassVar
@@ -13,61 +12,61 @@ from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.host.parent_death import exit_with_parent
-from dreamfleet.common.host.process_pool import map_in_processes
+from dreamfleet.common.host.process_pool import count_step, map_in_processes
 from dreamfleet.common.host.resource_limits import pin_thread_pools
+from dreamfleet.common.host.stall_watch import STALL_SECONDS
 from dreamfleet.common.host.stop_signals import outlive_stop_signals
 from dreamfleet.common.protocol.result_bounds import rejection_reason
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.common.runs.evaluation_report import EvaluationReport
 from dreamfleet.worker.scoring.agents import Agent
-from dreamfleet.worker.scoring.failure_cause import describe_exception
+from dreamfleet.worker.scoring.failure_cause import describe_exception, describe_loss
 from dreamfleet.worker.tools.agent_evaluator import AgentEvaluator
 
 Episode = EpisodeResult | FailedEpisode
+FIRST_LOSSES = 3  # processes lost before any episode has ended, after which the evaluation ends
 
 
 def evaluate(agent: Agent, seeds: tuple[int, ...], jobs: int) -> Iterator[Episode]:
     """Drive one whole episode for each seed in `jobs` processes, or in this one if it is 1; yield each when it ends.
 
-    An episode that fails does not end the others.
+    An episode that fails does not end the others. In this process, one that crashes or hangs does.
     """
-    pin_thread_pools()
-    if jobs == 1:  # in this process, so that a script needs no `if __name__ == "__main__"`
-        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-        driver = _Driver(agent)
-        yield from map(driver.drive, seeds)
-        driver.close()
+    if jobs > 1:
+        yield from evaluate_in_processes(agent, seeds, jobs)
         return
-    left = list(seeds)
-    while left:
-        try:
-            for each in _drive_in_processes(agent, left, jobs):
-                left.remove(each.seed)
-                yield each
-        except BrokenProcessPool as error:  # the seeds are handed out in order: one of the first crashed
-            alone = [_drive_alone(agent, seed) for seed in left[:jobs]]
-            if len(left) == len(seeds) and all(isinstance(each, FailedEpisode) for each in alone):
-                raise DreamfleetError(
-                    'a driving process has crashed; in your own script call this under `if __name__ == "__main__":` or '
-                    "with jobs=1; otherwise `dreamfleet doctor` looks for the cause"
-                ) from error
-            yield from alone
-            del left[:jobs]
+    pin_thread_pools()
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    driver = _Driver(agent)  # in this process, so that a script needs no `if __name__ == "__main__"`
+    yield from map(driver.drive, seeds)
+    driver.close()
 
 
-def _drive_in_processes(agent: Agent, seeds: Sequence[int], jobs: int) -> Iterator[Episode]:
-    """`BrokenProcessPool` if one of the processes crashes."""
-    work = tuple(seeds)
-    return map_in_processes(jobs, _ProcessEvaluator.start, (agent, os.getpid()), _ProcessEvaluator.drive, work)
+def evaluate_in_processes(
+    agent: Agent, seeds: tuple[int, ...], jobs: int, stall: float = STALL_SECONDS
+) -> Iterator[Episode]:
+    """Like `evaluate`, in `jobs` processes. An episode fails that ends its process, or makes no step for `stall` s.
 
+    `DreamfleetError` if the first processes are all lost before any episode has ended.
+    """
+    lost: list[Episode] = []
+    ended = False
 
-def _drive_alone(agent: Agent, seed: int) -> Episode:
-    """Drive one episode in a process of its own, which may crash."""
-    try:
-        (found,) = _drive_in_processes(agent, (seed,), 1)
-        return found
-    except BrokenProcessPool:
-        return FailedEpisode(seed, "the driving process crashed")
+    def lose(seed: int, reason: int | str) -> Episode:
+        error = describe_loss(reason)
+        lost.append(FailedEpisode(seed, error))
+        if not ended and len(lost) == max(jobs, FIRST_LOSSES):
+            raise DreamfleetError(
+                f"the first {len(lost)} driving processes are lost: {error}; in your own script call this under "
+                '`if __name__ == "__main__":` or with jobs=1; otherwise `dreamfleet doctor` looks for the cause'
+            )
+        return lost[-1]
+
+    pin_thread_pools()
+    start, drive = _ProcessEvaluator.start, _ProcessEvaluator.drive
+    for each in map_in_processes(jobs, start, (agent, os.getpid()), drive, seeds, lose, stall):
+        ended = ended or each not in lost
+        yield each
 
 
 def run_evaluation(
@@ -75,7 +74,7 @@ def run_evaluation(
 ) -> EvaluationReport:
     """Evaluate an agent and report it under `name`; `on_episode` gets all episodes so far after each."""
     began, episodes = perf_counter(), list[Episode]()
-    for each in evaluate(agent, seeds, jobs):
+    for each in evaluate_in_processes(agent, seeds, jobs):
         episodes.append(each)
         on_episode(episodes)
     results = EpisodeResults.of(episodes)
@@ -98,7 +97,8 @@ class _Driver:
         try:
             if self._evaluator is None:
                 self._evaluator = AgentEvaluator(self._agent)
-            found = self._evaluator.drive(seed)
+                count_step()  # it is ready
+            found = self._evaluator.drive(seed, count_step)
             why = rejection_reason(found.score, found.steps, 0.0, found.steps)
             return found if why is None else FailedEpisode(seed, why)
         except DreamfleetError:

@@ -38,7 +38,7 @@ def open_sink(out: str, rate: int, stdout: BinaryIO) -> Iterator[SendFrame]:
         from dreamfleet.worker.tools.video import Video
 
         check_output_path(path)
-        with Video(path, rate) as video:
+        with Video(path, rate, keep_partial=True) as video:
             yield lambda shown: shown is None or _write_frame(video, shown)
     elif path.suffix or path.is_file():
         raise UsageError(f"--out {out}: name an .mp4, a folder for pictures, or - for a stream of them")

@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, ClassVar, NoReturn
 
-from dreamfleet.common.host.stop_signals import Stop, never_stop
+from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.files.atomic_write import reporting_write_errors
+from dreamfleet.common.host.parent_death import exit_with_parent
+from dreamfleet.common.host.process_pool import count_step, map_in_processes
+from dreamfleet.common.host.stall_watch import STALL_SECONDS
+from dreamfleet.common.host.stop_signals import Stop, never_stop, outlive_stop_signals
 from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
 from dreamfleet.worker.scoring.agents import Agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
+from dreamfleet.worker.scoring.failure_cause import describe_loss
 from dreamfleet.worker.tools.drive_frames import FilmedPolicy, FramePainter, WorldModelView, episode_errors
 from dreamfleet.worker.tools.video import Video
 
@@ -26,7 +37,7 @@ def record(
     environment = agent.make_evaluation_environment("rgb_array")
     policy: Any = agent.make_policies()(seed)
     policy.begin(agent.parameters)
-    config, bundle = dreaming or ParallelDreamConfig(seed=seed), agent.bundle
+    config, bundle = replace(dreaming or ParallelDreamConfig(), seed=seed), agent.bundle
     model_view = None if bundle is None else WorldModelView(bundle, policy, agent.parameters, config)
     score = 0.0
     with episode_errors(seed), Video(out, agent.world.frames_per_second) as video:
@@ -38,3 +49,57 @@ def record(
                 break
     environment.close()
     return score
+
+
+def record_in_process(
+    film: partial[float], seed: int, out: Path, on_step: Callable[[int], None], stop: Stop,
+    stall: float = STALL_SECONDS,
+) -> tuple[float, int]:  # fmt: skip
+    """Record an episode in a child process; return its score and its steps. `film` is `record` without what is here.
+
+    `DreamfleetError` if the episode fails, ends its process, or makes no step for `stall` seconds; then `out` is as it
+    was before. `on_step` is called about once a second.
+    """
+    is_stopped = get_context("spawn").Value("B", 0, lock=False)
+
+    def look(steps: int) -> None:
+        on_step(steps)
+        is_stopped.value = stop()
+
+    def lose(_item: object, reason: int | str) -> NoReturn:
+        raise DreamfleetError(f"the episode of seed {seed} failed: {describe_loss(reason)}")
+
+    arguments = os.getpid(), is_stopped
+    with reporting_write_errors(out), TemporaryDirectory(prefix=f".{out.stem}-", dir=out.parent) as folder:
+        video = Path(folder) / out.name
+        items = [(film, seed, video)]
+        (made,) = map_in_processes(1, _Recorder.start, arguments, _Recorder.record, items, lose, stall, look)
+        video.replace(out)
+    return made
+
+
+class _Recorder:
+    """Records in a child process."""
+
+    is_stopped: ClassVar[Any]
+
+    @classmethod
+    def start(cls, parent: int, is_stopped: Any) -> None:
+        """Initialise the process, which ends with its parent."""
+        exit_with_parent(parent)
+        outlive_stop_signals()  # Ctrl-C reaches the whole process group; the parent says when to stop
+        cls.is_stopped = is_stopped
+
+    @classmethod
+    def record(cls, item: tuple[partial[float], int, Path]) -> tuple[float, int]:
+        """Record one episode; return its score and its steps."""
+        film, seed, out = item
+        steps = 0
+
+        def on_step(made: int) -> None:
+            nonlocal steps
+            steps = made
+            count_step()
+
+        score = film(seed=seed, out=out, on_step=on_step, stop=lambda: bool(cls.is_stopped.value))
+        return score, steps

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.host.fingerprint import fingerprint
+from dreamfleet.common.host.parent_death import exit_with_parent
+from dreamfleet.common.host.process_pool import count_step, map_in_processes
 from dreamfleet.common.host.resource_limits import pin_thread_pools
+from dreamfleet.common.host.stall_watch import STALL_SECONDS
+from dreamfleet.common.host.stop_signals import outlive_stop_signals
 from dreamfleet.common.protocol.failures import failure_cause
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, class_from_fingerprint
 from dreamfleet.common.runs.records import StoredFailure, StoredResult
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.scoring_params import ScoringParams, scoring_params_of
-from dreamfleet.worker.scoring.failure_cause import describe_exception, is_crash
+from dreamfleet.worker.scoring.failure_cause import describe_exception, describe_loss, is_crash
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,6 +29,18 @@ if TYPE_CHECKING:
 
     from dreamfleet.common.protocol.messages import TaskSpec
     from dreamfleet.worker.scoring.scorer import Scorer
+
+    Item = tuple[int, NDArray[np.float32], int, TaskSpec]  # episode, parameters, seed and how it is driven
+
+
+@dataclass(frozen=True)
+class ReplayAttempt:
+    """What an episode came to now: its fitness, or an error; neither: it was not driven."""
+
+    episode: int
+    host_class: str = ""  # of this host; empty: unknown
+    fitness: float | None = None
+    error: str = ""
 
 
 @dataclass(frozen=True)
@@ -47,7 +64,7 @@ class ReplayedEpisode:
 
     @property
     def attempted(self) -> bool:
-        """Whether it was driven again; an episode that would end or block this program is not."""
+        """Whether it was driven again; an episode that would end or block its process is not."""
         return self.replayed is not None or bool(self.error)
 
     def agrees(self, tolerance: float | None) -> bool | None:
@@ -64,36 +81,39 @@ class ReplayedEpisode:
         return None if tolerance is None else abs(self.stored - self.replayed) <= tolerance
 
 
-def replay(run: RunFolder, generation: int, candidate: int) -> Iterator[ReplayedEpisode]:
+def replay(run: RunFolder, generation: int, candidate: int, stall: float = STALL_SECONDS) -> Iterator[ReplayedEpisode]:
     """Drive each stored episode of a candidate again, with its generation's parameters, bundle and seeds.
 
+    It drives in a child process: an episode that ends it, or makes no step for `stall` seconds, has that error now.
     Episodes of a vector that was discarded and drawn anew are left out.
     """
     with run.read_transaction():
         parameters = run.candidate(generation, candidate)
         scoring_params, own = scoring_params_of(run, generation), run.spec
         stored = _stored_episodes(run, generation, candidate, scoring_params)
-    pin_thread_pools()
-    os.environ["SDL_VIDEODRIVER"] = "dummy"
-    from dreamfleet.worker.scoring.scorer import Scorer
-
-    scorer = Scorer(own, Bundle.open(run.bundle_path, own.bundle) if own.bundle else None)
-    here = {scorer.host_class, class_from_fingerprint(fingerprint(run.settings.packages))}
+    failures = {each.episode: each.error for each in stored if isinstance(each, StoredFailure)}
+    specs = {each.episode: scoring_params.episode_spec(each.episode) for each in stored}
+    items = [
+        (each.episode, parameters, each.seed, specs[each.episode])
+        for each in stored
+        if not is_crash(failures.get(each.episode, ""))
+    ]
+    driven = _drive_all(own, run.bundle_path if own.bundle else None, items, stall)
+    here = {*(each.host_class for each in driven.values()), class_from_fingerprint(fingerprint(run.settings.packages))}
     for each in stored:
-        spec = scoring_params.episode_spec(each.episode)
+        now = driven.get(each.episode, ReplayAttempt(each.episode))
         if isinstance(each, StoredFailure):
             # R8: a failure for good was independent of the host.
-            fitness, host_class, failure, comparable = None, "", each.error, True
+            fitness, host_class, comparable = None, "", True
         else:
-            fitness, host_class, failure = each.fitness, each.host_class, ""
-            comparable = host_class in here
-        replayed, error = (None, "") if is_crash(failure) else _drive(scorer, parameters, each.seed, spec)
-        deterministic = NON_DETERMINISTIC not in (scorer.host_class, host_class)
+            # An episode that ends or blocks its process differs, wherever it had a score.
+            fitness, host_class, comparable = each.fitness, each.host_class, is_crash(now.error)
+        comparable = comparable or host_class in here
+        deterministic = NON_DETERMINISTIC not in (*here, host_class)
         yield ReplayedEpisode(
-            each.episode, each.seed, fitness, replayed, host_class, deterministic and comparable, deterministic,
-            failure, error,
+            each.episode, each.seed, fitness, now.fitness, host_class, deterministic and comparable, deterministic,
+            failures.get(each.episode, ""), now.error,
         )  # fmt: skip
-    scorer.close()
 
 
 def _stored_episodes(
@@ -112,11 +132,45 @@ def _stored_episodes(
     return sorted(filter(is_final, stored), key=lambda each: each.episode)
 
 
-def _drive(
-    scorer: Scorer, parameters: NDArray[np.float32], seed: int, spec: TaskSpec
-) -> tuple[float | None, str]:  # fmt: skip
-    """An episode's fitness, or `None` and the error."""
-    try:
-        return scorer.score("score", parameters, seed, spec=spec).fitness, ""
-    except (Exception, SystemExit) as error:  # a simulator may raise anything
-        return None, describe_exception(error)
+def _drive_all(spec: TaskSpec, bundle: Path | None, items: Sequence[Item], stall: float) -> dict[int, ReplayAttempt]:
+    """Drive the episodes one after another in a child process; the attempts by episode."""
+
+    def lose(item: Item, reason: int | str) -> ReplayAttempt:
+        return ReplayAttempt(item[0], error=describe_loss(reason))
+
+    pin_thread_pools()
+    arguments = os.getpid(), spec, bundle
+    attempts = map_in_processes(1, _Replayer.start, arguments, _Replayer.drive, items, lose, stall) if items else ()
+    return {each.episode: each for each in attempts}
+
+
+class _Replayer:
+    """Drives episodes in a child process."""
+
+    spec: ClassVar[TaskSpec]
+    bundle: ClassVar[Path | None]
+    scorer: ClassVar[Scorer | None] = None
+
+    @classmethod
+    def start(cls, parent: int, spec: TaskSpec, bundle: Path | None) -> None:
+        """Initialise the process, which ends with its parent."""
+        exit_with_parent(parent)
+        os.environ["SDL_VIDEODRIVER"] = "dummy"
+        outlive_stop_signals()  # Ctrl-C reaches the whole process group; the parent ends this process
+        cls.spec, cls.bundle = spec, bundle
+
+    @classmethod
+    def drive(cls, item: Item) -> ReplayAttempt:
+        """Drive one episode; `DreamfleetError` if the task cannot be scored here."""
+        from dreamfleet.worker.scoring.scorer import Scorer
+
+        episode, parameters, seed, spec = item
+        if cls.scorer is None:
+            cls.scorer = Scorer(cls.spec, None if cls.bundle is None else Bundle.open(cls.bundle, cls.spec.bundle))
+        host_class = cls.scorer.host_class  # before the episode, as it drives the environment too
+        count_step()
+        try:
+            score = cls.scorer.score("score", parameters, seed, count_step, spec=spec)
+            return ReplayAttempt(episode, host_class, score.fitness)
+        except (Exception, SystemExit) as error:  # a simulator may raise anything
+            return ReplayAttempt(episode, host_class, error=describe_exception(error))

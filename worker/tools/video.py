@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -10,30 +11,31 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.files.atomic_write import open_output
 
 
 class Video:
-    """An mp4 that grows picture by picture; use it in a `with`. It is playable even if it ends early."""
+    """An mp4 that grows picture by picture; use it in a `with`. The file appears, whole, when it ends.
 
-    def __init__(self, out: Path, frames_per_second: int) -> None:
-        self._out, self._rate = out, frames_per_second
+    After an error there is no file; with `keep_partial` there is one of the pictures so far.
+    """
+
+    def __init__(self, out: Path, frames_per_second: int, *, keep_partial: bool = False) -> None:
+        self._out, self._rate, self._keep_partial = out, frames_per_second, keep_partial
+        self._output = ExitStack()
+        self._container: Any = None
         self._stream: Any = None
 
     def __enter__(self) -> Video:
-        try:
-            self._out.parent.mkdir(parents=True, exist_ok=True)
-            self._container: Any = av.open(str(self._out), "w")
-        except OSError as error:
-            raise DatasetError(f"cannot write {self._out}: {error.strerror}; choose another --out") from error
         return self
 
-    def __exit__(self, *_error: object) -> None:
+    def __exit__(self, *error: Any) -> None:
         if self._stream is not None:
             self._container.mux(self._stream.encode())
-        self._container.close()
-        if self._stream is None:
-            self._out.unlink(missing_ok=True)  # no picture came
+        if self._container is not None:
+            self._container.close()
+        is_kept = self._keep_partial and self._stream is not None
+        self._output.__exit__(*((None, None, None) if is_kept else error))
 
     def add(self, picture: NDArray[np.uint8]) -> None:
         """Add a picture `(height, width, 3)` with even sides, of the same size as the first."""
@@ -42,6 +44,8 @@ class Video:
         self._container.mux(self._stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
 
     def _open_stream(self, width: int, height: int) -> Any:
+        file = self._output.enter_context(open_output(self._out))
+        self._container = av.open(file, "w", format="mp4")
         stream = self._container.add_stream("libx264", rate=self._rate)
         stream.width, stream.height = width, height
         stream.pix_fmt = "yuv420p"

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.files.atomic_write import check_output_path
-from dreamfleet.common.host.stop_signals import Stop, stop_on_signals
+from dreamfleet.common.host.stop_signals import stop_on_signals
 from dreamfleet.common.runs.seeds import TEST
-
-Record = Callable[[int, Path, Callable[[int], None], Stop], float]
-"""Records the drive of a seed into a file and returns its score; calls the third argument with each step."""
 
 
 def add_video_flags(parser: argparse.ArgumentParser) -> None:
@@ -41,21 +38,18 @@ def video_paths(args: argparse.Namespace) -> dict[int, Path]:
     return videos
 
 
-def record_videos(args: argparse.Namespace, videos: dict[int, Path], record: Record) -> int:
-    """Record one video after another and print each score; Ctrl-C ends the current video and the verb."""
+def record_videos(args: argparse.Namespace, videos: dict[int, Path], film: partial[float]) -> int:
+    """Record one video after another and print each score; Ctrl-C ends the current video and the verb.
+
+    `film` is as in `record_in_process`.
+    """
     from dreamfleet.common.cli.progress import progress_bar
+    from dreamfleet.worker.tools.recording import record_in_process
 
     with stop_on_signals() as stop:
         for seed, video in videos.items():
-            driven = 0
-
-            def move(done: int) -> None:
-                nonlocal driven
-                driven = done
-                bar.update(done)
-
             with progress_bar("record", args.steps, "steps") as bar:
-                score = record(seed, video, move, stop)
+                score, driven = record_in_process(film, seed, video, bar.update, stop)
             if stop():
                 raise StoppedError(
                     f"stopped: {video} shows the first {driven} steps on seed {seed}, with a score of {score:.1f}; "

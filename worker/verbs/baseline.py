@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,6 @@ from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, open_output
 from dreamfleet.common.host.resource_limits import pin_thread_pools, usable_cores
-from dreamfleet.common.host.stop_signals import Stop
 from dreamfleet.common.runs.seeds import TEST, VALIDATION
 from dreamfleet.worker.tools.video_cli import add_video_flags, record_videos, video_paths
 
@@ -134,12 +133,7 @@ def record_baseline(args: argparse.Namespace) -> int:
     from dreamfleet.worker.baselines.agents import find_baseline
     from dreamfleet.worker.tools.recording import record
 
-    agent = find_baseline(args.agent, args.data)
-
-    def film(seed: int, video: Path, move: Callable[[int], None], stop: Stop) -> float:
-        return record(agent, seed, args.steps, video, on_step=move, stop=stop)
-
-    return record_videos(args, videos, film)
+    return record_videos(args, videos, partial(record, find_baseline(args.agent, args.data), steps=args.steps))
 
 
 def configure_export(parser: argparse.ArgumentParser) -> None:

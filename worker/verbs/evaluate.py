@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, open_output
 from dreamfleet.common.host.resource_limits import pin_thread_pools, usable_cores
+from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.seeds import TEST
 
 if TYPE_CHECKING:
@@ -67,16 +68,26 @@ def judge(name: str, agent: Agent, seeds: tuple[int, ...], jobs: int) -> Evaluat
     """Drive one whole episode per seed, with a progress bar and a line on stderr for each that fails."""
     from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.common.runs.episode_results import EpisodeResult
+    from dreamfleet.common.runs.standard_error import format_with_error, standard_error
     from dreamfleet.worker.tools.evaluation import run_evaluation
 
     def move(episodes: list[Episode]) -> None:
+        so_far[:] = episodes
         scores = [each.score for each in episodes if isinstance(each, EpisodeResult)]
-        bar.update(len(episodes), f"mean {sum(scores) / len(scores):.1f}" if scores else "")
+        bar.update(len(episodes), f"mean {format_with_error(sum(scores) / len(scores), None)}" if scores else "")
         if not isinstance(last := episodes[-1], EpisodeResult):
             print(f"an episode failed: {last}", file=sys.stderr)
 
+    so_far: list[Episode] = []
     with progress_bar("evaluate", len(seeds), "episodes") as bar:
-        return run_evaluation(name, agent, seeds, jobs, move)
+        try:
+            return run_evaluation(name, agent, seeds, jobs, move)
+        except KeyboardInterrupt:
+            scores = [each.score for each in so_far if isinstance(each, EpisodeResult)]
+            if not scores:
+                raise
+            mean = format_with_error(sum(scores) / len(scores), standard_error(scores))
+            raise StoppedError(f"interrupted after {len(scores)} of {plural(len(seeds), 'episode')}: {mean}") from None
 
 
 def _choose_agent(args: argparse.Namespace) -> tuple[str, Agent]:

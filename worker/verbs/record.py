@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
+from functools import partial
 
 from dreamfleet.common.cli.global_config import add_global_flags
-from dreamfleet.common.host.stop_signals import Stop
 from dreamfleet.worker.tools.video_cli import add_video_flags, record_videos, video_paths
 
 SUMMARY = "record drives as mp4s: the track, what the model sees, what it decodes, what it dreams"
@@ -34,11 +31,7 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.worker.scoring.agents import make_agent
     from dreamfleet.worker.tools.recording import record
 
-    daydream = ParallelDreamConfig(args.temperature)
     controller, beside = find_agent(args.controller, args.runs_dir)
     agent = make_agent(controller, find_bundle_of(controller, args.bundle, beside))
-
-    def film(seed: int, video: Path, move: Callable[[int], None], stop: Stop) -> float:
-        return record(agent, seed, args.steps, video, replace(daydream, seed=seed), move, stop)
-
-    return record_videos(args, videos, film)
+    dreaming = ParallelDreamConfig(args.temperature)
+    return record_videos(args, videos, partial(record, agent, steps=args.steps, dreaming=dreaming))

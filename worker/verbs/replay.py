@@ -76,7 +76,7 @@ def _describe(each: ReplayedEpisode, tolerance: float | None) -> str:
         return f"stored {each.stored!r}  replayed {each.replayed!r}  {_describe_match(each, tolerance)}"
     then = f"failed then ({one_line(each.failure)})" if each.failure else f"stored {each.stored!r}"
     if not each.attempted:
-        return f"{then}  not driven again, as it would end or block this program"
+        return f"{then}  not driven again, as it would end or block its process"
     now = f"fails now ({one_line(each.error)})" if each.error else f"replayed {each.replayed!r}"
     return f"{then}  {now}  {'same cause' if each.same else _describe_match(each, tolerance)}"
 

@@ -50,7 +50,7 @@ def test_figures_that_an_environment_does_not_report_are_left_out():
 
 def test_the_description_covers_driving_and_origin():
     score, manner, origin = JUDGEMENT.description.splitlines()
-    assert score.startswith("670.0 ± 210.7 (standard error) on 3 seeds, 250 to 910, median 850")
+    assert score.startswith("670.0 ± 210.7 (standard error) on 3 seeds, 250.0 to 910.0, median 850.0")
     assert manner == (
         "above 800: 67%, above 900: 33%, laps finished: 1 of 3, mean speed 60.0, brake on in 10% of the steps"
     )

@@ -39,6 +39,21 @@ def test_a_mean_without_an_error_is_printed_without_one():
     assert format_with_error(1234.56, 7.89) == "1234.6 ± 7.9"
     assert format_with_error(1234.56, 7890.1, sign=",") == "1,234.6 ± 7,890.1"
     assert format_with_error(0.5, 0.25, 2, sign="+") == "+0.50 ± 0.25"
+
+
+@pytest.mark.parametrize(
+    ("mean", "error", "text"),
+    [
+        (-3.5, None, "-3.5"),
+        (0.1234, 0.0031, "0.123 ± 0.003"),
+        (0.00042, None, "0.0004"),
+        (500.0, 0.0, "500.0 ± 0.0"),
+        (-0.01, 2.0, "0.0 ± 2.0"),
+        (-1e-12, None, "0.000000"),
+    ],
+)
+def test_a_small_score_has_enough_digits_and_a_zero_no_sign(mean, error, text):
+    assert format_with_error(mean, error) == text
     assert format_with_error(812.4, None, 0) == "812"
 
 

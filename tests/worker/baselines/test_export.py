@@ -28,7 +28,7 @@ from dreamfleet.worker.car_racing.agents import NO_PARAMETERS, NetworkPolicy
 from dreamfleet.worker.car_racing.native_check import make_car_racing
 from dreamfleet.worker.scoring.agents import make_agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
-from dreamfleet.worker.tools import agent_evaluator
+from dreamfleet.worker.tools import agent_evaluator, evaluation
 from dreamfleet.worker.training.checkpoint import save_checkpoint
 from dreamfleet.worker.worldmodel.inference import open_graph
 
@@ -40,6 +40,7 @@ LEARNING = LearningConfig(episodes=2, random_episodes=1, steps=12, batch=2, repo
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
     monkeypatch.setattr(agent_evaluator, "EpisodeConfig", lambda seed, _horizon: EpisodeConfig(seed, STEPS))
+    monkeypatch.setattr(evaluation, "evaluate_in_processes", evaluation.evaluate)  # a child would not know it
 
 
 def networks_of(layers, seed=0):

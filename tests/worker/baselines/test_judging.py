@@ -16,7 +16,7 @@ from dreamfleet.worker.baselines.network import Networks
 from dreamfleet.worker.baselines.presets import DISCRETE, DRQN, NAMES, RANDOM
 from dreamfleet.worker.baselines.train import CHECKPOINT
 from dreamfleet.worker.scoring.episode import EpisodeConfig
-from dreamfleet.worker.tools import agent_evaluator
+from dreamfleet.worker.tools import agent_evaluator, evaluation
 from dreamfleet.worker.tools.recording import record
 from dreamfleet.worker.training.checkpoint import save_checkpoint
 from dreamfleet.worker.verbs import baseline
@@ -30,6 +30,7 @@ LAYERS = AgentConfig(channels=(2,), kernels=(8,), strides=(8,), hidden=4, frame_
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
     monkeypatch.setattr(agent_evaluator, "EpisodeConfig", lambda seed, _horizon: EpisodeConfig(seed, STEPS))
+    monkeypatch.setattr(evaluation, "evaluate_in_processes", evaluation.evaluate)  # a child would not know it
 
 
 def keep(folder, model):

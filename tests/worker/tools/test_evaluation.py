@@ -1,4 +1,5 @@
 import json
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -14,8 +15,8 @@ from dreamfleet.worker.scoring import episode
 from dreamfleet.worker.scoring.agents import make_agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig
 from dreamfleet.worker.tasks.registry import find_task
-from dreamfleet.worker.tools.evaluation import evaluate
-from tests.support import tasks
+from dreamfleet.worker.tools.evaluation import evaluate, evaluate_in_processes
+from tests.support import rough_tasks, tasks
 
 SEEDS = (10_000, 10_001, 10_002)
 
@@ -100,6 +101,42 @@ def test_a_crash_costs_only_its_own_episode(controller, random_bundle):
     found = EpisodeResults.of(evaluate(make_agent(controller(tasks.FRAGILE), random_bundle), tuple(range(8)), 2))
     assert [each.seed for each in found.failed] == [6]
     assert len(found.drives) == 7
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_an_episode_that_hangs_is_given_up_and_the_others_go_on(controller, random_bundle, monkeypatch, jobs):
+    monkeypatch.setenv(rough_tasks.HALT, "5")
+    monkeypatch.setenv(rough_tasks.EXIT, "2")
+    agent = make_agent(controller(rough_tasks.name_of(rough_tasks.Halting)), random_bundle)
+    found = EpisodeResults.of(evaluate_in_processes(agent, tuple(range(8)), jobs, stall=2.0))
+    assert {each.seed: each.error for each in found.failed} == {
+        2: "slot crashed (exit status 3)",
+        5: "slot crashed (no step for 2 s)",
+    }
+    assert len(found.drives) == 6
+
+
+def test_the_verb_outlives_a_simulator_that_ends_its_only_process(
+    processes, controller, random_bundle, tmp_path, monkeypatch
+):
+    monkeypatch.setenv(rough_tasks.EXIT, "10000")
+    controller(rough_tasks.name_of(rough_tasks.Halting)).save(tmp_path / "toy.npz")
+    judged = ("--controller", tmp_path / "toy.npz", "--bundle", random_bundle.path, "--episodes", 3, "--jobs", 1)
+    code, out, err = processes.call("evaluate", *judged, "--trust", rough_tasks.MODULE)
+    assert (code, "2 of 3 episodes, 1 failed: seed 10000, slot crashed (exit status 3)" in out) == (0, True), err
+
+
+def test_an_interrupted_evaluation_says_what_it_has(processes, controller, random_bundle, tmp_path, monkeypatch):
+    monkeypatch.setenv(rough_tasks.EXIT, "10003")
+    monkeypatch.setenv(rough_tasks.HALT, "10004")
+    controller(rough_tasks.name_of(rough_tasks.Halting)).save(tmp_path / "toy.npz")
+    judged = ("--controller", tmp_path / "toy.npz", "--bundle", random_bundle.path, "--episodes", 5, "--jobs", 1)
+    evaluation = processes.start("evaluate", *judged, "--trust", rough_tasks.MODULE)
+    evaluation.wait_for("an episode failed")
+    evaluation.popen.send_signal(signal.SIGINT)
+    assert evaluation.finish()[0] == 130
+    said = evaluation.last_line()
+    assert (said.startswith("interrupted after 3 of 5 episodes: -"), "±" in said) == (True, True), said
 
 
 def test_a_world_model_is_found_beside_its_controller_or_by_name(controller, random_bundle):

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import partial
 
 import av
 import numpy as np
@@ -7,13 +8,14 @@ import pytest
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, write_bundle
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.host.stop_signals import never_stop
 from dreamfleet.worker.scoring import episode
 from dreamfleet.worker.scoring.agents import make_agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.tools.canvas import AWAKE, DREAMING
-from dreamfleet.worker.tools.recording import record
+from dreamfleet.worker.tools.recording import record, record_in_process
 
 SEED, STEPS = 10_003, 8
 
@@ -78,6 +80,7 @@ def test_a_bundle_without_a_dream_is_recorded_with_two_pictures(controller, rand
         ("Dark", "this environment (Dark) draws no pictures"),
         ("Blank", "this environment (Blank) draws no pictures"),
         ("Raising", "the episode of seed 10000 failed: ZeroDivisionError: no light"),
+        ("Plain", "this environment (tests.support.dark_environments:Plain-v0) draws no pictures"),
     ],
 )
 def test_an_environment_that_cannot_be_filmed_ends_with_one_line(processes, tmp_path, monkeypatch, name, says):
@@ -87,8 +90,47 @@ def test_an_environment_that_cannot_be_filmed_ends_with_one_line(processes, tmp_
     for verb in ("record", "live"):
         out = tmp_path / f"{verb}.mp4"
         code, _, err = processes.call(verb, "--controller", tmp_path / "dark.npz", "--out", out)
-        assert (code > 0, says in err, "Traceback" in err) == (True, True, False), err
-        assert not out.exists()
+        assert (code > 0, says in err, "Traceback" in err, "\x1b" in err) == (True, True, False, False), err
+        assert list(tmp_path.glob("*.mp4*")) == list(tmp_path.glob(".*")) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "error"), [("Breaking", "ZeroDivisionError: no road"), ("Leaving", "slot crashed (exit status 3)")]
+)
+def test_an_episode_that_fails_leaves_no_video_and_the_one_that_is_there(processes, tmp_path, monkeypatch, name, error):
+    monkeypatch.setenv("DREAMFLEET_TRUST", "tests")
+    task = f"gym:tests.support.dark_environments:{name}-v0"
+    Controller(ControllerShape(4, 2), np.zeros(10, np.float32), task, "").save(tmp_path / "breaking.npz")
+    (tmp_path / "videos").mkdir()
+    (tmp_path / "videos" / "drive-10001.mp4").write_text("earlier")
+    code, _, err = processes.call(
+        "record", "--controller", tmp_path / "breaking.npz", "--seed", 10_001, 10_000, "--out",
+        tmp_path / "videos" / "drive.mp4",
+    )  # fmt: skip
+    assert (code, f"the episode of seed 10001 failed: {error}" in err) == (1, True), err
+    assert {each.name: each.read_text() for each in (tmp_path / "videos").iterdir()} == {"drive-10001.mp4": "earlier"}
+
+
+def film_of(name, monkeypatch):
+    monkeypatch.setenv("DREAMFLEET_TRUST", "tests")
+    task = f"gym:tests.support.dark_environments:{name}-v0"
+    return partial(record, make_agent(Controller(ControllerShape(4, 2), np.zeros(10, np.float32), task, "")), steps=900)
+
+
+def test_an_episode_that_hangs_ends_the_recording(tmp_path, monkeypatch):
+    with pytest.raises(DreamfleetError, match=r"slot crashed \(no step for 2 s\)"):
+        record_in_process(film_of("Stuck", monkeypatch), SEED, tmp_path / "drive.mp4", print, never_stop, stall=2.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recording_in_another_process_can_be_stopped(tmp_path, monkeypatch):
+    seen = [0]
+    film = film_of("Slow", monkeypatch)
+    score, steps = record_in_process(film, SEED, tmp_path / "drive.mp4", seen.append, lambda: seen[-1] > 0)
+    assert 0 < seen[-1] <= steps < 900
+    assert score == steps
+    with av.open(str(tmp_path / "drive.mp4")) as container:
+        assert len(list(container.decode(container.streams.video[0]))) == steps
 
 
 def test_another_task_or_an_impossible_place_is_refused(controller, random_bundle, tmp_path):

@@ -6,7 +6,8 @@ import pytest
 
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_paths import JOURNAL
-from tests.support import tasks
+from dreamfleet.worker.tools.replay import replay
+from tests.support import rough_tasks, tasks
 
 
 @pytest.fixture
@@ -47,6 +48,24 @@ def test_results_of_another_host_class_are_counted_and_optionally_compared(proce
     code, out, err = processes.call(*replay, "--tolerance", 1)
     assert (code, out.count("within 1, of class there"), err) == (0, 1, "")
     assert processes.call(*replay, "--tolerance", 0.25)[0] == 1
+
+
+def test_an_episode_that_hangs_or_ends_its_process_now_differs(processes, random_bundle, monkeypatch):
+    task = rough_tasks.name_of(rough_tasks.Halting)
+    coordinator = processes.coordinator(
+        "--bundle", random_bundle.path, "--task", task, "--population", 4, "--episodes", 3, "--generations", 1,
+        "--evaluate-every", 0,
+    )  # fmt: skip
+    processes.worker("--task", task, "--exit-when-done")
+    assert coordinator.finish()[0] == 0
+    with RunFolder(processes.runs / "test") as run:
+        seeds = [each.seed for each in run.results(0, 1)]
+        monkeypatch.setenv(rough_tasks.HALT, str(seeds[0]))
+        monkeypatch.setenv(rough_tasks.EXIT, str(seeds[1]))
+        monkeypatch.setenv("DREAMFLEET_TRUST", rough_tasks.MODULE)
+        hung, crashed, sound = replay(run, 0, 1, stall=2.0)
+    assert (hung.error, crashed.error) == ("slot crashed (no step for 2 s)", "slot crashed (exit status 3)")
+    assert (hung.agrees(None), crashed.agrees(None), sound.agrees(None)) == (False, False, True)
 
 
 @pytest.fixture

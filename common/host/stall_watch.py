@@ -1,0 +1,36 @@
+"""When a process that drives episodes counts as hung: it made no step for too long."""
+
+from __future__ import annotations
+
+from time import monotonic
+
+STALL_SECONDS = 30.0  # without a step, after which an episode is given up
+START_LIMIT = 120.0  # seconds that a process may take to load task and world model
+
+
+class StallWatch:
+    """Watches a count of steps; seconds for which this host was suspended do not count."""
+
+    def __init__(self) -> None:
+        self.restart()
+
+    def restart(self) -> None:
+        """Count from now and from no step."""
+        self._steps, self._since = 0, monotonic()
+
+    def quiet_seconds(self, steps: int, now: float, gap: float) -> float:
+        """Seconds since the number of steps changed; `gap` is for how many before `now` this host was suspended."""
+        self._since += gap
+        if steps != self._steps:
+            self._steps, self._since = steps, now
+        return now - self._since
+
+
+def describe_stall(limit: float) -> str:
+    """Why a process was killed that made no step for `limit` seconds."""
+    return f"no step for {limit:g} s"
+
+
+def describe_slow_start(limit: float) -> str:
+    """Why a process was killed that was not ready for a step after `limit` seconds."""
+    return f"not ready after {limit:g} s"

@@ -1,0 +1,84 @@
+"""A receipt says what is true of its run, and its commands run as they are printed."""
+
+import json
+import shlex
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from dreamfleet.common.cli import command_line
+from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC
+from dreamfleet.common.runs.run_paths import JOURNAL
+from dreamfleet.coordinator.storage.journal import Journal
+
+RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
+
+
+@pytest.fixture
+def change(tmp_path):
+    shutil.copytree(RUNS / "reality", tmp_path / "runs" / "reality")
+    Journal(tmp_path / "runs" / "reality" / JOURNAL).close()  # in the newest schema
+
+    def change(*statements):
+        with closing(sqlite3.connect(tmp_path / "runs" / "reality" / JOURNAL)) as connection, connection:
+            for each in statements:
+                connection.execute(*each)
+
+    return change
+
+
+@pytest.fixture
+def printed(tmp_path, capsys):
+    def call(*words):
+        assert command_line.main(["runs", *words, "--runs-dir", str(tmp_path / "runs")]) == 0
+        return capsys.readouterr().out
+
+    return call
+
+
+def test_failed_candidates_are_counted(change, printed):
+    change(("UPDATE generation SET failed = 2 WHERE number < 2",))
+    for verb in ("receipt", "show"):
+        said = next(line for line in printed(verb, "reality").splitlines() if "failed" in line and "candidates" in line)
+        assert "4 in " in said
+        assert "--on-failure" in said
+        assert json.loads(printed(verb, "reality", "--json"))["failed_candidates"] == 4
+
+
+def test_no_bits_are_promised_where_there_are_none(change, printed):
+    assert "the whole run again, to the bit" in printed("receipt", "reality")
+    change(("UPDATE result SET host_class = 'another' WHERE generation = 1",))
+    assert "the whole run again, not to the bit: hosts of several classes scored" in printed("receipt", "reality")
+    change(("UPDATE result SET host_class = ?", (NON_DETERMINISTIC,)))
+    said = printed("receipt", "reality")
+    assert said.count("not to the bit: the environment is not deterministic") == 2
+    assert ", to the bit" not in said
+
+
+def test_receipt_and_comparison_count_the_same_effort(change, printed, tmp_path):
+    shutil.copytree(tmp_path / "runs" / "reality", tmp_path / "runs" / "other")
+    change(("DELETE FROM run WHERE key IN ('ended', 'ended_at')",), ("UPDATE result SET steps = steps + 100",))
+    spent = json.loads(printed("receipt", "reality", "--json"))["spent"]
+    assert spent == json.loads(printed("compare", "reality", "other", "--json"))["runs"][0]["effort"]
+    assert "with the results of the open generation" in printed("receipt", "reality")
+
+
+@pytest.mark.slow
+def test_the_commands_of_a_run_in_an_environment_of_a_module_run_as_printed(processes):
+    task, module = "gym:tests.support.dark_environments:Dark-v0", "tests.support.dark_environments"
+    coordinator = processes.coordinator(
+        "--task", task, "--population", 4, "--episodes", 1, "--generations", 1, "--evaluate-every", 0
+    )
+    processes.worker("--task", task, "--exit-when-done")
+    assert coordinator.finish()[0] == 0
+    code, out, err = processes.call("runs", "receipt", "test", "--runs-dir", processes.runs, "--json")
+    assert code == 0, err
+    commands = [shlex.split(each)[1:] for each in json.loads(out)["commands"].values()]
+    assert [each[0] for each in commands] == ["replay", "repeat", "evaluate"]
+    assert all(each[-2:] == ["--trust", module] for each in commands)
+    for words in (commands[0], commands[2]):
+        code, _, err = processes.call(*words)
+        assert code == 0, err
