@@ -82,11 +82,14 @@ class DryRunProcess:
                 raise DryRunError(late)
         return self._lines.pop()
 
+    @property
+    def exit_code(self) -> int | None:
+        """The child's, negative for a signal; `None` while it runs."""
+        return self._child.returncode
+
     def describe_failure(self) -> str:
-        """How the ended child failed and what it printed last; empty if it did not fail."""
+        """How the ended child ended before it was through, and what it printed last."""
         code = self._child.returncode
-        if code == 0:
-            return ""
         how = f"crashed ({_signal_name(-code)})" if code < 0 else f"ended the process (exit code {code})"
         lines = self._printed.decode(errors="replace").splitlines()
         words = [text for line in lines if (text := one_line(line))]

@@ -16,6 +16,7 @@ from dreamfleet.common.serialization.optional_fields import OPTIONAL
 from dreamfleet.common.serialization.validation import from_plain
 
 CHILD = "dreamfleet.worker.scoring.task_check"
+LAST_STEP = "close()"
 STEP_LIMIT = 120.0  # seconds of one step of a dry run, such as a reset; as long as a worker's child may take to start
 SECOND_RUN_LIMIT = 20.0  # seconds of the first dry run's episode from which on there is no second dry run
 DRY_RUN_LIMIT = 3600.0  # seconds of a whole dry run, which may normalise observations in 20 episodes
@@ -102,12 +103,13 @@ def _dry_run(request: Mapping[str, Any], limit: float) -> DryRunReport:
                 step = step if answer.step is None else answer.step
             else:
                 raise DryRunError("wrote to the pipe of this check")
-            failure = child.describe_failure()
+            is_through = report is not None and (bool(report.fault) or step == LAST_STEP)
+            failure = "" if is_through and child.exit_code == 0 else child.describe_failure()
         except DryRunError as error:
             failure = str(error)
     failure = failure and f"{one_line(step) or 'normalising'} {failure}"
     if report is None or (report.description is None and not report.fault):
-        return DryRunReport(fault=f"{name} cannot be scored: {failure or 'the dry run ended without a report'}")
+        return DryRunReport(fault=f"{name} cannot be scored: {failure or 'it does not describe itself'}")
     report.fault = one_line(report.fault)
     report.warnings = tuple(one_line(each) for each in (*report.warnings, failure) if each)
     return report

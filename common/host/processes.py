@@ -132,10 +132,12 @@ class VerbProcess:
         return code, "".join(self._out)
 
     def last_line(self) -> str:
-        """The last line of its log, or of stderr."""
+        """The last line of its log, or of stderr; after which signal killed it, if one did."""
         lines: Iterable[str] = self.lines if self._log is None else self._log.read_text(errors="replace").splitlines()
         printed = [line.strip() for line in lines if line.strip()]
-        return printed[-1].removeprefix("dreamfleet: ") if printed else "it printed nothing"
+        said = printed[-1].removeprefix("dreamfleet: ") if printed else "it printed nothing"
+        code = self.popen.poll()
+        return said if code is None or code >= 0 else f"killed by signal {-code}; its last line: {said}"
 
     def end(self, patience: float = PATIENCE) -> None:
         """Send SIGTERM, twice if needed, then SIGKILL to its whole process group."""

@@ -113,7 +113,7 @@ def check_room_for_session() -> None:
     except RuntimeError as error:
         raise DreamfleetError(
             "this user may start too few threads for a network session: end other processes, or raise the limit "
-            "(ulimit -u)"
+            "(ulimit -u), or that of its memory (ulimit -v)"
         ) from error
     finally:
         done.set()

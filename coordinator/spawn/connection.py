@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shlex
@@ -13,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib.resources import files
+from time import monotonic
 from typing import Any, TypeVar
 
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError
@@ -30,6 +32,7 @@ KEPT_LINES = 50  # of ssh's messages
 MAX_MESSAGE = 4096  # bytes kept of one of them
 MAX_LINE = 1 << 20  # bytes of an answer, and of all that a host prints beside its answers
 MAX_PROGRESS = 1000  # messages of a request's progress
+MAX_RENEWALS = 4  # times its `silence` that a request may report progress instead of an answer
 QUICK, SLOW = 60.0, 1800.0  # seconds of silence: of an agent that starts or looks, of one that installs or drains
 PATIENCE = 5.0  # seconds for ssh to exit
 FORWARD = 30.0  # seconds for ssh to report the tunnel's port once the agent runs
@@ -155,21 +158,22 @@ class Connection:
             self._popen.stdin.flush()
 
     def _answer(self, silence: float | None, on_message: OnMessage) -> dict[str, Any]:
-        """The next answer; hands on the messages before it."""
-        progress = 0
+        """The next answer; hands on the messages before it. Only `follow`, of endless patience, has lines of a log."""
+        messages = ("failed", "say", "line") if silence is None else ("failed", "say")
+        progress, until = 0, math.inf if silence is None else monotonic() + MAX_RENEWALS * silence
         while True:
             with self._patience(silence):
                 kind, content = self._read_message()
             if kind == "ok" and isinstance(content, dict):
                 return content
-            if kind not in ("failed", "say", "line") or not isinstance(content, str):
+            if kind not in messages or not isinstance(content, str):
                 self._end("it answers in a form that no agent of this version uses")
                 raise self._failure()
             if kind == "failed":
                 raise DreamfleetError(one_line(content[:MAX_TEXT]))
             progress += kind == "say"
-            if progress > MAX_PROGRESS:
-                self._end(f"it reports progress without end: more than {MAX_PROGRESS} messages")
+            if progress > MAX_PROGRESS or monotonic() > until:
+                self._end(f"it reports progress without end: {progress} messages, and no answer")
                 raise self._failure()
             on_message(kind, content)
 

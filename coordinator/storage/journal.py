@@ -309,6 +309,8 @@ class Journal(JournalConnection):
         for each, candidate in self._read(query, number):
             rounds.setdefault(each, []).append(candidate)
         try:
+            if not all(each in range(len(vectors)) for candidates in rounds.values() for each in candidates):
+                raise ValueError(f"generation {number} has no such candidate as one that was drawn anew")
             return StoredOpenGeneration(
                 number, row[0], tuple(json.loads(row[1])), tuple(vector for (vector,) in vectors),
                 tuple(map(tuple, rounds.values())), to_finite(row[2] or 0.0),

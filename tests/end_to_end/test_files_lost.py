@@ -45,14 +45,13 @@ def closed(coordinator):
 
 
 def goes_on(processes, coordinator, said, name="test"):
-    """The command that the error names continues the run, with every generation that was reported."""
+    """The command that the error names continues the run, with its worker and every generation that was reported."""
     generations = closed(coordinator)
     command = said.split("go on with: ")[1].strip()
     with subprocess.Popen(
         f"{command} --generations {generations + 1} --listen {processes.endpoint}", shell=True, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True, env=environment(processes.cache),
     ) as again:  # fmt: skip
-        processes.worker("--task", tasks.SLOW_TOY, "--run", name)
         _, err = again.communicate(timeout=DEADLINE)
         assert again.returncode == 0, err
     with open_run(processes.runs, name) as run:

@@ -68,6 +68,7 @@ _DEEDS = {
     "nested": lambda: _write_to_all(b'{"report":' + b"[" * 50_000 + b"\n"),
     "null report": lambda: _write_to_all(b'{"report": {"description": 5}}\n'),
     "steps": lambda: _write_to_all(b'{"step": "another"}\n', 1000),
+    "exit in peace": lambda: os._exit(0),
     "flood": _print_without_end,
 }  # what an environment does as it is made
 
@@ -98,6 +99,8 @@ class Odd(gymnasium.Env):
             time.sleep(3600)
         if self._fault == "checker" and seed == 123:  # gymnasium's checker alone resets so
             os._exit(4)
+        if self._fault == "checker in peace" and seed == 123:
+            os._exit(0)
         at = self.np_random.uniform(-1, 1, 2)
         self._at = {"random": np.random.uniform(-1, 1, 2), "nan": np.full(2, np.nan), "outside": np.full(2, 99.0)}.get(  # noqa: NPY002
             self._fault, at

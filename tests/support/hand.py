@@ -75,6 +75,12 @@ class Hand:
     def vanish(self):
         self._token.undeclare()
 
+    def leave(self):
+        """Vanish, and answer nothing more."""
+        self.vanish()
+        for each in self._declared:
+            each.undeclare()
+
     def close(self):
         for query in self._held:
             query.drop()
@@ -161,7 +167,7 @@ class Hand:
 
     def _status(self, query):
         with query:
-            document = {"run": self.run, "state": "running", "slots": self.slots}
+            document = {"run": self.run, "run_uid": self.run_uid, "state": "running", "slots": self.slots}
             query.reply(keys.status(self.run), json.dumps(document).encode(), encoding="application/json")
 
     def _part(self, query):

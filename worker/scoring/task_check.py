@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, field
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
-from dreamfleet.common.cli.task_check import DryRunReport
+from dreamfleet.common.cli.task_check import LAST_STEP, DryRunReport
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.printable import one_line
@@ -144,7 +144,7 @@ def dry_run(
         announce("gymnasium's checker")
         report.warnings = (*checked.warnings, *_check_by_gymnasium(checked.environment))
         yield report
-    announce("close()")
+    announce(LAST_STEP)
     with suppress(Exception):
         checked.environment.close()
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import random
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 import zenoh
 
@@ -108,12 +109,28 @@ def _is_reply_of(reply: HelloReply, run: str | None) -> bool:
 def find_run_with_fewest_slots(session: zenoh.Session, excluded: Collection[str] = ()) -> str | None:
     """The live run with the fewest slots, without those in `excluded`; of equals the first by name."""
     found = []
-    for payload in query_all(session, [keys.status("*")], HELLO_TIMEOUT):
+    for document in _live_statuses(session):
         with suppress(ValueError, KeyError, TypeError):  # another version may answer in another form
-            document = json.loads(payload)
             if document["state"] not in ("ended", "paused") and document["run"] not in excluded:
                 found.append((int(document["slots"]), str(document["run"])))
     return min(found)[1] if found else None
+
+
+def find_names_of_run(session: zenoh.Session, uid: str) -> list[str]:
+    """The names under which the run of this `uid` is live now, sorted: more than one where a copy is served too."""
+    found = []
+    for document in _live_statuses(session):
+        with suppress(KeyError, TypeError, UsageError):
+            if document["run_uid"] == uid:
+                found.append(keys.check_run_name(document["run"]))
+    return sorted(found)
+
+
+def _live_statuses(session: zenoh.Session) -> Iterator[Any]:
+    """What answers to a query for all runs' statuses: JSON that nobody has checked."""
+    for payload in query_all(session, [keys.status("*")], HELLO_TIMEOUT):
+        with suppress(ValueError, RecursionError):
+            yield json.loads(payload)
 
 
 def make_request(worker: str, tasks: tuple[str, ...], slots: int, *, leaves_with_run: bool = False) -> HelloRequest:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 NEXT_RUN_AFTER = 5.0  # seconds without a coordinator after which an idle worker of any run looks for another
 NEXT_RUN_PATIENCE = 60.0  # the same for one that has jobs or results of the run
+SEARCH_INTERVAL = 5.0  # seconds without a coordinator after which, and then between which, it looks for its run
 SILENT_BEATS = 5  # heartbeat intervals in which a coordinator that knows this worker would have answered
 UPLOAD_GRACE = 30.0  # seconds more while a rollout is being sent: the verdict comes only after it
 
@@ -56,6 +57,7 @@ class Membership:
         self._run_is_over = ""
         self._no_coordinator_since: float | None = now  # `None` while one is in sight
         self._next_hello_at = now
+        self._next_search_at = now + SEARCH_INTERVAL
         self.rejoin(nonce, now)
 
     def rejoin(self, nonce: str, now: float) -> None:
@@ -99,6 +101,7 @@ class Membership:
         self._may_be_forgotten |= nonce == self._nonce
         if not self._coordinators and self._no_coordinator_since is None:
             self._no_coordinator_since = now
+            self._next_search_at = now + SEARCH_INTERVAL
 
     def is_leaving(self, now: float) -> bool:
         """Whether this worker accepts neither another job nor another run."""
@@ -111,7 +114,7 @@ class Membership:
             return f"goes on to the next run after {NEXT_RUN_AFTER:g} s, or {NEXT_RUN_PATIENCE:g} s with results"
         if self._conditions.leaves_with_run:
             return f"leaves too if it is not back within {self._conditions.coordinator_timeout:g} s"
-        return "waits for that run alone (--any: the next one)"
+        return "waits for that run alone, whatever its name (--any: the next one)"
 
     @property
     def draining(self) -> bool:
@@ -157,6 +160,13 @@ class Membership:
     def _is_alone(self, now: float, seconds: float) -> bool:
         """Whether no coordinator has been in sight for longer than `seconds`."""
         return self._no_coordinator_since is not None and now - self._no_coordinator_since > seconds
+
+    def start_search_if_due(self, now: float) -> bool:
+        """Whether to look for the joined run under another name; the next look is due some seconds later."""
+        if self._no_coordinator_since is None or now < self._next_search_at:
+            return False
+        self._next_search_at = now + SEARCH_INTERVAL
+        return True
 
     def must_rejoin(self, now: float, load: WorkerLoad) -> bool:
         """Whether to say hello again.

@@ -23,7 +23,7 @@ from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import CountingDecoder
 from dreamfleet.common.protocol.messages import MAX_LEASES, JobBatch, Result
 from dreamfleet.common.transport.session import enqueue_into
-from dreamfleet.worker.service.admission import Admission
+from dreamfleet.worker.service.admission import Admission, find_names_of_run
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.farewell import describe_failure
 from dreamfleet.worker.service.frame_publisher import FramePublisher
@@ -79,25 +79,25 @@ class RunSession:
 
         `ConnectionFailedError` if it gave the run up because its coordinator was out of sight for too long.
         """
-        declared = self._startup()
+        self._startup()
         try:
             why = self._main_loop()
         except BaseException as error:
-            self._shutdown(declared, describe_failure(error))
+            self._shutdown(describe_failure(error))
             raise
-        self._shutdown(declared, why)
+        self._shutdown(why)
         if self._membership.gives_up(monotonic()):
             raise ConnectionFailedError(
                 f"left run {self._admission.run}: {why}{self._lost_results()}; start this worker again, or give it "
                 "more --coordinator-timeout"
             )
 
-    def _startup(self) -> list[Any]:
+    def _startup(self) -> None:
         run, session = self._admission.run, self._link.session
         self._membership.join(self._admission.nonce, self._admission.intervals.beat, monotonic())
         coordinators = keys.live_coordinator(run, "*")
         self._frame_publisher = FramePublisher(session, run, self._link.identity, enqueue_into(self._events, "viewers"))
-        declared = [
+        self._declared: list[Any] = [
             session.declare_subscriber(
                 keys.job(run, self._link.identity), enqueue_into(self._events, "job", MAX_WAITING_BATCHES)
             ),
@@ -108,7 +108,6 @@ class RunSession:
             self._frame_publisher,
         ]
         log.info("joined run %s as %s, %s", run, self._link.identity, plural(len(self._slots), "slot"))
-        return declared
 
     def _main_loop(self) -> str:
         """Work; return why it ended."""
@@ -126,12 +125,14 @@ class RunSession:
             self._send(now)
             if self._membership.must_rejoin(now, self._load()):
                 self._rejoin(now)
+            elif self._membership.start_search_if_due(now):
+                self._follow_run()
         return why
 
-    def _shutdown(self, declared: list[Any], why: str) -> None:
+    def _shutdown(self, why: str) -> None:
         # R24: a last heartbeat without capacity says that this worker left in order and was not killed, and why.
         self._send_heartbeat(monotonic(), capacity=0, reason=why)
-        for each in declared:
+        for each in self._declared:
             each.undeclare()
         log.info("leaving run %s (%s): %d jobs, %d environment steps%s", self._admission.run, why, self._finished,
                  self._steps_finished, self._lost_results())  # fmt: skip
@@ -301,6 +302,32 @@ class RunSession:
         self._membership.rejoin(admission.nonce, monotonic())
         level = logging.INFO if restarted else logging.DEBUG  # an idle worker of a paused run says hello repeatedly
         log.log(level, "joined run %s again, incarnation %d", admission.run, admission.incarnation)
+
+    def _follow_run(self) -> None:
+        """Join the run under another name, if it is live under one: its folder was moved, renamed or rescued.
+
+        R22: its uid is the same, so running jobs go on and results without a verdict are kept. Another answer than
+        a welcome of this run decides nothing, because anybody could have sent it.
+        """
+        joined = self._admission
+        names = find_names_of_run(self._link.session, joined.run_uid)
+        if not names or joined.run in names:  # its token says when that one is back
+            return
+        try:
+            admission = self._link.request_admission(names[0], self._slots.host_class, joined.run_uid)
+        except RefusedError as error:
+            self._error_counter.record("run of another name", error, names)
+            return
+        if admission is None or (admission.run_uid, admission.spec) != (joined.run_uid, joined.spec):
+            return
+        log.info("run %s goes on under the name %s", joined.run, admission.run)
+        for each in self._declared:
+            each.undeclare()
+        self._slots.show(False)
+        self._admission = admission
+        self._sender = CoordinatorSender(self._link.session, self._link.identity, admission)
+        self._restart_numbering(admission.numbering)
+        self._startup()
 
     def _restart_numbering(self, numbering: int) -> None:
         """Start a new numbering of batches.

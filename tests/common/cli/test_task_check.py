@@ -32,6 +32,7 @@ def dry_run(fault, name=ODD, **options):
         ("nan", "its first observation holds NaN or infinity"),
         ("raise", "its first steps raised RuntimeError: the engine stalled"),
         ("exit", r"reset\(seed=0\) raised SystemExit: 3"),
+        ("exit in peace", r"making it ended the process \(exit code 0\)"),
         ("exit at once", r"reset\(seed=0\) ended the process \(exit code 3\)"),
         ("crash", r"reset\(seed=0\) crashed \(SIGSEGV\)"),
     ],
@@ -75,11 +76,12 @@ def test_a_sound_environment_is_described_without_a_word():
     assert '"normal"' in found.description.options
 
 
-def test_gymnasiums_checker_only_warns():
+@pytest.mark.parametrize(("fault", "code"), [("checker", 4), ("checker in peace", 0)])
+def test_gymnasiums_checker_only_warns(fault, code):
     assert any("not within the observation space" in text for text in dry_run("outside").warnings)
-    found = dry_run("checker")  # the process is gone, and what was found before counts
+    found = dry_run(fault)  # the process is gone, and what was found before counts
     assert (found.fault, found.varies) == ("", "")
-    assert found.warnings == ("gymnasium's checker ended the process (exit code 4)",)
+    assert found.warnings == (f"gymnasium's checker ended the process (exit code {code})",)
 
 
 def test_pictures_are_hinted_at():

@@ -70,3 +70,12 @@ def test_a_child_dies_with_a_killed_parent(tmp_path):
         assert select.select([child], [], [], DEADLINE)[0], "it lives on"
     finally:
         os.close(child)
+
+
+def test_the_last_line_of_a_killed_child_says_so():
+    with VerbProcess("worker", "--connect", "tcp/127.0.0.1:1") as child:
+        child.wait_for("waiting for a coordinator")
+        child.popen.kill()
+        child.finish(DEADLINE)
+        assert child.last_line().startswith("killed by signal 9; its last line: ")
+        assert "waiting for a coordinator" in child.last_line()

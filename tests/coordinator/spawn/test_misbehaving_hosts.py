@@ -29,6 +29,13 @@ MISBEHAVIOUR = {
     ),
     "an-endless-banner": ("while True: say('welcome')", "prints more than 1 MiB"),
     "endless-progress": ("while True: say('dreamfleet-host {\"say\": \"on it\"}')", "progress without end"),
+    "slow-progress": ("while True: say('dreamfleet-host {\"say\": \"on it\"}'); time.sleep(1)", "progress without end"),
+    "lines-of-no-log": (
+        "while True: say('dreamfleet-host {\"line\": \"hello\"}'); time.sleep(1)", "answers in a form",
+    ),
+    "lines-amid-a-look": (
+        READY + "\nwhile True: say('dreamfleet-host {\"line\": \"hello\"}'); time.sleep(1)", "answers in a form",
+    ),
     "endless-errors": ("while True: os.write(2, b'x' * 65536)", "does not answer within"),
     "silence": ("time.sleep(1000)", "does not answer within"),
     "what-it-never-reads": (READY + "time.sleep(1000)", "does not answer within"),
@@ -52,6 +59,7 @@ def fake_ssh(tmp_path):
     return shlex.quote(str(path))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pipes of connections that ended
 def test_each_fails_alone_in_little_memory(fake_ssh, tmp_path, monkeypatch):
     monkeypatch.setattr(connection, "QUICK", 3.0)

@@ -48,6 +48,16 @@ def fill(journal):
     journal.commit()
 
 
+@pytest.mark.parametrize("candidate", [2, -1, 2**62])
+def test_a_candidate_that_was_drawn_anew_and_does_not_exist_is_damage(journal, folder, candidate):
+    fill(journal)
+    with sqlite3.connect(folder / "journal.sqlite") as other:
+        other.execute("INSERT INTO redraw VALUES (1, 0, ?, x'00')", (candidate,))
+    other.close()
+    with pytest.raises(JournalError, match=r"is damaged: .* drawn anew; restore it from a copy"):
+        journal.last_generation()
+
+
 def test_it_gives_back_what_was_written(journal, folder):
     fill(journal)
     last = journal.last_generation()

@@ -10,6 +10,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from dreamfleet.worker.service.membership import (
     NEXT_RUN_AFTER,
     NEXT_RUN_PATIENCE,
+    SEARCH_INTERVAL,
     SILENT_BEATS,
     UPLOAD_GRACE,
     LeaveConditions,
@@ -88,6 +89,16 @@ def test_an_unanswered_hello_is_repeated_after_a_pause():
     member.note_hello_sent(1.0, pause=2.0)
     assert not member.must_rejoin(2.9, BUSY)
     assert member.must_rejoin(3.0, BUSY)
+
+
+def test_it_looks_for_its_run_in_intervals_while_no_coordinator_is_in_sight():
+    member = joined()
+    assert not member.start_search_if_due(1e6), "one is in sight"
+    member.remove_coordinator("first", 1e6)
+    assert not member.start_search_if_due(1e6 + SEARCH_INTERVAL - 0.1)
+    assert member.start_search_if_due(1e6 + SEARCH_INTERVAL)
+    assert not member.start_search_if_due(1e6 + SEARCH_INTERVAL)
+    assert member.start_search_if_due(1e6 + 2 * SEARCH_INTERVAL)
 
 
 def test_stopped_once_it_drains_until_all_is_delivered():

@@ -108,6 +108,33 @@ def test_it_says_hello_to_a_silent_coordinator(stage, cached, owed):
     hand.hello()
 
 
+def test_it_follows_its_run_to_another_name_with_its_results(stage, said, cached):
+    hand = stage.hand(tasks.SLOW_TOY)
+    stage.worker()
+    hand.ready()
+    done, running = hand.job(0), hand.job(1)
+    hand.send(1, done, running)
+    hand.result(done)
+    hand.leave()
+    again = stage.also(hand, tasks.SLOW_TOY, run="test-rescued")
+    again.nonce, again.incarnation = SECOND, 2
+    wait_for(said, "run test goes on under the name test-rescued")
+    again.hello()
+    assert again.results(done, running) == {done.digest, running.digest}
+    again.send(1, again.job(2), accepted=(done, running))
+    assert again.result(again.job(2)).fitness is not None
+
+
+def test_it_stays_with_its_name_where_the_run_is_refused_under_another(stage, said, cached):
+    hand = stage.hand()
+    stage.worker()
+    hand.ready()
+    hand.leave()
+    stage.also(hand, run="other").refusal = ("no", "none")
+    wait_for(said, "run of another name")
+    stage.also(hand).ready()
+
+
 def test_another_run_of_the_same_name_is_joined_anew(stage, said, cached):
     hand = stage.hand()
     _, served = stage.worker()
