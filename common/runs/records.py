@@ -164,7 +164,7 @@ class StoredFailure:
 
 @dataclass(frozen=True)
 class StoredCandidate:
-    """One candidate: its fitness, and the effort of its accepted results."""
+    """One candidate: its fitness, and the effort of its accepted results, also of those before a redraw."""
 
     generation: int
     number: int
@@ -186,7 +186,7 @@ class StoredGeneration:
     sigma: float
     steps: int
     seconds: float
-    failed: Count = field(default=0, metadata=OPTIONAL)  # candidates that failed; the statistics leave them out
+    failed: Count = field(default=0, metadata=OPTIONAL)  # candidates that failed at least once, also before a redraw
 
 
 @dataclass(frozen=True)
@@ -203,6 +203,11 @@ class StoredEvaluation:
     def rank(self) -> tuple[int, float]:
         """The greater, the better: a mean over the episodes that are easy enough not to fail would flatter."""
         return -self.failed, self.mean
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether at least half of its episodes have a score, so that the mean may end a run or a stage."""
+        return self.failed <= self.episodes
 
     @property
     def error(self) -> float | None:

@@ -200,6 +200,6 @@ class StageTracker:
         if end.steps and self._steps >= end.steps:
             return f"{self._steps} environment steps"
         found = finished.get(self.required_evaluation(self._generation))
-        if found is not None and end.score is not None and found.mean >= end.score:
+        if found is not None and end.score is not None and found.mean >= end.score and found.is_sound:
             return f"the mean of generation {found.generation} reached {found.mean:.1f}"
         return ""

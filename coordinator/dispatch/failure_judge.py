@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 from dreamfleet.common.protocol.failures import failure_cause, is_host_failure
 from dreamfleet.coordinator.dispatch.failures import Attempt, JobFailure, host_of
-from dreamfleet.coordinator.dispatch.member import Member, MemberState
+from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJobs
 
 EQUAL_ATTEMPTS = 2  # that fail for one cause show that the episode fails
@@ -68,7 +68,7 @@ class FailureJudge:
 
     def _present_hosts(self) -> set[str]:
         """The names of the hosts that are here, also while they replace a scoring process and take no job."""
-        return {host_of(name) for name, member in self._members.items() if member.state is MemberState.PRESENT}
+        return {host_of(name) for name, member in self._members.items() if member.has_been_ready}
 
 
 def is_lasting(attempts: Sequence[Attempt], working: Collection[str], present: Collection[str]) -> bool:

@@ -86,6 +86,7 @@ class Member:
     drawn_by: str = "-"
     host_class: str = ""  # empty: not known yet
     finished: int = 0  # accepted results
+    was_ready: bool = False  # some heartbeat named a slot that scores
     resent: int = 0  # batches that were sent again
     leases: dict[bytes, Lease] = field(default_factory=dict)  # by digest, in the order in which they were given
     trial_copies: dict[bytes, DispatchGroup] = field(default_factory=dict)  # copies that measure it, wanted or not
@@ -104,6 +105,11 @@ class Member:
         if self.is_guest:
             return MemberState.GUEST
         return MemberState.SILENT if self.silent else MemberState.PRESENT
+
+    @property
+    def has_been_ready(self) -> bool:
+        """Whether it is present and could take a job before, though it may replace a scoring process now."""
+        return self.state is MemberState.PRESENT and self.was_ready
 
     @property
     def is_lost(self) -> bool:
@@ -161,6 +167,7 @@ class Member:
         self.is_guest = False
         self.farewell = one_line(beat.reason)
         self.capacity, self.slots, self.confirmed = beat.capacity, beat.slots, beat.seen
+        self.was_ready = self.was_ready or beat.capacity > 0
         self.load, self.steps_per_second, self.drawn_by = beat.load, beat.steps_per_second, beat.drawn_by
         if beat.running and beat.steps_per_second:
             self.host_stats.steps_per_second = beat.steps_per_second / len(beat.running)

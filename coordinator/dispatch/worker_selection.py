@@ -7,9 +7,10 @@ should return before the others have finished the rest, so a bad worker does not
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Collection, Mapping
 
-from dreamfleet.coordinator.dispatch.member import Member, MemberState
+from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob, PendingJobs
 from dreamfleet.coordinator.jobs.work import Work
 
@@ -127,12 +128,17 @@ def assign_jobs(
 def _eligible_workers(pending: PendingJob, loads: Mapping[str, int], members: Mapping[str, Member]) -> list[str]:
     """Which of these members may be given a job.
 
-    R8: not one where it failed, unless every present member is such: a process that was killed once must not stop the
-    run. Guests do not count, so a stranger's hello cannot keep a failed job from being tried again.
+    R8: not one where it failed, unless every present member is such: then those where it failed least often. A process
+    that was killed once must not stop the run. A stranger's hello cannot keep a failed job from being tried again, and
+    neither can a worker that was never ready, so guests and these do not count.
     """
-    eligible = [name for name in loads if name not in pending.avoided_workers]
-    present = (name for name, member in members.items() if member.state is MemberState.PRESENT)
-    return list(loads) if not eligible and all(name in pending.avoided_workers for name in present) else eligible
+    if eligible := [name for name in loads if name not in pending.avoided_workers]:
+        return eligible
+    if any(name not in pending.avoided_workers for name, member in members.items() if member.has_been_ready):
+        return []
+    failed = Counter(each.worker for each in pending.attempts)
+    fewest = min(failed[name] for name in loads)
+    return [name for name in loads if failed[name] == fewest]
 
 
 def is_dependable(member: Member, now: float) -> bool:

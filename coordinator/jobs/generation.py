@@ -95,6 +95,12 @@ class Generation:
         return bool(self._failed.all())
 
     @property
+    def has_bad_seeds(self) -> bool:
+        """Whether each candidate failed that was to drive all episodes; in a race these are the better half."""
+        whole = self._wanted.all(axis=1)
+        return bool(whole.any() and self._failed[whole].all())
+
+    @property
     def missing(self) -> list[Work]:
         """Wanted jobs without a result, each digest once, candidate by candidate."""
         first = {work.job.digest: work for work in reversed(self.work)}

@@ -134,7 +134,7 @@ class Generations:
 
     def can_try_again(self, generation: Generation) -> bool:
         """Whether `try_again` would change the generation as its failures are now."""
-        reseed = generation.all_failed and self._reseeds < MAX_RESEEDS
+        reseed = generation.has_bad_seeds and self._reseeds < MAX_RESEEDS
         return reseed or (bool(generation.failed) and self._can_redraw)
 
     @property
@@ -144,15 +144,18 @@ class Generations:
     def try_again(self, generation: Generation) -> str | None:
         """Change the complete, open generation in the journal because of its failures; what changed, in words.
 
-        R8: if all candidates failed, the generation gets other seeds. Else, with `redraw`, the failed ones are drawn
-        anew. `None` if neither is to be done, or if it was done often enough. All others are scored, so the change does
-        not depend on the order of arrival. `reload` returns the changed generation.
+        R8: if all candidates failed that were to drive all episodes, the generation gets other seeds. Else, with
+        `redraw`, the failed ones are drawn anew. `None` if neither is to be done, or if it was done often enough. All
+        others are scored, so the change does not depend on the order of arrival. `reload` returns the changed
+        generation.
         """
         number, indices = generation.number, generation.failed
-        if generation.all_failed and self._reseeds < MAX_RESEEDS:
+        if generation.has_bad_seeds and self._reseeds < MAX_RESEEDS:
             self._reseeds += 1
             self._journal.set_seeds(number, self._seeds(number, generation.episodes, self._reseeds))
-            found = f"all candidates failed in generation {number}: it gets other seeds"
+            self.redrawn.update(range(generation.population))
+            who = "all candidates" if generation.all_failed else "all candidates of the better half"
+            found = f"{who} failed in generation {number}: it gets other seeds"
         elif indices and self._can_redraw:
             self._rounds += 1
             self._journal.redraw(number, indices, [vector_bytes(x) for x in self._strategy.redraw(indices)])

@@ -35,6 +35,7 @@ from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 
 REMEDY = "`dreamfleet resume` tries them again and goes on, however many fail in this generation"
+OTHER_SEEDS = "; if the seeds of the first generation are bad for every candidate, begin a run with another --seed"
 LIMIT_FROM = "limit_from"  # the fact that names the first generation whose failures count for `failure_limit`
 WRITE_RETRY = 2.0  # seconds until a full disk or a locked journal is tried again
 
@@ -245,7 +246,7 @@ class Run:
             if proof is None or not self.fleet.jobs.offer_proof(proof):
                 self.pause(
                     f"no host that is here has ever scored, and every job that it tried failed, such as {failure}; "
-                    "`dreamfleet resume` tries them again"
+                    f"`dreamfleet resume` tries them again{OTHER_SEEDS if proof is None else ''}"
                 )
         elif not is_judged and (failure := judge.find_pausing()) is not None:
             self.pause(f"{failure}; `dreamfleet resume` tries it again")
@@ -372,7 +373,7 @@ class Run:
         if limits.minutes and self.history.seconds >= 60 * limits.minutes:
             return f"{plural(limits.minutes, 'minute')} in which it could work"
         best = evaluations.best
-        if limits.target is not None and best is not None and best.mean >= limits.target:
+        if limits.target is not None and best is not None and best.mean >= limits.target and best.is_sound:
             return f"the mean of generation {best.generation} reached {best.mean:.1f}"
         if best is not None and limits.parted and self.background_jobs.have_fallen_behind(limits.parted):
             return f"the evaluated mean fell behind generation {best.generation}'s"

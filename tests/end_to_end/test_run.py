@@ -102,7 +102,7 @@ def test_status_is_json_that_zenoh_cli_reads_too(processes, settings):
 
 
 @pytest.mark.parametrize(
-    ("on_failure", "why"), [("worst", "every open job failed"), ("pause", "failed on two workers")]
+    ("on_failure", "why"), [("worst", "no host that is here has ever scored"), ("pause", "failed on two workers")]
 )
 def test_failures_on_all_workers_pause_the_run_and_say_why(processes, settings, on_failure, why):
     flags = "--task", tasks.RAISING, "--generations", 2, "--on-failure", on_failure

@@ -3,21 +3,43 @@
 from __future__ import annotations
 
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import gymnasium
 
-from dreamfleet.common.runs.seeds import fold_seed
+from dreamfleet.common.runs.seeds import TRAINING_LAST, fold_seed
+
+REFUSALS = (ValueError, TypeError, OverflowError, AssertionError, gymnasium.error.Error)  # of a seed that is too long
+_refusing: WeakKeyDictionary[gymnasium.Env[Any, Any], bool] = WeakKeyDictionary()  # environments that were tried
 
 
 def reset_folded(environment: gymnasium.Env[Any, Any], seed: int) -> Any:
     """Reset the environment and return its first observation.
 
-    Training seeds have up to 53 bits. If an environment raises on one of over 31 bits, it gets `fold_seed` of it.
+    Training seeds have up to 53 bits. An environment that takes at most 31 bits gets `fold_seed` of the others. It is
+    one if it refuses the longest seed twice and takes that seed folded; any other error of a reset is raised.
     """
+    if _refusing.get(environment) and seed != fold_seed(seed):
+        return environment.reset(seed=fold_seed(seed))[0]
     try:
-        observation, _ = environment.reset(seed=seed)
-    except Exception:  # environments may raise anything
-        if seed == fold_seed(seed):
+        return environment.reset(seed=seed)[0]
+    except REFUSALS as error:
+        if seed == fold_seed(seed) or not _refuses_long_seeds(environment, type(error)):
             raise
-        observation, _ = environment.reset(seed=fold_seed(seed))
-    return observation
+    _refusing[environment] = True
+    return environment.reset(seed=fold_seed(seed))[0]
+
+
+def _refuses_long_seeds(environment: gymnasium.Env[Any, Any], error: type[Exception]) -> bool:
+    """Whether the longest seed raises this error, and not by chance."""
+    for _ in range(2):
+        try:
+            environment.reset(seed=TRAINING_LAST)
+        except error:
+            continue
+        return False
+    try:
+        environment.reset(seed=fold_seed(TRAINING_LAST))
+    except Exception:  # environments may raise anything; the first error tells more
+        return False
+    return True

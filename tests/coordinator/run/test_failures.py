@@ -226,6 +226,17 @@ def test_a_seed_on_which_all_candidates_fail_is_replaced_with_the_same_bits_thro
     killed.journal.close()
 
 
+def test_seeds_on_which_the_whole_better_half_fails_are_replaced_in_a_race(failing):
+    settings = replace(SETTINGS, racing=True, episodes=4, population=8)
+    bad = training_seed(settings.seed, 1, 2)  # of the second half
+    bench = failing("race", settings=settings, fails=lambda job: job.seeds[0] == bad)
+    assert bench.run.ended
+    assert [each.failed for each in bench.run.history.rows] == [0, 8, 0]
+    with RunFolder(bench.path) as folder:
+        texts = [each.text for each in folder.events()]
+    assert "all candidates of the better half failed in generation 1: it gets other seeds" in texts
+
+
 def test_redraws_count_each_candidate_once_and_go_on_where_all_failed(tmp_path, random_bundle):
     settings = replace(SETTINGS, on_failure="redraw")
     first = []
@@ -308,6 +319,31 @@ def test_a_new_host_proves_itself_on_a_job_that_was_scored_before(left):
     assert left.run.ended
     assert [each.failed for each in left.run.history.rows] == [2] * GENERATIONS
     assert left.run.fleet.counts["duplicate"] == 1
+
+
+def test_a_failing_job_goes_to_the_host_where_it_failed_least(left):
+    """A new host that joins before the one that has scored gets no proof: both are here, and one is known."""
+    left.now += 1.0
+    left.run.tick(left.now)
+    left.hosts = [NEW, A]
+    for name in left.hosts:
+        left.run.admission.admit(left.request(name), left.now)
+    left.serve()
+    assert left.run.ended
+    assert [each.failed for each in left.run.history.rows] == [2] * GENERATIONS
+
+
+def test_a_host_that_was_never_ready_keeps_no_job_from_being_tried_again(tmp_path, random_bundle):
+    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate == 0)
+    bench.hosts = [A]
+    member = bench.run.fleet.members[B]
+    member.capacity, member.was_ready = 0, False
+    bench.handle_heartbeat(B)
+    member.capacity, member.was_ready = 0, False
+    bench.serve()
+    assert bench.run.ended
+    assert [each.failed for each in bench.run.history.rows] == [1] * GENERATIONS
+    bench.journal.close()
 
 
 def test_a_new_host_that_fails_the_proof_pauses_the_run(left):

@@ -1,0 +1,59 @@
+"""Environments that take no long seeds, and those whose resets fail for another reason."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from dreamfleet.common.runs.seeds import fold_seed, training_seed
+from dreamfleet.worker.tasks.reset import reset_folded
+
+LONG = training_seed(7, 0, 0)
+
+
+class Environment(gymnasium.Env):
+    """Its observation is the seed; `fails(seed, number)` raises for the reset of that number."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = spaces.Discrete(2)
+
+    def __init__(self, fails):
+        self.seeds, self._fails = [], fails
+
+    def reset(self, *, seed=None, options=None):
+        self.seeds.append(seed)
+        if (error := self._fails(seed, len(self.seeds))) is not None:
+            raise error
+        return np.array([seed], np.float64), {}
+
+
+@pytest.mark.parametrize("error", [ValueError("too long"), OverflowError("int too big"), TypeError("32 bits")])
+def test_an_environment_that_refuses_long_seeds_gets_them_folded_and_is_asked_once(error):
+    environment = Environment(lambda seed, _: error if seed >= 2**31 else None)
+    assert reset_folded(environment, LONG)[0] == fold_seed(LONG)
+    asked = len(environment.seeds)
+    assert reset_folded(environment, LONG + 1)[0] == fold_seed(LONG + 1)
+    assert len(environment.seeds) == asked + 1
+    assert reset_folded(environment, 5)[0] == 5
+
+
+@pytest.mark.parametrize("error", [RuntimeError("no answer"), ValueError("no answer"), MemoryError(), OSError(24, "x")])
+def test_a_reset_that_fails_by_chance_is_an_error_and_no_other_seed(error):
+    for period in (3, 4, 5):
+        environment = Environment(lambda _, number, period=period: error if number % period == 0 else None)
+        found = []
+        for each in range(12):
+            try:
+                assert reset_folded(environment, LONG + each)[0] == LONG + each
+                found.append("scored")
+            except type(error):
+                found.append("failed")
+        assert found.count("failed") >= 2
+        assert found.count("scored") >= 2
+
+
+def test_a_seed_that_an_environment_cannot_play_is_an_error():
+    environment = Environment(lambda seed, _: ValueError("no such level") if seed == LONG else None)
+    with pytest.raises(ValueError, match="no such level"):
+        reset_folded(environment, LONG)
+    assert reset_folded(environment, LONG + 1)[0] == LONG + 1
