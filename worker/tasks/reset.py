@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import gymnasium
 
 from dreamfleet.common.runs.seeds import TRAINING_LAST, fold_seed
 
 REFUSALS = (ValueError, TypeError, OverflowError, AssertionError, gymnasium.error.Error)  # of a seed that is too long
-_refusing: WeakKeyDictionary[gymnasium.Env[Any, Any], bool] = WeakKeyDictionary()  # environments that were tried
+KNOWN = "_dreamfleet_refuses_long_seeds"  # an environment's attribute, once it has shown that
 
 
 def reset_folded(environment: gymnasium.Env[Any, Any], seed: int) -> Any:
@@ -19,14 +18,14 @@ def reset_folded(environment: gymnasium.Env[Any, Any], seed: int) -> Any:
     Training seeds have up to 53 bits. An environment that takes at most 31 bits gets `fold_seed` of the others. It is
     one if it refuses the longest seed twice and takes that seed folded; any other error of a reset is raised.
     """
-    if _refusing.get(environment) and seed != fold_seed(seed):
+    if vars(environment).get(KNOWN) and seed != fold_seed(seed):
         return environment.reset(seed=fold_seed(seed))[0]
     try:
         return environment.reset(seed=seed)[0]
     except REFUSALS as error:
         if seed == fold_seed(seed) or not _refuses_long_seeds(environment, type(error)):
             raise
-    _refusing[environment] = True
+    vars(environment)[KNOWN] = True
     return environment.reset(seed=fold_seed(seed))[0]
 
 
