@@ -38,19 +38,22 @@ def _raise_broken(_item: object, reason: int | str) -> NoReturn:
 def map_in_processes(
     count: int, start: Callable[..., None], arguments: tuple[Any, ...], work: Callable[[Item], Answer],
     items: Sequence[Item], on_loss: Callable[[Item, int | str], Answer] = _raise_broken, stall: float = 0.0,
-    on_look: Callable[[int], None] = lambda _steps: None,
+    on_look: Callable[[int], None] = lambda _steps: None, has_failed: Callable[[Answer], bool] = lambda _answer: False,
 ) -> Generator[Answer, None, None]:  # fmt: skip
     """Yield `work(item)` of each item as it ends, in `count` spawned processes that begin with `start(*arguments)`.
 
-    A process that ends early costs its item, and another takes its place. `on_loss` makes that item's answer; it gets
-    the exit status, or why the process was killed. Without it, `BrokenProcessPool` ends the work. With `stall`, a
-    process is killed that does not call `count_step` for so many seconds, or for `START_LIMIT` before its first step.
+    An item whose answer `has_failed`, or that ends its process, is worked on once more in a fresh process, unless it
+    was its process's first: an earlier item may have spoilt that process. So no failure follows from `count`.
+
+    A process that ends early is replaced. `on_loss` makes the answer of its item; it gets the exit status, or why the
+    process was killed. Without it, `BrokenProcessPool` ends the work. With `stall`, a process is killed that does not
+    call `count_step` for so many seconds, or for `START_LIMIT` before its first step.
     About once in `LOOK_INTERVAL`, `on_look` gets the steps so far of the processes that work.
 
     When closed early, it waits until what runs is done; after any other exception it ends the processes at once.
     """
     idle = [_Process[Item, Answer](start, arguments, work, stall) for _ in range(min(count, len(items)))]
-    pool = _Pool(deque(items), idle, on_loss, on_look)
+    pool = _Pool(deque(items), idle, on_loss, on_look, has_failed)
     processes = tuple(idle)
     try:
         try:
@@ -79,6 +82,7 @@ class _Process(Generic[Item, Answer]):
         self._counter: Any = get_context("spawn").Value("Q", 0, lock=False)
         self._executor: ProcessPoolExecutor | None = None
         self._process: Any = None
+        self.is_fresh = True  # whether its item is, or was, its first
         self._descendants, self._watch = Descendants(), StallWatch()
 
     @property
@@ -94,6 +98,7 @@ class _Process(Generic[Item, Answer]):
     def submit(self, item: Item) -> Future[Answer]:
         """Begin the work on an item; start the process if there is none."""
         self._watch.restart()
+        self.is_fresh = self._executor is None
         if self._executor is not None:
             return self._executor.submit(self._work, item)
         self._counter.value, others = 0, set(active_children())
@@ -144,9 +149,10 @@ class _Pool(Generic[Item, Answer]):
 
     def __init__(
         self, waiting: deque[Item], idle: list[_Process[Item, Answer]], on_loss: Callable[[Item, int | str], Answer],
-        on_look: Callable[[int], None],
+        on_look: Callable[[int], None], has_failed: Callable[[Answer], bool],
     ) -> None:  # fmt: skip
         self.waiting, self._idle, self._on_loss, self._on_look = waiting, idle, on_loss, on_look
+        self._has_failed = has_failed
         self._running: dict[Future[Answer], tuple[_Process[Item, Answer], Item]] = {}
 
     def answers(self) -> Iterator[Answer]:
@@ -165,6 +171,11 @@ class _Pool(Generic[Item, Answer]):
                 elif (reason := process.find_loss(gap)) is None:
                     continue
                 del self._running[future]
+                failed = reason is not None or (future.exception() is None and self._has_failed(future.result()))
+                if failed and not process.is_fresh:
+                    process.kill()
+                    self._running[process.submit(item)] = process, item
+                    continue
                 self._idle.append(process)
                 yield future.result() if reason is None else self._on_loss(item, reason)
 

@@ -273,9 +273,10 @@ def count_failed(history: Iterable[StoredGeneration]) -> int:
 
 
 def describe_failed(settings: RunSettings, history: Sequence[StoredGeneration]) -> str:
-    """How many candidates failed, and what became of them."""
-    policy = f"--on-failure {settings.on_failure}"
-    return f"{count_failed(history)} in {plural(len(history), 'closed generation')}, by {policy}"
+    """How many candidates failed, and the setting that says what becomes of them."""
+    return (
+        f"{count_failed(history)} in {plural(len(history), 'closed generation')} (--on-failure {settings.on_failure})"
+    )
 
 
 def with_error(found: StoredEvaluation | StoredConfirmation) -> dict[str, Any]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from difflib import SequenceMatcher
 from pathlib import Path
 from typing import Any
@@ -201,6 +202,15 @@ class RunFolder:
             "(SELECT generation FROM evaluation WHERE vector = (SELECT vector FROM evaluation WHERE generation = ?1))"
         )
         return dict(self._journal.rows("if", query, generation, since, until - 1))
+
+    def training_seeds(self, generation: int) -> tuple[int, ...]:
+        """The seed of each episode of a generation; the last ones, if all candidates failed on earlier ones."""
+        row = self._journal.row("SELECT seeds FROM generation WHERE number = ?", generation)
+        with suppress(TypeError, ValueError, RecursionError):
+            seeds = json.loads(row[0])
+            if isinstance(seeds, list) and all(isinstance(each, int) for each in seeds):
+                return tuple(seeds)
+        raise self._journal.damage_error(f"generation {generation} has no seeds")
 
     def result_count(self) -> int:
         """Accepted results of every kind."""

@@ -53,6 +53,16 @@ class Breaking(CartPoleEnv):
         return super().step(action)
 
 
+class Interrupting(Breaking):
+    """Draws pictures, and later raises what Ctrl-C raises."""
+
+    def step(self, action):
+        try:
+            return super().step(action)
+        except ZeroDivisionError:
+            raise KeyboardInterrupt from None
+
+
 class Leaving(Breaking):
     """Draws pictures, and ends its process later."""
 
@@ -89,5 +99,5 @@ class Slow(Plain):
         return np.zeros((64, 64, 3), np.uint8)
 
 
-for each in (Dark, Blank, Raising, Plain, Breaking, Leaving, Stuck, Slow):
+for each in (Dark, Blank, Raising, Plain, Breaking, Interrupting, Leaving, Stuck, Slow):
     gymnasium.register(f"{each.__name__}-v0", entry_point=each)

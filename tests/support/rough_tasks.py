@@ -245,6 +245,23 @@ class Poisoned(Rough):
             POISONS[os.environ[POISON]]()
 
 
+class Wearing(Toy):
+    """Only the first episode of an environment ends well."""
+
+    def make_environment(self, assignment):
+        return WearingEnvironment()
+
+
+class WearingEnvironment(ToyEnvironment):
+    steps = 0
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps > 10:
+            fail()
+        return super().step(action)
+
+
 class PoisonedBatch(Toy):
     """From the second group of a process on, the last fitness of a group is out of bounds."""
 

@@ -30,16 +30,25 @@ FIRST_LOSSES = 3  # processes lost before any episode has ended, after which the
 def evaluate(agent: Agent, seeds: tuple[int, ...], jobs: int) -> Iterator[Episode]:
     """Drive one whole episode for each seed in `jobs` processes, or in this one if it is 1; yield each when it ends.
 
-    An episode that fails does not end the others. In this process, one that crashes or hangs does.
+    An episode that fails does not end the others, and fails again in a fresh process before it counts (R8). In this
+    process, a fresh environment has to do, and an episode that crashes or hangs ends the others.
     """
     if jobs > 1:
         yield from evaluate_in_processes(agent, seeds, jobs)
         return
     pin_thread_pools()
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-    driver = _Driver(agent)  # in this process, so that a script needs no `if __name__ == "__main__"`
-    yield from map(driver.drive, seeds)
+    # In this process, so that a script needs no `if __name__ == "__main__"`; Ctrl-C interrupts it.
+    driver = _Driver(agent, (Exception, SystemExit))
+    for number, seed in enumerate(seeds):
+        found = driver.drive(seed)
+        yield driver.drive(seed) if number and has_failed(found) else found
     driver.close()
+
+
+def has_failed(episode: Episode) -> bool:
+    """Whether it has no score."""
+    return isinstance(episode, FailedEpisode)
 
 
 def evaluate_in_processes(
@@ -64,7 +73,8 @@ def evaluate_in_processes(
 
     pin_thread_pools()
     start, drive = _ProcessEvaluator.start, _ProcessEvaluator.drive
-    for each in map_in_processes(jobs, start, (agent, os.getpid()), drive, seeds, lose, stall):
+    arguments = agent, os.getpid()
+    for each in map_in_processes(jobs, start, arguments, drive, seeds, lose, stall, has_failed=has_failed):
         ended = ended or each not in lost
         yield each
 
@@ -88,8 +98,8 @@ def run_evaluation(
 class _Driver:
     """Drives episodes; after one that failed it makes policy and environment anew, as they may be broken."""
 
-    def __init__(self, agent: Agent) -> None:
-        self._agent = agent
+    def __init__(self, agent: Agent, caught: tuple[type[BaseException], ...]) -> None:
+        self._agent, self._caught = agent, caught
         self._evaluator: AgentEvaluator | None = None
 
     def drive(self, seed: int) -> Episode:
@@ -100,14 +110,16 @@ class _Driver:
                 count_step()  # it is ready
             found = self._evaluator.drive(seed, count_step)
             why = rejection_reason(found.score, found.steps, 0.0, found.steps)
-            return found if why is None else FailedEpisode(seed, why)
+            if why is None:
+                return found
         except DreamfleetError:
             raise
-        except (Exception, SystemExit) as error:  # a simulator may raise anything
-            with suppress(Exception, SystemExit):
-                self.close()
-            self._evaluator = None
-            return FailedEpisode(seed, describe_exception(error))
+        except self._caught as error:  # a simulator may raise anything
+            why = describe_exception(error)
+        with suppress(*self._caught):
+            self.close()
+        self._evaluator = None
+        return FailedEpisode(seed, why)
 
     def close(self) -> None:
         """Release the environment."""
@@ -126,7 +138,8 @@ class _ProcessEvaluator:
         exit_with_parent(parent)
         os.environ["SDL_VIDEODRIVER"] = "dummy"
         outlive_stop_signals()  # Ctrl-C reaches the whole process group; the parent ends this process
-        cls.driver = _Driver(agent)  # its first episode loads the agent, so that errors are reported as that episode's
+        # The first episode loads the agent, so that errors are reported as that episode's. No Ctrl-C raises here.
+        cls.driver = _Driver(agent, (BaseException,))
 
     @classmethod
     def drive(cls, seed: int) -> Episode:

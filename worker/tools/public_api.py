@@ -94,8 +94,8 @@ def evaluate(
     """Evaluate a controller in whole episodes, one a seed, in `jobs` processes (default: one a core).
 
     This is what `dreamfleet evaluate` does. With more than one job, call it under `if __name__ == "__main__":` in a
-    script, because processes are spawned. The result's `failed` holds the episodes that raised an error.
-    `DreamfleetError` if no episode has a score.
+    script, because processes are spawned. The result's `failed` holds the episodes that failed in a fresh process too;
+    with one job, which drives in this process, in a fresh environment. `DreamfleetError` if no episode has a score.
 
     >>> from dreamfleet import evaluate, find_controller
     >>> results = evaluate(find_controller("cartpole"), episodes=3, jobs=1)  # the name of a run of yours

@@ -20,7 +20,7 @@ from dreamfleet.common.host.stop_signals import Stop, never_stop, outlive_stop_s
 from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
 from dreamfleet.worker.scoring.agents import Agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
-from dreamfleet.worker.scoring.failure_cause import describe_loss
+from dreamfleet.worker.scoring.failure_cause import describe_exception, describe_loss
 from dreamfleet.worker.tools.drive_frames import FilmedPolicy, FramePainter, WorldModelView, episode_errors
 from dreamfleet.worker.tools.video import Video
 
@@ -101,5 +101,8 @@ class _Recorder:
             steps = made
             count_step()
 
-        score = film(seed=seed, out=out, on_step=on_step, stop=lambda: bool(cls.is_stopped.value))
+        try:
+            score = film(seed=seed, out=out, on_step=on_step, stop=lambda: bool(cls.is_stopped.value))
+        except (KeyboardInterrupt, SystemExit, GeneratorExit) as error:  # of the simulator: no Ctrl-C raises here
+            raise DreamfleetError(f"the episode of seed {seed} failed: {describe_exception(error)}") from error
         return score, steps

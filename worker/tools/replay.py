@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.host.parent_death import exit_with_parent
 from dreamfleet.common.host.process_pool import count_step, map_in_processes
@@ -84,8 +85,9 @@ class ReplayedEpisode:
 def replay(run: RunFolder, generation: int, candidate: int, stall: float = STALL_SECONDS) -> Iterator[ReplayedEpisode]:
     """Drive each stored episode of a candidate again, with its generation's parameters, bundle and seeds.
 
-    It drives in a child process: an episode that ends it, or makes no step for `stall` seconds, has that error now.
-    Episodes of a vector that was discarded and drawn anew are left out.
+    It drives in a child process: an episode that ends it, or makes no step for `stall` seconds, has that error now. An
+    episode that fails does so in a fresh process (R8). Left out are episodes of a vector that was drawn anew, and those
+    on seeds that were replaced.
     """
     with run.read_transaction():
         parameters = run.candidate(generation, candidate)
@@ -119,12 +121,13 @@ def replay(run: RunFolder, generation: int, candidate: int, stall: float = STALL
 def _stored_episodes(
     run: RunFolder, generation: int, candidate: int, params: ScoringParams
 ) -> list[StoredResult | StoredFailure]:
-    """The results and failures of a candidate's final vector, by episode."""
+    """The results and failures of a candidate's final vector on the generation's final seeds, by episode."""
+    seeds = dict(enumerate(run.training_seeds(generation)))
     vector = hashlib.sha256(run.candidate(generation, candidate).astype("<f4").tobytes()).digest()
 
     def is_final(each: StoredResult | StoredFailure) -> bool:
         digest = params.episode_spec(each.episode).digest("score", vector, (each.seed,))
-        return bytes.fromhex(each.digest) == digest
+        return each.seed == seeds.get(each.episode) and bytes.fromhex(each.digest) == digest
 
     place = "score", generation, candidate
     failures = [each for each in run.failures() if (each.kind, each.generation, each.candidate) == place]
@@ -139,8 +142,10 @@ def _drive_all(spec: TaskSpec, bundle: Path | None, items: Sequence[Item], stall
         return ReplayAttempt(item[0], error=describe_loss(reason))
 
     pin_thread_pools()
-    arguments = os.getpid(), spec, bundle
-    attempts = map_in_processes(1, _Replayer.start, arguments, _Replayer.drive, items, lose, stall) if items else ()
+    attempts = map_in_processes(
+        1, _Replayer.start, (os.getpid(), spec, bundle), _Replayer.drive, items, lose, stall,
+        has_failed=lambda attempt: bool(attempt.error),
+    )  # fmt: skip
     return {each.episode: each for each in attempts}
 
 
@@ -165,12 +170,15 @@ class _Replayer:
         from dreamfleet.worker.scoring.scorer import Scorer
 
         episode, parameters, seed, spec = item
-        if cls.scorer is None:
-            cls.scorer = Scorer(cls.spec, None if cls.bundle is None else Bundle.open(cls.bundle, cls.spec.bundle))
-        host_class = cls.scorer.host_class  # before the episode, as it drives the environment too
-        count_step()
+        host_class = ""
         try:
+            if cls.scorer is None:
+                cls.scorer = Scorer(cls.spec, None if cls.bundle is None else Bundle.open(cls.bundle, cls.spec.bundle))
+            host_class = cls.scorer.host_class  # before the episode, as it drives the environment too
+            count_step()
             score = cls.scorer.score("score", parameters, seed, count_step, spec=spec)
             return ReplayAttempt(episode, host_class, score.fitness)
-        except (Exception, SystemExit) as error:  # a simulator may raise anything
+        except BaseException as error:  # a simulator may raise anything, and no Ctrl-C raises here
+            if cls.scorer is None and isinstance(error, DreamfleetError):
+                raise
             return ReplayAttempt(episode, host_class, error=describe_exception(error))

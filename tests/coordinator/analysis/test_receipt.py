@@ -44,7 +44,7 @@ def test_failed_candidates_are_counted(change, printed):
     for verb in ("receipt", "show"):
         said = next(line for line in printed(verb, "reality").splitlines() if "failed" in line and "candidates" in line)
         assert "4 in " in said
-        assert "--on-failure" in said
+        assert "closed generations (--on-failure " in said
         assert json.loads(printed(verb, "reality", "--json"))["failed_candidates"] == 4
 
 

@@ -1,4 +1,5 @@
 import json
+import os
 import signal
 from dataclasses import replace
 
@@ -103,6 +104,34 @@ def test_a_crash_costs_only_its_own_episode(controller, random_bundle):
     assert len(found.drives) == 7
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("poison", ["fail", "segfault"])
+def test_an_episode_fails_only_in_a_fresh_process(controller, random_bundle, monkeypatch, poison):
+    monkeypatch.setenv(rough_tasks.POISON, poison)
+    agent = make_agent(controller(rough_tasks.name_of(rough_tasks.Poisoned)), random_bundle)
+    alone, beside = (EpisodeResults.of(evaluate_in_processes(agent, tuple(range(4)), jobs)) for jobs in (1, 2))
+    assert (len(alone.drives), alone.failed) == (4, ())
+    assert sorted(alone.drives, key=lambda each: each.seed) == sorted(beside.drives, key=lambda each: each.seed)
+
+
+def test_in_the_own_process_an_episode_fails_only_in_a_fresh_environment(controller, random_bundle):
+    agent = make_agent(controller(rough_tasks.name_of(rough_tasks.Wearing)), random_bundle)
+    assert len(EpisodeResults.of(evaluate(agent, tuple(range(4)), 1)).drives) == 4
+
+
+@pytest.mark.parametrize("error", ["KeyboardInterrupt", "GeneratorExit"])
+def test_what_only_python_itself_should_raise_is_an_episodes_failure(
+    processes, controller, random_bundle, tmp_path, monkeypatch, error
+):
+    monkeypatch.setenv(rough_tasks.PLACE, "step")
+    monkeypatch.setenv(rough_tasks.ERROR, error)
+    controller(rough_tasks.name_of(rough_tasks.Raising)).save(tmp_path / "toy.npz")
+    judged = ("--controller", tmp_path / "toy.npz", "--bundle", random_bundle.path, "--episodes", 2, "--jobs", 1)
+    code, out, err = processes.call("evaluate", *judged, "--trust", rough_tasks.MODULE)
+    assert (code, out, "Traceback" in err) == (1, "", False), err
+    assert f"0 of 2 episodes, 2 failed: seed 10000, {error}: " in err
+
+
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_an_episode_that_hangs_is_given_up_and_the_others_go_on(controller, random_bundle, monkeypatch, jobs):
     monkeypatch.setenv(rough_tasks.HALT, "5")
@@ -133,7 +162,7 @@ def test_an_interrupted_evaluation_says_what_it_has(processes, controller, rando
     judged = ("--controller", tmp_path / "toy.npz", "--bundle", random_bundle.path, "--episodes", 5, "--jobs", 1)
     evaluation = processes.start("evaluate", *judged, "--trust", rough_tasks.MODULE)
     evaluation.wait_for("an episode failed")
-    evaluation.popen.send_signal(signal.SIGINT)
+    os.killpg(evaluation.popen.pid, signal.SIGINT)  # as a terminal does
     assert evaluation.finish()[0] == 130
     said = evaluation.last_line()
     assert (said.startswith("interrupted after 3 of 5 episodes: -"), "±" in said) == (True, True), said

@@ -95,7 +95,12 @@ def test_an_environment_that_cannot_be_filmed_ends_with_one_line(processes, tmp_
 
 
 @pytest.mark.parametrize(
-    ("name", "error"), [("Breaking", "ZeroDivisionError: no road"), ("Leaving", "slot crashed (exit status 3)")]
+    ("name", "error"),
+    [
+        ("Breaking", "ZeroDivisionError: no road"),
+        ("Interrupting", "KeyboardInterrupt:"),
+        ("Leaving", "slot crashed (exit status 3)"),
+    ],
 )
 def test_an_episode_that_fails_leaves_no_video_and_the_one_that_is_there(processes, tmp_path, monkeypatch, name, error):
     monkeypatch.setenv("DREAMFLEET_TRUST", "tests")

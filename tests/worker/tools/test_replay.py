@@ -68,12 +68,43 @@ def test_an_episode_that_hangs_or_ends_its_process_now_differs(processes, random
     assert (hung.agrees(None), crashed.agrees(None), sound.agrees(None)) == (False, False, True)
 
 
+@pytest.mark.slow
+def test_an_episode_fails_only_in_a_fresh_process(processes, random_bundle, monkeypatch):
+    monkeypatch.setenv(rough_tasks.POISON, "fail")
+    monkeypatch.setenv("DREAMFLEET_TRUST", rough_tasks.MODULE)
+    task = rough_tasks.name_of(rough_tasks.Poisoned)
+    coordinator = processes.coordinator(
+        "--bundle", random_bundle.path, "--task", task, "--population", 4, "--episodes", 2, "--generations", 1,
+        "--evaluate-every", 0,
+    )  # fmt: skip
+    processes.worker("--task", task, "--exit-when-done")
+    assert coordinator.finish()[0] == 0
+    code, out, err = processes.call("replay", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
+    assert (code, out.count("same bits")) == (0, 2), (out, err)
+
+
+@pytest.mark.parametrize("place", ["make", "step"])
+def test_what_only_python_itself_should_raise_is_an_episodes_failure(processes, random_bundle, monkeypatch, place):
+    task = rough_tasks.name_of(rough_tasks.Raising)
+    coordinator = processes.coordinator(
+        "--bundle", random_bundle.path, "--task", task, "--population", 4, "--episodes", 2, "--generations", 1,
+        "--evaluate-every", 0,
+    )  # fmt: skip
+    processes.worker("--task", task, "--exit-when-done")
+    assert coordinator.finish()[0] == 0
+    monkeypatch.setenv(rough_tasks.PLACE, place)
+    monkeypatch.setenv(rough_tasks.ERROR, "KeyboardInterrupt")
+    replay = ("replay", "test", "--runs-dir", processes.runs, "--candidate", "0/1", "--trust", rough_tasks.MODULE)
+    code, out, err = processes.call(*replay)
+    assert (code, out.count("fails now (KeyboardInterrupt:)"), "Traceback" in err) == (1, 2, False), (out, err)
+
+
 @pytest.fixture
 def brittle_run(processes, random_bundle):
-    def run(on_failure):
+    def run(on_failure, seed=7):
         coordinator = processes.coordinator(
             "--bundle", random_bundle.path, "--task", tasks.BRITTLE, "--population", 12, "--episodes", 3,
-            "--generations", 1, "--evaluate-every", 0, "--seed", 7, "--on-failure", on_failure, "--failure-limit", 1,
+            "--generations", 1, "--evaluate-every", 0, "--seed", seed, "--on-failure", on_failure, "--failure-limit", 1,
         )  # fmt: skip
         processes.worker("--task", tasks.BRITTLE, "--exit-when-done")
         assert coordinator.finish()[0] == 0
@@ -139,3 +170,20 @@ def test_a_candidate_that_was_drawn_anew_is_compared_with_its_final_vector_alone
     replay = ("replay", "test", "--runs-dir", processes.runs, "--candidate", f"0/{number}")
     code, out, err = processes.call(*replay)
     assert (code, out.count("same bits"), len(out.splitlines())) == (0, 3, 3), (out, err)
+
+
+@pytest.mark.slow
+def test_a_candidate_whose_generation_got_other_seeds_is_compared_on_these_alone(processes, brittle_run):
+    folder = brittle_run("worst", seed=5)  # everybody fails on the second of its first three seeds
+    with RunFolder(folder) as run:
+        seeds = run.training_seeds(0)
+        assert run.failures()[0].seed not in seeds
+        number = next(number for number in range(12) if run.fitness(0, number) is not None)
+    replay = ("replay", "test", "--runs-dir", processes.runs, "--candidate", f"0/{number}")
+    code, out, err = processes.call(*replay)
+    assert (code, out.count("same bits"), len(out.splitlines())) == (0, 3, 3), (out, err)
+    with closing(sqlite3.connect(folder / JOURNAL)) as connection, connection:
+        connection.execute("UPDATE generation SET seeds = '7'")
+    connection.close()
+    code, _, err = processes.call(*replay)
+    assert (code, "damaged: generation 0 has no seeds" in err, "Traceback" in err) == (1, True, False), err
