@@ -186,7 +186,7 @@ class Run:
     def _flush(self) -> bool:
         """Take the journal's lock before a generation closes, which nothing may interrupt; whether that succeeded."""
         try:
-            self._journal.flush()
+            self._journal.take_lock()
         except NotWritableNowError as error:
             self.wait_until_writable(error)
             return False
@@ -218,7 +218,9 @@ class Run:
         self.fleet.notes.append(f"paused: {why}")
 
     def resume(self) -> None:
-        """Dispatch again; failed jobs may go to any worker again."""
+        """Dispatch again; failed jobs may go to any worker again. It changes nothing while `stalled` says why."""
+        if not self._flush():
+            return
         if self.paused is not None:
             self.fleet.notes.append("resumed")
         self.paused = None
@@ -382,6 +384,8 @@ class Run:
     def _finish(self) -> None:
         """Once a limit is reached and no background job is left: confirm the reported mean, then end the run."""
         if self._ending is None or self.background_jobs.in_progress or self.ended is not None:
+            return
+        if not self._flush():
             return
         if work := self.background_jobs.confirm():
             self.fleet.notes.append(self.background_jobs.round_description)

@@ -57,6 +57,8 @@ class Control:
             why = f"{truncate(verb, LONGEST_VERB)!r} is no control verb of this version; it knows: {known}"
         else:
             self._verbs[verb]()
+            if verb == "resume" and self._run.stalled is not None:
+                why = f"it cannot go on now: {self._run.stalled}; say `resume` again then"
             if verb in LEAVING_VERBS and len(resume_command) <= MAX_TEXT and resume_command.isprintable():
                 again = resume_command
         return ControlReply(v=keys.PROTOCOL_VERSION, run=self._name, accepted=not why, why=why, again=again)

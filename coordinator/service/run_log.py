@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import asdict
 from datetime import UTC, datetime
 from itertools import islice
-from time import time
+from time import monotonic, time
 from typing import Any
 
 from dreamfleet.common.monitoring.eta import estimate_eta, summarise_status
@@ -41,7 +41,7 @@ class RunLog:
         self._summary_at = now
         self._no_worker_since = now
         self._expiry_at = 0.0
-        self._clock_offset = time() - now
+        self._clock_offset = time() - monotonic()
 
     def begin(self) -> None:
         """The run is served from now on."""
@@ -78,7 +78,7 @@ class RunLog:
     def check(self, snapshot: Snapshot, now: float) -> None:
         """Log what is due: a warning that no worker is present, the minute's summary, the join file's expiry."""
         self._warn_if_no_worker(now)
-        self._note_clock(now)
+        self._note_clock()
         if now - self._summary_at >= SUMMARY_INTERVAL:
             self._summary_at = now
             text, facts = summary(snapshot.full_status())
@@ -87,9 +87,9 @@ class RunLog:
                 self._expiry_at = now + DAY
                 _warn_of_expiry(self._network.credentials)
 
-    def _note_clock(self, now: float) -> None:
+    def _note_clock(self) -> None:
         """Note that the wall clock moved against the monotonic one, by which all deadlines are kept."""
-        offset = time() - now
+        offset = time() - monotonic()  # `now` may be older: a commit waits for a locked journal
         if abs(moved := offset - self._clock_offset) > CLOCK_STEP:
             self._run.fleet.notes.append(f"the wall clock moved by {moved:+,.0f} s: it was set, or this host slept")
             self._clock_offset = offset

@@ -15,7 +15,7 @@ from typing import Any
 
 import zenoh
 
-from dreamfleet.common.errors import DreamfleetError, JournalError, RefusedError
+from dreamfleet.common.errors import DreamfleetError, JournalError, NotWritableNowError, RefusedError
 from dreamfleet.common.host.error_counter import ErrorCounter
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import CountingDecoder, encode, encode_json, encoding
@@ -211,12 +211,14 @@ class Service:
     def _handle(self, kind: str, event: Any) -> None:
         """Handle one event. An exception drops that event alone, for no message may end the run: its sender repeats it.
 
-        A `DreamfleetError` passes: a journal that cannot be written ends the coordinator.
+        A full disk or a locked journal makes the run wait. Another `DreamfleetError` passes: it ends the coordinator.
         """
         try:
             self._handle_event(kind, event, monotonic())
         except MalformedError as error:
             self._error_counter.record(kind, error, event)
+        except NotWritableNowError as error:
+            self._run.wait_until_writable(error)
         except DreamfleetError:
             raise
         except Exception as error:

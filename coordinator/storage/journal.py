@@ -103,7 +103,8 @@ class Journal(JournalConnection):
 
     def check_incarnation(self) -> None:
         """`JournalError` if another coordinator began a life in this journal: a lock held neither of them back."""
-        found = int(self.fact("incarnation") or 0)
+        rows = self._read_written("SELECT value FROM run WHERE key = 'incarnation'")
+        found = int(rows[0][0]) if rows else 0
         if found != self._incarnation:
             raise JournalError(
                 f"another coordinator serves {self.path} too (incarnation {found}, this one is {self._incarnation}): "

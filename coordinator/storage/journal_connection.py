@@ -122,12 +122,16 @@ class JournalConnection:
             self._stamp = file_stamp(self.path)
 
     def flush(self) -> None:
-        """Begin a transaction with everything written so far; until its commit no other program can lock the journal.
-
-        After `NotWritableNowError` it may be called again.
-        """
+        """Send everything written so far to the database; after `NotWritableNowError` it may be called again."""
         with self._kept_writes():
             self._flush()
+
+    def take_lock(self) -> None:
+        """Flush in a transaction: until its commit no other program can lock the journal. Errors as of `flush`."""
+        self.flush()
+        if not self._connection.in_transaction:
+            with journal_errors(self.path):
+                self._connection.execute("BEGIN IMMEDIATE")
 
     @contextmanager
     def _kept_writes(self) -> Iterator[None]:
@@ -176,7 +180,11 @@ class JournalConnection:
 
     def _read(self, query: str, *values: Any) -> list[Any]:
         """All rows of a query: a damaged page raises its error here, not in the code that iterates over the rows."""
-        self._flush()
+        self.flush()
+        return self._read_written(query, *values)
+
+    def _read_written(self, query: str, *values: Any) -> list[Any]:
+        """All rows of a query, without what waits to be written: a locked journal does not hold it up."""
         with journal_errors(self.path):
             return self._connection.execute(query, values).fetchall()
 

@@ -101,7 +101,7 @@ class MemoryJournal:
         """No rule hangs on the time of a generation, which is written with them."""
         return False
 
-    def flush(self) -> None:
+    def take_lock(self) -> None:
         """Nobody else locks it."""
 
     def set_seconds(self, generation: int, seconds: float) -> None:

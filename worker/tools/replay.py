@@ -17,8 +17,10 @@ from dreamfleet.common.host.process_pool import count_step, map_in_processes
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.stall_watch import STALL_SECONDS
 from dreamfleet.common.host.stop_signals import outlive_stop_signals
+from dreamfleet.common.host.trusted_modules import check_trusted
 from dreamfleet.common.protocol.failures import failure_cause
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, class_from_fingerprint
+from dreamfleet.common.protocol.tasks import module_of
 from dreamfleet.common.runs.records import StoredFailure, StoredResult
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.scoring_params import ScoringParams, scoring_params_of
@@ -89,6 +91,8 @@ def replay(run: RunFolder, generation: int, candidate: int, stall: float = STALL
     episode that fails does so in a fresh process (R8). Left out are episodes of a vector that was drawn anew, and those
     on seeds that were replaced.
     """
+    if module := module_of(run.spec.task):
+        check_trusted(module, f"task {run.spec.task!r}")
     with run.read_transaction():
         parameters = run.candidate(generation, candidate)
         scoring_params, own = scoring_params_of(run, generation), run.spec

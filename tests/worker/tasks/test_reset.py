@@ -28,13 +28,22 @@ class Environment(gymnasium.Env):
 
 
 @pytest.mark.parametrize("error", [ValueError("too long"), OverflowError("int too big"), TypeError("32 bits")])
-def test_an_environment_that_refuses_long_seeds_gets_them_folded_and_is_asked_once(error):
-    environment = Environment(lambda seed, _: error if seed >= 2**31 else None)
+@pytest.mark.parametrize("limit", [2**31, 2**32])
+def test_an_environment_that_refuses_long_seeds_gets_them_folded(error, limit):
+    environment = Environment(lambda seed, _: error if seed >= limit else None)
     assert reset_folded(environment, LONG)[0] == fold_seed(LONG)
-    asked = len(environment.seeds)
     assert reset_folded(environment, LONG + 1)[0] == fold_seed(LONG + 1)
-    assert len(environment.seeds) == asked + 1
     assert reset_folded(environment, 5)[0] == 5
+
+
+@pytest.mark.parametrize("refuses", [lambda seed: seed >= 2**52, lambda seed: seed % 9 == (2**53 - 1) % 9])
+def test_what_a_seed_means_does_not_depend_on_the_seeds_before(refuses):
+    environment = Environment(lambda seed, _: ValueError("no such level") if refuses(seed) else None)
+    legal = next(seed for seed in range(LONG % 2**51, 2**52) if not refuses(seed))
+    assert reset_folded(environment, legal)[0] == legal
+    with pytest.raises(ValueError, match="no such level"):
+        reset_folded(environment, 2**53 - 1)
+    assert reset_folded(environment, legal)[0] == legal
 
 
 @pytest.mark.parametrize("error", [RuntimeError("no answer"), ValueError("no answer"), MemoryError(), OSError(24, "x")])
