@@ -44,6 +44,8 @@ sqlite3.register_adapter(Checkpoint, Checkpoint.packed)  # when it is written, n
 
 MAX_EVENTS = 10_000  # R26: strangers and failing hosts cause some
 LEAVES = "the coordinator leaves"  # the last event of an incarnation that was not killed
+# Seconds for which a write waits for another program's lock. A run tries again, so that it answers meanwhile.
+SERVING_PATIENCE, LEAVING_PATIENCE = 0.5, 5.0
 MOST_VARIABLES = 500  # of one SQL statement
 FINGERPRINT, HOST_CLASS = "fingerprint", "host_class"  # the facts' names
 
@@ -149,11 +151,13 @@ class Journal(JournalConnection):
         self.set_fact("incarnation", str(number))
         self.add_event(f"incarnation {number} begins{killed}")
         self.commit()
+        self.set_patience(SERVING_PATIENCE)
         self._opened = self._committed = self._read_row("SELECT max(number) FROM generation")[0]
         return number
 
     def end_incarnation(self) -> None:
         """Write that the coordinator leaves by itself."""
+        self.set_patience(LEAVING_PATIENCE)
         self.add_event(LEAVES)
 
     def open_generation(

@@ -144,6 +144,10 @@ class JournalConnection:
             self._writes, self._uncommitted = [*self._uncommitted, *self._writes], []
             raise
 
+    def set_patience(self, seconds: float) -> None:
+        """How long a write waits for another program's lock."""
+        self._connection.execute(f"PRAGMA busy_timeout = {int(1000 * seconds)}")
+
     @property
     def has_writes(self) -> bool:
         """Whether something waits for the next commit."""

@@ -4,6 +4,7 @@ import os
 import shutil
 import sqlite3
 import subprocess
+import time
 from contextlib import closing
 
 import numpy as np
@@ -13,6 +14,7 @@ from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
 
 DRIVES = 30
+FILE_CHECK = 1.0  # seconds between two looks at the files
 ROOM = 900_000  # bytes: for a while of journal, and not for a drive
 
 
@@ -66,9 +68,14 @@ def test_a_run_whose_journal_is_locked_waits_and_goes_on(processes, random_bundl
     with closing(sqlite3.connect(processes.runs / "test" / "journal.sqlite", timeout=60)) as other:
         other.execute("BEGIN IMMEDIATE")
         locked.wait_for("locked; end the program that keeps it locked, and the run goes on")
+        code, _, err = processes.call("resume", "test", "--connect", processes.endpoint)
+        assert (code, "it cannot go on now" in err) == (1, True), err
+        time.sleep(15 * FILE_CHECK)  # meanwhile the coordinator looks whether its files are still there
+        assert locked.popen.poll() is None, "".join(locked.lines)
         other.rollback()
     locked.wait_for("can be written again")
     assert locked.finish()[0] == 0
+    assert "the wall clock" not in "".join(locked.lines)
     with open_run(processes.runs, "test") as run:
         assert len(run.history()) == 12
 

@@ -101,6 +101,9 @@ class MemoryJournal:
         """No rule hangs on the time of a generation, which is written with them."""
         return False
 
+    def set_patience(self, seconds: float) -> None:
+        """Nobody else locks it."""
+
     def take_lock(self) -> None:
         """Nobody else locks it."""
 
