@@ -7,7 +7,7 @@ import pytest
 
 from dreamfleet.common.errors import RefusedError
 from dreamfleet.common.protocol.codec import encode_json
-from dreamfleet.common.protocol.messages import Intervals, ResultBatch, UploadPart
+from dreamfleet.common.protocol.messages import Heartbeat, Intervals, ResultBatch, UploadPart
 from dreamfleet.common.transport.session import Network, open_session
 from tests.support import samples, tasks
 from tests.support.hand import DEADLINE, SECOND, tag
@@ -121,6 +121,7 @@ def test_it_follows_its_run_to_another_name_with_its_results(stage, said, cached
     wait_for(said, "run test goes on under the name test-rescued")
     again.hello()
     assert again.results(done, running) == {done.digest, running.digest}
+    again.next(Heartbeat)  # it listens under this name
     again.send(1, again.job(2), accepted=(done, running))
     assert again.result(again.job(2)).fitness is not None
 
