@@ -14,7 +14,7 @@ EQUAL_ATTEMPTS = 2  # that fail for one cause show that the episode fails
 ANY_ATTEMPTS = 3  # that fail for several causes show it too
 HOST_ATTEMPTS = 10  # that a host's shortage ends, over about eight minutes: no host has what the episode needs
 PAUSING_ATTEMPTS = 3  # on the only worker
-MAX_CAUSES = 20  # that are told of: a simulator may invent names without end
+MAX_CAUSES = 20  # that are logged: a simulator may invent names without end
 ENOUGH_JOBS = 10  # of which none could be scored show that no host can
 
 

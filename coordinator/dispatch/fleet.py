@@ -337,7 +337,7 @@ class Fleet:
         return ("duplicate", None) if pending.is_proof else ("accepted", pending.work)
 
     def _record_failure(self, identity: str, result: Result) -> None:
-        """Record a failed attempt; people are told of the first one of each cause."""
+        """Record a failed attempt; the first one of each cause is logged."""
         self.jobs.record_failure(identity, result, self._now)
         self.counts["errors"] += 1
         failure = self.jobs[result.digest].failure

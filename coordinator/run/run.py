@@ -29,14 +29,13 @@ from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.jobs.work import Work
 from dreamfleet.coordinator.run.admission import WorkerAdmission
 from dreamfleet.coordinator.run.background_jobs import BackgroundJobs
+from dreamfleet.coordinator.run.failure_limit import FailureLimit
 from dreamfleet.coordinator.run.generations import Generations
 from dreamfleet.coordinator.run.work_clock import WorkClock
 from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 
-REMEDY = "`dreamfleet resume` tries them again and goes on, however many fail in this generation"
 OTHER_SEEDS = "; if the seeds of the first generation are bad for every candidate, begin a run with another --seed"
-LIMIT_FROM = "limit_from"  # the fact that names the first generation whose failures count for `failure_limit`
 WRITE_RETRY = 2.0  # seconds until a full disk or a locked journal is tried again
 
 
@@ -72,9 +71,8 @@ class Run:
         self.background_jobs = BackgroundJobs(journal, settings, self.uid, self.history, evaluations, self._agenda)
         evaluated = self.background_jobs.evaluations.finished
         self.generations = Generations(journal, settings, self._agenda, self.history, evaluated)
-        self.failure_limit = network.failure_limit
+        self.failure_limit = FailureLimit(journal, self.generations, network.failure_limit)
         self.generation = self.generations.begin()
-        self._limit_from = int(journal.fact(LIMIT_FROM) or 0)
         self.work_clock = WorkClock(now, self.generations.seconds)  # of the open generation
         self.fleet.failure_judge.working_hosts.update(map(host_of, journal.workers()))
         if self.incarnation > 1:  # the last incarnation may have sent the next generation's jobs before it was durable
@@ -147,7 +145,7 @@ class Run:
     def advance(self, now: float) -> bool:
         """Close the complete generation and open the next one; whether a generation was opened."""
         closed = len(self.history)
-        if self.stalled is not None or (self.generation.complete and not self._flush()):
+        if self.stalled is not None or (self.generation.complete and not self._take_lock()):
             return False
         self._settle_failures()
         while self.ended is None and self.paused is None and self.generation.complete and not self._is_waiting:
@@ -183,8 +181,8 @@ class Run:
             self.fleet.notes.append("the journal can be written again: the run goes on")
         return True
 
-    def _flush(self) -> bool:
-        """Take the journal's lock before a generation closes, which nothing may interrupt; whether that succeeded."""
+    def _take_lock(self) -> bool:
+        """Take the journal's lock before changes that nothing may interrupt; whether that succeeded."""
         try:
             self._journal.take_lock()
         except NotWritableNowError as error:
@@ -219,15 +217,14 @@ class Run:
 
     def resume(self) -> None:
         """Dispatch again; failed jobs may go to any worker again. It changes nothing while `stalled` says why."""
-        if not self._flush():
+        if not self._take_lock():
             return
         if self.paused is not None:
             self.fleet.notes.append("resumed")
         self.paused = None
         self.fleet.paused = self.stalled is not None
         self.fleet.jobs.clear_failures()
-        self._limit_from = self.generation.number + 1
-        self._journal.set_fact(LIMIT_FROM, str(self._limit_from))
+        self.failure_limit.accept(self.generation.number)
         self.fleet.jobs.offer(self.background_jobs.retry_failed())
         if self.generation.failed:
             self._journal.drop_failures(self.generation.number)
@@ -241,9 +238,9 @@ class Run:
                 self._record_failure(lasting)
         if self.paused is not None:
             return
-        if (why := self._too_many_failures()) is not None:
+        if (why := self.failure_limit.find_excess(self.generation)) is not None:
             self.pause(f"{why} (`dreamfleet runs story` lists why)")
-        elif is_judged and (failure := judge.find_broken_fleet(at_once=self.failure_limit < 1)) is not None:
+        elif is_judged and (failure := judge.find_broken_fleet(at_once=self.failure_limit.share < 1)) is not None:
             proof = self.generations.find_scored(self.generation)
             if proof is None or not self.fleet.jobs.offer_proof(proof):
                 self.pause(
@@ -252,22 +249,6 @@ class Run:
                 )
         elif not is_judged and (failure := judge.find_pausing()) is not None:
             self.pause(f"{failure}; `dreamfleet resume` tries it again")
-
-    def _too_many_failures(self) -> str | None:
-        """What failed so often that the run pauses, in words; `None` if nothing did."""
-        generation = self.generation
-        failed, counted = self.generations.count_recent_failures(generation, self._limit_from)
-        total = len(counted) * generation.population
-        if failed > self.failure_limit * total:
-            first, last = counted[0], counted[-1]
-            where = f"generation {last}" if first == last else f"generations {first} to {last}"
-            return f"{failed} of {plural(total, 'candidate')} failed in {where}; {REMEDY}"
-        if generation.all_failed and not self.generations.can_try_again(generation):
-            return (
-                f"all candidates failed in generation {generation.number} on each set of seeds, so that none can be "
-                "ranked; `dreamfleet resume` tries them again, `dreamfleet fork` begins another run at the mean"
-            )
-        return None
 
     def _record_failure(self, failure: JobFailure) -> None:
         """Journal that a job's episode fails wherever it is scored; it is wanted no more."""
@@ -385,7 +366,7 @@ class Run:
         """Once a limit is reached and no background job is left: confirm the reported mean, then end the run."""
         if self._ending is None or self.background_jobs.in_progress or self.ended is not None:
             return
-        if not self._flush():
+        if not self._take_lock():
             return
         if work := self.background_jobs.confirm():
             self.fleet.notes.append(self.background_jobs.round_description)

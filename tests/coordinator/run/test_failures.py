@@ -168,7 +168,7 @@ def test_more_failures_than_the_limit_pause_the_run_and_resume_scores_these_cand
 
 def test_all_candidates_failing_is_a_pause_that_says_so_whatever_the_limit(tmp_path, random_bundle):
     bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate >= 0)
-    bench.run.failure_limit = 1.0
+    bench.run.failure_limit.share = 1.0
     bench.run.fleet.failure_judge.working_hosts = {"a", "b"}
     bench.serve()
     assert bench.run.paused.startswith("all candidates failed in generation 0")
@@ -246,7 +246,7 @@ def test_redraws_count_each_candidate_once_and_go_on_where_all_failed(tmp_path, 
         return job.digest in first
 
     bench = Failing(tmp_path / "night", random_bundle.path, settings, fails=fails)
-    bench.run.failure_limit = 1.0
+    bench.run.failure_limit.share = 1.0
     bench.run.fleet.failure_judge.working_hosts = {"a", "b"}
     bench.serve()
     assert bench.run.ended
