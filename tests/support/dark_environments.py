@@ -49,38 +49,32 @@ class Breaking(CartPoleEnv):
     def step(self, action):
         self.steps += 1
         if self.steps > 3:
-            raise ZeroDivisionError("no road")
+            self.break_down()
         return super().step(action)
+
+    def break_down(self):
+        raise ZeroDivisionError("no road")
 
 
 class Interrupting(Breaking):
     """Draws pictures, and later raises what Ctrl-C raises."""
 
-    def step(self, action):
-        try:
-            return super().step(action)
-        except ZeroDivisionError:
-            raise KeyboardInterrupt from None
+    def break_down(self):
+        raise KeyboardInterrupt
 
 
 class Leaving(Breaking):
     """Draws pictures, and ends its process later."""
 
-    def step(self, action):
-        try:
-            return super().step(action)
-        except ZeroDivisionError:
-            os._exit(3)
+    def break_down(self):
+        os._exit(3)
 
 
 class Stuck(Breaking):
     """Draws pictures, and hangs later."""
 
-    def step(self, action):
-        try:
-            return super().step(action)
-        except ZeroDivisionError:
-            time.sleep(600)
+    def break_down(self):
+        time.sleep(600)
 
 
 class Slow(Plain):

@@ -76,6 +76,18 @@ def finished(path, bundle, settings=SETTINGS, **options):
     return bench
 
 
+def story_of_killed(path, bundle, results, settings, **options):
+    """The story of a run whose coordinator is killed each time that so many results and errors have come."""
+    bench = Failing(path / "killed" / "night", bundle.path, settings, **options)
+    while not bench.run.ended:
+        bench.serve(stop=lambda run: run.fleet.counts["accepted"] + run.fleet.counts["errors"] > results)
+        if not bench.run.ended:
+            bench.restart()
+    story = bench.story()
+    bench.journal.close()
+    return story
+
+
 @pytest.fixture
 def failing(tmp_path, random_bundle):
     made = []
@@ -117,14 +129,8 @@ def test_the_bits_are_the_same_on_any_fleet_and_through_restarts(failing, tmp_pa
     lone.run.fleet.handle_departure(B, lone.now)
     lone.serve()
     assert lone.story() == whole
-    killed = Failing(tmp_path / "killed" / "night", random_bundle.path, settings, fails=fails, limit=1.0)
-    while not killed.run.ended:
-        killed.serve(stop=lambda run: run.fleet.counts["accepted"] + run.fleet.counts["errors"] > 12)
-        if not killed.run.ended:
-            killed.restart()
-    assert killed.story() == whole
+    assert story_of_killed(tmp_path, random_bundle, 12, settings, fails=fails, limit=1.0) == whole
     lone.journal.close()
-    killed.journal.close()
 
 
 def test_a_candidate_that_is_drawn_anew_is_another_and_the_old_one_stays_in_the_journal(failing):
@@ -217,13 +223,7 @@ def test_a_seed_on_which_all_candidates_fail_is_replaced_with_the_same_bits_thro
         assert texts.count("all candidates failed in generation 1: it gets other seeds") == 2
     (seeds,) = bench.journal._connection.execute("SELECT seeds FROM generation WHERE number = 1").fetchone()
     assert json.loads(seeds) == [training_seed(settings.seed, 1, each) for each in (4, 5)]
-    killed = Failing(tmp_path / "killed" / "night", random_bundle.path, settings, fails=fails)
-    while not killed.run.ended:
-        killed.serve(stop=lambda run: run.fleet.counts["accepted"] + run.fleet.counts["errors"] > 26)
-        if not killed.run.ended:
-            killed.restart()
-    assert killed.story() == whole
-    killed.journal.close()
+    assert story_of_killed(tmp_path, random_bundle, 26, settings, fails=fails) == whole
 
 
 def test_seeds_on_which_the_whole_better_half_fails_are_replaced_in_a_race(failing):
@@ -258,13 +258,7 @@ def test_racing_with_failures_is_the_same_through_restarts(failing, tmp_path, ra
     settings = replace(SETTINGS, racing=True, episodes=4, population=8)
     fails = by_vector(0.1)
     whole = failing("whole", settings=settings, fails=fails).story()
-    killed = Failing(tmp_path / "killed" / "night", random_bundle.path, settings, fails=fails)
-    while not killed.run.ended:
-        killed.serve(stop=lambda run: run.fleet.counts["accepted"] + run.fleet.counts["errors"] > 14)
-        if not killed.run.ended:
-            killed.restart()
-    assert killed.story() == whole
-    killed.journal.close()
+    assert story_of_killed(tmp_path, random_bundle, 14, settings, fails=fails) == whole
 
 
 def test_a_host_that_never_scored_condemns_nobody(tmp_path, random_bundle):

@@ -74,6 +74,13 @@ def test_a_bundle_without_a_dream_is_recorded_with_two_pictures(controller, rand
         assert (stream.width, stream.height) == AWAKE.size
 
 
+def save_controller(monkeypatch, name, path):
+    """A controller of an environment of `tests.support.dark_environments`, which is trusted."""
+    monkeypatch.setenv("DREAMFLEET_TRUST", "tests")
+    task = f"gym:tests.support.dark_environments:{name}-v0"
+    Controller(ControllerShape(4, 2), np.zeros(10, np.float32), task, "").save(path)
+
+
 @pytest.mark.parametrize(
     ("name", "says"),
     [
@@ -84,9 +91,7 @@ def test_a_bundle_without_a_dream_is_recorded_with_two_pictures(controller, rand
     ],
 )
 def test_an_environment_that_cannot_be_filmed_ends_with_one_line(processes, tmp_path, monkeypatch, name, says):
-    monkeypatch.setenv("DREAMFLEET_TRUST", "tests")
-    task = f"gym:tests.support.dark_environments:{name}-v0"
-    Controller(ControllerShape(4, 2), np.zeros(10, np.float32), task, "").save(tmp_path / "dark.npz")
+    save_controller(monkeypatch, name, tmp_path / "dark.npz")
     for verb in ("record", "live"):
         out = tmp_path / f"{verb}.mp4"
         code, _, err = processes.call(verb, "--controller", tmp_path / "dark.npz", "--out", out)
@@ -103,9 +108,7 @@ def test_an_environment_that_cannot_be_filmed_ends_with_one_line(processes, tmp_
     ],
 )
 def test_an_episode_that_fails_leaves_no_video_and_the_one_that_is_there(processes, tmp_path, monkeypatch, name, error):
-    monkeypatch.setenv("DREAMFLEET_TRUST", "tests")
-    task = f"gym:tests.support.dark_environments:{name}-v0"
-    Controller(ControllerShape(4, 2), np.zeros(10, np.float32), task, "").save(tmp_path / "breaking.npz")
+    save_controller(monkeypatch, name, tmp_path / "breaking.npz")
     (tmp_path / "videos").mkdir()
     (tmp_path / "videos" / "drive-10001.mp4").write_text("earlier")
     code, _, err = processes.call(

@@ -50,14 +50,19 @@ def test_results_of_another_host_class_are_counted_and_optionally_compared(proce
     assert processes.call(*replay, "--tolerance", 0.25)[0] == 1
 
 
-def test_an_episode_that_hangs_or_ends_its_process_now_differs(processes, random_bundle, monkeypatch):
-    task = rough_tasks.name_of(rough_tasks.Halting)
+def score_generation(processes, bundle, task, episodes):
+    """A run of one generation, to its end."""
     coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--task", task, "--population", 4, "--episodes", 3, "--generations", 1,
+        "--bundle", bundle.path, "--task", task, "--population", 4, "--episodes", episodes, "--generations", 1,
         "--evaluate-every", 0,
     )  # fmt: skip
     processes.worker("--task", task, "--exit-when-done")
     assert coordinator.finish()[0] == 0
+
+
+def test_an_episode_that_hangs_or_ends_its_process_now_differs(processes, random_bundle, monkeypatch):
+    task = rough_tasks.name_of(rough_tasks.Halting)
+    score_generation(processes, random_bundle, task, 3)
     with RunFolder(processes.runs / "test") as run:
         seeds = [each.seed for each in run.results(0, 1)]
         monkeypatch.setenv(rough_tasks.HALT, str(seeds[0]))
@@ -73,12 +78,7 @@ def test_an_episode_fails_only_in_a_fresh_process(processes, random_bundle, monk
     monkeypatch.setenv(rough_tasks.POISON, "fail")
     monkeypatch.setenv("DREAMFLEET_TRUST", rough_tasks.MODULE)
     task = rough_tasks.name_of(rough_tasks.Poisoned)
-    coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--task", task, "--population", 4, "--episodes", 2, "--generations", 1,
-        "--evaluate-every", 0,
-    )  # fmt: skip
-    processes.worker("--task", task, "--exit-when-done")
-    assert coordinator.finish()[0] == 0
+    score_generation(processes, random_bundle, task, 2)
     code, out, err = processes.call("replay", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
     assert (code, out.count("same bits")) == (0, 2), (out, err)
 
@@ -86,12 +86,7 @@ def test_an_episode_fails_only_in_a_fresh_process(processes, random_bundle, monk
 @pytest.mark.parametrize("place", ["make", "step"])
 def test_what_only_python_itself_should_raise_is_an_episodes_failure(processes, random_bundle, monkeypatch, place):
     task = rough_tasks.name_of(rough_tasks.Raising)
-    coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--task", task, "--population", 4, "--episodes", 2, "--generations", 1,
-        "--evaluate-every", 0,
-    )  # fmt: skip
-    processes.worker("--task", task, "--exit-when-done")
-    assert coordinator.finish()[0] == 0
+    score_generation(processes, random_bundle, task, 2)
     monkeypatch.setenv(rough_tasks.PLACE, place)
     monkeypatch.setenv(rough_tasks.ERROR, "KeyboardInterrupt")
     replay = ("replay", "test", "--runs-dir", processes.runs, "--candidate", "0/1", "--trust", rough_tasks.MODULE)
