@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
 from dreamfleet.common.runs.evaluation_report import EvaluationReport
 from dreamfleet.common.runs.paired_difference import PairedDifference
@@ -57,12 +58,14 @@ class Reproduction:
     def description(self) -> str:
         """A text for display."""
         name, count, mean = self.recorded.name, len(self.pairs), self.repeated.results.mean
+        failed = len(self.recorded.failed)
         if self.repeated.failed:
-            failed = self.repeated.results.failure_text
-            return f"{name}: NOT reproduced: {failed}; all had a score when they were recorded"
+            now = self.repeated.results.failure_text
+            return f"{name}: NOT reproduced: {now}; all had a score when they were recorded"
         if not self.differing_seeds:
             host = "" if self.same_fingerprint else ", though this host is of another fingerprint"
-            return f"{name}: reproduced: the same {count} scores to the bit, mean {mean:.1f}{host}"
+            left = f"; {plural(failed, 'episode')} that failed then not driven again" if failed else ""
+            return f"{name}: reproduced: the same {count} scores to the bit, mean {mean:.1f}{host}{left}"
         if self.same_fingerprint:
             seeds = ", ".join(map(str, self.differing_seeds[:5])) + (", ..." if len(self.differing_seeds) > 5 else "")
             return (

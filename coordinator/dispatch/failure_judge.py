@@ -57,14 +57,20 @@ class FailureJudge:
         R8: all open jobs must have failed, or with `at_once` ten of them while the run has no score from anywhere.
         Before that, a host that works may still show itself.
         """
-        failures, hosts = self._jobs.failures, self._present_hosts()
-        tried = {attempt.host for each in failures for attempt in each.history}
-        if not hosts or not hosts <= tried or hosts & self.working_hosts or not _is_pausing(failures):
+        failures = self._jobs.failures
+        if not self._present_hosts() or self.has_hope or not _is_pausing(failures):
             return None
         is_early = at_once and not self.working_hosts and len(failures) >= ENOUGH_JOBS
         if not is_early and len(failures) < len(self._jobs):
             return None
         return max(failures, key=lambda each: len(each.history))
+
+    @property
+    def has_hope(self) -> bool:
+        """Whether a host is here that has scored, or that has not failed yet."""
+        hosts = self._present_hosts()
+        tried = {attempt.host for each in self._jobs.failures for attempt in each.history}
+        return bool(hosts & self.working_hosts or hosts - tried)
 
     def _present_hosts(self) -> set[str]:
         """The names of the hosts that are here, also while they replace a scoring process and take no job."""

@@ -339,8 +339,11 @@ class Fleet:
     def _record_failure(self, identity: str, result: Result) -> None:
         """Record a failed attempt; the first one of each cause is logged."""
         self.jobs.record_failure(identity, result, self._now)
+        self._note_failure(result.digest)
+
+    def _note_failure(self, digest: bytes) -> None:
         self.counts["errors"] += 1
-        failure = self.jobs[result.digest].failure
+        failure = self.jobs[digest].failure
         if self.failure_judge.is_new_cause(failure):
             self.notes.append(f"{failure}; it is tried again")
 
@@ -377,9 +380,11 @@ class Fleet:
         if member.silent and not member.is_guest:  # a guest's silence was not logged either
             self._note_arrival(member.identity, now, "back")
         member.silent = False
+        member.held_at_silence.clear()
 
     def _note_arrival(self, identity: str, now: float, what: Literal["joined", "back"]) -> None:
         self.event_log.add(now, what, identity)
+        self.jobs.forgive_losses(identity)
         self.notes.append(f"worker {identity} {'joined' if what == 'joined' else 'is back'}")
 
     def _release_lost(self, member: Member, now: float, what: str) -> None:
@@ -390,9 +395,20 @@ class Fleet:
         self.notes.append(f"worker {member.identity} {what}: {freed}")
         gone: EventKind = "lost" if member.is_lost else "left"
         self.event_log.add(now, "silent" if member.gone_since is None else gone, member.identity, why=member.farewell)
+        if member.is_lost:
+            self._record_losses(member)
+        elif member.silent:  # it may have ended: its token says so later
+            member.held_at_silence = set(member.leases)
         if member.leases:
             (self._hosts.get(member.identity) or member.host_stats).record_loss(now - member.joined_at)
         self._release_leases(member)
+
+    def _record_losses(self, member: Member) -> None:
+        """Note which jobs were in the hands of a worker that ended without a word: one of them may have ended it."""
+        held = {digest for digest, lease in member.leases.items() if not lease.finished} | member.held_at_silence
+        for digest in held & self.jobs.keys():
+            if self.jobs.record_loss(member.identity, digest, self._now):
+                self._note_failure(digest)
 
     def _add_lease(self, member: Member, digest: bytes, lease: Lease) -> None:
         lease.is_background = self.jobs[digest].is_background

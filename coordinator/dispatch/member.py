@@ -89,6 +89,7 @@ class Member:
     was_ready: bool = False  # some heartbeat named a slot that scores
     resent: int = 0  # batches that were sent again
     leases: dict[bytes, Lease] = field(default_factory=dict)  # by digest, in the order in which they were given
+    held_at_silence: set[bytes] = field(default_factory=set)  # its jobs when it became silent
     trial_copies: dict[bytes, DispatchGroup] = field(default_factory=dict)  # copies that measure it, wanted or not
     returned: list[DispatchGroup] = field(default_factory=list)  # groups with a new result since the last dispatch
     last_delivery: float = 0.0  # when a heartbeat last confirmed a batch

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from enum import Enum, auto
 
+from dreamfleet.common.protocol.failures import HOST_PREFIX
 from dreamfleet.common.protocol.messages import TAG_BYTES, Kind, Result
 from dreamfleet.coordinator.dispatch.deficit_round_robin import DeficitCounter
 from dreamfleet.coordinator.dispatch.failures import Attempt, JobFailure, pause_before_retry
@@ -14,6 +15,8 @@ from dreamfleet.coordinator.jobs.work import Work
 
 MAX_FAILED = 64  # failed attempts of a job that are remembered
 MAX_HOLDERS = 2  # workers that a job is leased to at a time
+SUSPECT_LOSSES = 2  # workers that ended while they held a job: it may be what ended them
+WORKER_ENDED = f"{HOST_PREFIX}its worker ended without a word"
 
 
 class JobState(Enum):
@@ -35,6 +38,7 @@ class PendingJob:
     given_to: set[str] = field(default_factory=set)  # workers that hold it or held it
     overrun_by: set[str] = field(default_factory=set)  # workers that reported more steps than it can have
     attempts: list[Attempt] = field(default_factory=list)  # the failed ones
+    lost_with: list[str] = field(default_factory=list)  # workers that ended while they held it
     is_proof: bool = False  # it was scored before: who scores it again shows that a host can score
     retry_at: float = 0.0  # seconds of the monotonic clock before which it is not tried again
     # Worker that lost its lease -> environment steps it had made; `None`: it had finished.
@@ -51,6 +55,11 @@ class PendingJob:
     def is_background(self) -> bool:
         """Whether it is an evaluation or a kept rollout: it uses idle slots, and a share of busy ones."""
         return self.work.job.kind != "score"
+
+    @property
+    def is_suspect(self) -> bool:
+        """Whether it may be what ended the workers that held it."""
+        return len(self.lost_with) >= SUSPECT_LOSSES
 
     @property
     def avoided_workers(self) -> Set[str]:
@@ -216,8 +225,36 @@ class PendingJobs(Mapping[bytes, PendingJob]):
 
         R8: an error is no fitness; it decides who is given the job next and when, and whether the job has failed.
         """
-        pending = self._failing[result.digest] = self._pending[result.digest]
-        pending.attempts.append(Attempt(worker, result.error or "no fitness and no reason"))
+        self._add_attempt(result.digest, Attempt(worker, result.error or "no fitness and no reason"), now)
+
+    def record_loss(self, worker: str, digest: bytes, now: float) -> bool:
+        """Note that a worker ended without a word while it held a wanted job; whether that counts as a failed attempt.
+
+        R8: a job that was in hand at two such ends is a suspect. A worker gets one suspect at a time, so a further end
+        is the failure of that one and not of its company.
+        """
+        pending = self._pending[digest]
+        is_failure = pending.is_suspect
+        pending.lost_with.append(worker)
+        if is_failure:
+            self._add_attempt(digest, Attempt(worker, WORKER_ENDED), now)
+        return is_failure
+
+    def holders_of_suspects(self) -> set[str]:
+        """The workers that hold a suspect."""
+        return {name for each in self._pending.values() if each.is_suspect for name in each.holders}
+
+    def forgive_losses(self, worker: str) -> None:
+        """Forget the ends of a worker that is back: its link was cut."""
+        for pending in self._pending.values():
+            if worker in pending.lost_with:
+                pending.lost_with.remove(worker)
+                pending.attempts = [each for each in pending.attempts if each != Attempt(worker, WORKER_ENDED)]
+        self._failing = {digest: pending for digest, pending in self._failing.items() if pending.attempts}
+
+    def _add_attempt(self, digest: bytes, attempt: Attempt, now: float) -> None:
+        pending = self._failing[digest] = self._pending[digest]
+        pending.attempts.append(attempt)
         del pending.attempts[:-MAX_FAILED]
         pending.order, self._next_order = self._next_order, self._next_order + 1
         if pause := pause_before_retry(len(pending.attempts)):

@@ -183,10 +183,12 @@ class SpeculativeExecution:
 def _may_take(digest: bytes, taker: Member, jobs: Mapping[bytes, PendingJob]) -> bool:
     """Whether a job has one holder and may be given to `taker`.
 
-    R17: a job has at most two holders, which bounds the wasted work.
+    R17: a job has at most two holders, which bounds the wasted work. R8: what may have ended its workers has one.
     """
     job = jobs.get(digest)
-    return job is not None and job.state is JobState.LEASED and taker.identity not in job.avoided_workers
+    if job is None or job.is_suspect:
+        return False
+    return job.state is JobState.LEASED and taker.identity not in job.avoided_workers
 
 
 def _is_trial_due(taker: Member, now: float) -> bool:

@@ -105,7 +105,8 @@ def assign_jobs(
         if (next_job := jobs.next(slots, idle=idle, drain_background=drain_background)) is None:
             break
         pending = jobs[next_job.digest]
-        eligible = _eligible_workers(pending, loads, members)
+        free = loads.keys() - jobs.holders_of_suspects() if pending.is_suspect else loads.keys()
+        eligible = _eligible_workers(pending, free, members)
         if not eligible:
             passed_over.append(next_job.digest)
             continue
@@ -125,20 +126,20 @@ def assign_jobs(
     return given
 
 
-def _eligible_workers(pending: PendingJob, loads: Mapping[str, int], members: Mapping[str, Member]) -> list[str]:
-    """Which of these members may be given a job.
+def _eligible_workers(pending: PendingJob, free: Collection[str], members: Mapping[str, Member]) -> list[str]:
+    """Which of these `free` members may be given a job.
 
     R8: not one where it failed, unless every present member is such: then those where it failed least often. A process
     that was killed once must not stop the run. A stranger's hello cannot keep a failed job from being tried again, and
     neither can a worker that was never ready, so guests and these do not count.
     """
-    if eligible := [name for name in loads if name not in pending.avoided_workers]:
+    if eligible := [name for name in free if name not in pending.avoided_workers]:
         return eligible
     if any(name not in pending.avoided_workers for name, member in members.items() if member.has_been_ready):
         return []
     failed = Counter(each.worker for each in pending.attempts)
-    fewest = min(failed[name] for name in loads)
-    return [name for name in loads if failed[name] == fewest]
+    fewest = min((failed[name] for name in free), default=0)
+    return [name for name in free if failed[name] == fewest]
 
 
 def is_dependable(member: Member, now: float) -> bool:

@@ -30,6 +30,11 @@ class FailureLimit:
 
     def find_excess(self, generation: Generation) -> str | None:
         """What failed so often that the run pauses, in words; `None` if nothing did."""
+        if generation.all_failed and not self._generations.can_try_again(generation):
+            return (
+                f"all candidates failed in generation {generation.number} on each set of seeds, so that none can be "
+                "ranked; `dreamfleet resume` tries them again, `dreamfleet fork` begins another run at the mean"
+            )
         failed, counted = self._generations.count_recent_failures(generation, self._since)
         total = len(counted) * generation.population
         if failed > self.share * total:
@@ -38,10 +43,5 @@ class FailureLimit:
             return (
                 f"{failed} of {plural(total, 'candidate')} failed in {where}; `dreamfleet resume` tries them again and "
                 "goes on, however many fail in this generation"
-            )
-        if generation.all_failed and not self._generations.can_try_again(generation):
-            return (
-                f"all candidates failed in generation {generation.number} on each set of seeds, so that none can be "
-                "ranked; `dreamfleet resume` tries them again, `dreamfleet fork` begins another run at the mean"
             )
         return None

@@ -34,8 +34,7 @@ class Generations:
         self.history = history
         self.scoring_params: ScoringParams  # of the open generation
         self.last: CandidateScores | None = None  # of the last closed generation
-        # Candidates of the open generation that failed before they were drawn anew or got other seeds.
-        self.redrawn: set[int] = set()
+        self.redrawn: set[int] = set()  # candidates of the open generation that failed and were drawn anew
         self.seconds = 0.0  # for which the restored generation could be scored before
         self._rounds = 0  # in which candidates were drawn anew
         self._reseeds = 0  # times that the open generation got other seeds
@@ -83,8 +82,7 @@ class Generations:
         self.seconds = stored.seconds
         self.redrawn = {index for indices in stored.redrawn for index in indices}
         self._rounds = len(stored.redrawn)
-        if (reseeds := self._count_reseeds(stored)) is not None:
-            self._reseeds, self.redrawn = reseeds, set(range(len(stored.vectors)))
+        self._reseeds = self._count_reseeds(stored)
         vectors = tuple(vector_bytes(x) for x in population)
         if vectors != stored.vectors:
             raise JournalError(
@@ -134,8 +132,11 @@ class Generations:
 
     def can_try_again(self, generation: Generation) -> bool:
         """Whether `try_again` would change the generation as its failures are now."""
-        reseed = generation.has_bad_seeds and self._reseeds < MAX_RESEEDS
-        return reseed or (bool(generation.failed) and self._can_redraw)
+        return self.can_reseed(generation) or (bool(generation.failed) and self._can_redraw)
+
+    def can_reseed(self, generation: Generation) -> bool:
+        """Whether `try_again` would give the generation other seeds."""
+        return generation.has_bad_seeds and self._reseeds < MAX_RESEEDS
 
     @property
     def _can_redraw(self) -> bool:
@@ -150,20 +151,19 @@ class Generations:
         generation.
         """
         number, indices = generation.number, generation.failed
-        if generation.has_bad_seeds and self._reseeds < MAX_RESEEDS:
+        if self.can_reseed(generation):
             self._reseeds += 1
             self._journal.set_seeds(number, self._seeds(number, generation.episodes, self._reseeds))
-            self.redrawn.update(range(generation.population))
             who = "all candidates" if generation.all_failed else "all candidates of the better half"
             found = f"{who} failed in generation {number}: it gets other seeds"
         elif indices and self._can_redraw:
             self._rounds += 1
+            self.redrawn.update(indices)
             self._journal.redraw(number, indices, [vector_bytes(x) for x in self._strategy.redraw(indices)])
             names = f"candidate {indices[0]}" if len(indices) == 1 else f"candidates {', '.join(map(str, indices))}"
             found = f"{names} of generation {number} failed and {'is' if len(indices) == 1 else 'are'} drawn anew"
         else:
             return None
-        self.redrawn.update(indices)
         return found
 
     def count_recent_failures(self, generation: Generation, since: int) -> tuple[int, range]:
@@ -197,15 +197,15 @@ class Generations:
         first = reseeds * episodes
         return [training_seed(self._settings.seed, number, each) for each in range(first, first + episodes)]
 
-    def _count_reseeds(self, stored: StoredOpenGeneration) -> int | None:
-        """How many times a restored generation got other seeds; `None` if it never did."""
+    def _count_reseeds(self, stored: StoredOpenGeneration) -> int:
+        """How many times a restored generation got other seeds."""
         return next(
             (
                 each
                 for each in range(1, MAX_RESEEDS + 1)
                 if list(stored.seeds) == self._seeds(stored.number, len(stored.seeds), each)
             ),
-            None,
+            0,
         )
 
     def _recall(self, stored: StoredOpenGeneration, scoring_params: ScoringParams) -> Generation:

@@ -36,6 +36,7 @@ from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 
 OTHER_SEEDS = "; if the seeds of the first generation are bad for every candidate, begin a run with another --seed"
+PAUSED, BY_HAND = "paused", "by hand"  # the fact that somebody paused the run, and what it holds
 WRITE_RETRY = 2.0  # seconds until a full disk or a locked journal is tried again
 
 
@@ -50,6 +51,7 @@ class Run:
         self.fleet = Fleet(network.beat, network.evaluation_share)
         self.ended: str | None = None
         self.paused: str | None = None
+        self._lacks_host = False  # it is paused until a host comes that may score
         self.stalled: str | None = None  # why the journal cannot be written now
         self._retry_at = 0.0  # when it is tried again
         self._now = now
@@ -149,11 +151,12 @@ class Run:
             return False
         self._settle_failures()
         while self.ended is None and self.paused is None and self.generation.complete and not self._is_waiting:
-            if (note := self.generations.try_again(self.generation)) is not None:
+            reseeds = self.generations.can_reseed(self.generation)
+            if not reseeds and (why := self.failure_limit.find_excess(self.generation)) is not None:
+                self.pause(f"{why} (`dreamfleet runs story` lists why)")
+            elif (note := self.generations.try_again(self.generation)) is not None:
                 self.fleet.notes.append(note)
                 self._replace_generation(self.generations.reload(self.generation.number))
-            elif self.generation.all_failed:
-                break
             else:
                 self._close(now)
         self.fleet.drain_background = self._is_waiting
@@ -209,9 +212,15 @@ class Run:
         """Prepare the next generation while workers are busy."""
         self.generations.prepare()
 
+    def keep_paused(self) -> None:
+        """Stay paused if the coordinator is started again before somebody resumes the run."""
+        if self._take_lock():
+            self._journal.set_fact(PAUSED, BY_HAND)
+            self.commit()
+
     def pause(self, why: str) -> None:
         """Stop dispatching until the run is resumed."""
-        self.paused = why
+        self.paused, self._lacks_host = why, False
         self.fleet.paused = True
         self.fleet.notes.append(f"paused: {why}")
 
@@ -221,14 +230,19 @@ class Run:
             return
         if self.paused is not None:
             self.fleet.notes.append("resumed")
-        self.paused = None
-        self.fleet.paused = self.stalled is not None
-        self.fleet.jobs.clear_failures()
+        self._go_on()
+        self._journal.drop_fact(PAUSED)
         self.failure_limit.accept(self.generation.number)
         self.fleet.jobs.offer(self.background_jobs.retry_failed())
         if self.generation.failed:
             self._journal.drop_failures(self.generation.number)
             self._replace_generation(self.generations.reload(self.generation.number))
+
+    def _go_on(self) -> None:
+        """Dispatch again, what failed too."""
+        self.paused, self._lacks_host = None, False
+        self.fleet.paused = self.stalled is not None
+        self.fleet.jobs.clear_failures()
 
     def _settle_failures(self) -> None:
         """Make lasting failures facts of the run (R8), and pause it where too many candidates or all hosts fail."""
@@ -237,16 +251,18 @@ class Run:
             for lasting in judge.find_lasting():
                 self._record_failure(lasting)
         if self.paused is not None:
+            if self._lacks_host and judge.has_hope:
+                self.fleet.notes.append("a host is here that may score: the run goes on")
+                self._go_on()
             return
-        if (why := self.failure_limit.find_excess(self.generation)) is not None:
-            self.pause(f"{why} (`dreamfleet runs story` lists why)")
-        elif is_judged and (failure := judge.find_broken_fleet(at_once=self.failure_limit.share < 1)) is not None:
+        if is_judged and (failure := judge.find_broken_fleet(at_once=self.failure_limit.share < 1)) is not None:
             proof = self.generations.find_scored(self.generation)
             if proof is None or not self.fleet.jobs.offer_proof(proof):
                 self.pause(
                     f"no host that is here has ever scored, and every job that it tried failed, such as {failure}; "
-                    f"`dreamfleet resume` tries them again{OTHER_SEEDS if proof is None else ''}"
+                    f"another host, or `dreamfleet resume`, tries them again{OTHER_SEEDS if proof is None else ''}"
                 )
+                self._lacks_host = True
         elif not is_judged and (failure := judge.find_pausing()) is not None:
             self.pause(f"{failure}; `dreamfleet resume` tries it again")
 
@@ -295,6 +311,8 @@ class Run:
         if len(self._agenda.stages) > 1:
             self.fleet.notes.append(f"generation {generation.number} is in {self._stage_text}")
         self._prepare_fleet(generation)
+        if self._journal.fact(PAUSED) is not None:
+            self.pause(BY_HAND)
         work = self.background_jobs.begin(self.generations.mean, now)
         if self._ending is None and not generation.done and (reason := self._stop_reason(generation)):
             self._begin_ending(reason)

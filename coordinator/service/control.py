@@ -11,7 +11,7 @@ from dreamfleet.common.protocol.messages import ControlReply
 from dreamfleet.common.serialization.validation import MAX_TEXT
 from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.packing import BatchContent, OutgoingBatch
-from dreamfleet.coordinator.run.run import Run
+from dreamfleet.coordinator.run.run import BY_HAND, Run
 
 LONGEST_VERB = 60  # characters of an unknown verb in the reply
 LEAVING_VERBS = ("drain", "stop", "disband")
@@ -27,7 +27,7 @@ class Control:
         self._beat = beat
         self._stop = stop
         self._verbs: dict[str, Callable[[], None]] = {
-            "pause": lambda: self._pause("by hand"),
+            "pause": self._pause_by_hand,
             "resume": self._resume,
             "drain": self._drain,
             "stop": stop,
@@ -81,6 +81,10 @@ class Control:
         """Empty batches that say that the run has ended, for those present that then exit."""
         return _empty_batches(each for each in self._run.fleet.members.values()
                               if each.leaves_with_run and each.gone_since is None)  # fmt: skip
+
+    def _pause_by_hand(self) -> None:
+        self._pause(BY_HAND)
+        self._run.keep_paused()
 
     def _pause(self, why: str) -> None:
         """Pause the run; an earlier reason is kept behind `why`."""

@@ -195,6 +195,13 @@ def test_other_differences_than_the_controllers_are_noted(tmp_path, capsys):
 ELSEWHERE = {"fingerprint": "aarch64"}
 
 
+def test_episodes_that_failed_when_they_were_recorded_are_named_and_not_driven_again():
+    recorded = replace(scored(100, 500), failed=(FailedEpisode(10002, "ValueError: sick"),))
+    found = Reproduction(recorded, scored(100, 500))
+    assert found.is_reproduced
+    assert found.description.endswith("; 1 episode that failed then not driven again")
+
+
 def test_a_single_differing_seed_is_not_reproduced():
     found = Reproduction(scored(100, 500), scored(110, **ELSEWHERE))
     assert not found.is_reproduced

@@ -1,5 +1,6 @@
 """Candidates whose episodes fail wherever they are scored."""
 
+import itertools
 import json
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ import pytest
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.seeds import training_seed
+from dreamfleet.coordinator.run.run import BY_HAND
 from dreamfleet.coordinator.settings.config import LimitsConfig
 from tests.coordinator.run.test_run import SETTINGS as TWO
 from tests.coordinator.run.test_run import A, B, Bench
@@ -48,6 +50,7 @@ class Failing(Bench):
                 return
             self.now += 1.0
             self.run.tick(self.now)
+            self.run.advance(self.now)
             for name in self.hosts:
                 self.handle_heartbeat(name, host_class=self.host_class)
             for send in self.run.fleet.dispatch(self.now):
@@ -217,7 +220,9 @@ def test_a_seed_on_which_all_candidates_fail_is_replaced_with_the_same_bits_thro
     bench = failing("whole", settings=settings, fails=fails)
     whole = bench.story()
     assert bench.run.ended
-    assert [each.failed for each in whole[0]] == [0, 6, 0]
+    assert [each.failed for each in whole[0]] == [0, 0, 0], (
+        "what fails on a seed on which all fail is not the candidate's"
+    )
     with RunFolder(bench.path) as folder:
         texts = [each.text for each in folder.events()]
         assert texts.count("all candidates failed in generation 1: it gets other seeds") == 2
@@ -226,12 +231,19 @@ def test_a_seed_on_which_all_candidates_fail_is_replaced_with_the_same_bits_thro
     assert story_of_killed(tmp_path, random_bundle, 26, settings, fails=fails) == whole
 
 
+def test_a_bad_seed_of_the_first_generation_is_replaced_before_the_limit_counts(failing):
+    bad = training_seed(SETTINGS.seed, 0, 0)
+    bench = failing("first", fails=lambda job: job.seeds[0] == bad)
+    assert bench.run.ended
+    assert [each.failed for each in bench.run.history.rows] == [0, 0, 0]
+
+
 def test_seeds_on_which_the_whole_better_half_fails_are_replaced_in_a_race(failing):
     settings = replace(SETTINGS, racing=True, episodes=4, population=8)
     bad = training_seed(settings.seed, 1, 2)  # of the second half
     bench = failing("race", settings=settings, fails=lambda job: job.seeds[0] == bad)
     assert bench.run.ended
-    assert [each.failed for each in bench.run.history.rows] == [0, 8, 0]
+    assert [each.failed for each in bench.run.history.rows] == [0, 0, 0]
     with RunFolder(bench.path) as folder:
         texts = [each.text for each in folder.events()]
     assert "all candidates of the better half failed in generation 1: it gets other seeds" in texts
@@ -347,6 +359,26 @@ def test_a_new_host_that_fails_the_proof_pauses_the_run(left):
     assert left.run.generation.failed == []
 
 
+def test_a_host_that_has_scored_ends_the_pause_of_a_fleet_that_cannot(left):
+    sound = left.fails
+    left.fails = lambda job: True
+    replace_host(left)
+    assert left.run.state == "paused"
+    left.fails = sound
+    answer = left.answer_one
+    left.answer_one = lambda name, job: (
+        answer(name, job) if name == A else left.deliver(name, Result(job.digest, None, 0, 0.1, "OSError: sick", None))
+    )
+    left.hosts = [NEW, A]
+    left.run.admission.admit(left.request(A), left.now)
+    left.handle_heartbeat(A, host_class=left.host_class)
+    left.run.advance(left.now)
+    assert left.run.paused is None
+    left.serve()
+    assert left.run.ended
+    assert [each.failed for each in left.run.history.rows] == [2] * GENERATIONS
+
+
 def test_a_run_that_nobody_can_score_pauses_before_every_job_was_tried(tmp_path, random_bundle):
     settings = replace(SETTINGS, population=40)
     for limit, tried in ((0.5, 10), (1.0, 80)):
@@ -414,6 +446,71 @@ def test_time_without_workers_or_paused_is_no_time_of_the_run(tmp_path, random_b
     spent = bench.run.work_clock.seconds
     bench.restart()
     assert bench.run.work_clock.seconds == pytest.approx(spent), "the open generation's time outlives its coordinator"
+    bench.journal.close()
+
+
+def test_a_pause_by_hand_outlives_its_coordinator(tmp_path, random_bundle):
+    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: False)
+    bench.run.pause(BY_HAND)
+    bench.run.keep_paused()
+    bench.restart()
+    assert bench.run.paused == BY_HAND
+    bench.run.resume()
+    bench.run.commit()
+    bench.restart()
+    bench.serve()
+    assert bench.run.ended
+    bench.journal.close()
+
+
+class Lethal(Failing):
+    """A bench whose workers end without a word on the jobs of `fails`; another life of each joins after that."""
+
+    lives = itertools.count(16)
+
+    def answer_one(self, name, job):
+        if name not in self.hosts:  # it ended on a job before
+            return
+        if self.fails(job):
+            self.run.fleet.handle_departure(name, self.now)
+            life = f"{name.partition('/')[0]}/{next(self.lives):08x}"
+            self.hosts[self.hosts.index(name)] = life
+            self.run.admission.admit(self.request(life), self.now)
+        else:
+            super().answer_one(name, job)
+
+
+def test_an_episode_that_ends_its_worker_counts_as_failed_and_its_company_does_not(tmp_path, random_bundle):
+    bench = Lethal(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate == 3)
+    bench.serve(turns=3000)
+    assert bench.run.ended
+    assert [each.failed for each in bench.run.history.rows] == [1] * GENERATIONS
+    with RunFolder(bench.path) as folder:
+        facts = folder.failures()
+    assert {each.candidate for each in facts} == {3}
+    assert all("its worker ended without a word" in each.error for each in facts)
+    bench.journal.close()
+
+
+def test_a_cut_link_is_no_end_of_a_worker(tmp_path, random_bundle):
+    """A worker of the same life that is back was never gone: nothing that it held is a suspect."""
+    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: False)
+    bench.hosts = [A]
+    bench.run.fleet.handle_departure(B, bench.now)
+    for _ in range(20):
+        bench.now += 1.0
+        bench.run.tick(bench.now)
+        bench.run.fleet.dispatch(bench.now)
+        bench.run.fleet.handle_departure(A, bench.now)
+        bench.now += 1.0
+        bench.run.tick(bench.now)
+        assert any(each.lost_with for each in bench.run.fleet.jobs.values())
+        bench.run.admission.admit(bench.request(A), bench.now)
+        bench.handle_heartbeat(A, host_class=bench.host_class)
+        assert not any(each.lost_with for each in bench.run.fleet.jobs.values())
+    bench.serve()
+    assert bench.run.ended
+    assert sum(each.failed for each in bench.run.history.rows) == 0
     bench.journal.close()
 
 
