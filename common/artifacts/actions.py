@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.errors import UsageError
+
 Floats = NDArray[np.float32]
 
 
@@ -109,6 +111,51 @@ class Discrete:
 
 
 Actions = Continuous | Discrete
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """The action in the left-right mirrored world: its column `i` is column `order[i]` of the action times `signs[i]`.
+
+    `UsageError` if `order` does not name each column once, or `signs` has another length.
+
+    >>> import numpy as np
+    >>> Mirror(order=(0, 2, 1), signs=(1, 1, 1)).apply(np.array([[0, 1, 0], [1, 0, 0]], np.float32))
+    array([[0., 0., 1.],
+           [1., 0., 0.]], dtype=float32)
+    """
+
+    order: tuple[int, ...]
+    signs: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if sorted(self.order) != list(range(len(self.signs))):
+            raise UsageError(
+                f"a mirror of {len(self.signs)} signs orders the columns 0 to {len(self.signs) - 1}, not {self.order}"
+            )
+
+    def apply(self, action: Floats) -> Floats:
+        """The mirrored actions `(..., actions)`; `UsageError` for another number of columns."""
+        if action.shape[-1:] != (len(self.order),):
+            raise UsageError(f"a mirror of {len(self.order)} columns does not fit actions of shape {action.shape}")
+        mirrored: Floats = action[..., self.order] * np.array(self.signs, np.float32)
+        return mirrored
+
+
+def one_hot(count: int) -> Continuous:
+    """Actions of which one of `count` is chosen: the action is that row of the identity matrix `(count, count)`.
+
+    `UsageError` for a count below 1.
+
+    >>> import numpy as np
+    >>> one_hot(3).to_action(np.array([0.1, 0.9, 0.2], np.float32))
+    array([0., 1., 0.], dtype=float32)
+    """
+    if count < 1:
+        raise UsageError(f"a choice is among at least one action, not {count}")
+    rows = tuple(tuple(float(row == column) for column in range(count)) for row in range(count))
+    return replace(Continuous.between([0.0] * count, [1.0] * count), choices=rows)
+
 
 # hardmaru/WorldModelsExperiments, carracing: steering tanh; gas (tanh + 1) / 2; brake clip(tanh, 0, 1).
 STEERING_GAS_BRAKE = Continuous(scale=(1, 0.5, 1), shift=(0, 0.5, 0), low=(-1, 0, 0), high=(1, 1, 1))

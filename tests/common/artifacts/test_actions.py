@@ -1,7 +1,9 @@
 import numpy as np
+import pytest
 
-from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, Continuous
+from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, Continuous, Mirror, one_hot
 from dreamfleet.common.artifacts.car_racing_variants import Variant
+from dreamfleet.common.errors import UsageError
 
 ONE_PEDAL = Variant(pedals="one").controls
 
@@ -65,3 +67,35 @@ def test_each_action_has_its_own_output_by_default():
     logits = np.random.default_rng(0).normal(size=3).astype(np.float32)
     own = Continuous(*(getattr(STEERING_GAS_BRAKE, name) for name in ("scale", "shift", "low", "high")), (0, 1, 2))
     assert np.array_equal(own.to_action(logits), STEERING_GAS_BRAKE.to_action(logits))
+
+
+def test_a_mirror_is_exact_and_twice_nothing():
+    steering = Mirror((0, 1, 2), (-1, 1, 1))
+    action = np.random.default_rng(2).normal(size=(50, 3)).astype(np.float32)
+    assert np.array_equal(steering.apply(action), action * np.array([-1, 1, 1], np.float32))
+    assert np.array_equal(steering.apply(steering.apply(action)), action)
+    moves = Mirror((0, 2, 1), (1, 1, 1))
+    assert moves.apply(np.eye(3, dtype=np.float32)).tolist() == [[1, 0, 0], [0, 0, 1], [0, 1, 0]]
+
+
+@pytest.mark.parametrize("shape", [(5, 1), (5, 2), (1,), (), (5, 4)])
+def test_a_mirror_widens_no_action(shape):
+    with pytest.raises(UsageError, match="a mirror of 3 columns does not fit actions of shape"):
+        Mirror((0, 1, 2), (-1, 1, 1)).apply(np.zeros(shape, np.float32))
+
+
+@pytest.mark.parametrize(("order", "signs"), [((0, 1), (1, 1, 1)), ((0, 0), (1, 1)), ((1, 2), (1, 1)), ((0,), ())])
+def test_a_mirror_orders_each_column_once(order, signs):
+    with pytest.raises(UsageError, match="a mirror of"):
+        Mirror(order, signs)
+
+
+def test_one_of_some_actions_is_a_row_of_zeros_and_a_one():
+    three = one_hot(3)
+    assert (three.outputs, three.actions) == (3, 3)
+    logits = np.array([[2, 1, 0], [0, 0, 0], [-3, -2, -1]], np.float32)
+    chosen = three.to_action(logits)
+    assert chosen.tolist() == [[1, 0, 0], [1, 0, 0], [0, 0, 1]]
+    assert np.array_equal(three.to_outputs(chosen), chosen)
+    with pytest.raises(UsageError, match="at least one action, not 0"):
+        one_hot(0)

@@ -1,0 +1,153 @@
+"""How the controllers of a world model drive: variants of CarRacing, and what every other world has of these."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Literal, Protocol
+
+from dreamfleet.common.artifacts.actions import Continuous
+from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, Variant
+from dreamfleet.common.artifacts.world_facts import WorldFacts
+from dreamfleet.common.errors import UsageError
+
+__all__ = ["Driving", "Variant", "WorldDriving", "parse_driving"]
+
+OPTION_HELP = {"decide_every": "a whole number from 1 to 50", "feedback": "none or last"}
+
+
+class Driving(Protocol):
+    """How controllers drive: their actions, how long they hold one, and what they see beside the world model's state.
+
+    >>> driving: Driving = parse_driving("car-racing", None, '{"feedback": "last"}')
+    >>> driving.controls.outputs, driving.extra_features, driving.option_texts
+    (3, 6, ('feedback=last',))
+    """
+
+    @property
+    def controls(self) -> Continuous:
+        """The conversion of a controller's outputs to actions."""
+
+    @property
+    def decide_every(self) -> int:
+        """Steps for which an action is repeated."""
+
+    @property
+    def extra_features(self) -> int:
+        """Number of features beside the world model's."""
+
+    @property
+    def is_default(self) -> bool:
+        """Whether no option differs from its default."""
+
+    @property
+    def without_costs(self) -> Driving:
+        """The same without penalties, on which a controller's parameters do not depend."""
+
+    @property
+    def options(self) -> str:
+        """The options that differ from the defaults as canonical JSON; empty if none does."""
+
+    @property
+    def option_texts(self) -> tuple[str, ...]:
+        """The options that differ from the defaults, each as NAME=VALUE."""
+
+    @property
+    def version(self) -> int:
+        """Version of the task under these options."""
+
+
+@dataclass(frozen=True)
+class WorldDriving:
+    """How controllers drive in a world that its world model describes; `UsageError` for a value out of range.
+
+    >>> from dreamfleet.common.artifacts.actions import one_hot
+    >>> facts = WorldFacts.of(one_hot(3), packages=("numpy",), horizon=525, frames_per_second=9)
+    >>> WorldDriving(facts, decide_every=4, feedback="last").options
+    '{"decide_every": 4, "feedback": "last"}'
+    """
+
+    facts: WorldFacts
+    decide_every: int = 1
+    feedback: Literal["none", "last"] = "none"  # last: the last action and its change are features too
+
+    def __post_init__(self) -> None:
+        valid = {
+            "decide_every": type(self.decide_every) is int and 1 <= self.decide_every <= 50,
+            "feedback": self.feedback in ("none", "last"),
+        }
+        for name, is_valid in valid.items():
+            if not is_valid:
+                raise UsageError(f"{name} must be {OPTION_HELP[name]}, not {getattr(self, name)!r}")
+
+    @property
+    def controls(self) -> Continuous:
+        """The world's actions."""
+        return self.facts.actions
+
+    @property
+    def extra_features(self) -> int:
+        """Each output's last value and its change, with feedback."""
+        return 2 * self.controls.outputs if self.feedback == "last" else 0
+
+    @property
+    def is_default(self) -> bool:
+        """Whether no option differs from its default."""
+        return not self._non_default
+
+    @property
+    def without_costs(self) -> WorldDriving:
+        """This: such a world has no penalties."""
+        return self
+
+    @property
+    def options(self) -> str:
+        """The options that differ from the defaults as canonical JSON; empty if none does."""
+        return json.dumps(self._non_default, sort_keys=True) if self._non_default else ""
+
+    @property
+    def option_texts(self) -> tuple[str, ...]:
+        """The options that differ from the defaults, each as NAME=VALUE."""
+        return tuple(f"{name}={value}" for name, value in self._non_default.items())
+
+    @property
+    def version(self) -> int:
+        """Version of the world."""
+        return self.facts.version
+
+    @property
+    def _non_default(self) -> dict[str, Any]:
+        values = {"decide_every": self.decide_every, "feedback": self.feedback}
+        defaults = {"decide_every": 1, "feedback": "none"}
+        return {name: value for name, value in values.items() if value != defaults[name]}
+
+
+def parse_driving(task: str, facts: WorldFacts | None, options: str) -> Driving:
+    """How controllers of a world model drive under a run's options, a JSON object or an empty text.
+
+    `task` and `facts` are of the world model's manifest. Without facts its world is CarRacing, or one without options.
+    `UsageError` for options that the world does not have.
+
+    >>> parse_driving("car-racing", None, "").controls.outputs
+    3
+    """
+    if facts is not None:
+        return _parse_options(task, facts, options)
+    variant = Variant.from_json(options)
+    if task != CAR_RACING and not variant.is_default:
+        raise UsageError(f"{variant.options} are options of {CAR_RACING}")
+    return variant
+
+
+@lru_cache
+def _parse_options(task: str, facts: WorldFacts, options: str) -> WorldDriving:
+    try:
+        names = json.loads(options or "{}")
+        if not isinstance(names, dict):
+            raise TypeError("it is no object")
+    except (ValueError, TypeError, RecursionError) as error:
+        raise UsageError(f"{task}'s options must be a JSON object, not {options!r:.200}") from error
+    if unknown := sorted(set(names) - set(OPTION_HELP)):
+        raise UsageError(f"{task} knows no option {', '.join(unknown)}: known are {', '.join(OPTION_HELP)}")
+    return WorldDriving(facts, **names)

@@ -1,0 +1,142 @@
+"""What a world model's manifest says of its world, so that nobody needs the world's package to begin a run in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Annotated, Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.artifacts.actions import Continuous
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.serialization.optional_fields import OPTIONAL
+from dreamfleet.common.serialization.validation import Between, Length, MalformedError, Word
+
+DRAWN: Final = "drawn"  # the text of the rule that draws its ends
+MAX_OPTIONS = 20_000  # characters of a task's options
+Components = Annotated[tuple[float, ...], Length(1, 1000)]  # one number for each component of an action
+
+
+@dataclass(frozen=True)
+class RewardFacts:
+    """The reward of a dreamt step: `gain * value - cost`, whatever `source` the value has.
+
+    `value`: the reward that the world model predicts. `label`: the probability that its head gives to a positive
+    reward. `survival`: 1 while the dream goes on, and 0 as it ends.
+
+    >>> RewardFacts(source="survival", gain=4.0)
+    RewardFacts(source='survival', gain=4.0, cost=0.0)
+    """
+
+    source: Literal["value", "label", "survival"] = "value"
+    gain: float = 1.0
+    cost: float = 0.0
+
+
+@dataclass(frozen=True)
+class EndRule:
+    """When a dream ends: at the first step whose predicted probability of the end is above that step's bar.
+
+    `threshold`: the bar is `at` at every step. `drawn`: the bar is random, so that a dream ends as often as predicted.
+    `UsageError` if `at` is not from 0 to 1.
+
+    >>> EndRule.parse("drawn").kind, EndRule.parse("0.25").at, EndRule().text
+    ('drawn', 0.25, '0.5')
+    """
+
+    kind: Literal["threshold", "drawn"] = "threshold"
+    at: Annotated[float, Between(0, 1)] = 0.5
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.at <= 1:
+            raise UsageError(f"a dream ends at a probability from 0 to 1, or {DRAWN!r}, not {self.at}")
+
+    @classmethod
+    def parse(cls, text: str) -> EndRule:
+        """The rule of a text, `drawn` or a threshold from 0 to 1; `UsageError` for another one."""
+        if text == DRAWN:
+            return cls(DRAWN)
+        try:
+            return cls(at=float(text))
+        except ValueError:
+            raise UsageError(f"a dream ends at a probability from 0 to 1, or {DRAWN!r}, not {text!r:.50}") from None
+
+    @property
+    def text(self) -> str:
+        """The rule as a text that `parse` reads."""
+        return DRAWN if self.kind == DRAWN else str(self.at)
+
+    def bars(self, uniform: NDArray[np.float64], temperature: float) -> NDArray[np.float32]:
+        """The bars `(n,)` of steps with the random numbers `uniform` `(n,)` in [0, 1), at a dream's temperature.
+
+        A drawn bar `b` has `p > b` exactly where `sigmoid(logit(p) / temperature) > uniform`. At temperature 1 a dream
+        ends with probability `p`; above 1 likely ends come less often, and unlikely ones more often.
+
+        >>> EndRule().bars(np.array([0.1, 0.9]), temperature=2.0)
+        array([0.5, 0.5], dtype=float32)
+        >>> EndRule("drawn").bars(np.array([0.0, 0.2, 0.5]), temperature=2.0).round(3)
+        array([0.   , 0.059, 0.5  ], dtype=float32)
+        """
+        if self.kind != DRAWN:
+            return np.full(len(uniform), self.at, np.float32)
+        drawn = np.asarray(uniform, dtype=np.float64)
+        with np.errstate(divide="ignore", over="ignore"):  # at 0, or at a high temperature, the bar is 0
+            return (1 / (1 + ((1 - drawn) / drawn) ** temperature)).astype(np.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldFacts:
+    """A world as a bundle's manifest describes it; `MalformedError` if its actions do not fit together.
+
+    >>> from dreamfleet.common.artifacts.actions import one_hot
+    >>> facts = WorldFacts.of(one_hot(3), packages=("numpy", "onnxruntime"), horizon=525, frames_per_second=9)
+    >>> facts.actions == one_hot(3), facts.end.text
+    (True, '0.5')
+    """
+
+    scale: Components  # this and the next five as in `Continuous`
+    shift: Components
+    low: Components
+    high: Components
+    output_indices: tuple[int, ...] = field(default=(), metadata=OPTIONAL)
+    choices: tuple[tuple[float, ...], ...] = field(default=(), metadata=OPTIONAL)
+    packages: Annotated[tuple[Word, ...], Length(0, 64)]  # distributions on whose versions a fitness may depend
+    horizon: Annotated[int, Between(1, 10**6)]  # most steps of an evaluation episode
+    frames_per_second: Annotated[int, Between(1, 1000)]  # of videos
+    reward: RewardFacts = field(default=RewardFacts(), metadata=OPTIONAL)
+    end: EndRule = field(default=EndRule(), metadata=OPTIONAL)
+    options: Annotated[str, Length(0, MAX_OPTIONS)] = field(default="", metadata=OPTIONAL)  # of the task, frozen
+    version: Annotated[int, Between(1, 2**31 - 1)] = field(default=1, metadata=OPTIONAL)  # of the task's world
+    score_word: Word = field(default="seed", metadata=OPTIONAL)  # what a scored seed is called
+    marks: Annotated[tuple[float, ...], Length(0, 8)] = field(default=(), metadata=OPTIONAL)  # scores to compare with
+    action_names: Annotated[tuple[Word, ...], Length(0, 1000)] = field(default=(), metadata=OPTIONAL)
+
+    def __post_init__(self) -> None:
+        size = len(self.scale)
+        if not len(self.shift) == len(self.low) == len(self.high) == size:
+            raise MalformedError("scale, shift, low and high differ in length")
+        if any(low > high for low, high in zip(self.low, self.high, strict=True)):
+            raise MalformedError("low is above high")
+        if self.output_indices and (len(self.output_indices) != size or not _are_all_used(self.output_indices)):
+            raise MalformedError("output_indices do not name one output for each component of an action")
+        if any(len(choice) != size for choice in self.choices):
+            raise MalformedError("a choice has another length than the action")
+
+    @classmethod
+    def of(cls, actions: Continuous, **facts: Any) -> WorldFacts:
+        """The facts of a world with these actions; `facts` are the other fields."""
+        for name in ("scale", "shift", "low", "high"):
+            facts[name] = tuple(map(float, getattr(actions, name)))
+        choices = tuple(tuple(map(float, choice)) for choice in actions.choices)
+        return cls(output_indices=actions.output_indices, choices=choices, **facts)
+
+    @cached_property
+    def actions(self) -> Continuous:
+        """The conversion of a controller's outputs to actions."""
+        return Continuous(self.scale, self.shift, self.low, self.high, self.output_indices, self.choices)
+
+
+def _are_all_used(outputs: tuple[int, ...]) -> bool:
+    return sorted(set(outputs)) == list(range(len(set(outputs))))
