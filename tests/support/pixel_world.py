@@ -9,11 +9,10 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from dreamfleet.common.artifacts.actions import one_hot
-from dreamfleet.worker.car_racing.task import CarRacingPolicy
-from dreamfleet.worker.tasks.api import DreamReward, Preprocessing, Task, World
+from dreamfleet.worker.tasks.api import DreamReward, Mirror, Preprocessing, Task, World, one_hot
 from dreamfleet.worker.tasks.drivers import HeldActions, UniformActions
 from dreamfleet.worker.tasks.pictures import CropAndResize, VectorActions, box_resize
+from dreamfleet.worker.worldmodel.policy import ModelPolicy
 
 MODULE = "tests.support.pixel_world"
 DODGE, DODGE_TASK = f"gym:{MODULE}:Dodge-v0", f"{MODULE}:DodgeTask"
@@ -70,6 +69,7 @@ class DodgeTask(Task):
     world = World(
         ACTIONS, ("numpy", "onnxruntime", "gymnasium"), horizon=200, frames_per_second=10,
         action_names=("stay", "left", "right"), dream_reward=DreamReward(gain=1.0, source="survival"), threshold=100.0,
+        score_word="game", marks=(50, 100), mirror=Mirror((0, 2, 1), (1, 1, 1)),
     )  # fmt: skip
     preprocessings: ClassVar = {"box-64": Preprocessing("box-64", 64, lambda picture: box_resize(picture, 64))}
     drivers: ClassVar = {
@@ -89,4 +89,4 @@ class DodgeTask(Task):
         return self.make_recorded("box-64", render_mode)
 
     def make_policy(self, assignment):
-        return CarRacingPolicy(assignment.world_model)
+        return ModelPolicy(assignment.world_model)

@@ -3,15 +3,19 @@
 import numpy as np
 
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
-from dreamfleet.worker.tasks.api import Continuous
+from dreamfleet.worker.tasks.api import Continuous, RecordableTask
 from dreamfleet.worker.tasks.policy import DriverPolicy
 
 STEPS = 40
 SEED = 2**53 - 1  # the longest
 
 
-def check_world(task):
-    """Assert the contract of a `RecordableTask` by driving each of its drivers in each of its pictures."""
+def check_world(task, steps=STEPS):
+    """Assert the contract of a `RecordableTask` by driving in each of its pictures.
+
+    Drives have `steps` steps at most; after that many, two seeds must differ.
+    """
+    assert isinstance(task, RecordableTask)
     assert isinstance(task.name, str)
     assert isinstance(task.world.actions, Continuous)
     assert {"numpy", "onnxruntime"} <= set(task.world.packages)
@@ -24,7 +28,7 @@ def check_world(task):
         assert preprocessing.name == name
         assert len(name) <= 128
         assert preprocessing.size in (64, 96)
-        check_drives(task, preprocessing)
+        check_drives(task, preprocessing, steps)
 
 
 def check_driver(task, name):
@@ -47,14 +51,14 @@ def check_action(actions, action):
 
 def check_mirror(task):
     """A mirrored action is an action too, and the mirror's mirror is the action."""
-    mirror = getattr(task.world, "mirror", None)
+    mirror = task.world.mirror
     driver = next(iter(task.drivers.values()))(np.random.default_rng(1))
     for action in (driver.act() for _ in range(20 if mirror else 0)):
         check_action(task.world.actions, mirror.apply(action))
         assert (mirror.apply(mirror.apply(action)) == action).all()
 
 
-def check_drives(task, preprocessing):
+def check_drives(task, preprocessing, steps):
     """Drives of one seed are equal, in one environment or two, after others too; those of another seed differ."""
     drives = []
     for seeds in ((5, SEED, 5), (SEED,)):
@@ -62,7 +66,7 @@ def check_drives(task, preprocessing):
         assert environment.observation_space.shape == preprocessing.shape
         assert environment.observation_space.dtype == np.uint8
         try:
-            drives += [drive(task, environment, preprocessing, seed) for seed in seeds]
+            drives += [drive(task, environment, preprocessing, seed, steps) for seed in seeds]
         finally:
             environment.close()
     five, longest, five_again, longest_again = drives
@@ -71,11 +75,11 @@ def check_drives(task, preprocessing):
     assert five != longest
 
 
-def drive(task, environment, preprocessing, seed):
+def drive(task, environment, preprocessing, seed, steps):
     """The bytes of all pictures and rewards of a short drive."""
     policy = DriverPolicy(next(iter(task.drivers.values()))(np.random.default_rng(3)))
     taken = []
-    for moment in run_episode(environment, policy, EpisodeConfig(seed, STEPS)):
+    for moment in run_episode(environment, policy, EpisodeConfig(seed, steps)):
         assert moment.seen.shape == preprocessing.shape
         assert moment.seen.dtype == np.uint8
         check_action(task.world.actions, moment.action)

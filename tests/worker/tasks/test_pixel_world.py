@@ -81,12 +81,13 @@ def test_grey_and_float_pictures_become_pixels():
 @pytest.mark.parametrize(
     ("space", "is_one"),
     [
-        (spaces.Box(0, 255, (8, 6, 3), np.uint8), True),
-        (spaces.Box(0, 255, (8, 6, 1), np.uint8), True),
-        (spaces.Box(0, 1, (8, 6), np.float32), True),
-        (spaces.Box(0, 255, (8, 6, 4), np.uint8), False),
-        (spaces.Box(-1, 1, (8, 6, 3), np.float32), False),
-        (spaces.Box(0, 255, (8, 6, 3), np.int64), False),
+        (spaces.Box(0, 255, (8, 9, 3), np.uint8), True),
+        (spaces.Box(0, 255, (8, 9, 1), np.uint8), True),
+        (spaces.Box(0, 1, (8, 9), np.float32), True),
+        (spaces.Box(0, 255, (7, 7, 3), np.uint8), False),
+        (spaces.Box(0, 255, (8, 9, 4), np.uint8), False),
+        (spaces.Box(-1, 1, (8, 9, 3), np.float32), False),
+        (spaces.Box(0, 255, (8, 9, 3), np.int64), False),
         (spaces.Box(0, 255, (8,), np.uint8), False),
         (spaces.Discrete(3), False),
     ],
@@ -98,7 +99,7 @@ def test_a_picture_is_known_by_its_space(space, is_one):
 class Scripted(gymnasium.Env):
     """Observes a plain picture of the step's number times ten; ends after five steps."""
 
-    observation_space, action_space = spaces.Box(0, 255, (4, 6, 3), np.uint8), spaces.Discrete(2)
+    observation_space, action_space = spaces.Box(0, 255, (8, 12, 3), np.uint8), spaces.Discrete(2)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -110,7 +111,7 @@ class Scripted(gymnasium.Env):
         return self.picture(), float(self.steps), self.steps == 5, False, {"step": self.steps}
 
     def picture(self):
-        return np.full((4, 6, 3), 10 * self.steps, np.uint8)
+        return np.full((8, 12, 3), 10 * self.steps, np.uint8)
 
 
 def test_a_held_action_adds_rewards_and_stops_at_an_end():
@@ -125,16 +126,16 @@ def test_a_held_action_adds_rewards_and_stops_at_an_end():
 def test_a_part_of_the_picture_is_resized():
     class Halves(Scripted):
         def picture(self):
-            picture = np.zeros((4, 6, 3), np.uint8)
-            picture[:, 3:] = 200
+            picture = np.zeros((8, 12, 3), np.uint8)
+            picture[:, 6:] = 200
             return picture
 
-    environment = CropAndResize(Halves(), 64, crop=(0, 4, 3, 6))
+    environment = CropAndResize(Halves(), 64, crop=(0, 8, 6, 12))
     assert environment.observation_space == spaces.Box(0, 255, (64, 64, 3), np.uint8)
     assert (environment.reset()[0] == 200).all()
     assert (CropAndResize(Halves(), 96).reset()[0][:, :48] == 0).all()
-    with pytest.raises(UsageError, match="the crop 0:5,0:6 is no part of a picture of 4 rows and 6 columns"):
-        CropAndResize(Halves(), 64, crop=(0, 5, 0, 6))
+    with pytest.raises(UsageError, match="the crop 0:9,0:12 is no part of a picture of 8 rows and 12 columns"):
+        CropAndResize(Halves(), 64, crop=(0, 9, 0, 12))
     with pytest.raises(UsageError, match=r"what is observed is Box.*a picture is uint8"):
         CropAndResize(gymnasium.make("CartPole-v1"), 64)
 
@@ -151,7 +152,7 @@ def test_the_difference_is_of_whole_numbers_and_begins_anew_at_a_reset():
 def test_every_difference_fits_into_a_byte(before, now, expected):
     class Two(Scripted):
         def picture(self):
-            return np.full((4, 6, 3), now if self.steps else before, np.uint8)
+            return np.full((8, 12, 3), now if self.steps else before, np.uint8)
 
     environment = FrameDifference(Two())
     environment.reset()
@@ -161,7 +162,7 @@ def test_every_difference_fits_into_a_byte(before, now, expected):
 def test_grey_weighs_the_colours():
     class Colours(Scripted):
         def picture(self):
-            picture = np.zeros((4, 6, 3), np.uint8)
+            picture = np.zeros((8, 12, 3), np.uint8)
             picture[0, 0], picture[0, 1], picture[0, 2] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
             return picture
 
