@@ -9,15 +9,15 @@ import pytest
 
 from dreamfleet.common.artifacts.actions import one_hot
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
-from dreamfleet.common.errors import BundleError, UsageError
+from dreamfleet.common.errors import BundleError, RefusedError, UsageError
 from dreamfleet.common.host.trusted_modules import VARIABLE
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.seeds import fold_seed
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.scoring.scorer import Scorer
-from dreamfleet.worker.tasks.api import Assignment
+from dreamfleet.worker.tasks.api import Assignment, RecordableTask
 from dreamfleet.worker.tasks.policy import DriverPolicy
-from dreamfleet.worker.tasks.registry import find_task, task_of
+from dreamfleet.worker.tasks.registry import check_world_allowed, find_task, task_of
 from tests.support import pixel_fakes
 from tests.support.bundles import write_world_bundle
 from tests.support.pixel_world import DODGE
@@ -197,6 +197,17 @@ def test_controllers_are_scored_in_the_world_of_their_world_models_options(bundl
     assert rollout.arrays()["action"].shape == (score.steps, 3)
     assert rollout.arrays()["picture"].shape == (score.steps, 64, 64, 3)
     scorer.close()
+
+
+def test_a_worker_scores_in_a_world_models_module_only_if_that_was_named(bundle):
+    check_world_allowed(bundle, ("dream", "gym", GREY))
+    with pytest.raises(RefusedError, match=f"start it with --task {GREY}"):
+        check_world_allowed(bundle, ("dream", "gym"))
+
+
+def test_a_task_without_options_makes_no_environment_when_it_is_asked_for_pictures():
+    assert not isinstance(find_task("gym:Nothing-v0"), RecordableTask)
+    assert find_task("gym:Nothing-v0").with_options("").options == ""
 
 
 def test_a_world_model_of_other_pictures_is_refused(bundle):
