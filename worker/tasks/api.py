@@ -409,10 +409,18 @@ class RecordableTask(Protocol):
     """
 
     name: str
-    world: World
-    preprocessings: Mapping[str, Preprocessing]
-    drivers: Mapping[str, Callable[[np.random.Generator], Driver]]
-    """Random drivers by name, in the order in which collecting uses them in turn."""
+
+    @property
+    def world(self) -> World:
+        """The world."""
+
+    @property
+    def preprocessings(self) -> Mapping[str, Preprocessing]:
+        """The kinds of pictures by name."""
+
+    @property
+    def drivers(self) -> Mapping[str, Callable[[np.random.Generator], Driver]]:
+        """Random drivers by name, in the order in which collecting uses them in turn."""
 
     def make_recorded(self, preprocessing: str) -> gymnasium.Env[Any, Any]:
         """A new environment that observes the pictures of the preprocessing with this name."""

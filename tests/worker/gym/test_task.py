@@ -11,6 +11,7 @@ from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import describe_task, family_of
 from dreamfleet.worker.gym.task import DEFAULT_MAX_STEPS
 from dreamfleet.worker.scoring.scorer import Scorer
+from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task, known_tasks
 
 CARTPOLE = "gym:CartPole-v1"
@@ -44,6 +45,34 @@ def test_sizes_and_packages_are_the_environments_own(name, observations, outputs
     assert (description.observations, description.outputs) == (observations, outputs)
     assert description.packages == ("numpy", "gymnasium", *engine)
     assert description.options == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "observations", "outputs"),
+    [
+        ("gym:FrozenLake-v1", 16, 4),  # Discrete
+        ("gym:Blackjack-v1", 32 + 11 + 2, 2),  # a Tuple of Discrete
+        ("gym:tests.support.pixel_fakes:Gauges-v0", 3 + 2 + 4, 4),  # a Dict, and a Dict of actions
+    ],
+)
+def test_observations_and_actions_of_any_numbers_are_flattened(name, observations, outputs):
+    description = describe_task(name, {"normalise": True, "seed": 1})
+    assert (description.observations, description.outputs) == (observations, outputs)
+    scorer = Scorer(spec(name))
+    parameters = np.random.default_rng(2).normal(size=scorer.spec.controller.size).astype(np.float32)
+    scores = [scorer.score("evaluate", parameters, seed).fitness for seed in (5, 6, 5)]
+    assert scores[0] == scores[2]
+    scorer.close()
+
+
+@pytest.mark.parametrize(("number", "taken"), [(0, (0, [0])), (1, (0, [1])), (2, (1, [0])), (3, (1, [1]))])
+def test_a_number_stands_for_a_whole_action(number, taken):
+    task = find_task("gym:tests.support.pixel_fakes:Gauges-v0")
+    with task.make_environment(Assignment(spec(task.name))) as environment:
+        observation, _ = environment.reset(seed=1)
+        assert observation.tolist() == [0, 0, 1, 0.5, 0.25, 0, 1, 0, 1]  # keys in their order: hand, speeds, switches
+        info = environment.step(number)[4]
+        assert (info["taken"]["gear"] - 1, info["taken"]["lamps"].tolist()) == taken
 
 
 def test_the_environments_arguments_are_part_of_the_run():
@@ -92,7 +121,7 @@ def test_observations_are_normalised_by_what_the_run_froze():
         ("gym:tests.support.no_such:X-v0", r"No module named 'tests\.support\.no_such'"),
         ("gym:", "makes no environment ''"),
         ("gym", "cannot be loaded"),
-        ("gym:Blackjack-v1", "only Box observations"),
+        ("gym:tests.support.pixel_fakes:Telling-v0", "wrap it so that it observes numbers"),
         ("car-racing:x", "cannot be loaded"),
     ],
 )

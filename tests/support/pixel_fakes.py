@@ -1,0 +1,148 @@
+"""Environments of pictures, each with something that world models must get along with; all are dodged as `Dodge` is."""
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from tests.support.pixel_world import HEIGHT, WIDTH, Dodge
+
+MODULE = "tests.support.pixel_fakes"
+
+
+class InDict(Dodge):
+    """Observes a Dict of a picture and a number."""
+
+    observation_space = spaces.Dict({"screen": Dodge.observation_space, "speed": spaces.Box(-1, 1, (1,), np.float32)})
+
+    def reset(self, *, seed=None, options=None):
+        picture, info = super().reset(seed=seed, options=options)
+        return self.both(picture), info
+
+    def step(self, action):
+        picture, *rest = super().step(action)
+        return (self.both(picture), *rest)
+
+    def both(self, picture):
+        return {"screen": picture, "speed": np.zeros(1, np.float32)}
+
+
+class InTwo(InDict):
+    """Observes a Dict of two pictures."""
+
+    observation_space = spaces.Dict({"screen": Dodge.observation_space, "map": Dodge.observation_space})
+
+    def both(self, picture):
+        return {"screen": picture, "map": picture[::-1]}
+
+
+class Grey(Dodge):
+    """Observes `(H, W)`."""
+
+    observation_space = spaces.Box(0, 255, (HEIGHT, WIDTH), np.uint8)
+
+    def render(self):
+        return super().render()[..., 0]
+
+
+class Reporting(Dodge):
+    """Reports the action that it gets."""
+
+    def step(self, action):
+        assert action in self.action_space
+        *moment, info = super().step(self.move(action))
+        return (*moment, {**info, "taken": action})
+
+
+class Floats(Reporting):
+    """Observes floats from 0 to 1, and takes a flat Box: below -1/3 is left, above 1/3 right."""
+
+    observation_space = spaces.Box(0, 1, (HEIGHT, WIDTH, 3), np.float32)
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def move(self, action):
+        return 1 if action[0] < -1 / 3 else 2 if action[0] > 1 / 3 else 0
+
+    def render(self):
+        return super().render().astype(np.float32) / np.float32(255)
+
+
+class Buttons(Reporting):
+    """Takes MultiDiscrete actions: a move that counts from 1, and a button that does nothing."""
+
+    action_space = spaces.MultiDiscrete([3, 2], start=[1, 0])
+
+    def move(self, action):
+        return action[0] - 1
+
+
+class Switches(Reporting):
+    """Takes MultiBinary actions: left and right, which cancel each other."""
+
+    action_space = spaces.MultiBinary(2)
+
+    def move(self, action):
+        return {(1, 0): 1, (0, 1): 2}.get(tuple(action.tolist()), 0)
+
+
+class BothEnds(Dodge):
+    """Its own limit of 25 steps sets both flags, as ViZDoom's does; its seeds have 32 bits."""
+
+    def reset(self, *, seed=None, options=None):
+        if seed is not None and seed >= 2**32:
+            raise TypeError("a seed has 32 bits")
+        self.steps = 0
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        picture, reward, dead, _, info = super().step(action)
+        self.steps += 1
+        return picture, reward, dead or self.steps >= 25, self.steps >= 25, info
+
+
+class Unseen(Dodge):
+    """Observes numbers, and draws pictures."""
+
+    observation_space = spaces.Box(-1, 1, (2,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(2, np.float32), super().reset(seed=seed, options=options)[1]
+
+    def step(self, action):
+        return (np.zeros(2, np.float32), *super().step(action)[1:])
+
+
+class Gauges(gymnasium.Env):
+    """No pictures: observes a Dict of numbers of all kinds, and takes a Dict of numbered actions."""
+
+    observation_space = spaces.Dict(
+        {
+            "switches": spaces.Tuple((spaces.MultiDiscrete([2]), spaces.MultiBinary(2))),
+            "speeds": spaces.Box(-1, 1, (2, 1), np.float32),
+            "hand": spaces.Discrete(3, start=5),
+        }
+    )
+    action_space = spaces.Dict({"lamps": spaces.MultiBinary(1), "gear": spaces.Discrete(2, start=1)})
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self.observe(), {}
+
+    def step(self, action):
+        assert action in self.action_space
+        self.steps += 1
+        return self.observe(), float(action["gear"] + action["lamps"][0]), self.steps == 5, False, {"taken": action}
+
+    def observe(self):
+        switches = np.array([1]), np.array([0, 1], np.int8)
+        return {"switches": switches, "speeds": np.float32([[0.5], [0.25]]), "hand": np.int64(7)}
+
+
+class Telling(Gauges):
+    """Observes a text among others, as MiniGrid does."""
+
+    observation_space = spaces.Dict({"hand": spaces.Discrete(3), "mission": spaces.Text(9)})
+
+
+for each in (InDict, InTwo, Grey, Floats, Buttons, Switches, BothEnds, Unseen, Gauges, Telling):
+    gymnasium.register(f"{each.__name__}-v0", each, max_episode_steps=200)

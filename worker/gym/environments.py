@@ -1,0 +1,105 @@
+"""Making an environment by the name and arguments of a task, and what it says of itself."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Mapping
+from importlib.metadata import packages_distributions
+from typing import Any
+
+import gymnasium
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.trusted_modules import check_trusted
+from dreamfleet.common.protocol.tasks import GYM
+from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, World
+
+RGB = "rgb_array"  # gymnasium's render mode that returns pictures
+_MODULE_PREFIX = re.compile(r"([\w.]+):")  # of an environment's name
+DEFAULT_MAX_STEPS = 10_000  # steps of an episode, if the environment was registered without a limit
+# Packages that gymnasium's own environments compute with. Other environments: the distribution of their module.
+ENGINES = {
+    "gymnasium.envs.box2d": ("box2d", "box2d-py"),
+    "gymnasium.envs.mujoco": ("mujoco",),
+    "gymnasium.envs.classic_control": (),
+    "gymnasium.envs.toy_text": (),
+}
+
+Environment = gymnasium.Env[Any, Any]
+
+
+def make_environment(name: str, arguments: Mapping[str, Any], render_mode: str | None = None) -> Environment:
+    """The environment of gymnasium with this id; `UsageError` if it cannot be made, or draws no wanted pictures."""
+    if render_mode is None:
+        return _make(name, arguments)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*render_mode")  # gymnasium's: the error says it
+            return _make(name, {**arguments, "render_mode": render_mode})
+    except UsageError as error:
+        if not isinstance(error.__cause__, TypeError):
+            raise
+        _make(name, arguments).close()  # without pictures it is sound
+        raise UsageError(
+            f"this environment ({name}) draws no pictures: it must take `render_mode`, and its `render` must "
+            f"return an array (height, width, 3) in the render mode {render_mode}"
+        ) from error
+
+
+def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
+    _check_arguments(f"{GYM}:{name}", arguments)
+    try:
+        return gymnasium.make(name, disable_env_checker=True, **arguments)
+    except gymnasium.error.DependencyNotInstalled as error:
+        raise UsageError(f"{name} lacks a package on this host: {error}") from error
+    except (gymnasium.error.Error, ModuleNotFoundError) as error:
+        module, colon, _ = name.rpartition(":")
+        remedy = "" if colon else f"; an environment of another package is written {GYM}:its_module:Its-v0"
+        if colon and isinstance(error, ModuleNotFoundError):
+            remedy = f"; install the package of {module} on this host, or name its folder in PYTHONPATH"
+        raise UsageError(f"gymnasium makes no environment {name!r} here ({error}){remedy}") from error
+    except TypeError as error:
+        raise UsageError(f"{name} takes no such arguments: {error}") from error
+    except (Exception, SystemExit) as error:  # environments may raise anything
+        raise UsageError(f"{name} cannot be made: {type(error).__name__}: {error}") from error
+
+
+def _check_arguments(task: str, arguments: Any) -> None:
+    """`UsageError` for an argument `module:Environment` of an untrusted module: some environments make others."""
+    if isinstance(arguments, str) and (found := _MODULE_PREFIX.match(arguments)):
+        check_trusted(found[1], f"argument {arguments!r:.100} of task {task!r}")
+    if isinstance(arguments, Mapping):
+        arguments = list(arguments.values())
+    if isinstance(arguments, list):
+        for each in arguments:
+            _check_arguments(task, each)
+
+
+def describe_environment(environment: Environment, frames: int = 1) -> dict[str, Any]:
+    """Fields of the environment's `World` that do not depend on its spaces; an action is held for `frames` steps."""
+    spec = environment.spec
+    limited = spec is not None and bool(spec.max_episode_steps)
+    rate = environment.metadata.get("render_fps") or World.frames_per_second
+    return {
+        "packages": ("numpy", "gymnasium", *_engine_packages(environment)),
+        "horizon": ENVIRONMENT_LIMIT if limited else -(-DEFAULT_MAX_STEPS // frames),
+        "frames_per_second": max(1, round(rate / frames)),
+        "threshold": spec.reward_threshold if spec else None,
+    }
+
+
+def is_gymnasiums(environment: Environment) -> bool:
+    """Whether gymnasium itself has this environment."""
+    return type(environment.unwrapped).__module__.startswith(tuple(ENGINES))
+
+
+def _engine_packages(environment: Environment) -> tuple[str, ...]:
+    module = type(environment.unwrapped).__module__
+    engine = next((packages for prefix, packages in ENGINES.items() if module.startswith(prefix)), None)
+    return distributions_of(module) if engine is None else engine
+
+
+def distributions_of(module: str) -> tuple[str, ...]:
+    """The installed distributions that have a module; empty for a module of no distribution."""
+    return tuple(sorted(set(packages_distributions().get(module.partition(".")[0], ()))))

@@ -1,0 +1,121 @@
+"""Observations and actions of any space as flat vectors, as `gymnasium.spaces.flatten` writes them.
+
+A number of a `Discrete` or `MultiDiscrete` space is one-hot there; entries of a `Dict` stand in the order of its keys.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import product
+from math import prod
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.wrappers import FlattenObservation, TransformAction
+from numpy.typing import NDArray
+
+from dreamfleet.common.artifacts.actions import Actions, Continuous, Discrete
+from dreamfleet.common.errors import UsageError
+
+Floats = NDArray[np.float32]
+MAX_CHOICES = 64  # a controller has an output for each
+NUMBERED = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+
+
+def vector_actions(space: Any, name: str) -> Continuous:
+    """The actions of a space as vectors `(A,)`: of float Boxes between their bounds, of numbered spaces as choices.
+
+    `UsageError` with the environment's `name` for a space of both kinds or neither, or with too many choices.
+
+    >>> vector_actions(spaces.MultiDiscrete([2, 3]), "it").choices[1]
+    (1.0, 0.0, 0.0, 1.0, 0.0)
+    """
+    leaves = list(_leaves(space))
+    if leaves and all(isinstance(each, spaces.Box) for each in leaves):
+        for each in leaves:
+            _check_box(each, name)
+        low, high = ([getattr(each, end).ravel() for each in leaves] for end in ("low", "high"))
+        return Continuous.between(np.concatenate(low), np.concatenate(high))
+    if not leaves or not all(isinstance(each, NUMBERED) for each in leaves):
+        raise UsageError(f"{name} takes actions {space}: wrap it so that they are a flat Box of floats, or Discrete")
+    if (count := prod(prod(_sizes(each)) for each in leaves)) > MAX_CHOICES:
+        raise UsageError(f"{name} takes {count} different actions: wrap it so that they are {MAX_CHOICES} at most")
+    rows = tuple(tuple(map(float, sum(parts, ()))) for parts in product(*map(_rows, leaves)))
+    width = len(rows[0])
+    return replace(Continuous.between([0.0] * width, [1.0] * width), choices=rows)
+
+
+def make_converter(space: Any, actions: Continuous) -> Callable[[Floats], Any]:
+    """What turns a vector of `vector_actions` into an action of the space: the nearest choice, if there are choices."""
+    table = np.array(actions.choices, dtype=np.float32)
+
+    def convert(action: Floats) -> Any:
+        exact = table[np.argmin(((table - action) ** 2).sum(axis=1))] if len(table) else action
+        return spaces.unflatten(space, exact)
+
+    return convert
+
+
+def flatten_environment(environment: gymnasium.Env[Any, Any], name: str) -> tuple[gymnasium.Env[Any, Any], Actions]:
+    """The environment for a controller without a world model, and the actions that it then takes.
+
+    Box observations, Discrete actions and flat Boxes stay as they are. Other observations and actions become vectors,
+    and other numbered actions one number. `UsageError` where that is impossible.
+    """
+    observed, space = environment.observation_space, environment.action_space
+    if not isinstance(observed, spaces.Box):
+        if not all(isinstance(each, (spaces.Box, *NUMBERED)) for each in _leaves(observed)):
+            raise UsageError(
+                f"{name} observes {observed}: wrap it so that it observes numbers (Box, Discrete, MultiDiscrete, "
+                "MultiBinary, or a Dict or Tuple of these)"
+            )
+        environment = FlattenObservation(environment)
+    if isinstance(space, spaces.Discrete):
+        return environment, Discrete(int(space.n), int(space.start))
+    actions = vector_actions(space, name)
+    if isinstance(space, spaces.Box) and len(space.shape) == 1:
+        return environment, actions
+    convert = make_converter(space, actions)
+    if not actions.choices:
+        return TransformAction(environment, convert, spaces.flatten_space(space)), actions
+    table = np.array(actions.choices, dtype=np.float32)
+    numbers = spaces.Discrete(len(table))
+    return TransformAction(environment, lambda number: convert(table[number]), numbers), Discrete(len(table))
+
+
+def _leaves(space: Any) -> Iterator[Any]:
+    """The spaces in a Dict or Tuple, however deep, in the order in which they are flattened."""
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        for each in space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces:
+            yield from _leaves(each)
+    else:
+        yield space
+
+
+def _check_box(space: spaces.Box, name: str) -> None:
+    if 0 in space.shape:
+        raise UsageError(f"{name} takes actions {space}: a controller gives at least one number")
+    if not np.issubdtype(space.dtype, np.floating):
+        raise UsageError(f"{name} takes whole numbers as actions: wrap it so that they are Discrete, or of a float Box")
+    if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+        raise UsageError(f"{name} takes actions without bounds: wrap it so that its actions have a range")
+
+
+def _sizes(space: Any) -> list[int]:
+    """How many values each number of a numbered space has."""
+    if isinstance(space, spaces.MultiBinary):
+        return [2] * int(np.prod(space.shape))
+    return [int(space.n)] if isinstance(space, spaces.Discrete) else space.nvec.ravel().tolist()
+
+
+def _rows(space: Any) -> Iterator[tuple[int, ...]]:
+    """Every element of a numbered space, flattened; the last number varies fastest."""
+    sizes = _sizes(space)
+    for numbers in product(*map(range, sizes)):
+        if isinstance(space, spaces.MultiBinary):
+            yield numbers
+        else:
+            yield tuple(int(k == number) for number, size in zip(numbers, sizes, strict=True) for k in range(size))

@@ -1,0 +1,58 @@
+"""Random drivers for worlds of any actions, which collect the data of a first world model.
+
+They draw each action evenly: one of its choices, or a number between the bounds of each component.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.artifacts.actions import Continuous
+
+Floats = NDArray[np.float32]
+
+
+class UniformActions:
+    """Draws another action at every step.
+
+    >>> UniformActions(np.random.default_rng(1), Continuous.between([-1, 0], [1, 1])).act().shape
+    (2,)
+    """
+
+    def __init__(self, random: np.random.Generator, actions: Continuous) -> None:
+        self._random = random
+        self._low, self._high = (np.array(each, dtype=np.float32) for each in (actions.low, actions.high))
+        self._choices = np.array(actions.choices, dtype=np.float32)
+
+    def act(self) -> Floats:
+        """The next action `(A,)`."""
+        if len(self._choices):
+            drawn = self._choices[self._random.integers(len(self._choices))]
+        else:
+            drawn = self._random.uniform(self._low, self._high)
+        return np.array(drawn, dtype=np.float32)
+
+
+class HeldActions:
+    """Draws an action and holds it for a drawn number of steps, from `shortest` to `longest`.
+
+    >>> driver = HeldActions(np.random.default_rng(1), Continuous.between([-1], [1]), shortest=2)
+    >>> bool((driver.act() == driver.act()).all())
+    True
+    """
+
+    def __init__(self, random: np.random.Generator, actions: Continuous, shortest: int = 1, longest: int = 10) -> None:
+        self._random = random
+        self._uniform = UniformActions(random, actions)
+        self._lengths = shortest, longest
+        self._left = 0
+        self._action = np.zeros(actions.actions, dtype=np.float32)
+
+    def act(self) -> Floats:
+        """The held action `(A,)`, or a new one."""
+        if self._left == 0:
+            self._action = self._uniform.act()
+            self._left = int(self._random.integers(*self._lengths, endpoint=True))
+        self._left -= 1
+        return self._action.copy()

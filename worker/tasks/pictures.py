@@ -1,0 +1,218 @@
+"""Pictures of any environment for world models: an exact resize, and wrappers that make one kind of environment of all.
+
+A recordable task chains them in the order in which they stand here. What is left observes uint8 pictures
+`(size, size, 3)` and takes float32 actions `(A,)`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from dreamfleet.common.artifacts.actions import Continuous
+from dreamfleet.common.errors import UsageError
+
+Floats = NDArray[np.float32]
+Pixels = NDArray[np.uint8]
+Crop = tuple[int, int, int, int]  # first row, row after the last, first column, column after the last
+SHORTEST = 8  # pixels of a side; smaller boxes hold codes, such as MiniGrid's of 7x7 cells
+MIDDLE = 128  # the difference of equal pictures
+
+
+def is_picture(space: Any) -> bool:
+    """Whether a space holds pictures that `to_pixels` takes, of at least 8 pixels a side.
+
+    >>> is_picture(spaces.Box(0, 255, (48, 40), np.uint8)), is_picture(spaces.Box(0, 255, (48,), np.uint8))
+    (True, False)
+    """
+    if not isinstance(space, spaces.Box) or space.shape[2:] not in ((), (1,), (3,)):
+        return False
+    if len(space.shape) < 2 or min(space.shape[:2]) < SHORTEST:
+        return False
+    floats = np.issubdtype(space.dtype, np.floating) and bool((space.low >= 0).all() and (space.high <= 1).all())
+    return space.dtype == np.uint8 or floats
+
+
+def to_pixels(picture: NDArray[Any]) -> Pixels:
+    """The picture as uint8 `(H, W, 3)`; grey ones `(H, W)` or `(H, W, 1)` are repeated, floats are of 0 to 1.
+
+    >>> to_pixels(np.full((1, 2), 0.5)).tolist()
+    [[[128, 128, 128], [128, 128, 128]]]
+    """
+    pixels = picture if picture.dtype == np.uint8 else np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
+    pixels = pixels[..., None] if pixels.ndim == 2 else pixels
+    return pixels if pixels.shape[2] == 3 else np.repeat(pixels, 3, axis=2)
+
+
+def box_resize(picture: Pixels, size: int) -> Pixels:
+    """A picture `(H, W, C)` as `(size, size, C)`, larger or smaller; the same bits on every host.
+
+    A new pixel is the mean of the area that it covers, rounded to the nearest integer, halves up.
+
+    >>> box_resize(np.array([[[0], [100], [200]]], np.uint8), 2)[0].ravel().tolist()
+    [33, 167]
+    """
+    height, width, channels = picture.shape
+    area = height * width
+    exact = np.int32 if 255 * area + area // 2 < 2**31 else np.int64
+    rows = _area_sums(picture.reshape(height, width * channels).astype(exact), size)
+    columns = rows.reshape(size, width, channels).transpose(1, 0, 2).reshape(width, size * channels)
+    means = (_area_sums(columns, size) + area // 2) // area
+    return np.ascontiguousarray(means.astype(np.uint8).reshape(size, size, channels).transpose(1, 0, 2))
+
+
+def _area_sums(values: NDArray[Any], size: int) -> NDArray[Any]:
+    """Rows `(n, m)` as `(size, m)`: each the sum of the rows that it covers, times how much of each.
+
+    A matrix product would be the same, but its threads wait for each other on a busy host, 40 ms for one picture.
+    """
+    old, overlap = _overlaps(len(values), size)
+    sums = np.zeros((size, values.shape[1]), values.dtype)
+    for covered, weights in zip(old, overlap, strict=True):
+        sums += weights[:, None].astype(values.dtype) * values[covered]
+    return sums
+
+
+@lru_cache(maxsize=64)
+def _overlaps(length: int, size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The old rows that each new one covers, `(most of them, size)`, and how much of each in a common unit."""
+    new = np.arange(size)
+    first, last = new * length // size, ((new + 1) * length - 1) // size
+    old = first + np.arange((last - first).max() + 1)[:, None]
+    overlap = np.minimum((new + 1) * length, (old + 1) * size) - np.maximum(new * length, old * size)
+    return np.minimum(old, length - 1), np.maximum(overlap, 0)
+
+
+def cut_and_resize(picture: NDArray[Any], size: int, crop: Crop | None = None) -> Pixels:
+    """A picture that `to_pixels` takes, or its part `crop`, as `(size, size, 3)`."""
+    top, bottom, left, right = crop or (0, *picture.shape[:1], 0, *picture.shape[1:2])
+    return box_resize(to_pixels(picture[top:bottom, left:right]), size)
+
+
+def frame_difference(now: Pixels, before: Pixels) -> Pixels:
+    """Two pictures `(H, W, 3)` as one: grey now, grey before, and `128 + (now - before) // 2`.
+
+    Grey is `(77 R + 150 G + 29 B) >> 8`.
+
+    >>> frame_difference(np.full((1, 1, 3), 20, np.uint8), np.full((1, 1, 3), 10, np.uint8)).tolist()
+    [[[20, 10, 133]]]
+    """
+    red, green, blue = np.moveaxis(np.stack([now, before]).astype(np.int32), -1, 0)
+    greys = (77 * red + 150 * green + 29 * blue) >> 8
+    return np.stack([*greys, MIDDLE + (greys[0] - greys[1]) // 2], axis=-1).astype(np.uint8)
+
+
+class SkipFrames(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Repeats each action for `frames` steps, fewer if the episode ends, and adds their rewards.
+
+    >>> with SkipFrames(gymnasium.make("CartPole-v1"), 4) as environment:
+    ...     _ = environment.reset(seed=1)
+    ...     environment.step(0)[1]
+    4.0
+    """
+
+    def __init__(self, environment: gymnasium.Env[Any, Any], frames: int) -> None:
+        super().__init__(environment)
+        if frames < 1:
+            raise UsageError(f"an action is held for at least 1 step, not {frames}")
+        self._frames = frames
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """The last of the steps, with the sum of their rewards."""
+        total = 0.0
+        for _ in range(self._frames):
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            total += float(reward)
+            if terminated or truncated:
+                break
+        return observation, total, terminated, truncated, info
+
+
+class CropAndResize(gymnasium.ObservationWrapper[Pixels, Any, NDArray[Any]]):
+    """Observes uint8 `(size, size, 3)`: a part of each picture, or all of it, after `to_pixels` and `box_resize`.
+
+    `UsageError` if the environment observes no pictures, or the part lies outside of them.
+
+    >>> frame = gymnasium.spaces.Box(0, 255, (48, 40), np.uint8)
+    >>> class Grey(gymnasium.Env):
+    ...     observation_space, action_space = frame, gymnasium.spaces.Discrete(2)
+    ...     def reset(self, *, seed=None, options=None):
+    ...         return np.zeros((48, 40), np.uint8), {}
+    >>> CropAndResize(Grey(), 64, crop=(8, 48, 0, 40)).reset()[0].shape
+    (64, 64, 3)
+    """
+
+    def __init__(self, environment: gymnasium.Env[Any, Any], size: int, crop: Crop | None = None) -> None:
+        super().__init__(environment)
+        space = environment.observation_space
+        if not is_picture(space):
+            raise UsageError(
+                f"what is observed is {space}, and a picture is uint8, or float from 0 to 1, of shape "
+                "(height, width), (height, width, 1) or (height, width, 3)"
+            )
+        height, width = (space.shape or (0, 0))[:2]
+        top, bottom, left, right = crop or (0, height, 0, width)
+        if not (0 <= top < bottom <= height and 0 <= left < right <= width):
+            raise UsageError(
+                f"the crop {top}:{bottom},{left}:{right} is no part of a picture of {height} rows and {width} columns"
+            )
+        self._size, self._crop = size, (top, bottom, left, right)
+        self.observation_space = spaces.Box(0, 255, (size, size, 3), np.uint8)
+
+    def observation(self, observation: NDArray[Any]) -> Pixels:
+        """The picture."""
+        return cut_and_resize(np.asarray(observation), self._size, self._crop)
+
+
+class FrameDifference(gymnasium.Wrapper[Pixels, Any, Pixels, Any]):
+    """Shows movement: observes `frame_difference` of each picture and the one before; after a reset they are equal."""
+
+    def __init__(self, environment: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(environment)
+        self._before = np.zeros((0, 0, 3), np.uint8)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Pixels, dict[str, Any]]:
+        """Begin with a picture in which nothing moves."""
+        self._before, info = self.env.reset(seed=seed, options=options)
+        return frame_difference(self._before, self._before), info
+
+    def step(self, action: Any) -> tuple[Pixels, Any, bool, bool, dict[str, Any]]:
+        """The environment's step, with the difference to the picture before."""
+        now, reward, terminated, truncated, info = self.env.step(action)
+        before, self._before = self._before, now
+        return frame_difference(now, before), reward, terminated, truncated, info
+
+
+class VectorActions(gymnasium.ActionWrapper[Any, Floats, Any]):
+    """Takes float32 vectors `(A,)` as actions; `convert` makes of each what the simulator takes.
+
+    `InvalidAction` for another shape or NaN.
+
+    >>> one_of_two = Continuous((1, 1), (0, 0), (0, 0), (1, 1), choices=((1, 0), (0, 1)))
+    >>> with VectorActions(gymnasium.make("CartPole-v1"), one_of_two, np.argmax) as environment:
+    ...     _ = environment.reset(seed=1)
+    ...     environment.step(np.array([0, 1], np.float32))[1]
+    1.0
+    """
+
+    def __init__(
+        self, environment: gymnasium.Env[Any, Any], actions: Continuous, convert: Callable[[Floats], Any]
+    ) -> None:
+        super().__init__(environment)
+        self.actions = actions
+        self._convert = convert
+        low, high = (np.array(each, dtype=np.float32) for each in (actions.low, actions.high))
+        self.action_space = spaces.Box(low, high, dtype=np.float32)
+        self._shape = low.shape
+
+    def action(self, action: Floats) -> Any:
+        """The simulator's own action."""
+        if np.shape(action) != self._shape or not np.isfinite(action).all():
+            raise gymnasium.error.InvalidAction(f"an action is {self._shape[0]} finite numbers, not {action!r:.200}")
+        return self._convert(action)
