@@ -17,6 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host import parent_death
 
 SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - POSIX shared memory, where ViZDoom puts it
@@ -30,7 +31,7 @@ def start_game(game: Any, program: Path) -> None:
     """Start the process of a configured `vizdoom.DoomGame`, whose executable is `program`.
 
     The game ends with this process, however that ends, and outlives Ctrl-C and SIGTERM, which are for this process to
-    handle. ViZDoom's own error if it does not start.
+    handle. `UsageError` if temporary files cannot be programs; ViZDoom's own error if the game does not start.
     """
     remove_leftovers()
     folder = Path(tempfile.mkdtemp(prefix=f"{FOLDER_PREFIX}{os.getpid()}-"))
@@ -38,6 +39,8 @@ def start_game(game: Any, program: Path) -> None:
         launcher = folder / "launcher"
         launcher.write_text(launcher_text(folder, program, os.getpid()))
         launcher.chmod(0o700)
+        if not os.access(launcher, os.X_OK):  # ViZDoom crashes this process if the game cannot be started
+            raise UsageError(f"no program may run in {folder.parent}: let TMPDIR name a folder of another file system")
         game.set_vizdoom_path(str(launcher))
         game.set_doom_config_path(os.devnull)  # read as the game starts, and written as it ends
         with parent_death.signals_blocked():  # the game inherits that
