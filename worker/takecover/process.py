@@ -70,13 +70,12 @@ def remove_leftovers() -> None:
 
 
 def _is_running(process: int) -> bool:
+    """Whether a process of this user runs; a zombie does not."""
     try:
-        os.kill(process, 0)
-    except ProcessLookupError:
+        state = Path(f"/proc/{process}/stat").read_bytes().rpartition(b") ")[2][:1]
+    except (FileNotFoundError, ProcessLookupError):
         return False
-    except (OSError, OverflowError):  # another user's
-        pass
-    return True
+    return state not in b"ZX"
 
 
 def _remove(folder: Path) -> None:
