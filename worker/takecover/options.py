@@ -17,6 +17,7 @@ OPTION_HELP = {
     "actions": "choices or thirds",
     "crop": f"TOP:BOTTOM,LEFT:RIGHT of a picture of {HEIGHT} rows and {WIDTH} columns",
 }
+FLAGS = {"skip": "tics", "crop": "crop"}  # of any world, and what they are here
 _CROP = re.compile(r"(\d{1,3}):(\d{1,3}),(\d{1,3}):(\d{1,3})", re.ASCII)
 
 
@@ -55,24 +56,23 @@ class TakeCoverOptions:
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> TakeCoverOptions:
-        """The options in a mapping with the key `environment`, whose value has those that differ from the defaults.
+        """The options in a mapping: `environment` holds them by name; `skip` and `crop` are tics and crop.
 
-        >>> TakeCoverOptions.of({"environment": {"actions": "thirds"}}).actions
-        'thirds'
+        >>> TakeCoverOptions.of({"environment": {"actions": "thirds"}, "skip": 1}).text
+        '{"environment": {"actions": "thirds", "tics": 1}}'
         """
-        values = given.get("environment") or {}
-        if unknown := sorted({*given} - {"environment"}):
+        if unknown := sorted(set(given) - {"environment", *FLAGS}):
             raise UsageError(f"takecover knows no option {', '.join(unknown)}: write --environment tics=1")
+        values = given.get("environment") or {}
         if not isinstance(values, Mapping) or (unknown := sorted(set(values) - set(OPTION_HELP))):
             named = ", ".join(unknown) or repr(values)
             raise UsageError(f"takecover knows no argument {named:.200}: known are {', '.join(OPTION_HELP)}")
-        return cls(**values)
+        return cls(**{**{name: given[flag] for flag, name in FLAGS.items() if flag in given}, **values})
 
     @property
     def text(self) -> str:
         """The options that differ from the defaults as canonical JSON; empty if none does."""
-        changed = {each.name: getattr(self, each.name) for each in fields(self)}
-        changed = {each.name: changed[each.name] for each in fields(self) if changed[each.name] != each.default}
+        changed = {each.name: value for each in fields(self) if (value := getattr(self, each.name)) != each.default}
         return json.dumps({"environment": changed}, sort_keys=True) if changed else ""
 
     @property

@@ -9,9 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.actions import Continuous, one_hot
-from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.errors import BundleError
+from dreamfleet.common.artifacts.actions import Continuous, Mirror, one_hot
 from dreamfleet.worker.takecover.game import LEFT, RIGHT, STAY, TakeCover
 from dreamfleet.worker.takecover.options import TakeCoverOptions
 from dreamfleet.worker.takecover.picture import BAND, ObserveBand, make_preprocessings
@@ -28,6 +26,8 @@ from dreamfleet.worker.tasks.api import (
 from dreamfleet.worker.tasks.drivers import HeldActions, UniformActions
 from dreamfleet.worker.tasks.pictures import CropAndResize, VectorActions
 from dreamfleet.worker.tasks.policy import DriverPolicy, FlatPolicy
+from dreamfleet.worker.tasks.registry import preprocessing_for
+from dreamfleet.worker.worldmodel.policy import ModelPolicy
 
 PACKAGES = ("numpy", "onnxruntime", "vizdoom")
 SOLVED = 750.0  # tics, the mean of 100 episodes: OpenAI Gym's DoomTakeCover-v0
@@ -50,41 +50,58 @@ def pick_choice(action: NDArray[np.float32]) -> int:
     return int(np.argmax(action))
 
 
+def actions_of(options: TakeCoverOptions) -> Continuous:
+    """Three outputs, of which the largest is done, or one that is cut in thirds."""
+    return CHOICES if options.actions == "choices" else THIRDS
+
+
+def make_world(options: TakeCoverOptions) -> World:
+    """The world under these options.
+
+    >>> make_world(TakeCoverOptions(tics=1)).horizon
+    2100
+    """
+    actions = actions_of(options)
+    return World(
+        actions=actions,
+        packages=PACKAGES,
+        horizon=options.horizon,
+        frames_per_second=options.frames_per_second,
+        action_names=("stay", "left", "right") if actions.choices else ("aside",),
+        dream_reward=DreamReward(gain=float(options.tics), source="survival"),
+        threshold=SOLVED,
+        score_word="game",
+        marks=(SOLVED,),
+        mirror=Mirror((0, 2, 1), (1, 1, 1)) if actions.choices else Mirror((0,), (-1,)),
+        preset="takecover",
+    )
+
+
 class TakeCoverTask(Task):
     """The task `takecover`: on a world model's latent state, or without one on the brightness of a band of pixels."""
 
     name = "takecover"
+    world = make_world(TakeCoverOptions())
 
     def __init__(self, options: TakeCoverOptions | None = None) -> None:
         self._options = options or TakeCoverOptions()
+        self.world = make_world(self._options)
+        actions = actions_of(self._options)
+        self.drivers: Mapping[str, Callable[[np.random.Generator], Driver]] = {
+            "held": lambda random: HeldActions(random, actions)  # the article's
+        }
+        self.policies: Mapping[str, Callable[[np.random.Generator], Policy]] = {
+            "uniform": lambda random: DriverPolicy(UniformActions(random, actions))
+        }
         self.preprocessings: Mapping[str, Preprocessing] = make_preprocessings(self._options)
-        self.world = World(
-            actions=self._actions,
-            packages=PACKAGES,
-            horizon=self._options.horizon,
-            frames_per_second=self._options.frames_per_second,
-            action_names=("stay", "left", "right") if self._actions.choices else ("aside",),
-            dream_reward=DreamReward(gain=float(self._options.tics), source="survival"),
-            threshold=SOLVED,
-        )
-
-    @property
-    def drivers(self) -> Mapping[str, Callable[[np.random.Generator], Driver]]:
-        """The paper's: a random action for 1 to 10 decisions."""
-        return {"held": lambda random: HeldActions(random, self._actions)}
-
-    @property
-    def policies(self) -> Mapping[str, Callable[[np.random.Generator], Policy]]:
-        """Another action at each decision."""
-        return {"uniform": lambda random: DriverPolicy(UniformActions(random, self._actions))}
 
     def with_options(self, options: str) -> TakeCoverTask:
         """The same task under the options in a JSON object; `UsageError` for unknown ones."""
         return TakeCoverTask(TakeCoverOptions.parse(options))
 
-    def parse_options(self, given: Mapping[str, Any]) -> str:
+    def parse_options(self, arguments: Mapping[str, Any]) -> str:
         """The canonical text of options as flags give them; `UsageError` for unknown ones."""
-        return TakeCoverOptions.of(given).text
+        return TakeCoverOptions.of(arguments).text
 
     def describe(self, options: Mapping[str, Any]) -> Description:
         """Sizes, packages and options of a run without a world model, whose controllers see a band of pixels."""
@@ -101,7 +118,7 @@ class TakeCoverTask(Task):
         task = self._bound_to(assignment)
         if assignment.bundle is None:
             return task._with_actions(ObserveBand(task._make_game()))
-        return task.make_recorded(task.preprocessing(assignment.bundle).name)
+        return task.make_recorded(preprocessing_for(assignment.bundle, task).name)
 
     def make_recorded(self, preprocessing: str) -> gymnasium.Env[Any, Any]:
         """The game in the preprocessing of this name."""
@@ -123,30 +140,21 @@ class TakeCoverTask(Task):
         task = self._bound_to(assignment)
         if assignment.bundle is None:
             return FlatPolicy(assignment.controller, task.world.actions)
-        raise BundleError(f"{self.name} has no policies of world models in this version")
-
-    def preprocessing(self, bundle: Bundle) -> Preprocessing:
-        """The preprocessing of the bundle's pictures; `BundleError` if this task has no such pictures."""
-        manifest = bundle.manifest
-        found = self.preprocessings.get(manifest.preprocessing)
-        if manifest.task != self.name or found is None or manifest.picture != found.shape:
-            given = " or ".join(f"{each.name!r} {each.shape}" for each in self.preprocessings.values())
-            raise BundleError(
-                f"bundle {manifest.name} is of task {manifest.task!r} and pictures {manifest.preprocessing!r} "
-                f"{manifest.picture}; {self.name} gives {given}: leave the bundle out for a run without a world model"
-            )
-        return found
-
-    @property
-    def _actions(self) -> Continuous:
-        return CHOICES if self._options.actions == "choices" else THIRDS
+        preprocessing_for(assignment.bundle, task)
+        return ModelPolicy(assignment.world_model)
 
     def _bound_to(self, assignment: Assignment) -> TakeCoverTask:
-        return self.with_options(assignment.spec.options) if assignment.bundle is None else self
+        """The task under the options of the world model, or of a run without one."""
+        if assignment.bundle is None:
+            return self.with_options(assignment.spec.options)
+        manifest = assignment.bundle.manifest
+        return (
+            self if manifest.task != self.name or manifest.world is None else self.with_options(manifest.world.options)
+        )
 
     def _make_game(self) -> TakeCover:
         return TakeCover(self._options.tics)
 
     def _with_actions(self, environment: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
-        convert = pick_choice if self._actions.choices else cut_in_thirds
-        return VectorActions(environment, self._actions, convert)
+        actions = actions_of(self._options)
+        return VectorActions(environment, actions, pick_choice if actions.choices else cut_in_thirds)

@@ -9,6 +9,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import BundleError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import describe_task
@@ -17,8 +18,16 @@ from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.takecover.game import LEFT, LIMIT, RIGHT, STAY, TakeCover
 from dreamfleet.worker.takecover.options import TakeCoverOptions
 from dreamfleet.worker.takecover.task import TakeCoverTask, cut_in_thirds, pick_choice
-from dreamfleet.worker.tasks.api import Assignment, TaskWithPolicies
-from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.tasks.api import (
+    Assignment,
+    EndRule,
+    RecordableTask,
+    RewardFacts,
+    TaskWithOptions,
+    TaskWithPolicies,
+)
+from dreamfleet.worker.tasks.registry import find_task, find_world
+from tests.support.bundles import write_world_bundle
 from tests.support.doom import games
 from tests.support.world_contract import check_driver, check_world
 
@@ -49,7 +58,7 @@ def pictures_of(tics, actions, seed=3):
 def test_the_task_keeps_the_contract_of_recordable_worlds(doom, options):
     task = find_task("takecover").with_options(options)
     check_world(task)
-    assert isinstance(task, TaskWithPolicies)
+    assert all(isinstance(task, each) for each in (RecordableTask, TaskWithOptions, TaskWithPolicies))
 
 
 def test_a_world_follows_from_its_options():
@@ -71,6 +80,11 @@ def test_options_are_frozen_where_they_differ_from_the_defaults():
     changed = TakeCoverOptions.parse(ALL_CHANGED)
     assert changed.text == ALL_CHANGED
     assert changed.part == (30, 90, 0, 160)
+
+
+def test_flags_that_any_world_takes_are_options_too():
+    arguments = {"environment": {"actions": "thirds"}, "skip": 1, "crop": "30:90,0:160"}
+    assert TakeCoverTask().parse_options(arguments) == ALL_CHANGED
 
 
 @pytest.mark.parametrize(
@@ -176,6 +190,29 @@ def test_whoever_watches_gets_the_games_picture(fake_doom):
     environment.close()
 
 
+@pytest.mark.parametrize("options", ["", ALL_CHANGED])
+def test_a_world_model_brings_its_options(doom, tmp_path, options):
+    world = find_world("takecover", options)
+    facts = world.world.facts(RewardFacts("survival", world.world.dream_reward.gain), EndRule("drawn"), options)
+    bundle = write_world_bundle(
+        tmp_path / "takecover.zip", facts, "takecover", preprocessing=next(iter(world.preprocessings))
+    )
+    assert (facts.score_word, facts.marks, facts.horizon) == ("game", (750.0,), world.world.horizon)
+    scorer = Scorer(TaskSpec("takecover", bundle.sha256, horizon=5, patience=0), bundle)
+    parameters = np.random.default_rng(1).normal(size=bundle.controller_shape.size).astype(np.float32)
+    score = scorer.score("score", parameters, 2**40)
+    assert (score.steps, score.fitness) == (5, 5 * facts.reward.gain)
+    assert score == scorer.score("score", parameters, 2**40)
+    scorer.close()
+
+
+def test_a_mirrored_picture_shows_the_other_way():
+    choices, thirds = (find_world("takecover", options).world.mirror for options in ("", ALL_CHANGED))
+    stay, left, right = np.eye(3, dtype=np.float32)
+    assert [(choices.apply(each) == other).all() for each, other in ((stay, stay), (left, right), (right, left))]
+    assert thirds.apply(np.float32([0.5])) == -0.5
+
+
 def test_a_bundle_of_another_world_is_refused(fake_doom, random_bundle):
     assignment = Assignment.of("takecover", random_bundle)
     with pytest.raises(BundleError, match=r"is of task 'car-racing'.*takecover gives 'box-64'"):
@@ -193,3 +230,11 @@ def test_an_environment_that_nobody_resets_starts_no_game(doom):
     environment = TakeCoverTask().make_recorded("box-64")
     assert games(os.getpid()) == set()
     environment.close()
+
+
+def test_the_list_of_tasks_names_the_missing_package(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "vizdoom", None)
+    assert main(["tasks", "--json"]) == 0
+    found = {row["task"]: row["here"] for row in json.loads(capsys.readouterr().out)}
+    assert found["takecover"] == "lacks the package 'vizdoom': pip install 'dreamfleet[doom]'"
+    assert found["car-racing"].startswith("ready")
