@@ -139,4 +139,4 @@ class WorldFacts:
 
 
 def _are_all_used(outputs: tuple[int, ...]) -> bool:
-    return min(outputs) >= 0 and set(outputs) == set(range(max(outputs) + 1))
+    return sorted(set(outputs)) == list(range(len(set(outputs))))

@@ -57,7 +57,7 @@ def find_world(name: str, options: str = "") -> RecordableTask:
     """
     task = _bind(find_task(name), options)
     if not isinstance(task, RecordableTask):
-        raise UsageError(f"task {name!r} has no drivers and pictures to collect: docs/tasks.md says what it needs")
+        raise UsageError(f"task {name!r} has no drivers and pictures to collect: docs/worlds.md says what it needs")
     return task
 
 

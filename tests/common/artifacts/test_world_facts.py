@@ -45,6 +45,7 @@ def test_what_is_as_usual_is_not_written():
         {"scale": [], "shift": [], "low": [], "high": []},
         {"output_indices": [0, 2, 2]},
         {"output_indices": [-1, 0, 1]},
+        {"output_indices": [0, 1, 2**62]},
         {"output_indices": [0, 1]},
         {"choices": [[1.0, 0.0]]},
         {"horizon": 0},
