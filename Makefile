@@ -6,7 +6,7 @@ SUPPLY := .venv-supply
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 SOURCES := pyproject.toml constraints.txt $(wildcard worker/car_racing/native/*)
 
-.PHONY: demo test test-newest slow setup check wheel long box2d-py simulate chaos weekend fuzz sanitize bundle worker-size \
+.PHONY: demo test test-doom test-newest slow setup check wheel long box2d-py simulate chaos weekend fuzz sanitize bundle worker-size \
   stranger reproduce reproduce-evolution lock audit sbom structure clean
 
 demo: $(VENV)/.demo  ## evolve a controller here, judge it, plot it, record it
@@ -17,6 +17,13 @@ test: $(VENV)/.dev  ## every test that ends within seconds: under ten minutes
 
 slow: $(VENV)/.dev  ## those that take longer, each under two minutes; what lands has passed both
 	$(BIN)/pytest -m "slow and not long" --numprocesses 2 --dist worksteal $(ARGS)
+
+$(VENV)/.doom: $(VENV)/.dev
+	$(PIP) --editable '.[doom]'
+	touch $@
+
+test-doom: $(VENV)/.doom  ## the tests that play Doom; they need the package vizdoom, 184 MB
+	$(BIN)/pytest -m "needs_doom and not long" --numprocesses 2 --dist worksteal $(ARGS)
 
 NEWEST ?= $(shell deploy/newest_python.sh)
 test-newest:  ## a short part of the tests on the newest Python that is here, in an environment of its own

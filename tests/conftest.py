@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.bundles import write_random_bundle
+from tests.support.doom import require_doom
 from tests.support.processes import processes_in
 from tests.support.programs import LIST, NOT_INSTALLED, require_programs
 
@@ -21,6 +22,8 @@ if (
 def pytest_runtest_setup(item):
     for mark in item.iter_markers("needs_programs"):
         require_programs(*mark.args)
+    if item.get_closest_marker("needs_doom"):
+        require_doom()
 
 
 @pytest.hookimpl(wrapper=True)

@@ -87,7 +87,8 @@ def _check_packages() -> Iterator[Finding]:
     for name, (module, extra) in PACKAGES.items():
         found = package_version(name) or (package_version("box2d-py") if name == "box2d" else None)
         ok = found is not None and find_spec(module) is not None
-        yield Finding(name, ok, True, found or "-", extra or "everything", install_command(extra))
+        needed = not extra or extra in ROLES  # other extras are of single tasks
+        yield Finding(name, ok, needed, found or "-", extra or "everything", install_command(extra))
 
 
 def _check_box2d() -> Finding:

@@ -14,6 +14,7 @@ PACKAGES = {
     "pygame-ce": ("pygame", "worker"),
     "box2d": ("Box2D", "worker"),
     "onnxruntime": ("onnxruntime", "worker"),
+    "vizdoom": ("vizdoom", "doom"),
     "av": ("av", "views"),
     "matplotlib": ("matplotlib", "views"),
     "torch": ("torch", "train"),

@@ -7,10 +7,12 @@ import json
 from collections.abc import Iterator
 from dataclasses import asdict
 from importlib.metadata import EntryPoint
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.output import print_rows
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.packages import PACKAGES, install_command
 
 if TYPE_CHECKING:
     from dreamfleet.common.cli.task_check import TaskReport
@@ -87,5 +89,10 @@ def _row(name: str, point: EntryPoint) -> dict[str, object]:
         return {"task": shown, "package": distribution, "ready": False, "here": lacks}
     except Exception as error:  # whatever a package raises as it is imported
         return {"task": shown, "package": distribution, "ready": False, "here": f"cannot be loaded: {error}"}
+    for package in getattr(getattr(made, "world", None), "packages", ()):
+        module, extra = PACKAGES.get(package, ("sys", ""))
+        if find_spec(module) is None:
+            lacks = f"lacks the package {package!r}: {install_command(extra)}"
+            return {"task": shown, "package": distribution, "ready": False, "here": lacks}
     text = str(made.__doc__ or "").strip().partition("\n")[0]
     return {"task": shown, "package": distribution, "ready": True, "here": f"ready: {text}" if text else "ready"}

@@ -1,0 +1,80 @@
+"""ViZDoom in tests: the real package or a stand-in, what a game's process is, and what it leaves behind."""
+
+import hashlib
+import importlib.util
+import os
+import select
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dreamfleet.worker.takecover.game import TakeCover
+from dreamfleet.worker.takecover.process import GAME_NAME_FLAG, SHARED_FILES
+from tests.support.processes import DEADLINE, ROOT
+
+FAKE = Path(__file__).parent / "fake_vizdoom"
+REAL_IS_HERE = importlib.util.find_spec("vizdoom") is not None
+SHARED_MEMORY = Path("/dev/shm")
+
+
+def require_doom():
+    if not REAL_IS_HERE:
+        pytest.skip("not installed: vizdoom (make test-doom)")
+
+
+def use_fake(monkeypatch):
+    """Let `import vizdoom` find the stand-in, in this process and in those that multiprocessing spawns."""
+    spec = importlib.util.spec_from_file_location("vizdoom", FAKE / "vizdoom" / "__init__.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    monkeypatch.setitem(sys.modules, "vizdoom", module)
+    monkeypatch.syspath_prepend(FAKE)
+
+
+def search_path():
+    """`PYTHONPATH` for processes that find the same vizdoom as this one."""
+    return os.pathsep.join([str(FAKE), str(ROOT)] if str(FAKE) in sys.path else [str(ROOT)])
+
+
+def games(parent=None, environment=b""):
+    """Ids of the running processes of games, or of those with this parent, or with this text in their environment."""
+    found = set()
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has ended
+            state, its_parent, *_ = (process / "stat").read_text().rpartition(") ")[2].split()
+            is_game = GAME_NAME_FLAG.encode() in (process / "cmdline").read_bytes().split(b"\0") and state not in "ZX"
+            if is_game and parent in (None, int(its_parent)) and environment in (process / "environ").read_bytes():
+                found.add(int(process.name))
+    return found
+
+
+def name_of_game(process):
+    words = Path(f"/proc/{process}/cmdline").read_text().split("\0")
+    return words[words.index(GAME_NAME_FLAG) + 1]
+
+
+def shared_files(name):
+    """The files in /dev/shm of the game of this name."""
+    return [path for each in SHARED_FILES if (path := SHARED_MEMORY / f"{each}{name}").exists()]
+
+
+def has_ended(process):
+    """Wait for the end of a process, by its descriptor."""
+    return bool(select.select([process], [], [], DEADLINE)[0])
+
+
+def play(seeds, tics=4):
+    """A digest of all pictures and rewards of episodes under random actions."""
+    digest, game = hashlib.sha256(), TakeCover(tics)
+    for seed in seeds:
+        random, over = np.random.default_rng(seed), False
+        digest.update(game.reset(seed=seed)[0].tobytes())
+        while not over:
+            picture, reward, terminated, truncated, _ = game.step(int(random.integers(3)))
+            digest.update(picture.tobytes() + np.float64(reward).tobytes())
+            over = terminated or truncated
+    game.close()
+    return digest.hexdigest()

@@ -1,0 +1,101 @@
+"""A stand-in for the package vizdoom: its game is a child process that sleeps, and three files in /dev/shm.
+
+Like the real one it writes into the current folder of that process, gives equal bits for equal seeds and actions, has
+no picture after a death, and takes seeds of 32 bits. Who goes right at each tic never dies.
+"""
+
+import secrets
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+
+SHARED = tuple(Path("/dev/shm", name) for name in ("ViZDoomSM", "ViZDoomMQCtr", "ViZDoomMQDoom"))
+scenarios_path = str(Path(__file__).parent)
+ScreenResolution = SimpleNamespace(RES_160X120=(120, 160))
+ScreenFormat = SimpleNamespace(RGB24="RGB24")
+
+
+class CrashError(Exception):
+    pass
+
+
+class DoomGame:
+    _process = None
+
+    def load_config(self, path):
+        assert Path(path).name == "take_cover.cfg"
+
+    def set_doom_skill(self, skill):
+        assert skill == 4
+
+    def set_living_reward(self, reward):
+        assert reward == 1
+
+    def set_window_visible(self, visible):
+        assert not visible
+
+    def set_screen_resolution(self, resolution):
+        assert resolution == ScreenResolution.RES_160X120
+
+    def set_screen_format(self, kind):
+        assert kind == ScreenFormat.RGB24
+
+    def set_render_hud(self, shown):
+        assert not shown
+
+    def set_vizdoom_path(self, path):
+        self._path = path
+
+    def set_doom_config_path(self, path):
+        self._config = path
+
+    def init(self):
+        name = secrets.token_hex(5)
+        for path in SHARED:
+            Path(f"{path}{name}").write_bytes(b"x")
+        words = [self._path, "-config", self._config, "+viz_instance_id", name]
+        self._process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+        if self._process.stdout.readline() != "up\n":
+            self.close()
+            raise CrashError("ViZDoom exited unexpectedly")
+
+    def is_running(self):
+        return self._process is not None and self._process.poll() is None
+
+    def set_seed(self, seed):
+        if not 0 <= seed < 2**32:
+            raise TypeError("set_seed(): incompatible function arguments")
+        self._seed = seed
+
+    def new_episode(self):
+        self._tic, self._moves = 0, 0
+        self._last = 40 + self._seed % 50
+
+    def get_state(self):
+        if self.is_episode_finished():
+            return None
+        random = np.random.default_rng([self._seed, self._tic, self._moves])
+        return SimpleNamespace(screen_buffer=random.integers(0, 256, (120, 160, 3), dtype=np.uint8))
+
+    def make_action(self, buttons, tics):
+        if not self.is_running():
+            raise CrashError("Unexpected ViZDoom instance crash.")
+        lived = 0
+        while lived < tics and not self.is_episode_finished():
+            lived += 1
+            self._tic += 1
+            self._moves = self._moves * 3 % 2**31 + buttons[0] + 2 * buttons[1]
+            self._last += buttons[1]
+        return float(lived)
+
+    def is_episode_finished(self):
+        return self._tic >= self._last
+
+    def close(self):
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process.stdout.close()
+            self._process = None

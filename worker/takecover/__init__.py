@@ -1,0 +1,1 @@
+"""ViZDoom's Take Cover: a player who can only step aside lives as long as no fireball hits."""

@@ -1,0 +1,105 @@
+"""How Take Cover is played: what a run, or a world model's data, freezes of it."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.takecover.game import HEIGHT, LIMIT, TICS_PER_SECOND, WIDTH
+from dreamfleet.worker.tasks.pictures import Crop
+
+OPTION_HELP = {
+    "tics": "a whole number from 1 to 10",
+    "actions": "choices or thirds",
+    "crop": f"TOP:BOTTOM,LEFT:RIGHT of a picture of {HEIGHT} rows and {WIDTH} columns",
+}
+FLAGS = {"skip": "tics", "crop": "crop"}  # of any world, and what they are here
+_CROP = re.compile(r"(\d{1,3}):(\d{1,3}),(\d{1,3}):(\d{1,3})", re.ASCII)
+
+
+@dataclass(frozen=True)
+class TakeCoverOptions:
+    """The options of task `takecover`; `UsageError` for a value out of range.
+
+    >>> TakeCoverOptions.parse('{"environment": {"tics": 1}}').horizon
+    2100
+    """
+
+    tics: int = 4  # for which a decision holds
+    actions: Literal["choices", "thirds"] = "choices"  # stay, left, right; or one number from -1 to 1, cut in thirds
+    crop: str = f"0:100,0:{WIDTH}"  # of the game's picture, what a world model sees; the article's, without the floor
+
+    def __post_init__(self) -> None:
+        valid = {
+            "tics": type(self.tics) is int and 1 <= self.tics <= 10,
+            "actions": self.actions in ("choices", "thirds"),
+            "crop": _is_crop(self.crop),
+        }
+        for name, is_valid in valid.items():
+            if not is_valid:
+                raise UsageError(f"takecover's {name} must be {OPTION_HELP[name]}, not {getattr(self, name)!r}")
+
+    @classmethod
+    def parse(cls, text: str) -> TakeCoverOptions:
+        """The options in a JSON object as `text` gives it; an empty text names none."""
+        try:
+            given = json.loads(text or "{}")
+            if not isinstance(given, dict):
+                raise TypeError("it is no object")
+        except (ValueError, TypeError, RecursionError) as error:
+            raise UsageError(f"takecover's options must be a JSON object, not {text!r:.200}") from error
+        return cls.of(given)
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any]) -> TakeCoverOptions:
+        """The options in a mapping: `environment` holds them by name; `skip` and `crop` are tics and crop.
+
+        >>> TakeCoverOptions.of({"environment": {"actions": "thirds"}, "skip": 1}).text
+        '{"environment": {"actions": "thirds", "tics": 1}}'
+        """
+        if unknown := sorted(set(given) - {"environment", *FLAGS}):
+            raise UsageError(f"takecover knows no option {', '.join(unknown)}: write --environment tics=1")
+        values = given.get("environment") or {}
+        if not isinstance(values, Mapping) or (unknown := sorted(set(values) - set(OPTION_HELP))):
+            named = ", ".join(unknown) or repr(values)
+            raise UsageError(f"takecover knows no argument {named:.200}: known are {', '.join(OPTION_HELP)}")
+        return cls(**{**{name: given[flag] for flag, name in FLAGS.items() if flag in given}, **values})
+
+    @property
+    def text(self) -> str:
+        """The options that differ from the defaults as canonical JSON; empty if none does."""
+        changed = {each.name: value for each in fields(self) if (value := getattr(self, each.name)) != each.default}
+        return json.dumps({"environment": changed}, sort_keys=True) if changed else ""
+
+    @property
+    def horizon(self) -> int:
+        """Decisions of the longest episode."""
+        return -(-LIMIT // self.tics)
+
+    @property
+    def frames_per_second(self) -> int:
+        """Decisions of a second."""
+        return max(1, round(TICS_PER_SECOND / self.tics))
+
+    @property
+    def part(self) -> Crop:
+        """The crop's first row and the one after its last, then its columns."""
+        return _read_crop(self.crop)
+
+
+def _read_crop(text: str) -> Crop:
+    found = _CROP.fullmatch(text)
+    assert found is not None
+    top, bottom, left, right = map(int, found.groups())
+    return top, bottom, left, right
+
+
+def _is_crop(text: Any) -> bool:
+    if not isinstance(text, str) or not _CROP.fullmatch(text):
+        return False
+    top, bottom, left, right = _read_crop(text)
+    return top < bottom <= HEIGHT and left < right <= WIDTH
