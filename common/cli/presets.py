@@ -13,7 +13,7 @@ from dreamfleet.common.errors import UsageError
 Kind = Literal["run", "training", "baseline"]
 NAMES: dict[Kind, tuple[str, ...]] = {
     "run": ("article", "dream", "frugal", "mixed", "notebook", "paper", "real"),
-    "training": ("article", "attentive", "notebook", "paper", "tiny"),
+    "training": ("article", "attentive", "notebook", "paper", "pixels", "takecover", "tiny"),
     "baseline": ("learning", "notebook"),
 }
 VERBS: dict[Kind, str] = {

@@ -14,10 +14,12 @@ from dreamfleet.worker.training.data.rollouts import (
     Rollouts,
     done_labels,
     load_rollouts,
+    model_inputs,
     teacher_force,
     with_reward_label,
 )
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, Prediction, reward_labels
+from dreamfleet.worker.worldmodel.mdnrnn_config import calibrate_end
 
 DREAM_STEPS = (1, 10, 50)  # lengths of dreams
 START_EVERY = 25  # recorded steps between the beginnings of dreams
@@ -52,6 +54,32 @@ def foresight(model: MDNRNN, held_out: Sequence[Path]) -> dict[str, float]:
             figures[f"latent_error_after_{ahead}"] = float(error)
     named = {name if "error" in name else _figure_name(model, name): value for name, value in figures.items()}
     return {name: round(value, 3) for name, value in named.items() if np.isfinite(value)}
+
+
+def end_quality(model: MDNRNN, held_out: Sequence[Path]) -> dict[str, float]:
+    """How good the done head's probabilities are on recorded steps, as `calibrate_end` gives them.
+
+    `done_brier` is their mean squared error, `done_calibration` their mean over the share of ends: below 1, dreams are
+    longer than reality. Empty without a done head; without an end there is no `done_calibration`.
+    """
+    if not model.config.done:
+        return {}
+    device = next(model.parameters()).device
+    predicted, ended = list[Floats](), list[Floats]()
+    model.eval()
+    with torch.no_grad():
+        for start in range(0, len(held_out), MAX_ROLLOUTS):
+            for chunk in load_rollouts(held_out[start : start + MAX_ROLLOUTS]).chunks():
+                rollouts = chunk.to(device)
+                logits = model(model_inputs(model.config, rollouts.mu, rollouts)).done
+                for found, part in ((predicted, torch.sigmoid(logits)), (ended, done_labels(model.config, rollouts))):
+                    found.append(part[rollouts.mask > 0].cpu().numpy())
+    probability = calibrate_end(np.concatenate(predicted).astype(np.float64), model.config.done_weight)
+    label = np.concatenate(ended)
+    figures = {"done_brier": float(np.square(probability - label).mean())}
+    if label.any():
+        figures["done_calibration"] = float(probability.mean() / label.mean())
+    return {name: float(f"{value:.4g}") for name, value in figures.items()}
 
 
 def area_under_curve(scores: Floats, positive: NDArray[np.bool_]) -> float:
@@ -97,7 +125,7 @@ def _dream(
 def _labels(model: MDNRNN, rollouts: Rollouts) -> dict[str, Tensor]:
     config, labels = model.config, dict[str, Tensor]()
     if config.has_reward_head:
-        labels["reward"] = reward_labels(config.reward, rollouts.reward, rollouts.done)
+        labels["reward"] = reward_labels(config.reward, rollouts.reward, rollouts.done, config.reward_scale)
     if config.done:
         labels["done"] = done_labels(config, rollouts)
     return labels
@@ -109,7 +137,7 @@ def _head(prediction: Prediction, name: str) -> Tensor:
 
 def _score_head(model: MDNRNN, name: str, predicted: Tensor, label: Tensor) -> float:
     if name == "reward" and model.config.reward == "value":
-        return float((predicted - label).square().mean().sqrt())
+        return float((predicted - label).square().mean().sqrt()) * model.config.reward_scale
     return area_under_curve(predicted.cpu().numpy(), label.cpu().numpy() > 0)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from dreamfleet.common.cli.config import option
@@ -51,7 +51,10 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class TrainingPreset:
-    """The configuration of a whole pipeline: collecting, both trainings, both models' layers."""
+    """The configuration of a whole pipeline: collecting, both trainings, both models' layers.
+
+    `task` is the task whose world its amounts are of; empty: any world with pictures.
+    """
 
     name: str
     collect: CollectConfig
@@ -59,6 +62,7 @@ class TrainingPreset:
     mdnrnn: TrainConfig
     vae_layers: VAEConfig = vae_config.PAPER
     mdnrnn_layers: MDNRNNConfig = mdnrnn_config.REWARDED
+    task: str = "car-racing"
 
 
 # About 12 minutes on two cores. More data or updates made a VAE distinguish pictures better but dream worse, while an
@@ -102,7 +106,29 @@ PAPER = TrainingPreset(
     mdnrnn=TrainConfig(updates=4000, batch=100, rate=1e-3, patience=10),
     mdnrnn_layers=mdnrnn_config.PAPER,
 )
-PRESETS = {preset.name: preset for preset in (TINY, NOTEBOOK, ARTICLE, ATTENTIVE, PAPER)}
+# Half of the paper's channels, so that a bundle is small enough to ship. Things of a few pixels, such as a ball, decide
+# many games; an error of theirs counts more.
+SMALL_EYES = VAEConfig(channels=(16, 32, 64, 128), pixel_weight=3.0)
+PIXELS = TrainingPreset(
+    name="pixels",
+    collect=CollectConfig(episodes=400, steps=1000, anywhere=0.0, patience=0),
+    vae=TrainConfig(updates=1500, batch=100, rate=1e-3),
+    mdnrnn=TrainConfig(updates=500, batch=16, rate=1e-3),
+    vae_layers=SMALL_EYES,
+    mdnrnn_layers=MDNRNNConfig(reward="value", reward_scale=0, done=True, done_weight=3.0),
+    task="",
+)
+# 525 decisions of 4 tics are the game's limit of 2,100 tics. To survive is the reward, and its end the done head's.
+TAKECOVER = TrainingPreset(
+    name="takecover",
+    collect=CollectConfig(episodes=4000, steps=525, driver="held", anywhere=0.0, patience=0),
+    vae=TrainConfig(updates=2500, batch=100, rate=1e-3),
+    mdnrnn=TrainConfig(updates=1200, batch=32, rate=1e-3),
+    vae_layers=replace(SMALL_EYES, latent=64),
+    mdnrnn_layers=MDNRNNConfig(latent=64, reward="none", done=True, done_weight=3.0),
+    task="takecover",
+)
+PRESETS = {each.name: each for each in (TINY, NOTEBOOK, ARTICLE, ATTENTIVE, PAPER, PIXELS, TAKECOVER)}
 
 
 def find_preset(name: str) -> TrainingPreset:

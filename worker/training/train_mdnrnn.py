@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -12,12 +13,12 @@ from torch import Tensor
 
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.host.stop_signals import Stop, never_stop
-from dreamfleet.worker.training.checkpoint import load_progress
-from dreamfleet.worker.training.data.dataset import episode_paths, load_arrays, split_held_out
+from dreamfleet.worker.training.checkpoint import load_config, load_progress
+from dreamfleet.worker.training.data.dataset import episode_paths, existing_episodes, load_steps, split_held_out
 from dreamfleet.worker.training.data.rollouts import Rollouts, done_labels, load_rollouts, model_inputs
 from dreamfleet.worker.training.encode import ENCODED, encodes_mirrored, latents_encoder_hash
 from dreamfleet.worker.training.loss_curve import AddPoint, open_loss_curve
-from dreamfleet.worker.training.prediction_quality import foresight
+from dreamfleet.worker.training.prediction_quality import end_quality, foresight
 from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.training.train_vae import ReportProgress
 from dreamfleet.worker.training.training_state import TrainingState
@@ -41,9 +42,10 @@ def train_mdnrnn(
     """
     train, held_out = split_held_out(episode_paths(folder, ENCODED))
     vae, mirrors = latents_encoder_hash(folder), encodes_mirrored(folder)
-    latents = load_arrays(train[0], "mu")["mu"].shape[1]
+    latents = load_steps(train[0], "mu")["mu"].shape[1]
     if layers.latent != latents:
         raise DatasetError(f"the encoded rollouts have {latents} latents, this MDN-RNN {layers.latent}: give --latent")
+    layers = fit_layers(layers, folder, continue_from, new)
     torch.manual_seed(config.seed)
     model = MDNRNN(layers).to(device)
     schedule = TrainingState(folder / CHECKPOINT, model, config, len(train), continue_from, new, ADDABLE_HEADS)
@@ -70,6 +72,33 @@ def train_mdnrnn(
                 lambda: _record_validation(model, held_out[:VALIDATION_ROLLOUTS], point, schedule.update, device)
             )
     return measure_quality(model, held_out, device)
+
+
+def fit_layers(
+    layers: MDNRNNConfig, folder: Path, continue_from: Path | None = None, new: bool = False
+) -> MDNRNNConfig:
+    """Return the configuration with what a data set determines: the size of its actions, and a measured reward scale.
+
+    A training that goes on, or continues from a checkpoint, keeps that one's scale. Without drives nothing is fitted.
+    """
+    paths = sorted((folder / ENCODED).glob("[0-9]*.npz")) or existing_episodes(folder)
+    if not paths:
+        return layers
+    layers = replace(layers, actions=load_steps(paths[0])["action"].shape[1])
+    if layers.reward_scale:
+        return layers
+    own = folder / CHECKPOINT
+    begun = own if own.exists() and not new else continue_from
+    scale = load_config(begun, MDNRNNConfig).reward_scale if begun else _measure_reward_scale(layers, paths)
+    return replace(layers, reward_scale=scale)
+
+
+def _measure_reward_scale(layers: MDNRNNConfig, paths: Sequence[Path]) -> float:
+    """The standard deviation of the rewards to learn from, in six digits; 1 for equal rewards and for no value head."""
+    if layers.reward != "value":
+        return 1.0
+    rewards = np.concatenate([load_steps(path)["reward"] for path in split_held_out(paths)[0]])
+    return float(f"{rewards.std(dtype=np.float64):.6g}") or 1.0
 
 
 def _record_validation(
@@ -122,10 +151,11 @@ def losses(model: MDNRNN, rollouts: Rollouts, noise: torch.Generator) -> dict[st
     ahead = type(prediction)(*(part[:, :-1] for part in prediction))
     parts = {"latent": latent_loss(ahead, sampled[:, 1:], rollouts.mask[:, 1:])}
     if config.has_reward_head:
-        labels = reward_labels(config.reward, rollouts.reward, rollouts.done)
+        labels = reward_labels(config.reward, rollouts.reward, rollouts.done, config.reward_scale)
         parts["reward"] = reward_loss(config.reward, prediction.reward, labels, rollouts.mask)
     if config.done:
-        parts["done"] = binary_loss(prediction.done, done_labels(config, rollouts), rollouts.mask)
+        labels = done_labels(config, rollouts)
+        parts["done"] = binary_loss(prediction.done, labels, rollouts.mask, config.done_weight)
     return parts
 
 
@@ -145,4 +175,5 @@ def measure_quality(model: MDNRNN, held_out: Sequence[Path], device: torch.devic
     """Nats per latent dimension, each head's loss, and the prediction quality on held-out rollouts."""
     parts = validate(model, held_out, device)
     figures = {"nats_per_dimension": round(parts.pop("latent"), 3)}
-    return figures | {f"{name}_loss": round(value, 4) for name, value in parts.items()} | foresight(model, held_out)
+    figures |= {f"{name}_loss": round(value, 4) for name, value in parts.items()}
+    return figures | foresight(model, held_out) | end_quality(model, held_out)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -25,7 +26,7 @@ from dreamfleet.worker.training.data.dataset import (
 from dreamfleet.worker.training.loss_curve import AddPoint, open_loss_curve
 from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.training.training_state import TrainingState
-from dreamfleet.worker.worldmodel.vae import VAE
+from dreamfleet.worker.worldmodel.vae import VAE, PixelWeights
 from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
 
 log = logging.getLogger(__name__)
@@ -33,6 +34,8 @@ log = logging.getLogger(__name__)
 CHECKPOINT, CURVE = "vae.safetensors", "vae.jsonl"
 VALIDATION_PICTURES = 2000
 CURVE_PICTURES = 500  # of them, for the curve during training
+MEAN_EPISODES = 48  # first ones to train on, of which the mean picture is
+LEAST_DEVIATION = 1e-4  # of pictures that are all equal
 ACTIVE_NATS = 0.1  # mean KL divergence per held-out picture above which a latent counts as active
 
 ReportProgress = Callable[[int, str], None]
@@ -67,6 +70,7 @@ def train_vae(
         raise UsageError("--decoder-only needs an encoder that was trained: give --continue-from")
     schedule = TrainingState(folder / CHECKPOINT, model, config, len(train), continue_from, new)
     progress = schedule.progress
+    pixels = _pixel_weights(layers, progress, train, device)
     report(schedule.update, "")
     validation = held_out_pictures(held_out, CURVE_PICTURES)
     batches = picture_batches(train, config.batch, config.seed, progress.get("pool", 0), progress.get("taken", 0))
@@ -76,13 +80,15 @@ def train_vae(
             pool, taken, batch = next(batches)
             schedule.set_rate(pool // epoch_pools)
             torch.manual_seed(config.seed * 1_000_003 + schedule.update)
-            loss = backward(model, batch, decoder_only, device)
+            loss = backward(model, batch, decoder_only, device, pixels)
             schedule.step(loss.weighted)
             schedule.progress |= {"pool": pool, "taken": taken}
             report(schedule.update, f"error {loss.error:.1f}  KL {loss.divergence:.1f}")
             if schedule.update % 20 == 0:
                 point(update=schedule.update, error=loss.error, kl=loss.divergence)
-            schedule.finish_update(lambda: _record_validation(model, validation, point, schedule.update, device))
+            schedule.finish_update(
+                lambda: _record_validation(model, validation, point, schedule.update, device, pixels)
+            )
     figures = measure_quality(model, held_out, device)
     if figures["reconstruction_error"] >= figures["mean_picture_error"]:
         log.warning(
@@ -93,33 +99,67 @@ def train_vae(
     return figures
 
 
+def measure_pixels(paths: Sequence[Path]) -> dict[str, Any]:
+    """The mean picture of episodes, rounded to bytes, in base64, and pictures' mean deviation from it, of 1.
+
+    Both follow from integers alone, so that they are the same on every host.
+    """
+    parts = [(len(pictures), pictures.sum(axis=0, dtype=np.int64)) for pictures in map(load_pictures, paths)]
+    count, total = sum(length for length, _ in parts), np.sum([each for _, each in parts], axis=0)
+    mean = (2 * total + count) // (2 * count)
+    away = sum(int(np.abs(load_pictures(path) - mean).sum()) for path in paths)
+    deviation = away / (255 * count * mean.size)
+    return {"mean": base64.b64encode(mean.astype(np.uint8).tobytes()).decode(), "deviation": deviation}
+
+
+def _pixel_weights(
+    layers: VAEConfig, progress: dict[str, Any], train: Sequence[Path], device: torch.device | None
+) -> PixelWeights | None:
+    """The configured weights; `progress` keeps what they were measured as, as drives may be added before a resume."""
+    if not layers.pixel_weight:
+        return None
+    if "pixels" not in progress:
+        progress["pixels"] = measure_pixels(train[:MEAN_EPISODES])
+    mean = np.frombuffer(base64.b64decode(progress["pixels"]["mean"]), np.uint8)
+    shape = (1, layers.picture, layers.picture, 3)
+    deviation = max(progress["pixels"]["deviation"], LEAST_DEVIATION)
+    return PixelWeights(as_tensor(mean.reshape(shape).copy(), device)[0], deviation, layers.pixel_weight)
+
+
 def _record_validation(
-    model: VAE, pictures: NDArray[np.uint8], point: AddPoint, update: int, device: torch.device | None
-) -> float:
+    model: VAE, pictures: NDArray[np.uint8], point: AddPoint, update: int, device: torch.device | None,
+    pixels: PixelWeights | None,
+) -> float:  # fmt: skip
     """Validate, add a point to the curve, and return the weighted held-out loss."""
-    loss = validate(model, pictures, device)
+    loss = validate(model, pictures, device, pixels)
     parts = {"held_out": loss.plain, "held_out_error": loss.error, "held_out_kl": loss.divergence}
     point(update=update, **parts)
     return loss.weighted
 
 
-def backward(model: VAE, pictures: NDArray[np.uint8], decoder_only: bool, device: torch.device | None) -> VAELossValues:
+def backward(
+    model: VAE, pictures: NDArray[np.uint8], decoder_only: bool, device: torch.device | None,
+    pixels: PixelWeights | None = None,
+) -> VAELossValues:  # fmt: skip
     """Compute a batch's gradients; return its losses."""
     model.train()
     if decoder_only:
         model.freeze_encoder()
     noise = torch.randn(len(pictures), model.config.latent).to(device)
-    loss = model.loss(as_tensor(pictures, device), noise)
+    loss = model.loss(as_tensor(pictures, device), noise, pixels)
     loss.weighted.backward()  # type: ignore[no-untyped-call]
     return VAELossValues(*(part.item() for part in loss))
 
 
-def validate(model: VAE, pictures: NDArray[np.uint8], device: torch.device | None) -> VAELossValues:
+def validate(
+    model: VAE, pictures: NDArray[np.uint8], device: torch.device | None, pixels: PixelWeights | None = None
+) -> VAELossValues:
     """Losses on held-out pictures, decoded from the latents' means."""
     model.eval()
+    latent = model.config.latent
     with torch.no_grad():
         parts = [
-            torch.stack(model.loss(batch, torch.zeros(len(batch), model.config.latent, device=device))) * len(batch)
+            torch.stack(model.loss(batch, torch.zeros(len(batch), latent, device=device), pixels)) * len(batch)
             for batch in (as_tensor(pictures[start : start + 100], device) for start in range(0, len(pictures), 100))
         ]
     return VAELossValues(*(torch.stack(parts).sum(dim=0) / len(pictures)).tolist())

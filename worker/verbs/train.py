@@ -77,6 +77,7 @@ def train_mdnrnn(args: argparse.Namespace) -> int:
     preset = find_preset(resolve_preset(args.data, args.preset))
     config, layers = apply_flags(preset.mdnrnn, args), apply_flags(preset.mdnrnn_layers, args)
     if args.summary:
+        layers = training.fit_layers(layers, args.data, args.continue_from, args.new)
         return _print_summary(args, MDNRNN(layers), ADDABLE_HEADS)
 
     def train(report: ReportProgress, stop: Stop) -> dict[str, float]:

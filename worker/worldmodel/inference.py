@@ -130,6 +130,7 @@ class RewardLabel:
         self._column = 2 * bundle.manifest.hidden if model.get("previous_reward") else None
         self._kind = model.get("reward")
         self._first = float(model.get("first_reward", 0.0))
+        self._scale = float(model.get("reward_scale", 1.0))
 
     def begin(self, state: Floats) -> Floats:
         """Set the previous reward of a first step, as in training, in a zero state; return the state."""
@@ -141,7 +142,7 @@ class RewardLabel:
         """Write the reward head's label of `rewards` (N,) into `state`; no step may have ended its episode."""
         if self._column is None:
             return
-        labels = rewards if self._kind == "value" else (rewards > 0) == (self._kind == "positive")
+        labels = rewards / self._scale if self._kind == "value" else (rewards > 0) == (self._kind == "positive")
         state[:, self._column] = labels
 
 

@@ -124,10 +124,10 @@ def latent_loss(prediction: Prediction, targets: Tensor, mask: Tensor) -> Tensor
     return -(likelihood * mask).sum() / mask.sum().clamp(min=1)
 
 
-def reward_labels(kind: Reward, rewards: Tensor, done: Tensor) -> Tensor:
-    """The reward head's targets `(N, T)`; `done` is 1 where a step ended its episode."""
+def reward_labels(kind: Reward, rewards: Tensor, done: Tensor, scale: float = 1.0) -> Tensor:
+    """The reward head's targets `(N, T)`; `done` is 1 where a step ended its episode. A value is divided by `scale`."""
     if kind == "value":
-        return rewards
+        return rewards if scale == 1 else rewards / scale
     positive = (rewards > 0).float()
     return positive if kind == "positive" else (1 - positive) * (1 - done)
 
@@ -139,7 +139,8 @@ def reward_loss(kind: Reward, predicted: Tensor, labels: Tensor, mask: Tensor) -
     return binary_loss(predicted, labels, mask)
 
 
-def binary_loss(logits: Tensor, labels: Tensor, mask: Tensor) -> Tensor:
-    """Binary cross-entropy in nats per step."""
-    losses = functional.binary_cross_entropy_with_logits(logits, labels, reduction="none")
+def binary_loss(logits: Tensor, labels: Tensor, mask: Tensor, weight: float = 1.0) -> Tensor:
+    """Binary cross-entropy in nats per step; steps with label 1 count `weight` times."""
+    positive = None if weight == 1 else logits.new_tensor(weight)
+    losses = functional.binary_cross_entropy_with_logits(logits, labels, reduction="none", pos_weight=positive)
     return (losses * mask).sum() / mask.sum().clamp(min=1)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
@@ -11,6 +14,7 @@ from dreamfleet.worker.worldmodel.layer_sizes import check_sizes
 from dreamfleet.worker.worldmodel.loss_factors import added_option, check_factors, loss_factor
 
 Reward = Literal["none", "positive", "notebook", "value"]
+Probability = TypeVar("Probability", float, NDArray[np.float32], NDArray[np.float64])
 MOST_REWARD = 1000
 
 
@@ -22,6 +26,9 @@ class MDNRNNConfig:
     positive and the episode goes on), or the reward's value. The done head predicts the logit of the episode's end.
     With `lost` a step also counts as an end if no reward follows for so many steps: dreams then end where the road is
     lost.
+
+    Ends are rare, so a step that ends may count `done_weight` times in the done head's loss. Such a head predicts ends
+    too often; `calibrate_end` undoes that.
     """
 
     latent: int = option(32, "latents of a picture, as many as the VAE's")
@@ -40,6 +47,11 @@ class MDNRNNConfig:
     z_factor: float = loss_factor("weight of the likelihood of the next latents")
     reward_factor: float = loss_factor("weight of the reward head's loss")
     first_reward: float = added_option(0.0, "previous reward's label at the first step of a drive")
+    done_factor: float = loss_factor("weight of the done head's loss")
+    done_weight: float = added_option(1.0, "weight of a step that ends against one that does not, as ends are rare")
+    reward_scale: float = added_option(
+        1.0, "what a reward is divided by before its value is learnt; 0: the rewards' standard deviation in the data"
+    )
 
     def __post_init__(self) -> None:
         check_sizes(self)
@@ -51,11 +63,17 @@ class MDNRNNConfig:
             raise UsageError("the previous reward as an input needs a reward head: in a dream nothing else predicts it")
         if self.lost < 0 or (self.lost and not self.done):
             raise UsageError("--lost is a number of steps that a done head predicts: give --done, and 0 or more")
-        check_factors(self, "z_factor", "reward_factor")
+        check_factors(self, "z_factor", "reward_factor", "done_factor", "done_weight")
         if self.reward_factor != 1 and self.reward == "none":
             raise UsageError(
                 "--reward-factor is the weight of a reward head's loss: give --reward another kind than none"
             )
+        if (self.done_factor, self.done_weight) != (1, 1) and not self.done:
+            raise UsageError("--done-factor and --done-weight are of a done head's loss: give --done")
+        if self.reward_scale not in (0, 1):
+            check_factors(self, "reward_scale")
+            if self.reward != "value":
+                raise UsageError("--reward-scale divides the rewards whose value is predicted: give --reward value")
         if self.first_reward and not self.previous_reward:
             raise UsageError("--first-reward is the --previous-reward of the first step: give that too")
         if not abs(self.first_reward) <= MOST_REWARD:
@@ -79,7 +97,7 @@ class MDNRNNConfig:
     @property
     def factors(self) -> dict[str, float]:
         """The weights of the parts of the loss, by name."""
-        return {"latent": self.z_factor, "reward": self.reward_factor, "done": 1.0}
+        return {"latent": self.z_factor, "reward": self.reward_factor, "done": self.done_factor}
 
     @property
     def outputs(self) -> int:
@@ -90,6 +108,21 @@ class MDNRNNConfig:
     def state(self) -> int:
         """The size of a state: hidden, cell, previous reward, window of latents and actions (oldest first)."""
         return 2 * self.hidden + self.previous_reward + self.window * (self.latent + self.actions)
+
+
+def calibrate_end(predicted: Probability, weight: float) -> Probability:
+    """The probabilities of an end of which a done head trained with `done_weight` `weight` predicted `predicted`.
+
+    With that weight the head learns odds that are `weight` times too high. At weight 1 the result is `predicted`.
+
+    >>> calibrate_end(0.75, weight=3.0)
+    0.5
+    """
+    if weight == 1:
+        return predicted
+    others: Any = weight * (1 - predicted)
+    calibrated: Probability = predicted / (predicted + others)
+    return calibrated
 
 
 # Fields that a resumed training may add to a trained model: a done head behind the others, and what it predicts.

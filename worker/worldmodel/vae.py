@@ -12,12 +12,28 @@ from dreamfleet.worker.worldmodel.vae_config import LEAK, ConvolutionLayer, VAEC
 
 
 class VAELoss(NamedTuple):
-    """The loss to minimise, the same with error factor 1, and its parts per picture: squared error, KL in nats."""
+    """The loss to minimise, the same without factors and pixels' weights, and its parts: squared error, KL in nats."""
 
     weighted: Tensor
     plain: Tensor
     error: Tensor
     divergence: Tensor
+
+
+class PixelWeights(NamedTuple):
+    """How often the error of each pixel counts: `1 + factor * |x - mean| / deviation`, `|x - mean|` over its channels.
+
+    `mean` `(3, side, side)` is the mean picture, in [0, 1], and `deviation` the mean of `|x - mean|` over pictures. A
+    weight is 1 where a picture is as its mean, and `1 + factor` on average.
+    """
+
+    mean: Tensor
+    deviation: float
+    factor: float
+
+    def of(self, pictures: Tensor) -> Tensor:
+        """The weights `(N, 1, side, side)` of pictures `(N, 3, side, side)`."""
+        return 1 + self.factor / self.deviation * (pictures - self.mean).abs().mean(dim=1, keepdim=True)
 
 
 class Down(nn.Conv2d):
@@ -79,22 +95,24 @@ class VAE(nn.Module):
         pictures: Tensor = self.decoder(self.dense(latents).reshape(-1, *self._start))
         return pictures
 
-    def loss(self, pictures: Tensor, noise: Tensor) -> VAELoss:
+    def loss(self, pictures: Tensor, noise: Tensor, pixels: PixelWeights | None = None) -> VAELoss:
         """The configured loss and its parts; `noise` `(N, latent)` is standard normal.
 
         With the error factor F, the paper's is F * squared error + max(KL, tolerance), the notebook's
-        F * 1000 * mean square + KL.
+        F * 1000 * mean square + KL. With `pixels` the squares are weighted.
         """
         mu, logvar = self.encode(pictures)
         decoded = self.decode(mu + noise * torch.exp(0.5 * logvar))
-        error = functional.mse_loss(decoded, pictures, reduction="none").sum(dim=(1, 2, 3)).mean()
+        squares = functional.mse_loss(decoded, pictures, reduction="none")
+        error = squares.sum(dim=(1, 2, 3)).mean()
+        weighed = error if pixels is None else (pixels.of(pictures) * squares).sum(dim=(1, 2, 3)).mean()
         divergence = -0.5 * (1 + logvar - mu.square() - logvar.exp()).sum(dim=1)
         if self.config.loss == "notebook":
-            cost, floored = 1000 / (3 * self.config.picture**2) * error, divergence
+            scale, floored = 1000 / (3 * self.config.picture**2), divergence
         else:
-            cost, floored = error, divergence.clamp(min=self.config.kl_tolerance * self.config.latent)
-        weighted = self.config.error_factor * cost + floored.mean()
-        return VAELoss(weighted, cost + floored.mean(), error, divergence.mean())
+            scale, floored = 1.0, divergence.clamp(min=self.config.kl_tolerance * self.config.latent)
+        weighted = self.config.error_factor * (scale * weighed) + floored.mean()
+        return VAELoss(weighted, scale * error + floored.mean(), error, divergence.mean())
 
 
 def _layers_after(config: VAEConfig, channels: int) -> list[nn.Module]:

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.worldmodel.layer_sizes import check_sizes
-from dreamfleet.worker.worldmodel.loss_factors import added_option, check_factors, loss_factor
+from dreamfleet.worker.worldmodel.loss_factors import MOST, added_option, check_factors, loss_factor
 
 LEAK = 0.2  # slope of the leaky activation below zero
 KERNEL, STRIDE = 4, 2
@@ -31,7 +31,7 @@ class ConvolutionLayer(NamedTuple):
 class VAEConfig:
     """The layers and the loss; the defaults are the paper's."""
 
-    picture: int = option(64, "height and width of a picture: 64, or 96 for the whole observation")
+    picture: int = option(64, "height and width of a picture: 64 or 96")
     latent: int = option(32, "latents of a picture")
     channels: tuple[int, ...] = option(
         (32, 64, 128, 256), "outputs of each of the encoder's convolutions; the decoder has as many"
@@ -49,6 +49,9 @@ class VAEConfig:
     dense: int = option(0, "inputs of a decoder that begins at 1x1; 0: as many as the encoder's outputs")
     error_factor: float = loss_factor(
         "weight of the reconstruction error against the divergence; above 1 latents keep more"
+    )
+    pixel_weight: float = added_option(
+        0.0, "how much more the error counts of pixels that deviate from the mean picture, so that small things stay"
     )
     kernels: tuple[int, ...] = added_option((), "kernel of each of the encoder's convolutions, else 4")
     strides: tuple[int, ...] = added_option((), "stride of each, else 2; the decoder's are the same in reverse")
@@ -68,6 +71,8 @@ class VAEConfig:
         if not 0 <= self.dropout < 1 or self.kl_tolerance < 0 or self.dense < 0:
             raise UsageError("--dropout must be from 0 to below 1; a tolerance and a width must not be negative")
         check_factors(self, "error_factor")
+        if not 0 <= self.pixel_weight <= MOST:
+            raise UsageError(f"--pixel-weight must be from 0 to {MOST:g}, not {self.pixel_weight:g}")
         count = len(self.channels)
         wanted = {"kernels": count, "strides": count, "decoder_channels": count - 1, "decoder_kernels": count}
         for name, length in wanted.items():

@@ -38,7 +38,7 @@ def test_help_lists_each_presets_values():
     add_training_flags(training, "vae")
     baseline.configure_train(learning)
     help_text = " ".join(training.format_help().split())
-    assert "(default 1500; notebook 30000; article 60000; attentive 19200; paper 1000000)" in help_text
+    assert "(default 1500; notebook 30000; article 60000; attentive 19200; paper 1000000; takecover 2500)" in help_text
     assert "0: never (default 0; attentive, paper 10)" in help_text
     assert "else such that the picture's size results (notebook 5 5 6 6)" in help_text
     assert "else the encoder's in reverse --" in help_text

@@ -6,7 +6,9 @@ import torch
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.training.data.rollouts import Rollouts, done_labels
-from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.training.prediction_quality import end_quality
+from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, binary_loss
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig, calibrate_end
 
 CONFIG = MDNRNNConfig(latent=1, hidden=4, done=True, lost=3)
 
@@ -58,3 +60,51 @@ def test_where_an_episode_ended_it_ends_too():
 def test_steps_of_a_loss_need_a_done_head(values):
     with pytest.raises(UsageError, match="--lost is a number of steps that a done head predicts"):
         replace(CONFIG, **values)
+
+
+@pytest.mark.parametrize("weight", [1.0, 3.0, 10.0])
+def test_a_weighted_head_learns_odds_that_are_so_much_too_high_until_they_are_calibrated(weight):
+    labels = torch.zeros(1, 1000)
+    labels[0, :50] = 1
+    logit = torch.zeros(1, requires_grad=True)
+    optimiser = torch.optim.LBFGS([logit], max_iter=100)
+
+    def loss():
+        optimiser.zero_grad()
+        value = binary_loss(logit.expand(1, 1000), labels, torch.ones(1, 1000), weight)
+        value.backward()
+        return value
+
+    optimiser.step(loss)
+    learnt = torch.sigmoid(logit).item()
+    assert learnt / (1 - learnt) == pytest.approx(weight * 0.05 / 0.95, rel=1e-3)
+    assert calibrate_end(learnt, weight) == pytest.approx(0.05, rel=1e-3)
+
+
+def test_certain_ends_stay_certain_and_without_a_weight_no_bit_changes():
+    found = np.random.default_rng(0).random(1000, np.float32)
+    assert calibrate_end(found, 1.0) is found
+    assert calibrate_end(np.array([0, 1], np.float32), 7.0).tolist() == [0, 1]
+    assert calibrate_end(found, 7.0).dtype == np.float32
+
+
+def encoded_drives(folder, count, steps):
+    """Drives of which each ends at its last step."""
+    paths = [folder / f"{number:06d}.npz" for number in range(count)]
+    for path in paths:
+        zeros, action = np.zeros((steps, 1), np.float32), np.zeros((steps, 3), np.float32)
+        np.savez(path, mu=zeros, logvar=zeros, action=action, reward=zeros[:, 0], ended=np.array(True))
+    return paths
+
+
+@pytest.mark.parametrize("weight", [1.0, 4.0])
+def test_the_quality_of_ends_is_of_calibrated_probabilities(tmp_path, weight):
+    model = MDNRNN(MDNRNNConfig(latent=1, hidden=4, reward="none", done=True, done_weight=weight))
+    with torch.no_grad():  # it predicts an end with probability 0.2 at every step
+        model.heads.weight.zero_()
+        model.heads.bias.fill_(np.log(weight * 0.2 / 0.8))
+    figures = end_quality(model, encoded_drives(tmp_path, 45, steps=10))
+    assert figures == {
+        "done_brier": pytest.approx(0.1 * 0.8**2 + 0.9 * 0.2**2), "done_calibration": pytest.approx(2),
+    }  # fmt: skip
+    assert end_quality(MDNRNN(replace(model.config, done=False, done_weight=1)), []) == {}

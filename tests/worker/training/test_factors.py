@@ -12,14 +12,14 @@ from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble, make_manifest
-from dreamfleet.worker.training.checkpoint import load_config, load_weights
+from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights
 from dreamfleet.worker.training.data.rollouts import load_rollouts
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.verbs import train as verbs
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
-from dreamfleet.worker.worldmodel.vae import VAE
+from dreamfleet.worker.worldmodel.vae import VAE, PixelWeights
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.coordinator.experiments.iteration.test_commands import commands
 from tests.support.drives import write_drives
@@ -92,6 +92,25 @@ def test_latents_and_rewards_are_weighted_in_the_gradients_and_not_in_reported_l
     torch.testing.assert_close(latents[:-1], 2 * plain[:-1])
 
 
+def gradients(rollouts, **changes):
+    torch.manual_seed(0)
+    model = MDNRNN(replace(RNN, done=True, **changes))
+    reported = train_mdnrnn.backward(model, rollouts, torch.Generator().manual_seed(0))
+    return model.heads.weight.grad, reported
+
+
+def test_ends_are_weighted_as_a_class_and_as_a_part(trained):
+    rollouts = load_rollouts(sorted((trained / "encoded").glob("*.npz")))
+    never, ended = (replace(rollouts, done=value * rollouts.mask) for value in (0, 1))
+    plain, reported = gradients(ended)
+    whole, weighted = gradients(ended, done_factor=3.0)
+    assert weighted == reported
+    torch.testing.assert_close(whole[-1], 3 * plain[-1])  # the done head's row
+    torch.testing.assert_close(gradients(ended, done_weight=3.0)[0], whole)
+    assert torch.equal(gradients(never, done_weight=3.0)[0], gradients(never)[0])
+    assert torch.equal(whole[:-1], plain[:-1])
+
+
 def test_at_one_nothing_is_written_and_files_from_before_factors_open(trained, tmp_path):
     bundle = assemble(trained, tmp_path / "b.zip", "b", with_weights=False)
     assert not any("factor" in name for model in bundle.manifest.models.values() for name in model)
@@ -112,7 +131,7 @@ def test_a_training_goes_on_under_its_own_factors_only(trained):
 def test_a_factor_that_weighs_nothing_or_all_is_refused(value):
     for change in (
         lambda: VAEConfig(error_factor=value), lambda: MDNRNNConfig(z_factor=value),
-        lambda: MDNRNNConfig(reward_factor=value),
+        lambda: MDNRNNConfig(reward_factor=value), lambda: MDNRNNConfig(done=True, done_factor=value),
     ):  # fmt: skip
         with pytest.raises(UsageError, match=r"-factor must be from 1e-06 to 1e\+06, not"):
             change()
@@ -129,3 +148,71 @@ def test_flags_pass_through_an_iteration_to_the_training(trained, tmp_path):
     given = [str(tmp_path) if word == "data/rounds/01" else word for word in words[2:]]
     assert verbs.VAE.run(parser.parse_args([*given, "--updates", "1", "--channels", "2", "2", "4", "4"])) == 0
     assert load_config(tmp_path / train_vae.CHECKPOINT, VAEConfig).error_factor == 4.0
+
+
+def write_encoded(folder, rewards, actions=1):
+    """Encoded drives of four latents with these rewards `(episodes, T)`."""
+    (folder / "encoded").mkdir(parents=True)
+    for number, reward in enumerate(np.asarray(rewards, np.float32)):
+        rows = [np.zeros((len(reward), size), np.float32) for size in (4, 4, actions)]
+        np.savez(folder / "encoded" / f"{number:06d}.npz", **dict(zip(("mu", "logvar", "action"), rows, strict=True)),
+                 reward=reward, ended=np.array(False))  # fmt: skip
+    return folder
+
+
+def test_a_model_has_as_many_actions_as_its_drives(tmp_path):
+    write_encoded(tmp_path, [[1.0, 2.0]] * 2, actions=5)
+    assert train_mdnrnn.fit_layers(RNN, tmp_path).actions == 5
+    assert train_mdnrnn.fit_layers(RNN, tmp_path / "empty") == RNN
+
+
+def test_the_scale_of_rewards_is_measured_once_and_kept_by_what_goes_on_from_it(trained, tmp_path):
+    value, own = replace(RNN, reward="value", reward_scale=0.0), train_mdnrnn.CHECKPOINT
+    data = tmp_path / "data"
+    data.mkdir()
+    linked(trained, data, "vae.safetensors", "encoded")
+    train_mdnrnn.train_mdnrnn(data, SHORT, ignore, value)
+    rewards = [np.load(path)["reward"] for path in sorted((trained / "encoded").glob("*.npz"))[1:]]  # one is held out
+    scale = load_config(data / own, MDNRNNConfig).reward_scale
+    assert scale == pytest.approx(np.std(np.concatenate(rewards)), rel=1e-5)
+    train_mdnrnn.train_mdnrnn(data, replace(SHORT, updates=3), ignore, value)  # it goes on under the same flags
+    other = write_encoded(tmp_path / "other", [[1.0, 2.0], [1.0, 2.0], [3.0, 2.0]], actions=3)
+    assert train_mdnrnn.fit_layers(value, other, data / own).reward_scale == scale
+    assert train_mdnrnn.fit_layers(value, other).reward_scale == pytest.approx(np.std([1, 2, 3, 2]), rel=1e-5)
+    assert train_mdnrnn.fit_layers(replace(value, reward="none"), other).reward_scale == 1
+
+
+def test_rewards_that_are_all_equal_are_not_scaled(tmp_path):
+    write_encoded(tmp_path, [[1.0] * 3] * 3)
+    assert train_mdnrnn.fit_layers(replace(RNN, reward="value", reward_scale=0.0), tmp_path).reward_scale == 1
+
+
+def test_an_error_counts_by_how_far_its_pixel_is_from_the_mean_picture():
+    torch.manual_seed(0)
+    model = VAE(replace(LAYERS, kl_tolerance=0.0))
+    pictures, noise, mean = torch.rand(2, 3, 64, 64), torch.zeros(2, 4), torch.rand(3, 64, 64)
+    found = model.loss(pictures, noise, PixelWeights(mean, deviation=0.25, factor=3.0))
+    plain = model.loss(pictures, noise)
+    squares = (model.decode(model.encode(pictures)[0]) - pictures).square()
+    away = (pictures - mean).abs().mean(dim=1, keepdim=True)
+    torch.testing.assert_close(found.weighted, ((1 + 3 * away / 0.25) * squares).sum() / 2 + found.divergence)
+    assert found[1:] == plain[1:]  # what is reported stays comparable
+    assert torch.equal(plain.weighted, plain.plain)
+
+
+def test_a_training_with_weighted_pixels_resumes_to_the_bit_though_drives_were_added(trained, tmp_path):
+    layers, learnt = replace(LAYERS, pixel_weight=3.0), []
+    for name, first in (("whole", 4), ("stopped", 2)):
+        folder = tmp_path / name
+        folder.mkdir()
+        write_drives(folder, episodes=6, steps=8)
+        train_vae.train_vae(folder, replace(SHORT, updates=first, validate_every=4), ignore, layers)
+        measured = load_progress(folder / train_vae.CHECKPOINT)["pixels"]
+        assert 0 < measured["deviation"] < 1
+        train_vae.train_vae(folder, replace(SHORT, updates=4, validate_every=4), ignore, layers)
+        learnt.append(load_weights(folder / train_vae.CHECKPOINT))
+    assert all(np.array_equal(learnt[0][name], learnt[1][name]) for name in learnt[0])
+    write_drives(tmp_path / "stopped", episodes=9, steps=8)
+    train_vae.train_vae(tmp_path / "stopped", replace(SHORT, updates=5), ignore, layers)
+    assert load_progress(tmp_path / "stopped" / train_vae.CHECKPOINT)["pixels"] == measured
+    assert "pixels" not in load_progress(trained / train_vae.CHECKPOINT)

@@ -149,7 +149,7 @@ def test_the_area_under_the_curve(scores, positive, area):
 
 # SWIG warns as Box2D is imported, and an error there kills the process.
 pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
-SHARES = {"tiny": 0.004, "notebook": 0.0005, "article": 0.0002, "attentive": 0.001, "paper": 0.00002}
+SHARES = {"tiny": 0.004, "notebook": 0.0005, "article": 0.0002, "attentive": 0.001, "paper": 0.00002, "pixels": 0.005}
 FEW = ("--jobs", "1", "--collect-flags", "--steps 24", "--vae-flags", "--batch 4")
 
 
@@ -169,7 +169,7 @@ def made(folder, preset):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name == "tiny" else pytest.mark.slow) for name in PRESETS]
+    "name", [pytest.param(name, marks=() if name == "tiny" else pytest.mark.slow) for name in SHARES]
 )
 def test_a_share_of_a_preset_becomes_a_bundle_of_its_own_layers(name, tmp_path, capsys):
     assert call("--data", tmp_path, "--preset", name, "--scale", SHARES[name], *FEW, "--json") == 0

@@ -72,6 +72,19 @@ def test_the_notebooks_trainings_end_with_their_last_update():
     assert PRESETS["attentive"].collect.steps == 384
 
 
+def test_take_covers_models_predict_no_reward_and_weigh_its_ends_and_small_things():
+    preset = PRESETS["takecover"]
+    assert (preset.task, preset.collect.driver, preset.mdnrnn_layers.outputs) == ("takecover", "held", 961)
+    assert (preset.vae_layers.pixel_weight, preset.mdnrnn_layers.done_weight) == (3, 3)
+    assert preset.collect.steps == 525  # decisions of 4 tics, 2,100 tics
+
+
+def test_other_presets_are_of_the_first_world_but_pixels_which_is_of_any():
+    assert {name: each.task for name, each in PRESETS.items() if each.task != "car-racing"} == {
+        "pixels": "", "takecover": "takecover",
+    }  # fmt: skip
+
+
 def test_every_preset_is_named_for_both_sides():
     assert sorted(PRESETS) == sorted(NAMES["training"])
 

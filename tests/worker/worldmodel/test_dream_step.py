@@ -114,9 +114,12 @@ def test_every_controller_acts_by_its_formula_in_the_dream_and_in_reality(tmp_pa
     np.testing.assert_allclose(np.delete(dreamt.state, column, 1), np.delete(real.state, column, 1), atol=1e-5)
 
 
-@pytest.mark.parametrize(("kind", "labels"), [("positive", [1, 0]), ("notebook", [0, 1]), ("value", [3.2, -0.1])])
-def test_reality_remembers_its_reward_in_the_heads_form(tmp_path, kind, labels):
-    config = MDNRNNConfig(**SMALL, reward=kind, previous_reward=True, window=2)
+@pytest.mark.parametrize(
+    ("kind", "scale", "labels"),
+    [("positive", 1, [1, 0]), ("notebook", 1, [0, 1]), ("value", 1, [3.2, -0.1]), ("value", 4, [0.8, -0.025])],
+)
+def test_reality_remembers_its_reward_in_the_heads_form(tmp_path, kind, scale, labels):
+    config = MDNRNNConfig(**SMALL, reward=kind, reward_scale=scale, previous_reward=True, window=2)
     policy = PolicyStep(write_random_bundle(tmp_path / "b.zip", rnn=config, vae=SMALL_VAE))
     state = policy.zero_state(2)
     policy.write_rewards(state, np.array([3.2, -0.1]))

@@ -129,6 +129,7 @@ def test_the_notebooks_label_is_one_where_nothing_is_gained_and_the_episode_goes
     assert reward_labels("positive", rewards, done).tolist() == [[1, 0, 0]]
     assert reward_labels("notebook", rewards, done).tolist() == [[0, 1, 0]]
     assert reward_labels("value", rewards, done) is rewards
+    assert reward_labels("value", rewards, done, 4.0).tolist() == (rewards / 4).tolist()
 
 
 @pytest.mark.parametrize(
@@ -146,6 +147,13 @@ def test_the_notebooks_label_is_one_where_nothing_is_gained_and_the_episode_goes
         lambda: VAEConfig(dropout=1.0),
         lambda: MDNRNNConfig(hidden=0),
         lambda: MDNRNNConfig(reward="none", previous_reward=True),
+        lambda: MDNRNNConfig(done_weight=3.0),
+        lambda: MDNRNNConfig(done_factor=3.0),
+        lambda: MDNRNNConfig(done=True, done_weight=0.0),
+        lambda: MDNRNNConfig(reward_scale=2.0),
+        lambda: MDNRNNConfig(reward="value", reward_scale=-1.0),
+        lambda: VAEConfig(pixel_weight=-1.0),
+        lambda: VAEConfig(pixel_weight=float("nan")),
     ],
 )
 def test_sizes_that_make_no_model_are_refused(make):
@@ -154,9 +162,9 @@ def test_sizes_that_make_no_model_are_refused(make):
 
 
 def test_a_model_of_the_paper_is_written_as_it_was_before_every_layer_had_a_flag():
-    later = {"error_factor", "kernels", "strides", "decoder_channels", "decoder_kernels"}
+    later = {"error_factor", "kernels", "strides", "decoder_channels", "decoder_kernels", "pixel_weight"}
     assert set(to_dict(vae.PAPER)) == set(asdict(vae.PAPER)) - later
-    assert not {"lost", "first_reward"} & set(to_dict(mdnrnn.REWARDED))
+    assert not {"lost", "first_reward", "done_factor", "done_weight", "reward_scale"} & set(to_dict(mdnrnn.REWARDED))
 
 
 def test_the_first_step_sees_the_label_that_the_notebooks_drives_begin_with(tmp_path):

@@ -85,7 +85,7 @@ def model_inputs(config: MDNRNNConfig, latents: Tensor, rollouts: Rollouts) -> T
     """
     parts = [latents, rollouts.action]
     if config.previous_reward:
-        labels = reward_labels(config.reward, rollouts.reward, rollouts.done)
+        labels = reward_labels(config.reward, rollouts.reward, rollouts.done, config.reward_scale)
         parts.append(functional.pad(labels, (1, 0), value=config.first_reward)[:, :-1, None])
     return torch.cat(parts, dim=-1)
 
@@ -93,7 +93,7 @@ def model_inputs(config: MDNRNNConfig, latents: Tensor, rollouts: Rollouts) -> T
 def teacher_force(model: MDNRNN, rollouts: Rollouts) -> tuple[Tensor, list[Tensor]]:
     """Run the model on recorded inputs: LSTM outputs `(N, T, hidden)`, and the state `(N, state)` before each step."""
     config = model.config
-    labels = reward_labels(config.reward, rollouts.reward, rollouts.done)
+    labels = reward_labels(config.reward, rollouts.reward, rollouts.done, config.reward_scale)
     state = rollouts.mu.new_zeros(len(rollouts.mu), config.state)
     states, hidden = [], []
     for step in range(rollouts.mu.shape[1]):
