@@ -16,8 +16,8 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, DEFAULT_VARIANT, Variant
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
+from dreamfleet.common.artifacts.driving import Driving, Variant, parse_driving
 from dreamfleet.common.artifacts.onnx_checks import (
     UnsafeModelError,
     check_model,
@@ -25,7 +25,8 @@ from dreamfleet.common.artifacts.onnx_checks import (
     is_empty_graph,
     read_float_array,
 )
-from dreamfleet.common.errors import BundleError, ControllerError
+from dreamfleet.common.artifacts.world_facts import WorldFacts
+from dreamfleet.common.errors import BundleError, ControllerError, UsageError
 from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive, write_archive
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import open_regular, read_regular
@@ -40,7 +41,8 @@ RECORDED_STATES = "recorded_states.npy"  # states of recorded drives; only in bu
 # Graphs for controllers of any size; their input holds a controller in each row.
 LINEAR_CONTROLLER, LAYERED_CONTROLLER = "controller-linear.onnx", "controller-hidden.onnx"
 WEIGHTS = "weights.safetensors"  # only in bundles from which training can continue
-REQUIRED = (ENCODER, DECODER, POLICY, INITIAL_LATENTS_PART)
+REQUIRED = (ENCODER, DECODER, POLICY, INITIAL_LATENTS_PART)  # of a bundle that does not describe its world
+REQUIRED_WITH_WORLD = (ENCODER, DECODER, DREAM_GRAPH, INITIAL_LATENTS_PART)
 MAX_BUNDLE = 256 << 20  # bytes, of the file and of its members together; the largest known bundle has 16 MB
 LIMITS = ArchiveLimits(MAX_BUNDLE)
 _MAX_MANIFEST = 1_000_000
@@ -64,10 +66,16 @@ class BundleManifest:
     format: int = FORMAT
     # The configurations of `vae` and `mdnrnn`; empty in older bundles, which have the paper's.
     models: dict[str, Any] = field(default_factory=dict, metadata=OPTIONAL)
+    world: WorldFacts | None = field(default=None, metadata=OPTIONAL)  # `None`: CarRacing, as all bundles once were
+
+    @property
+    def required_parts(self) -> tuple[str, ...]:
+        """Names of the parts without which it is no bundle."""
+        return REQUIRED if self.world is None else REQUIRED_WITH_WORLD
 
 
 class Bundle:
-    """A verified bundle, and the shape and variant of the controllers that drive by it.
+    """A verified bundle, the shape of the controllers that drive by it, and how they drive.
 
     >>> from dreamfleet import find_bundle
     >>> bundle = find_bundle("tiny")
@@ -77,12 +85,12 @@ class Bundle:
 
     def __init__(
         self, path: Path, sha256: str, manifest: BundleManifest, shape: ControllerShape | None = None,
-        variant: Variant = DEFAULT_VARIANT,
+        driving: Driving | None = None,
     ) -> None:  # fmt: skip
         self.path = path
         self.sha256 = sha256
         self.manifest = manifest
-        self.variant = variant  # how its controllers drive
+        self.driving: Driving = driving or self.driving_of("")
         self._shape = shape
 
     @classmethod
@@ -112,7 +120,7 @@ class Bundle:
         try:
             with open_archive(io.BytesIO(data), LIMITS) as archive:
                 manifest = _read_manifest(archive, path)
-                for name in {*REQUIRED, *manifest.parts}:
+                for name in {*manifest.required_parts, *manifest.parts}:
                     _check_part(path, manifest, name, _read_part(archive, path, manifest, name))
         except DamagedArchiveError as error:
             raise BundleError(f"{path} is not a whole bundle ({error}); fetch or build it again") from error
@@ -120,7 +128,7 @@ class Bundle:
 
     @property
     def default_shape(self) -> ControllerShape:
-        """The shape of a linear controller on latent and hidden state, which the policy graph contains."""
+        """The shape of a linear controller on latent and hidden state; a policy graph contains such a one."""
         return self.shape_of("zh")
 
     @property
@@ -128,46 +136,69 @@ class Bundle:
         """The shape of this bundle's controllers: `default_shape` unless `with_controllers` chose another."""
         return self._shape or self.default_shape
 
-    def shape_of(self, features: str, hidden: int = 0, variant: Variant = DEFAULT_VARIANT) -> ControllerShape:
+    @property
+    def variant(self) -> Variant:
+        """The variant of CarRacing by which its controllers drive; `UsageError` for another world's bundle."""
+        if not isinstance(self.driving, Variant):
+            raise UsageError(f"{self.path.name} is of {self.manifest.task}, which has no such variants")
+        return self.driving
+
+    def driving_of(self, options: str) -> Driving:
+        """How controllers drive under a run's options, JSON or empty; `UsageError` for options that do not exist."""
+        return parse_driving(self.manifest.task, self.manifest.world, options)
+
+    def shape_of(self, features: str, hidden: int = 0, driving: Driving | None = None) -> ControllerShape:
         """The shape of controllers on `features`, with `hidden` units between (0: linear).
 
-        `features` is `z` (latent) or `zh` (latent and hidden state). A `variant` may add outputs and features.
+        `features` is `z` (latent) or `zh` (latent and hidden state). `driving` may add outputs and features; `None`
+        has the world's own actions.
         """
+        driving = driving or self.driving_of("")
         width = self.manifest.latent + (self.manifest.hidden if features == "zh" else 0)
-        outputs = self.manifest.actions if variant.is_default else variant.controls.outputs
-        return ControllerShape(width + variant.extra_features, outputs, hidden)
+        is_plain = driving.is_default and self.manifest.world is None
+        outputs = self.manifest.actions if is_plain else driving.controls.outputs
+        return ControllerShape(width + driving.extra_features, outputs, hidden)
 
-    def with_controllers(self, shape: ControllerShape | None, variant: Variant = DEFAULT_VARIANT) -> Bundle:
-        """This bundle for controllers of another shape or variant; `None`: linear ones on all features.
+    def with_options(self, shape: ControllerShape | None, options: str) -> Bundle:
+        """This bundle for controllers of a run with these options, JSON or empty; errors as in `with_controllers`.
 
-        `ControllerError` if they do not fit it; `BundleError` if it is too old for them, or its task has no variants.
+        `UsageError` also for options that the bundle's world does not have.
         """
-        if variant.is_default and shape in (None, self.default_shape):
+        return self.with_controllers(shape, self.driving_of(options))
+
+    def with_controllers(self, shape: ControllerShape | None, driving: Driving | None = None) -> Bundle:
+        """This bundle for controllers of another shape, or that drive otherwise; `None`: linear ones on all features.
+
+        `ControllerError` if they do not fit it; `BundleError` if it is too old for them, or its world has no such
+        options.
+        """
+        try:
+            driving = self.driving_of(driving.options if driving else "")
+        except UsageError as error:
+            raise BundleError(f"{self.path.name} is of {self.manifest.task}: {error}") from error
+        if driving.is_default and shape in (None, self.default_shape):
             return Bundle(self.path, self.sha256, self.manifest)
-        if not variant.is_default and self.manifest.task != CAR_RACING:
-            raise BundleError(
-                f"{self.path.name} is of {self.manifest.task}: {variant.options} are options of {CAR_RACING}"
-            )
-        shape = shape or self.shape_of("zh", variant=variant)
-        if shape not in (self.shape_of(features, shape.hidden, variant) for features in ("z", "zh")):
-            fitting = self.shape_of("zh", variant=variant)
+        shape = shape or self.shape_of("zh", driving=driving)
+        if shape not in (self.shape_of(features, shape.hidden, driving) for features in ("z", "zh")):
+            fitting = self.shape_of("zh", driving=driving)
             raise ControllerError(
                 f"a controller of {shape.size} parameters does not fit {self.path.name}, which needs "
                 f"{fitting.size}, or other inputs: latent {self.manifest.latent}, hidden "
                 f"{self.manifest.hidden}, {fitting.actions} actions"
             )
-        if not {DREAM_GRAPH, LINEAR_CONTROLLER, LAYERED_CONTROLLER} <= self.manifest.parts.keys():
+        needed = {DREAM_GRAPH, LINEAR_CONTROLLER, LAYERED_CONTROLLER} if self.manifest.world is None else {DREAM_GRAPH}
+        if not needed <= self.manifest.parts.keys():
             raise BundleError(
                 f"{self.path.name} is too old for controllers other than linear ones on z and h: build it again"
             )
-        return Bundle(self.path, self.sha256, self.manifest, shape, variant)
+        return Bundle(self.path, self.sha256, self.manifest, shape, driving)
 
     def for_controller(self, controller: Controller) -> Bundle:
-        """This bundle with the shape and variant of one controller; errors as in `with_controllers`.
+        """This bundle for one controller, which drives as its options say; errors as in `with_options`.
 
         `ControllerError` also for a controller that was evolved on another world model.
         """
-        found = self.with_controllers(controller.shape, controller.variant)
+        found = self.with_options(controller.shape, controller.options)
         if self.sha256 != controller.bundle:
             raise ControllerError(
                 f"the controller belongs to {describe_bundle(controller.bundle)}, not to {self.path.name} "
@@ -300,6 +331,8 @@ def _read_manifest(archive: Archive, path: Path) -> BundleManifest:
         manifest = from_plain(BundleManifest, plain)
         if not all(isinstance(each, dict) for each in manifest.models.values()):
             raise MalformedError("models are no configurations")
+        if manifest.world is not None and manifest.world.actions.actions != manifest.actions:
+            raise MalformedError("its world has another number of actions")
     except DamagedArchiveError:
         raise
     except (ValueError, TypeError, KeyError, MalformedError, RecursionError) as error:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import Actions
-from dreamfleet.common.artifacts.car_racing_variants import Variant
+from dreamfleet.common.artifacts.driving import Variant
 from dreamfleet.common.errors import ControllerError
 from dreamfleet.common.files.archives import ArchiveLimits, read_arrays
 from dreamfleet.common.files.atomic_write import atomic_write
@@ -35,7 +35,7 @@ class ControllerShape:
     """
 
     features: int
-    actions: int = 3
+    actions: int
     hidden: int = field(default=0, metadata=OPTIONAL)
 
     @property
@@ -117,7 +117,7 @@ class Controller:
 
     @property
     def variant(self) -> Variant:
-        """The variant in the options, of a controller for a world model; `UsageError` if they name none."""
+        """The variant of CarRacing in the options; `UsageError` if they name none."""
         return Variant.from_json(self.options)
 
     @property

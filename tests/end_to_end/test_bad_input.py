@@ -140,7 +140,7 @@ def test_a_full_stdout_is_one_line(processes, odd, more):
 
 def test_a_controller_of_another_shape(processes, tmp_path):
     path = tmp_path / "small.npz"
-    Controller(ControllerShape(4), np.zeros(15, np.float32), "car-racing", "ab" * 32).save(path)
+    Controller(ControllerShape(4, 3), np.zeros(15, np.float32), "car-racing", "ab" * 32).save(path)
     complains(
         processes, "evaluate", "--controller", path, "--bundle", "tiny", "--episodes", "1",
         says="a controller of 15 parameters does not fit tiny.zip, which needs 867",

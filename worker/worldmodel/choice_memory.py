@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import Continuous
-from dreamfleet.common.artifacts.car_racing_variants import Variant
+from dreamfleet.common.artifacts.driving import Driving
 
 Floats = NDArray[np.float32]
 Layer = tuple[Floats, Floats]
@@ -24,10 +24,10 @@ class ChoiceMemory:
     There are no columns if each step makes a new choice and the controller does not see its choices.
     """
 
-    def __init__(self, variant: Variant) -> None:
-        self._every, self._actions = variant.decide_every, variant.controls
+    def __init__(self, driving: Driving) -> None:
+        self._every, self._actions = driving.decide_every, driving.controls
         self._size = self._actions.actions
-        self.extra_features = variant.extra_features > 0  # whether the controller sees its choices
+        self.extra_features = driving.extra_features > 0  # whether the controller sees its choices
         self.columns = 2 * self._size + 1 if self.extra_features or self._every > 1 else 0
 
     def features(self, state: Floats) -> Floats:

@@ -81,13 +81,14 @@ class PolicyOutput(NamedTuple):
 
 
 class PolicyStep:
-    """Encoder, controller and MDN-RNN: a single graph for default controllers, three graphs for others."""
+    """Encoder, controller and MDN-RNN: a single graph for default controllers where there is one, else three."""
 
     def __init__(self, bundle: Bundle) -> None:
         self.shape = bundle.controller_shape
         self.hidden_size = bundle.manifest.hidden
         self._reward = RewardLabel(bundle)
-        self._one_graph = bundle.variant.without_costs.is_default and self.shape == bundle.default_shape
+        is_plain = bundle.driving.without_costs.is_default and self.shape == bundle.default_shape
+        self._one_graph = is_plain and POLICY in bundle.manifest.parts
         if self._one_graph:
             session = open_part(bundle, POLICY)
             manifest = bundle.manifest
@@ -148,16 +149,14 @@ class Controllers:
     """Controllers of the bundle's shape, one per row, outside the policy's graph; in NumPy for variants."""
 
     def __init__(self, bundle: Bundle) -> None:
-        self.shape, variant = bundle.controller_shape, bundle.variant
-        self.choices = ChoiceMemory(variant)
-        remembered = self.shape.features - variant.extra_features > bundle.manifest.latent
+        self.shape, driving = bundle.controller_shape, bundle.driving
+        self.choices = ChoiceMemory(driving)
+        remembered = self.shape.features - driving.extra_features > bundle.manifest.latent
         self._hidden = bundle.manifest.hidden if remembered else 0
-        self._actions = variant.controls
-        self._run = (
-            open_part(bundle, LAYERED_CONTROLLER if self.shape.hidden else LINEAR_CONTROLLER).run
-            if variant.without_costs.is_default
-            else None
-        )
+        self._actions = driving.controls
+        graph = LAYERED_CONTROLLER if self.shape.hidden else LINEAR_CONTROLLER
+        has_graph = driving.without_costs.is_default and graph in bundle.manifest.parts
+        self._run = open_part(bundle, graph).run if has_graph else None
         self._parameters = np.zeros((0, self.shape.size), dtype=np.float32)
         self._layers: list[Layer] = []
         self._feed: dict[str, Floats] = {}

@@ -5,7 +5,7 @@ from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape, act
 from dreamfleet.common.errors import ControllerError
 
-SHAPE = ControllerShape(features=4)
+SHAPE = ControllerShape(features=4, actions=3)
 
 
 def controller(parameters):
@@ -13,7 +13,7 @@ def controller(parameters):
 
 
 def test_the_papers_controller_has_867_parameters():
-    assert ControllerShape(features=32 + 256).size == 867
+    assert ControllerShape(features=32 + 256, actions=3).size == 867
 
 
 def test_a_file_round_trips(tmp_path):
@@ -44,7 +44,7 @@ def test_weights_are_row_by_row_then_biases():
 
 
 def test_a_hidden_layer():
-    shape = ControllerShape(features=2, hidden=4)
+    shape = ControllerShape(features=2, actions=3, hidden=4)
     assert shape.size == 4 * 3 + 3 * 5
     parameters = np.random.default_rng(0).normal(size=27).astype(np.float32)
     (inner, shift), (outer, bias) = shape.unpack(parameters)

@@ -22,7 +22,7 @@ from dreamfleet.common.runs.run_provenance import (
 from dreamfleet.common.serialization.optional_fields import to_dict
 from tests.support.samples import SPEC
 
-SETTINGS = RunSettings(SPEC, ControllerShape(1), 4, 2, 0.1, "diagonal", 1, 2, 3, confirm_episodes=8)
+SETTINGS = RunSettings(SPEC, ControllerShape(1, 3), 4, 2, 0.1, "diagonal", 1, 2, 3, confirm_episodes=8)
 MEAN = np.array([0.1, -2.0, 1e-300])
 START = StartProvenance.of("run a", base64.b64encode(MEAN.tobytes()).decode(), Effort(driven=5))
 RECEIPTS = RunProvenance(
@@ -31,7 +31,7 @@ RECEIPTS = RunProvenance(
 
 
 def controller(**provenance):
-    shape = ControllerShape(1)
+    shape = ControllerShape(1, 3)
     return Controller(shape, np.zeros(shape.size, np.float32), "car-racing", "ab" * 32, provenance)
 
 

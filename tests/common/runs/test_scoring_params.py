@@ -13,7 +13,7 @@ from tests.support.samples import SPEC
 
 EVERY = 5
 SETTINGS = RunSettings(
-    dataclasses.replace(SPEC, temperature=1.0), ControllerShape(1), 2, 1, 0.1, "diagonal", 1,
+    dataclasses.replace(SPEC, temperature=1.0), ControllerShape(1, 3), 2, 1, 0.1, "diagonal", 1,
     evaluate_every=EVERY, evaluation_episodes=16, heat=1.5,
 )  # fmt: skip
 

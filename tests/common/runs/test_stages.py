@@ -10,7 +10,7 @@ from dreamfleet.common.runs.stages import begun_stages, longest_horizon, stages_
 from tests.support.samples import SPEC
 
 EVERY = 2
-PLAIN = RunSettings(SPEC, ControllerShape(1), 6, 2, 0.1, "diagonal", 1, evaluate_every=EVERY, evaluation_episodes=4)
+PLAIN = RunSettings(SPEC, ControllerShape(1, 3), 6, 2, 0.1, "diagonal", 1, evaluate_every=EVERY, evaluation_episodes=4)
 
 
 def scheduled(*stages):

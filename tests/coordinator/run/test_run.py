@@ -31,7 +31,7 @@ from tests.support.samples import SPEC
 A, B = "a/00000001", "b/00000002"
 DRIVES = 2
 SETTINGS = RunSettings(
-    SPEC, ControllerShape(1), 2, 1, 0.1, "diagonal", 1, evaluate_every=0, evaluation_episodes=1, collect_every=1,
+    SPEC, ControllerShape(1, 3), 2, 1, 0.1, "diagonal", 1, evaluate_every=0, evaluation_episodes=1, collect_every=1,
     collect_episodes=DRIVES,
 )  # fmt: skip
 

@@ -17,7 +17,7 @@ from dreamfleet.coordinator.jobs.work import vector_bytes
 from dreamfleet.coordinator.storage.journal import Journal
 from tests.support.samples import SPEC
 
-SETTINGS = RunSettings(SPEC, ControllerShape(1), 2, 1, 0.1, "diagonal", 1, 5, 2)
+SETTINGS = RunSettings(SPEC, ControllerShape(1, 3), 2, 1, 0.1, "diagonal", 1, 5, 2)
 VECTORS = [vector_bytes(np.full(6, value)) for value in (0.5, 1.5)]
 
 

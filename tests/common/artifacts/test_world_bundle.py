@@ -1,0 +1,120 @@
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.actions import Continuous, one_hot
+from dreamfleet.common.artifacts.bundle import (
+    DREAM_GRAPH,
+    LINEAR_CONTROLLER,
+    MANIFEST,
+    POLICY,
+    Bundle,
+    write_bundle,
+)
+from dreamfleet.common.artifacts.car_racing_variants import Variant
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.artifacts.driving import WorldDriving
+from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts, WorldFacts
+from dreamfleet.common.errors import BundleError, ControllerError, UsageError
+from dreamfleet.worker.worldmodel.inference import PolicyStep
+from tests.support.bundles import write_world_bundle
+
+ABOUT = {
+    "packages": ("numpy", "onnxruntime", "gymnasium"), "horizon": 200, "frames_per_second": 10, "score_word": "game",
+    "reward": RewardFacts("survival"), "end": EndRule("drawn"), "marks": (100.0,),
+}  # fmt: skip
+KINDS = {"one-hot": one_hot(3), "thirds": Continuous.between([-1], [1])}
+SIZES = {"one-hot": 3 * 289, "thirds": 289}
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def kind(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def bundle(kind, tmp_path_factory):
+    facts = WorldFacts.of(KINDS[kind], **ABOUT)
+    return write_world_bundle(tmp_path_factory.mktemp("world") / "world.zip", facts)
+
+
+def parts_of(bundle):
+    return {name: bundle.read(name) for name in bundle.manifest.parts}
+
+
+def test_a_bundle_describes_its_world_and_needs_no_policy_graph(bundle, kind):
+    opened = Bundle.open(bundle.path, bundle.sha256)
+    assert opened.manifest.world == WorldFacts.of(KINDS[kind], **ABOUT)
+    assert not {POLICY, LINEAR_CONTROLLER} & opened.manifest.parts.keys()
+
+
+def test_controllers_have_an_output_for_each_that_the_actions_read(bundle, kind):
+    assert bundle.controller_shape.size == SIZES[kind]
+    assert bundle.shape_of("z", hidden=5).size == 5 * 33 + KINDS[kind].outputs * 6
+    seen = bundle.with_options(None, '{"feedback": "last"}')
+    assert seen.controller_shape.features == 288 + 2 * KINDS[kind].outputs
+    assert seen.driving == WorldDriving(bundle.manifest.world, feedback="last")
+
+
+@pytest.mark.parametrize("options", ["", '{"decide_every": 3}', '{"decide_every": 2, "feedback": "last"}'])
+def test_a_policy_drives_by_encoder_controller_and_dream_graph(bundle, kind, options):
+    policy = PolicyStep(bundle.with_options(None, options))
+    random = np.random.default_rng(5)
+    parameters = random.normal(0, 0.5, (2, policy.shape.size)).astype(np.float32)
+    state = policy.zero_state(2)
+    for _ in range(4):
+        pictures = random.integers(0, 256, (2, 64, 64, 3), dtype=np.uint8)
+        action, state, _ = policy.step(pictures, parameters, state)
+        assert action.shape == (2, KINDS[kind].actions)
+        assert (action >= KINDS[kind].low).all()
+        assert (action <= KINDS[kind].high).all()
+
+
+def test_a_controller_belongs_to_its_bundle_and_no_other(bundle, random_bundle):
+    def controller(options):
+        shape = bundle.with_options(None, options).controller_shape
+        return Controller(shape, np.zeros(shape.size, np.float32), "dream", bundle.sha256, options=options)
+
+    for options in ("", '{"decide_every": 3}'):
+        assert bundle.for_controller(controller(options)).driving.options == options
+    with pytest.raises(UsageError, match="knows no option pedals"):
+        bundle.for_controller(replace(controller(""), options='{"pedals": "one"}'))
+    with pytest.raises(ControllerError, match=r"does not fit world\.zip"):
+        bundle.with_controllers(replace(bundle.controller_shape, features=7))
+
+
+def test_variants_of_the_first_world_are_no_options_of_another(bundle):
+    with pytest.raises(BundleError, match=r"world\.zip is of tests.*DodgeTask knows no option pedals"):
+        bundle.with_controllers(None, Variant(pedals="one"))
+    with pytest.raises(UsageError, match="has no such variants"):
+        bundle.variant  # noqa: B018 - reading it fails
+
+
+def test_what_cannot_be_is_refused(bundle, tmp_path):
+    parts = parts_of(bundle)
+    with pytest.raises(BundleError, match=r"the manifest cannot be read .its world has another number of actions"):
+        write_bundle(tmp_path / "a.zip", replace(bundle.manifest, actions=2), parts)
+    del parts[DREAM_GRAPH]
+    with pytest.raises(BundleError, match=f"no member {DREAM_GRAPH}|not a whole bundle"):
+        write_bundle(tmp_path / "b.zip", bundle.manifest, parts)
+    rewritten = tmp_path / "c.zip"
+    with zipfile.ZipFile(bundle.path) as given, zipfile.ZipFile(rewritten, "w") as archive:
+        for name in given.namelist():
+            data = given.read(name)
+            archive.writestr(name, data.replace(b'"low": [', b'"low": [9.5, ') if name == MANIFEST else data)
+    with pytest.raises(BundleError, match="the manifest cannot be read"):
+        Bundle.open(rewritten)
+
+
+def test_a_bundle_without_a_description_says_nothing_of_it(random_bundle):
+    with zipfile.ZipFile(random_bundle.path) as archive:
+        assert b'"world"' not in archive.read(MANIFEST)
+    assert random_bundle.manifest.world is None
+    assert POLICY in random_bundle.manifest.required_parts
+    with pytest.raises(BundleError, match="not a whole bundle"):
+        write_bundle(
+            random_bundle.path.with_name("less.zip"), random_bundle.manifest,
+            {name: part for name, part in parts_of(random_bundle).items() if name != POLICY},
+        )  # fmt: skip
