@@ -6,7 +6,7 @@ import pytest
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.dream.batch import DreamBatch
-from dreamfleet.worker.dream.environment import CarRacingDream, DreamPolicy
+from dreamfleet.worker.dream.environment import CarRacingDream, Dream, DreamPolicy
 from dreamfleet.worker.scoring import episode
 from dreamfleet.worker.scoring.episode import EpisodeConfig
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
@@ -38,6 +38,18 @@ def test_a_fitness_is_the_same_bits_alone_in_any_batch_and_in_any_order(dreaming
     assert dreaming.score(dreams[::-1])[::-1] == together
     assert [dreaming.score([dream])[0] for dream in dreams[:7]] == together[:7]
     assert dreaming.score(dreams[11:16]) == together[11:16]
+
+
+def test_in_any_world_a_fitness_is_the_same_bits_alone_in_any_batch_and_step_by_step(world_bundle):
+    dreamer = DreamBatch(world_bundle, spec(world_bundle))
+    dreams = [(vector, seed) for vector in candidates(world_bundle, 5) for seed in range(8)]
+    together = dreamer.score(dreams)
+    assert len(set(together)) > 4
+    assert dreamer.score(dreams[::-1])[::-1] == together
+    environment, policy = Dream(world_bundle, temperature=1.3, horizon=HORIZON), DreamPolicy(world_bundle)
+    for (vector, seed), found in zip(dreams, together, strict=True):
+        assert dreamer.score([(vector, seed)]) == [found]
+        assert episode.score(environment, policy, vector, EpisodeConfig(seed, HORIZON)) == found
 
 
 def test_the_environment_dreams_the_same_bits(dreaming, random_bundle):
