@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -12,18 +12,18 @@ from gymnasium import spaces
 from gymnasium.envs.box2d.car_dynamics import Car
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
+from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, Mirror
 from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.errors import BundleError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.worker.car_racing.drivers import DRIVERS, PushedDriver, UniformDriver
 from dreamfleet.worker.car_racing.native_check import make_car_racing
 from dreamfleet.worker.car_racing.preprocessing import PREPROCESSINGS
 from dreamfleet.worker.car_racing.random_network import RandomNetworkPolicy
 from dreamfleet.worker.car_racing.true_state import read_true_state
-from dreamfleet.worker.tasks.api import Assignment, DreamReward, Policy, Preprocessing, Task, World
+from dreamfleet.worker.tasks.api import Assignment, DreamReward, Driver, Policy, Preprocessing, Task, World
 from dreamfleet.worker.tasks.policy import DriverPolicy
-from dreamfleet.worker.worldmodel.inference import PolicyStep
+from dreamfleet.worker.tasks.registry import preprocessing_for
+from dreamfleet.worker.worldmodel.policy import ModelPolicy
 
 ENVIRONMENT = "CarRacing-v3"
 WORLD = World(
@@ -36,8 +36,15 @@ WORLD = World(
     off_course="off_road",  # `OffRoadInfo` says so
     threshold=gymnasium.spec(ENVIRONMENT).reward_threshold,
     finish="lap_finished",  # gymnasium says so as an episode ends; one that runs out of time says nothing
+    score_word="track",
+    marks=(800, 900),
+    mirror=Mirror(order=(0, 1, 2), signs=(-1, 1, 1)),  # steering
+    lost_after=40,
+    opening=50,  # the camera zooms in
+    preset="tiny",
 )
 
+CarRacingPolicy = ModelPolicy  # its former name
 POLICIES: dict[str, Callable[[np.random.Generator], Policy]] = {
     "uniform": lambda random: DriverPolicy(UniformDriver(random)),
     "pushed": lambda random: DriverPolicy(PushedDriver(random)),
@@ -50,9 +57,9 @@ class CarRacingTask(Task):
 
     name = "car-racing"
     world = WORLD
-    drivers = DRIVERS
+    drivers: Mapping[str, Callable[[np.random.Generator], Driver]] = DRIVERS
     policies = POLICIES
-    preprocessings = PREPROCESSINGS
+    preprocessings: Mapping[str, Preprocessing] = PREPROCESSINGS
 
     def world_of(self, assignment: Assignment) -> World:
         """The world with the actions and costs of the run's variant."""
@@ -78,10 +85,10 @@ class CarRacingTask(Task):
             make_reference_environment(self.preprocessing(assignment.world_model), render_mode), assignment
         )
 
-    def make_policy(self, assignment: Assignment) -> CarRacingPolicy:
+    def make_policy(self, assignment: Assignment) -> ModelPolicy:
         """The policy of a bundle: encoder, controller and MDN-RNN; `BundleError` for other pictures."""
         self.preprocessing(assignment.world_model)
-        return CarRacingPolicy(assignment.world_model)
+        return ModelPolicy(assignment.world_model)
 
     def begin_anywhere(self, environment: gymnasium.Env[Any, Any], random: np.random.Generator) -> Any:
         """Move the car to a random tile, a little turned and shifted, and skip the opening zoom."""
@@ -101,15 +108,7 @@ class CarRacingTask(Task):
 
     def preprocessing(self, bundle: Bundle) -> Preprocessing:
         """The preprocessing of the bundle's pictures; `BundleError` if this task has no such pictures."""
-        manifest = bundle.manifest
-        found = PREPROCESSINGS.get(manifest.preprocessing)
-        if manifest.task != self.name or found is None or manifest.picture != found.shape:
-            given = " or ".join(f"{each.name!r} {each.shape}" for each in PREPROCESSINGS.values())
-            raise BundleError(
-                f"bundle {manifest.name} is of task {manifest.task!r} and pictures {manifest.preprocessing!r} "
-                f"{manifest.picture}; {self.name} gives {given}"
-            )
-        return found
+        return preprocessing_for(bundle, self)
 
 
 def make_reference_environment(preprocessing: Preprocessing, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
@@ -144,32 +143,3 @@ class OffRoadInfo(gymnasium.Wrapper[Any, Any, Any, Any]):
 def _with_off_road_info(environment: gymnasium.Env[Any, Any], assignment: Assignment) -> gymnasium.Env[Any, Any]:
     """Wrap the environment in `OffRoadInfo` if candidates pay for steps off the road."""
     return OffRoadInfo(environment) if assignment.world_model.variant.offroad_cost else environment
-
-
-class CarRacingPolicy:
-    """A controller on latent and hidden state. The state advances at every step, also when an action is repeated.
-
-    The MDN-RNN was trained on every frame: if frames were skipped, it would misjudge the car's speed.
-    """
-
-    def __init__(self, bundle: Bundle) -> None:
-        self._step = PolicyStep(bundle)
-        self._parameters = np.zeros((1, self._step.shape.size), dtype=np.float32)
-        self.state = self._step.zero_state(1)
-        self.latent = np.zeros((1, bundle.manifest.latent), dtype=np.float32)
-
-    def begin(self, parameters: NDArray[np.float32]) -> None:
-        """Begin an episode: zero state."""
-        self._step.shape.check(parameters)
-        self._parameters = parameters.astype(np.float32).reshape(1, -1)
-        self.state = self._step.zero_state(1)
-
-    def act(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Steering, gas and brake `(3,)` for one picture."""
-        action, self.state, self.latent = self._step.step(observation[None], self._parameters, self.state)
-        chosen: NDArray[np.float32] = action[0]
-        return chosen
-
-    def reward(self, value: float) -> None:
-        """Record the reward of the last action, which some models see in the next step."""
-        self._step.write_rewards(self.state, np.array([value]))

@@ -19,7 +19,7 @@ from dreamfleet.worker.inspection.encoded_rollout import ZOOM
 from dreamfleet.worker.scoring.actors import Actor
 from dreamfleet.worker.scoring.disturbance import Disturbance, DisturbedPolicy
 from dreamfleet.worker.scoring.episode import EpisodeConfig, ResetHook, run_episode
-from dreamfleet.worker.tasks.api import Assignment, RecordableTask, Task, TaskWithTrueState
+from dreamfleet.worker.tasks.api import Assignment, Task, TaskWithBeginnings, TaskWithTrueState
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.worldmodel.observation import join_features
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
@@ -133,7 +133,7 @@ def record_disturbed_drives(
 
 
 def _random_begin(task: Task) -> Callable[[int], ResetHook]:
-    if not isinstance(task, RecordableTask):
+    if not isinstance(task, TaskWithBeginnings):
         raise UsageError(f"drives of task {task.name} cannot begin at a random place: give a --controller")
     begin = task.begin_anywhere
     return lambda seed: lambda environment, _seen: begin(environment, np.random.default_rng(seed))

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, class_from_fingerprint
@@ -33,7 +32,7 @@ from dreamfleet.worker.tasks.api import (
     World,
 )
 from dreamfleet.worker.tasks.former_names import FORMER_OBSERVER_NAMES, accept_former_names
-from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.tasks.registry import find_scored_task
 
 DRIVER_NAME = "controller"  # the driver's name in collected rollouts
 
@@ -54,8 +53,8 @@ class Scorer:
 
     def __init__(self, spec: TaskSpec, bundle: Bundle | None = None) -> None:
         self._observer: StepObserver | None = None
-        task = find_task(spec.task)
-        fitting = None if bundle is None else bundle.with_controllers(spec.controller, Variant.from_json(spec.options))
+        task = find_scored_task(spec.task, bundle)
+        fitting = None if bundle is None else bundle.with_options(spec.controller, spec.options)
         assignment = Assignment(spec, fitting)
         self.world = find_checked_world(assignment)
         self.spec = spec
@@ -208,7 +207,8 @@ class Scorer:
 
 def find_checked_world(assignment: Assignment) -> World:
     """The world that is scored in; `UsageError` if the task has another version on this host."""
-    spec, world = assignment.spec, find_task(assignment.spec.task).world_of(assignment)
+    spec, task = assignment.spec, find_scored_task(assignment.spec.task, assignment.bundle)
+    world = task.world_of(assignment)
     if world.version != spec.version:
         raise UsageError(
             f"the run scores in version {spec.version} of task {spec.task}, here is version {world.version}: "

@@ -14,10 +14,10 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, Actions, Continuous, Discrete
+from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, Actions, Continuous, Discrete, Mirror, one_hot
 from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts, WorldFacts
 from dreamfleet.common.errors import BundleError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import Description
@@ -26,9 +26,10 @@ from dreamfleet.worker.tasks.policy import Driver, FlatPolicy
 
 __all__ = [
     "STEERING_GAS_BRAKE", "Actions", "Assignment", "Batch", "BatchedTask", "Continuous", "Description", "Discrete",
-    "DreamReward", "Driver", "Episode", "Policy", "PolicyWithOutputs", "Preprocessing", "RecordableTask",
-    "RewardAwarePolicy", "Score", "StepObserver", "StepSnapshot", "Task", "TaskWithPolicies", "TaskWithTrueState",
-    "WatchableBatch", "World",
+    "DreamReward", "Driver", "EndRule", "Episode", "Mirror", "Policy", "PolicyWithOutputs", "Preprocessing",
+    "RecordableTask", "RewardAwarePolicy", "RewardFacts", "Score", "StepObserver", "StepSnapshot", "Task",
+    "TaskWithBeginnings", "TaskWithOptions", "TaskWithPolicies", "TaskWithTrueState", "WatchableBatch", "World",
+    "WorldFacts", "one_hot",
 ]  # fmt: skip
 
 ENVIRONMENT_LIMIT = 10**6  # steps: the environment's own limit ends an episode
@@ -155,8 +156,9 @@ class DreamReward:
 
 @dataclass(frozen=True)
 class World(metaclass=FormerFields):
-    """What the rest of the system must know of a world.
+    """What the rest of the system must know of a world; `UsageError` for a mirror of another number of actions.
 
+    The last six fields are of worlds in which world models are trained; docs/worlds.md lists all that these must give.
     `off_course` and `off_course_cost` may also be given and read by their former names `stray` and `stray_cost`.
 
     >>> from dreamfleet import Continuous, World
@@ -177,9 +179,34 @@ class World(metaclass=FormerFields):
     off_course: str = ""  # key of the environment's `info`: whether this step left the course; empty: there is none
     threshold: float | None = None  # mean score at which gymnasium considers the world solved; `None`: unknown
     finish: str = ""  # key of the environment's `info`: whether the course was driven to its end; empty: there is none
+    score_word: str = "seed"  # what a scored seed is called: "track", "game"
+    marks: tuple[float, ...] = ()  # scores to compare with: reports say what share of the episodes exceeds each
+    mirror: Mirror | None = None  # the action in a left-right mirrored picture; `None`: such pictures show no drive
+    lost_after: int = 0  # steps without a reward that are a loss of the course; 0: a loss is a death
+    opening: int = 0  # first steps of an episode that measurements leave out, while a camera moves
+    preset: str = "pixels"  # training preset of a new data set
 
     stray = property(lambda self: self.off_course)
     stray_cost = property(lambda self: self.off_course_cost)
+
+    def __post_init__(self) -> None:
+        own = self.actions.actions if isinstance(self.actions, Continuous) else 0
+        if self.mirror is not None and len(self.mirror.order) != own:
+            raise UsageError(f"a mirror of {len(self.mirror.order)} columns does not fit {own} actions")
+
+    def facts(self, reward: RewardFacts, end: EndRule, options: str = "") -> WorldFacts:
+        """What a bundle's manifest says of this world, under a task's `options`; `UsageError` for numbered actions.
+
+        >>> World(one_hot(3), frames_per_second=9).facts(RewardFacts("survival"), EndRule()).actions.outputs
+        3
+        """
+        if not isinstance(self.actions, Continuous):
+            raise UsageError("a world model sees actions as vectors: give the world `one_hot` actions, not Discrete")
+        return WorldFacts.of(
+            self.actions, reward=reward, end=end, options=options, packages=self.packages, horizon=self.horizon,
+            frames_per_second=self.frames_per_second, version=self.version, score_word=self.score_word,
+            marks=tuple(map(float, self.marks)), action_names=self.action_names,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -209,12 +236,12 @@ class Assignment:
 
     @property
     def world_model(self) -> Bundle:
-        """The bundle with the run's controller shape and variant; `BundleError` if there is no bundle."""
+        """The bundle for the run's controllers, which drive by its options; `BundleError` if there is no bundle."""
         spec = self.spec
         if self.bundle is None:
             raise BundleError(f"task {spec.task} needs a world model: give one with --bundle")
         own = spec.controller or spec.options
-        return self.bundle.with_controllers(spec.controller, Variant.from_json(spec.options)) if own else self.bundle
+        return self.bundle.with_options(spec.controller, spec.options) if own else self.bundle
 
     @property
     def controller(self) -> ControllerShape:
@@ -372,6 +399,9 @@ class Preprocessing:
 class RecordableTask(Protocol):
     """Optional: a task in whose world rollouts are recorded and world models are trained.
 
+    Its `world` has `Continuous` actions. What `make_recorded` makes takes them as float32 vectors `(actions,)`, and
+    observes uint8 `(size, size, 3)`. It says `terminated` where an episode ends by a death, `truncated` by a limit.
+
     >>> from dreamfleet.worker.tasks.registry import find_task
     >>> task: RecordableTask = find_task("car-racing")
     >>> task.drivers["random-walk"](np.random.default_rng(1)).act().shape
@@ -387,8 +417,48 @@ class RecordableTask(Protocol):
     def make_recorded(self, preprocessing: str) -> gymnasium.Env[Any, Any]:
         """A new environment that observes the pictures of the preprocessing with this name."""
 
+
+@runtime_checkable
+class TaskWithBeginnings(Protocol):
+    """Optional: a recordable task whose drives may also begin at random places in its world.
+
+    >>> from dreamfleet.worker.tasks.registry import find_task
+    >>> task = find_task("car-racing")
+    >>> with task.make_recorded("box-64") as environment:
+    ...     observation, info = environment.reset(seed=1)
+    ...     task.begin_anywhere(environment, np.random.default_rng(1)).shape
+    (64, 64, 3)
+    """
+
     def begin_anywhere(self, environment: gymnasium.Env[Any, Any], random: np.random.Generator) -> Any:
         """Move a reset environment to a random place in its world; return the observation there."""
+
+
+@runtime_checkable
+class TaskWithOptions(Protocol):
+    """Optional: a task that is recorded under options, such as a part of the picture. Data and bundles keep them.
+
+    >>> import json
+    >>> class Sized:
+    ...     def __init__(self, size=64):
+    ...         self.size = size
+    ...     def parse_options(self, arguments):
+    ...         return json.dumps({"size": int(arguments["size"])}) if arguments else ""
+    ...     def with_options(self, options):
+    ...         return Sized(**json.loads(options or "{}"))
+    >>> task: TaskWithOptions = Sized()
+    >>> task.with_options(task.parse_options({"size": "96"})).size
+    96
+    """
+
+    def parse_options(self, arguments: Mapping[str, Any]) -> str:
+        """Canonical JSON of the options that differ from their defaults, empty if none does; `UsageError` else."""
+
+    def with_options(self, options: str) -> Task:
+        """The task under these options, as `parse_options` writes them, or empty; a `RecordableTask`.
+
+        It makes no environment: that would start a simulator. `UsageError` for options that it does not have.
+        """
 
 
 @runtime_checkable

@@ -1,4 +1,4 @@
-"""Finding tasks by name: which ones this worker may look up, and what an incomplete one lacks.
+"""Finding tasks by name or world model: which ones this worker may look up, and what an incomplete one lacks.
 
 Looking up a task's name imports a module and calls what the name refers to. A coordinator's message must not cause
 that, so a worker announces the tasks that it has in its hello, and checks every other name before it looks it up.
@@ -11,9 +11,9 @@ from typing import Any
 
 from dreamfleet.common.artifacts.actions import Continuous, Discrete
 from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.errors import RefusedError, UsageError
+from dreamfleet.common.errors import BundleError, RefusedError, UsageError
 from dreamfleet.common.protocol.tasks import family_of, load_task, registered_tasks
-from dreamfleet.worker.tasks.api import Task, World
+from dreamfleet.worker.tasks.api import Preprocessing, RecordableTask, Task, TaskWithOptions, World
 from dreamfleet.worker.tasks.former_names import accept_former_names
 
 REQUIRED_METHODS = ("make_environment", "make_evaluation_environment", "make_policy", "world_of")
@@ -47,6 +47,61 @@ def find_task(name: str) -> Task:
         raise UsageError(f"task {name!r} is incomplete: {'; '.join(missing)}; docs/tasks.md shows a whole one")
     found: Task = task
     return found
+
+
+def find_world(name: str, options: str = "") -> RecordableTask:
+    """A task by name, under `options` as its `parse_options` writes them; `UsageError` if it cannot be recorded.
+
+    >>> find_world("car-racing").world.score_word
+    'track'
+    """
+    task = _bind(find_task(name), options)
+    if not isinstance(task, RecordableTask):
+        raise UsageError(f"task {name!r} has no drivers and pictures to collect: docs/tasks.md says what it needs")
+    return task
+
+
+def task_of(bundle: Bundle) -> Task:
+    """The task that a bundle was trained on, under the options in its manifest; errors as in `find_world`.
+
+    >>> from dreamfleet import find_bundle
+    >>> task_of(find_bundle("tiny")).name
+    'car-racing'
+    """
+    manifest = bundle.manifest
+    task = find_task(manifest.task)
+    return task if manifest.world is None else _bind(task, manifest.world.options)
+
+
+def find_scored_task(name: str, bundle: Bundle | None) -> Task:
+    """The task of a run's specification: that of its bundle under the bundle's options, or another one by name."""
+    return task_of(bundle) if bundle is not None and bundle.manifest.task == name else find_task(name)
+
+
+def preprocessing_for(bundle: Bundle, task: RecordableTask) -> Preprocessing:
+    """The preprocessing of the bundle's pictures; `BundleError` if they are not of this task.
+
+    >>> from dreamfleet import find_bundle
+    >>> preprocessing_for(find_bundle("tiny"), find_world("car-racing")).name
+    'box-64'
+    """
+    manifest, known = bundle.manifest, task.preprocessings
+    found = known.get(manifest.preprocessing)
+    if manifest.task != task.name or found is None or manifest.picture != found.shape:
+        given = " or ".join(f"{each.name!r} {each.shape}" for each in known.values())
+        raise BundleError(
+            f"bundle {manifest.name} is of task {manifest.task!r} and pictures {manifest.preprocessing!r} "
+            f"{manifest.picture}; {task.name} gives {given}"
+        )
+    return found
+
+
+def _bind(task: Task, options: str) -> Task:
+    if isinstance(task, TaskWithOptions):
+        return task.with_options(options)
+    if options:
+        raise UsageError(f"task {task.name!r} has no options, and these are given: {options:.200}")
+    return task
 
 
 def _find_problems(task: Any) -> Iterator[str]:

@@ -135,7 +135,6 @@ def _open_pictures(args: argparse.Namespace) -> Iterator[Iterator[CaptionedFrame
 def _worker_pictures(args: argparse.Namespace, client: Client) -> Iterator[Iterator[CaptionedFrame | None]]:
     """Pictures of what a worker of the run scores."""
     from dreamfleet.common.artifacts.bundle_store import BundleStore, default_cache
-    from dreamfleet.common.artifacts.car_racing_variants import Variant
     from dreamfleet.common.monitoring.live import LiveView
     from dreamfleet.common.protocol.codec import CountingDecoder
     from dreamfleet.worker.service.bundle_fetch import fetch_bundle
@@ -150,7 +149,7 @@ def _worker_pictures(args: argparse.Namespace, client: Client) -> Iterator[Itera
                 client.session, view.run, spec.bundle, BundleStore(default_cache()), CountingDecoder()
             )
             assert bundle is not None  # it is never stopped
-            fitting = bundle.with_controllers(spec.controller, Variant.from_json(spec.options))
+            fitting = bundle.with_options(spec.controller, spec.options)
             glass = LiveCanvas(view.run, _action_names(spec, fitting), LiveDreamer(fitting, args.temperature))
         print(f"watching run {view.run}; its workers: {view.status.workers.present}", file=sys.stderr)
         yield worker_frames(view, glass, args.fps)

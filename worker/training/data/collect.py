@@ -9,21 +9,20 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import hash_file
-from dreamfleet.common.errors import DatasetError, DreamfleetError
+from dreamfleet.common.errors import DatasetError, DreamfleetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.host.parent_death import exit_with_parent
 from dreamfleet.common.host.process_pool import map_in_processes
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.stop_signals import outlive_stop_signals
-from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
+from dreamfleet.worker.scoring.episode import EpisodeConfig, ResetHook, run_episode
 from dreamfleet.worker.scoring.rollout import Rollout, write_episode
 from dreamfleet.worker.scoring.scorer import DRIVER_NAME
-from dreamfleet.worker.tasks.api import Policy
+from dreamfleet.worker.tasks.api import Policy, RecordableTask, TaskWithBeginnings
 from dreamfleet.worker.tasks.policy import ALL_DRIVERS, DriverPolicy
 from dreamfleet.worker.training.data.collect_config import CollectConfig, source_policies
 from dreamfleet.worker.training.data.data_folder import explain_folder_errors, explain_write_errors
@@ -89,11 +88,9 @@ def drive_episode(config: CollectConfig, number: int, pilots: Sequence[Pilot] = 
     world = find_world()
     name, policy = _driver(config, number, pilots, random)
     preprocessing = preprocessing_of_size(config.picture)
+    begin = _begin_hook(world, config.anywhere, random)
     environment = world.make_recorded(preprocessing.name)
     episode_config = EpisodeConfig(int(random.integers(2**20, 2**31)), config.steps, config.patience)
-
-    def begin(environment: gymnasium.Env[Any, Any], observation: Any) -> Any:
-        return world.begin_anywhere(environment, random) if random.random() < config.anywhere else observation
 
     rollout = Rollout(name, preprocessing.name)
     for moment in run_episode(environment, policy, episode_config, begin):
@@ -101,6 +98,16 @@ def drive_episode(config: CollectConfig, number: int, pilots: Sequence[Pilot] = 
         rollout.ended = moment.ended
     environment.close()
     return rollout.arrays()
+
+
+def _begin_hook(world: RecordableTask, share: float, random: np.random.Generator) -> ResetHook | None:
+    """Begins this share of the drives at a random place; `UsageError` if the world has no such places."""
+    if not isinstance(world, TaskWithBeginnings):
+        if share:
+            raise UsageError(f"drives of task {world.name} begin at no random place: give --anywhere 0")
+        return None
+    begin = world.begin_anywhere
+    return lambda environment, observation: begin(environment, random) if random.random() < share else observation
 
 
 def _driver(

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.archives import ArchiveLimits, Arrays, DamagedArchiveError, open_archive, read_arrays
 from dreamfleet.common.files.regular_files import open_regular
+from dreamfleet.worker.tasks import registry
 from dreamfleet.worker.tasks.api import Preprocessing, RecordableTask
-from dreamfleet.worker.tasks.registry import find_task
 
 WORLD = "car-racing"  # the task of data sets
 POOL_EPISODES = 48  # episodes whose frames are shuffled together
@@ -25,10 +25,7 @@ LIMITS = ArchiveLimits(512 << 20)  # bytes of an episode: 19,000 pictures at 96x
 
 def find_world(name: str = WORLD) -> RecordableTask:
     """Find the task `name`; `UsageError` if it cannot be recorded."""
-    task = find_task(name)
-    if not isinstance(task, RecordableTask):
-        raise UsageError(f"task {name!r} has no drivers and pictures to collect: docs/tasks.md says what it needs")
-    return task
+    return registry.find_world(name)
 
 
 def preprocessing_of_size(size: int, world: str = WORLD) -> Preprocessing:
