@@ -22,6 +22,7 @@ from dreamfleet.worker.worldmodel.observation import Observation, open_bundle
 
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
+DEFAULT_HORIZON = 1000  # steps, as gymnasium's CarRacing has them
 
 
 def action_space(actions: Continuous) -> Any:
@@ -29,6 +30,11 @@ def action_space(actions: Continuous) -> Any:
     if actions.choices:
         return spaces.Discrete(len(actions.choices))
     return spaces.Box(np.array(actions.low, np.float32), np.array(actions.high, np.float32))
+
+
+def horizon_of(bundle: Bundle) -> int:
+    """The steps of a whole episode in the bundle's world."""
+    return DEFAULT_HORIZON if bundle.manifest.world is None else bundle.manifest.world.horizon
 
 
 def to_rows(actions: Continuous, given: Any, count: int) -> Floats:
@@ -57,8 +63,8 @@ class Dream(gymnasium.Env[Floats, Any]):
 
     An action is `(A,)`; where the world has choices, it may be the number of one. With `features="zh"` the MDN-RNN's
     hidden state follows the latent, `(latent + hidden,)`. An episode is a pure function of its seed and actions. It
-    terminates by the bundle's rule, or by `end`, `drawn` or the done head's threshold as a text. It is truncated after
-    `horizon` steps. `recorded` is the share of episodes that start at recorded states.
+    terminates by the bundle's rule, or by `end`: `drawn`, or a threshold as a text. It is truncated after `horizon`
+    steps, by default the world's. `recorded` is the share of episodes that start at recorded states.
 
     >>> dream = Dream("tiny", horizon=50)
     >>> latent, info = dream.reset(seed=1)
@@ -69,13 +75,13 @@ class Dream(gymnasium.Env[Floats, Any]):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - gymnasium's name
 
     def __init__(
-        self, bundle: Bundle | str = "tiny", temperature: float = 1.0, horizon: int = 1000,
+        self, bundle: Bundle | str = "tiny", temperature: float = 1.0, horizon: int | None = None,
         render_mode: str | None = None, recorded: float = 0.0, features: str = "z", end: str = "",
     ) -> None:  # fmt: skip
         self._bundle = open_bundle(bundle)
         self._world = DreamWorld(self._bundle, temperature, recorded=recorded, end=end)
         self.metadata = {**self.metadata, "render_fps": self._world.frames_per_second}
-        self._horizon = horizon
+        self._horizon = horizon or horizon_of(self._bundle)
         self.render_mode = render_mode
         self._decoder = Decoder(self._bundle) if render_mode else None
         self._observation = Observation(self._bundle, features)
@@ -120,13 +126,13 @@ class VectorDream(gymnasium.vector.VectorEnv[Floats, Any, Any]):
     metadata: dict[str, Any] = {"autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012 - gymnasium's name
 
     def __init__(
-        self, num_envs: int, bundle: Bundle | str = "tiny", temperature: float = 1.0, horizon: int = 1000,
+        self, num_envs: int, bundle: Bundle | str = "tiny", temperature: float = 1.0, horizon: int | None = None,
         render_mode: str | None = None, recorded: float = 0.0, features: str = "z", end: str = "",
     ) -> None:  # fmt: skip
         self._bundle = open_bundle(bundle)
         self._world = DreamWorld(self._bundle, temperature, recorded=recorded, end=end)
         self.metadata = {**self.metadata, "render_fps": self._world.frames_per_second}
-        self._horizon = horizon
+        self._horizon = horizon or horizon_of(self._bundle)
         self.num_envs = num_envs
         self.render_mode = render_mode
         self._decoder = Decoder(self._bundle) if render_mode else None

@@ -16,7 +16,7 @@ from dreamfleet.worker.dream.ends import DreamEnds
 from dreamfleet.worker.dream.noise import Draw
 from dreamfleet.worker.dream.start_states import StartStates
 from dreamfleet.worker.tasks.api import Assignment, World
-from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.worldmodel.inference import DreamOutput, DreamStep
 
 Floats = NDArray[np.float32]
@@ -123,7 +123,7 @@ def _reward_of(bundle: Bundle, world: World | WorldFacts, kind: str) -> RewardFa
 
 def world_of(bundle: Bundle) -> World:
     """The world of the task that a bundle was trained on."""
-    return find_task(bundle.manifest.task).world_of(Assignment.of(bundle.manifest.task, bundle))
+    return task_of(bundle).world_of(Assignment.of(bundle.manifest.task, bundle))
 
 
 def check_temperature(temperature: float) -> None:

@@ -123,6 +123,14 @@ def test_a_described_world_dreams_where_its_package_is_missing(tmp_path):
     assert environment.step(1)[1] in (0.0, 4.0)
 
 
+def test_a_dream_is_at_most_as_long_as_an_episode_of_its_world(choices_bundle, random_bundle):
+    for bundle, horizon in ((choices_bundle, 200), (random_bundle, 1000)):
+        environment = Dream(bundle, end="1.0")  # no probability is above it
+        environment.reset(seed=1)
+        truncated = [environment.step(environment.action_space.sample())[2:4] for _ in range(horizon)]
+        assert truncated == [(False, False)] * (horizon - 1) + [(False, True)]
+
+
 def test_another_rule_of_the_end_may_be_given(choices_bundle):
     environment = Dream(choices_bundle, end="0.0")
     environment.reset(seed=1)

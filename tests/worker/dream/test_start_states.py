@@ -136,7 +136,6 @@ def test_in_any_world_dreams_start_at_recorded_states_with_the_same_bits(world_b
     environment, policy = Dream(world_bundle, horizon=HORIZON, recorded=0.5), DreamPolicy(world_bundle)
     found = DreamBatch(world_bundle, spec(world_bundle)).score(dreams)
     assert [dreamt(environment, policy, *dream) for dream in dreams] == found
-    assert DreamBatch(world_bundle, spec(world_bundle, 0.0)).score(dreams) != found
 
 
 @pytest.mark.parametrize(("memory", "reward"), [("rewarded", 0), ("rewarded first", 1)])
