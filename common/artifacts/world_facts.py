@@ -15,6 +15,7 @@ from dreamfleet.common.serialization.optional_fields import OPTIONAL
 from dreamfleet.common.serialization.validation import Between, Length, MalformedError, Word
 
 DRAWN: Final = "drawn"  # the text of the rule that draws its ends
+ODDS_WEIGHTS: Final = (1e-6, 1e6)  # the least and the most
 MAX_OPTIONS = 20_000  # characters of a task's options
 Components = Annotated[tuple[float, ...], Length(1, 1000)]  # one number for each component of an action
 
@@ -40,7 +41,8 @@ class EndRule:
     """When a dream ends: at the first step whose predicted probability of the end is above that step's bar.
 
     `threshold`: the bar is `at` at every step. `drawn`: the bar is random, so that a dream ends as often as predicted.
-    `UsageError` if `at` is not from 0 to 1.
+    A model that was trained with ends `odds_weight` times as heavy predicts odds so many times too high: drawn bars
+    are higher by as much. `UsageError` for numbers out of range.
 
     >>> EndRule.parse("drawn").kind, EndRule.parse("0.25").at, EndRule().text
     ('drawn', 0.25, '0.5')
@@ -48,10 +50,14 @@ class EndRule:
 
     kind: Literal["threshold", "drawn"] = "threshold"
     at: Annotated[float, Between(0, 1)] = 0.5
+    odds_weight: Annotated[float, Between(*ODDS_WEIGHTS)] = field(default=1.0, metadata=OPTIONAL)
 
     def __post_init__(self) -> None:
         if not 0 <= self.at <= 1:
             raise UsageError(f"a dream ends at a probability from 0 to 1, or {DRAWN!r}, not {self.at}")
+        least, most = ODDS_WEIGHTS
+        if not least <= self.odds_weight <= most:
+            raise UsageError(f"the weight of an end's odds is from {least:g} to {most:g}, not {self.odds_weight}")
 
     @classmethod
     def parse(cls, text: str) -> EndRule:
@@ -65,25 +71,29 @@ class EndRule:
 
     @property
     def text(self) -> str:
-        """The rule as a text that `parse` reads."""
+        """The rule as a text that `parse` reads; without `odds_weight`, which is the model's."""
         return DRAWN if self.kind == DRAWN else str(self.at)
 
     def bars(self, uniform: NDArray[np.float64], temperature: float) -> NDArray[np.float32]:
         """The bars `(n,)` of steps with the random numbers `uniform` `(n,)` in [0, 1), at a dream's temperature.
 
         A drawn bar `b` has `p > b` exactly where `sigmoid(logit(p) / temperature) > uniform`. At temperature 1 a dream
-        ends with probability `p`; above 1 likely ends come less often, and unlikely ones more often.
+        ends with probability `p`; above 1 likely ends come less often, and unlikely ones more often. With `odds_weight`
+        the odds of `p` are first divided by it.
 
         >>> EndRule().bars(np.array([0.1, 0.9]), temperature=2.0)
         array([0.5, 0.5], dtype=float32)
         >>> EndRule("drawn").bars(np.array([0.0, 0.2, 0.5]), temperature=2.0).round(3)
         array([0.   , 0.059, 0.5  ], dtype=float32)
+        >>> EndRule("drawn", odds_weight=3.0).bars(np.array([0.2, 0.5]), temperature=1.0).round(3)
+        array([0.429, 0.75 ], dtype=float32)
         """
         if self.kind != DRAWN:
             return np.full(len(uniform), self.at, np.float32)
         drawn = np.asarray(uniform, dtype=np.float64)
         with np.errstate(divide="ignore", over="ignore"):  # at 0, or at a high temperature, the bar is 0
-            return (1 / (1 + ((1 - drawn) / drawn) ** temperature)).astype(np.float32)
+            against = ((1 - drawn) / drawn) ** temperature  # the odds
+            return (1 / (1 + against / self.odds_weight)).astype(np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,20 +1,24 @@
-"""CarRacing as the MDN-RNN predicts it: a task to evolve controllers in, and gymnasium environments.
+"""Worlds as their MDN-RNN predicts them: a task to evolve controllers in, and gymnasium environments.
 
-Importing this registers `dreamfleet/CarRacingDream-v0`, also for `gymnasium.make_vec`.
+Importing this registers `dreamfleet/Dream-v0` for the world of any bundle, also for `gymnasium.make_vec`.
+`dreamfleet/CarRacingDream-v0` is the same by its first name.
 
 >>> import gymnasium, dreamfleet.worker.dream
->>> environment = gymnasium.make("dreamfleet/CarRacingDream-v0")
+>>> environment = gymnasium.make("dreamfleet/Dream-v0", bundle="tiny", temperature=1.2)
+>>> environment.metadata["render_fps"]
+50
 """
 
 from __future__ import annotations
 
 import gymnasium
 
-ENVIRONMENT = "dreamfleet/CarRacingDream-v0"
+ENVIRONMENT, CAR_RACING_ENVIRONMENT = "dreamfleet/Dream-v0", "dreamfleet/CarRacingDream-v0"
 
-gymnasium.register(
-    id=ENVIRONMENT,
-    entry_point="dreamfleet.worker.dream.environment:CarRacingDream",
-    vector_entry_point="dreamfleet.worker.dream.environment:CarRacingDreamVector",
-    kwargs={"bundle": "tiny"},
-)
+for _name in (ENVIRONMENT, CAR_RACING_ENVIRONMENT):
+    gymnasium.register(
+        id=_name,
+        entry_point="dreamfleet.worker.dream.environment:Dream",
+        vector_entry_point="dreamfleet.worker.dream.environment:VectorDream",
+        kwargs={"bundle": "tiny"},
+    )

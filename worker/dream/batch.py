@@ -51,7 +51,7 @@ class DreamBatch:
         if parameters.shape[1] != self._size or not np.isfinite(parameters).all():
             raise UsageError(f"a dream needs controllers of {self._size} finite parameters")
         world, rows = self._world, np.arange(len(episodes))
-        noise = SharedNoise(np.array([seed for _, seed in episodes]), world.chance, world.start_states)
+        noise = SharedNoise(np.array([seed for _, seed in episodes]), world.chance, world.start_states, world.bars)
         fitness, steps = np.zeros(len(rows)), np.zeros(len(rows), dtype=np.int64)
         latent, state, made = noise.first.latent, world.begin(len(rows), noise.first.memory), 0
         for step in range(self._horizon):

@@ -1,6 +1,6 @@
 """The dream as gymnasium environments, single and vectorised. They observe latents; the decoder renders them.
 
-The environment of `car_racing.latent` has the same observations in reality.
+For CarRacing, the environment of `car_racing.latent` has the same observations in reality.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.actions import Actions, Discrete
+from dreamfleet.common.artifacts.actions import Continuous
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.worker.dream.noise import EpisodeNoise, stack_draws
 from dreamfleet.worker.dream.world import DreamWorld
@@ -22,55 +22,86 @@ from dreamfleet.worker.worldmodel.observation import Observation, open_bundle
 
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
-FRAMES_PER_SECOND = 50  # CarRacing's
+DEFAULT_HORIZON = 1000  # steps, as gymnasium's CarRacing has them
 
 
-def action_space(actions: Actions) -> Any:
-    """The gymnasium space of a world's actions."""
-    if isinstance(actions, Discrete):
-        return spaces.Discrete(actions.outputs, start=actions.first)
+def action_space(actions: Continuous) -> Any:
+    """The gymnasium space of a world's actions: a box, or the numbers of its choices."""
+    if actions.choices:
+        return spaces.Discrete(len(actions.choices))
     return spaces.Box(np.array(actions.low, np.float32), np.array(actions.high, np.float32))
 
 
-class CarRacingDream(gymnasium.Env[Floats, Floats]):
-    """One dream. It observes the latent `(latent,)` and takes CarRacing's actions `(3,)`.
+def horizon_of(bundle: Bundle) -> int:
+    """The steps of a whole episode in the bundle's world."""
+    return DEFAULT_HORIZON if bundle.manifest.world is None else bundle.manifest.world.horizon
 
-    With `features="zh"` the MDN-RNN's hidden state follows the latent, `(latent + hidden,)`. An episode is a pure
-    function of its seed and actions. It terminates when the model's done head predicts it, and is truncated after
-    `horizon` steps. `recorded` is the share of episodes that start at recorded states.
+
+def to_rows(actions: Continuous, given: Any, count: int) -> Floats:
+    """The actions `(count, A)` of that many dreams, each given as such a row, or as the number of a choice.
+
+    `ValueError` for anything else.
+
+    >>> from dreamfleet.common.artifacts.actions import one_hot
+    >>> to_rows(one_hot(3), [2, 0], count=2)
+    array([[0., 0., 1.],
+           [1., 0., 0.]], dtype=float32)
+    """
+    found, choices = np.asarray(given), len(actions.choices)
+    if choices and found.size == count and np.issubdtype(found.dtype, np.integer):
+        if not ((found >= 0) & (found < choices)).all():
+            raise ValueError(f"the number of an action must be from 0 to {choices - 1}")
+        found = np.array(actions.choices, np.float32)[found.reshape(-1)]
+    rows = found.astype(np.float32)
+    if rows.size != count * actions.actions or not np.isfinite(rows).all():
+        raise ValueError(f"an action must be {actions.actions} finite numbers")
+    return rows.reshape(count, actions.actions)
+
+
+class Dream(gymnasium.Env[Floats, Any]):
+    """One dream. It observes the latent `(latent,)` and takes the actions of the bundle's world.
+
+    An action is `(A,)`; where the world has choices, it may be the number of one. With `features="zh"` the MDN-RNN's
+    hidden state follows the latent, `(latent + hidden,)`. An episode is a pure function of its seed and actions. It
+    terminates by the bundle's rule, or by `end`: `drawn`, or a threshold as a text. It is truncated after `horizon`
+    steps, by default the world's. `recorded` is the share of episodes that start at recorded states.
+
+    >>> dream = Dream("tiny", horizon=50)
+    >>> latent, info = dream.reset(seed=1)
+    >>> latent.shape, dream.action_space.shape
+    ((32,), (3,))
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012 - gymnasium's name
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - gymnasium's name
 
     def __init__(
-        self, bundle: Bundle | str = "tiny", temperature: float = 1.0, horizon: int = 1000,
-        render_mode: str | None = None, recorded: float = 0.0, features: str = "z",
+        self, bundle: Bundle | str = "tiny", temperature: float = 1.0, horizon: int | None = None,
+        render_mode: str | None = None, recorded: float = 0.0, features: str = "z", end: str = "",
     ) -> None:  # fmt: skip
         self._bundle = open_bundle(bundle)
-        self._world = DreamWorld(self._bundle, temperature, recorded=recorded)
-        self._horizon = horizon
+        self._world = DreamWorld(self._bundle, temperature, recorded=recorded, end=end)
+        self.metadata = {**self.metadata, "render_fps": self._world.frames_per_second}
+        self._horizon = horizon or horizon_of(self._bundle)
         self.render_mode = render_mode
         self._decoder = Decoder(self._bundle) if render_mode else None
         self._observation = Observation(self._bundle, features)
         self.observation_space = self._observation.space
-        self.action_space = action_space(self._world.world.actions)
+        self.action_space = action_space(self._world.actions)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         """Start an episode; without a seed the next random one. `info["memory"]` is the model's memory at the start."""
         super().reset(seed=seed, options=options)
         dream = int(self.np_random.integers(2**31)) if seed is None else seed
-        self._noise = EpisodeNoise(dream, self._world.chance)
+        self._noise = EpisodeNoise(dream, self._world.chance, self._world.bars)
         begun = self._noise.begin(self._world.start_states)
         self._latent = begun.latent[None]
         self._state = self._world.begin(1, begun.memory)
         self._steps = 0
         return self._observe(), {"memory": begun.memory.copy()}
 
-    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        """Dream one step with `action` `(3,)`."""
-        given = np.asarray(action, dtype=np.float32).reshape(1, 3)
-        if not np.isfinite(given).all():
-            raise ValueError("an action must be three finite numbers")
+    def step(self, action: Any) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+        """Dream one step with `action`, `(A,)` or the number of a choice; `ValueError` for another."""
+        given = to_rows(self._world.actions, action, 1)
         moment = self._world.imagine(self._latent, given, self._state, self._noise.next())
         self._latent, self._state = moment.latent, moment.state
         self._steps += 1
@@ -86,27 +117,28 @@ class CarRacingDream(gymnasium.Env[Floats, Floats]):
         return seen
 
 
-class CarRacingDreamVector(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
+class VectorDream(gymnasium.vector.VectorEnv[Floats, Any, Any]):
     """Many dreams in one batch. A finished one restarts at the next step, as in gymnasium's vector environments.
 
     After `reset(seed=s)` dream `i` is the single environment's of seed `s + i`.
     """
 
-    metadata = {"autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012 - gymnasium's name
+    metadata: dict[str, Any] = {"autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012 - gymnasium's name
 
     def __init__(
-        self, num_envs: int, bundle: Bundle | str = "tiny", temperature: float = 1.0, horizon: int = 1000,
-        render_mode: str | None = None, recorded: float = 0.0, features: str = "z",
+        self, num_envs: int, bundle: Bundle | str = "tiny", temperature: float = 1.0, horizon: int | None = None,
+        render_mode: str | None = None, recorded: float = 0.0, features: str = "z", end: str = "",
     ) -> None:  # fmt: skip
         self._bundle = open_bundle(bundle)
-        self._world = DreamWorld(self._bundle, temperature, recorded=recorded)
-        self._horizon = horizon
+        self._world = DreamWorld(self._bundle, temperature, recorded=recorded, end=end)
+        self.metadata = {**self.metadata, "render_fps": self._world.frames_per_second}
+        self._horizon = horizon or horizon_of(self._bundle)
         self.num_envs = num_envs
         self.render_mode = render_mode
         self._decoder = Decoder(self._bundle) if render_mode else None
         self._observation = Observation(self._bundle, features)
         self.single_observation_space = self._observation.space
-        self.single_action_space = action_space(self._world.world.actions)
+        self.single_action_space = action_space(self._world.actions)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
@@ -121,19 +153,17 @@ class CarRacingDreamVector(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
         self._latent = np.zeros((self.num_envs, self._world.chance.latent), dtype=np.float32)
         self._state = self._world.begin(self.num_envs)
         self._memory = self._state[:, : self._world.memory_size].copy()
-        self._noise: list[EpisodeNoise] = [EpisodeNoise(0, self._world.chance)] * self.num_envs
+        self._noise = [EpisodeNoise(0, self._world.chance)] * self.num_envs
         self._steps = np.zeros(self.num_envs, dtype=np.int64)
         self._over = np.zeros(self.num_envs, dtype=bool)
         for index, each in enumerate(seeds):
             self._reset_one(index, each)
         return self._observe(), self._start_info(np.ones(self.num_envs, dtype=bool))
 
-    def step(
-        self, actions: Floats
-    ) -> tuple[Floats, NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Dream one step with `actions` `(num_envs, 3)`."""
+    def step(self, actions: Any) -> tuple[Floats, NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Dream one step with `actions`, `(num_envs, A)` or numbers of choices `(num_envs,)`."""
+        given = to_rows(self._world.actions, actions, self.num_envs)
         draw = stack_draws([noise.next() for noise in self._noise], axis=0).map(np.concatenate)
-        given = np.asarray(actions, dtype=np.float32)
         moment = self._world.imagine(self._latent, given, self._state, draw)
         self._latent, self._state = moment.latent.copy(), moment.state.copy()
         self._steps += 1
@@ -158,10 +188,13 @@ class CarRacingDreamVector(gymnasium.vector.VectorEnv[Floats, Floats, Any]):
 
     def _reset_one(self, index: int, seed: int | None) -> None:
         dream = int(self.np_random.integers(2**31)) if seed is None else seed
-        self._noise[index] = EpisodeNoise(dream, self._world.chance)
+        self._noise[index] = EpisodeNoise(dream, self._world.chance, self._world.bars)
         self._latent[index], self._memory[index] = self._noise[index].begin(self._world.start_states)
         self._state[index] = self._world.begin(1, self._memory[index])
         self._steps[index] = 0
+
+
+CarRacingDream, CarRacingDreamVector = Dream, VectorDream  # by these names CarRacing's dreams are known
 
 
 class DreamPolicy:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, Bundle
+from dreamfleet.worker.dream.ends import DreamEnds
 from dreamfleet.worker.dream.noise import EpisodeNoise
 from dreamfleet.worker.dream.world import check_temperature
 from dreamfleet.worker.worldmodel.inference import DreamStep
@@ -33,7 +34,8 @@ class ParallelDream:
 
     def __init__(self, bundle: Bundle, parameters: Floats, config: ParallelDreamConfig) -> None:
         self._step = DreamStep(bundle)
-        self._noise = EpisodeNoise(config.seed, self._step.chance)
+        self._ends = DreamEnds(bundle, config.temperature)
+        self._noise = EpisodeNoise(config.seed, self._step.chance, self._ends.bars)
         self._parameters = parameters.astype(np.float32).reshape(1, -1)
         self._config = config
         self._over = True
@@ -51,7 +53,8 @@ class ParallelDream:
         dream = self._step.step(
             dreamt, self._parameters, self._state, draw.uniform, draw.normal, self._config.temperature, draw.mask
         )
-        self._latent, self._state, self._over = dream.latent, dream.state, bool(dream.done[0] > 0.5)
+        self._latent, self._state = dream.latent, dream.state
+        self._over = bool(self._ends.are_reached(dream.done, draw)[0])
         return dreamt
 
 
@@ -60,7 +63,7 @@ class DreamContinuation:
 
     def __init__(self, bundle: Bundle, temperature: float) -> None:
         check_temperature(temperature)
-        self._step = DreamStep(bundle)
+        self._step, self._ends = DreamStep(bundle), DreamEnds(bundle, temperature)
         self._temperature = temperature
 
     def fits(self, latent: Floats, state: Floats, parameters: Floats) -> bool:
@@ -73,7 +76,7 @@ class DreamContinuation:
 
         All three arrays are flat; `state` is the model's before the action at `latent`.
         """
-        noise = EpisodeNoise(seed, self._step.chance)
+        noise = EpisodeNoise(seed, self._step.chance, self._ends.bars)
         latent, state, parameters = latent[None], state[None], parameters[None]
         while True:
             draw = noise.next()
@@ -81,7 +84,7 @@ class DreamContinuation:
                 latent, parameters, state, draw.uniform, draw.normal, self._temperature, draw.mask
             )  # fmt: skip
             latent, state = dream.latent, dream.state
-            if dream.done[0] > 0.5:
+            if self._ends.are_reached(dream.done, draw)[0]:
                 return
             yield latent
 

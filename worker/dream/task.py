@@ -8,7 +8,7 @@ import gymnasium
 
 from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.tasks.api import Assignment, Policy, Task, World
-from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.tasks.registry import task_of
 
 BATCH_SIZE = 256  # larger batches are no faster
 
@@ -44,4 +44,4 @@ class DreamTask(Task):
 
     def reality(self, assignment: Assignment) -> Task:
         """The task that the bundle was trained on; `UsageError` if no package registers it."""
-        return find_task(assignment.world_model.manifest.task)
+        return task_of(assignment.world_model)

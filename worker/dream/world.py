@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.artifacts.actions import Continuous
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, Bundle
+from dreamfleet.common.artifacts.world_facts import RewardFacts, WorldFacts
 from dreamfleet.common.errors import BundleError, UsageError
+from dreamfleet.worker.dream.ends import DreamEnds
 from dreamfleet.worker.dream.noise import Draw
 from dreamfleet.worker.dream.start_states import StartStates
-from dreamfleet.worker.tasks.api import Assignment, DreamReward, World
-from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.tasks.api import Assignment, World
+from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.worldmodel.inference import DreamOutput, DreamStep
 
 Floats = NDArray[np.float32]
@@ -33,26 +36,28 @@ class DreamWorld:
     """The frozen MDN-RNN as a world, at one temperature (Ha and Schmidhuber 2018, section 4)."""
 
     def __init__(
-        self, bundle: Bundle, temperature: float, world: World | None = None, recorded: float = 0.0
+        self, bundle: Bundle, temperature: float, world: World | None = None, recorded: float = 0.0, end: str = ""
     ) -> None:  # fmt: skip
-        """`world` is the bundle's; by default it is looked up. `recorded` is the share of `StartStates`.
+        """`recorded` is the share of `StartStates`, `end` a rule in place of the bundle's, as in `EndRule.parse`.
 
-        `BundleError` if the bundle cannot dream, or if the rewards of its dream are unknown.
+        `world` is the bundle's; by default it is looked up where the bundle does not describe it. `BundleError` if the
+        bundle cannot dream, or if the rewards of its dream are unknown.
         """
         check_temperature(temperature)
         if DREAM_GRAPH not in bundle.manifest.parts:
             raise BundleError(f"{bundle.path.name} is from before dreams: build it again with `dreamfleet bundle`")
-        self.world = world or world_of(bundle)
-        self._reward_kind = str(bundle.manifest.models.get("mdnrnn", {}).get("reward", "none"))
-        self._dream_reward = self.world.dream_reward
-        survival = self._dream_reward is not None and self._dream_reward.source == "survival"
-        if self._reward_kind == "none" and not survival:
-            raise BundleError(f"{bundle.path.name} predicts no reward: nothing can be scored in its dream")
-        if self._reward_kind != "value" and self._dream_reward is None:
-            raise BundleError(f"task {bundle.manifest.task} defines no reward for a dreamt step of {bundle.path.name}")
+        model: dict[str, Any] = bundle.manifest.models.get("mdnrnn", {})
+        self._reward_kind = str(model.get("reward", "none"))
+        self._reward_scale = float(model.get("reward_scale", 1.0))  # of a value: what its labels were divided by
+        described = bundle.manifest.world or world or world_of(bundle)
+        if not isinstance(described.actions, Continuous):
+            raise BundleError(f"the actions of {bundle.manifest.task} are numbers: a dream needs vectors (`one_hot`)")
+        self.actions, self.frames_per_second = described.actions, described.frames_per_second
+        self._reward = _reward_of(bundle, described, self._reward_kind)
         self._step = DreamStep(bundle)
+        self._ends = DreamEnds(bundle, temperature, end)
         self._temperature = temperature
-        self.chance = self._step.chance
+        self.chance, self.bars = self._step.chance, self._ends.bars
         self.memory_size = self._step.memory_size
         self.start_states = StartStates.of(bundle, recorded, self._step.zero_state(1)[0, : self.memory_size])
 
@@ -69,36 +74,56 @@ class DreamWorld:
     def step_controllers(self, latent: Floats, parameters: Floats, state: Floats, draw: Draw) -> DreamtStep:
         """One step in which controllers `parameters` `(rows, size)` act on `latent` `(rows, latent)` and `state`."""
         step = self._step.step
-        return self._make_step(step(latent, parameters, state, draw.uniform, draw.normal, self._temperature, draw.mask))
+        dream = step(latent, parameters, state, draw.uniform, draw.normal, self._temperature, draw.mask)
+        return self._make_step(dream, draw)
 
     def imagine(
         self, latent: Floats, action: Floats, state: Floats, draw: Draw, chosen: Floats | None = None
     ) -> DreamtStep:
         """One step under given actions `(rows, actions)`; `chosen` are the controllers' own, if those differ."""
         step = self._step.imagine
-        return self._make_step(
-            step(latent, action, state, draw.uniform, draw.normal, self._temperature, draw.mask, chosen)
+        dream = step(latent, action, state, draw.uniform, draw.normal, self._temperature, draw.mask, chosen)
+        return self._make_step(dream, draw)
+
+    def _make_step(self, dream: DreamOutput, draw: Draw) -> DreamtStep:
+        done = self._ends.are_reached(dream.done, draw)
+        value = self._value(dream.reward.astype(np.float64), done)
+        reward = np.asarray(self._reward.gain * value - self._reward.cost)
+        return DreamtStep(dream.latent, dream.state, reward, done, dream.action)
+
+    def _value(self, predicted: NDArray[np.float64], done: NDArray[np.bool_]) -> NDArray[np.float64]:
+        if self._reward.source == "survival":
+            return (~done).astype(np.float64)
+        if self._reward.source == "value":
+            return predicted * self._reward_scale
+        return 1 - predicted if self._reward_kind == "notebook" else predicted  # its head: steps without a reward
+
+
+def _reward_of(bundle: Bundle, world: World | WorldFacts, kind: str) -> RewardFacts:
+    """The reward of a dreamt step, of a model whose reward head predicts `kind`; `BundleError` if it is unknown."""
+    found = world.reward if isinstance(world, WorldFacts) else None
+    if isinstance(world, World):
+        terms = world.dream_reward
+        if kind == "value":
+            found = RewardFacts()
+        elif terms is not None:
+            found = RewardFacts(terms.source, terms.gain, terms.cost)
+    survives = found is not None and found.source == "survival"
+    if kind == "none" and not survives:
+        raise BundleError(f"{bundle.path.name} predicts no reward: nothing can be scored in its dream")
+    if found is None:
+        raise BundleError(f"task {bundle.manifest.task} defines no reward for a dreamt step of {bundle.path.name}")
+    if not survives and (found.source == "value") != (kind == "value"):
+        raise BundleError(
+            f"the reward in dreams of {bundle.path.name} is a {found.source}, which its reward head {kind!r} does not "
+            "predict: build it again"
         )
-
-    def _make_step(self, dream: DreamOutput) -> DreamtStep:
-        reward = dream.reward.astype(np.float64)
-        if self._dream_reward is not None and self._reward_kind != "value":
-            reward = self._label_reward(reward, self._dream_reward, dream)
-        return DreamtStep(dream.latent, dream.state, reward, dream.done > 0.5, dream.action)
-
-    def _label_reward(
-        self, predicted: NDArray[np.float64], terms: DreamReward, dream: DreamOutput
-    ) -> NDArray[np.float64]:
-        if terms.source == "survival":
-            label = (dream.done <= 0.5).astype(np.float64)
-        else:  # the notebook's head predicts steps without a reward
-            label = predicted if self._reward_kind == "positive" else 1 - predicted
-        return np.asarray(terms.gain * label - terms.cost)
+    return found
 
 
 def world_of(bundle: Bundle) -> World:
     """The world of the task that a bundle was trained on."""
-    return find_task(bundle.manifest.task).world_of(Assignment.of(bundle.manifest.task, bundle))
+    return task_of(bundle).world_of(Assignment.of(bundle.manifest.task, bundle))
 
 
 def check_temperature(temperature: float) -> None:

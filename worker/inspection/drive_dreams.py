@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.actions import Continuous
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.worker.dream.noise import BLOCK_STEPS, EpisodeNoise, stack_draws
@@ -52,7 +51,8 @@ class DriveDreamer:
         """
         drive, rows, features, rewards = segment.drive, len(self._parameters), list[Floats](), list[Doubles]()
         noises = [
-            EpisodeNoise((drive.seed << 20) + segment.step * rows + row, self._world.chance) for row in range(rows)
+            EpisodeNoise((drive.seed << 20) + segment.step * rows + row, self._world.chance, self._world.bars)
+            for row in range(rows)
         ]
         latent, state = (np.repeat(each[segment.step][None], rows, axis=0) for each in (drive.latent, drive.state))
         going = np.ones((rows, 1), dtype=bool)
@@ -72,7 +72,7 @@ class DriveDreamer:
 
         z is the dreamt one, except for the first step's, which is real; h is real.
         """
-        noise = EpisodeNoise(drive.seed, self._world.chance)
+        noise = EpisodeNoise(drive.seed, self._world.chance, self._world.bars)
         pieces = [noise.draw_block() for _ in range(0, len(drive), BLOCK_STEPS)]
         draw = stack_draws(pieces, axis=0).map(lambda part: part.reshape(-1, part.shape[-1])[: len(drive)])
         moment = self._world.imagine(drive.latent, drive.action, drive.state, draw)
@@ -80,6 +80,4 @@ class DriveDreamer:
         return join_features(latent, drive.state, self._hidden), moment.reward
 
     def _pushed(self, chosen: Floats, push: Floats) -> Floats:
-        actions = self._world.world.actions
-        assert isinstance(actions, Continuous)
-        return add_disturbance(actions, chosen, push[None])
+        return add_disturbance(self._world.actions, chosen, push[None])

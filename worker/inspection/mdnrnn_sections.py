@@ -85,7 +85,8 @@ def reward_section(bundle: Bundle, drive: EncodedRollout) -> Section:
 
 
 def _dreamt_rewards(world: DreamWorld, drive: EncodedRollout) -> list[float]:
-    noise, latent, state, rewards = EpisodeNoise(0, world.chance), drive.mu[:1], world.begin(1), []
+    noise, rewards = EpisodeNoise(0, world.chance, world.bars), []
+    latent, state = drive.mu[:1], world.begin(1)
     for action in drive.action:
         moment = world.imagine(latent, action[None], state, noise.next())
         rewards.append(float(moment.reward[0]))

@@ -51,6 +51,7 @@ def test_what_is_as_usual_is_not_written():
         {"horizon": 0},
         {"end": {"kind": "thresholds", "at": 0.5}},
         {"end": {"kind": "threshold", "at": 1.5}},
+        {"end": {"kind": "drawn", "at": 0.5, "odds_weight": 0.0}},
         {"reward": {"source": "score", "gain": 1.0, "cost": 0.0}},
         {"gravity": 9.81},
     ],
@@ -85,6 +86,27 @@ def test_a_drawn_bar_is_where_the_formula_of_the_logits_turns():
     for end in (0.01, 0.3, 0.97):
         squashed = 1 / (1 + np.exp(-np.log(end / (1 - end)) / 1.15))
         assert np.array_equal(end > bars, squashed > uniform)
+
+
+@pytest.mark.parametrize("weight", [3.0, 10.0])
+@pytest.mark.parametrize(("temperature", "share"), [(1.0, 0.2), (2.0, 1 / 3)])
+def test_drawn_ends_of_a_model_with_heavier_ends_come_as_often_as_they_really_do(weight, temperature, share):
+    predicted = np.float32(weight * 0.2 / (weight * 0.2 + 0.8))  # by a model that was trained with that weight
+    bars = EndRule("drawn", odds_weight=weight).bars(np.random.default_rng(7).random(100_000), temperature)
+    assert np.mean(predicted > bars) == pytest.approx(share, abs=0.005)
+
+
+def test_the_weight_of_odds_leaves_thresholds_and_is_written_only_where_it_is_given():
+    assert EndRule(odds_weight=3.0).bars(np.array([0.1]), 1.0) == np.float32(0.5)
+    for rule, extra in ((EndRule("drawn"), set()), (EndRule("drawn", odds_weight=3.0), {"odds_weight"})):
+        assert set(to_dict(rule)) == {"kind", "at", *extra}
+        assert from_plain(EndRule, to_dict(rule)) == rule
+
+
+@pytest.mark.parametrize("weight", [0.0, -1.0, 1e7, float("nan")])
+def test_a_weight_that_is_none_is_refused(weight):
+    with pytest.raises(UsageError, match="the weight of an end's odds is from 1e-06 to 1e"):
+        EndRule("drawn", odds_weight=weight)
 
 
 @pytest.mark.parametrize("temperature", [0.01, 1.0, 100.0])

@@ -3,20 +3,29 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from dreamfleet.common.artifacts.actions import one_hot
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.dream import ENVIRONMENT
-from dreamfleet.worker.dream.environment import CarRacingDream, CarRacingDreamVector
+from dreamfleet.worker.dream import CAR_RACING_ENVIRONMENT, ENVIRONMENT
+from dreamfleet.worker.dream.environment import CarRacingDream, CarRacingDreamVector, Dream, VectorDream, to_rows
 from dreamfleet.worker.worldmodel.inference import DreamStep
+from tests.support.dreams import ACTIONS, WORLDS, write_bundle_of
 
 ACTION = np.array([0.1, 0.5, 0.0], np.float32)
 
 
 @pytest.mark.parametrize("features", ["z", "zh"])
 def test_gymnasium_accepts_it(random_bundle, features):
-    made = gymnasium.make(ENVIRONMENT, bundle=random_bundle, render_mode="rgb_array", features=features)
+    made = gymnasium.make(CAR_RACING_ENVIRONMENT, bundle=random_bundle, render_mode="rgb_array", features=features)
     check_env(made.unwrapped)
     made.reset(seed=1)
     assert made.render().shape == (64, 64, 3)
+
+
+def test_gymnasium_accepts_the_dream_of_any_world(world, world_bundle):
+    made = gymnasium.make(ENVIRONMENT, bundle=world_bundle, render_mode="rgb_array")
+    check_env(made.unwrapped)
+    assert made.metadata["render_fps"] == (10 if WORLDS[world] else 50)
+    assert made.action_space.contains(ACTIONS[world])
 
 
 def test_a_dream_is_a_function_of_seed_and_actions(random_bundle):
@@ -49,7 +58,7 @@ def test_the_hidden_state_behind_the_latent_is_what_a_controller_remembers(rando
 @pytest.mark.parametrize("features", ["z", "zh"])
 def test_vectorised_dreams_equal_single_ones(random_bundle, features):
     many = gymnasium.make_vec(
-        ENVIRONMENT, num_envs=3, bundle=random_bundle, vectorization_mode="vector_entry_point", horizon=4,
+        CAR_RACING_ENVIRONMENT, num_envs=3, bundle=random_bundle, vectorization_mode="vector_entry_point", horizon=4,
         features=features,
     )  # fmt: skip
     assert isinstance(many.unwrapped, CarRacingDreamVector)
@@ -67,6 +76,69 @@ def test_vectorised_dreams_equal_single_ones(random_bundle, features):
     assert not truncated.any()
 
 
+def test_vectorised_dreams_of_any_world_equal_single_ones(world, world_bundle):
+    seeds, horizon = range(10, 16), 6
+    many = VectorDream(len(seeds), world_bundle, horizon=horizon)
+    single = [Dream(world_bundle, horizon=horizon) for _ in seeds]
+    latents, _ = many.reset(seed=seeds[0])
+    assert np.array_equal(latents, [each.reset(seed=seed)[0] for each, seed in zip(single, seeds, strict=True)])
+    going, ends = set(range(len(seeds))), 0
+    for _ in range(horizon):
+        latents, rewards, done, truncated, _ = many.step(np.stack([ACTIONS[world]] * len(seeds)))
+        for index in sorted(going):
+            latent, reward, *over, _ = single[index].step(ACTIONS[world])
+            assert np.array_equal(latents[index], latent)
+            assert (rewards[index], [done[index], truncated[index]]) == (reward, over)
+            ends += over[0]
+            going -= {index} if any(over) else set()
+    assert not going
+    assert bool(ends) == bool(WORLDS[world]), "the worlds with a drawn rule end some of their dreams"
+
+
+def test_a_choice_may_be_its_number_or_its_row(choices_bundle):
+    environment = Dream(choices_bundle)
+
+    def after(action):
+        environment.reset(seed=3)
+        return environment.step(action)[0].tobytes()
+
+    rows = np.eye(3, dtype=np.float32)
+    assert [after(number) for number in range(3)] == [after(row) for row in rows]
+    assert len({after(number) for number in range(3)}) == 3
+    assert np.array_equal(to_rows(one_hot(3), [2, 0], 2), rows[[2, 0]])
+
+
+@pytest.mark.parametrize("action", [3, -1, [0.0, np.nan, 1.0], [1.0, 0.0], 1.0], ids=str)
+def test_what_is_no_choice_is_refused(choices_bundle, action):
+    environment = Dream(choices_bundle)
+    environment.reset(seed=1)
+    with pytest.raises(ValueError, match=r"must be (3 finite numbers|from 0 to 2)"):
+        environment.step(action)
+
+
+def test_a_described_world_dreams_where_its_package_is_missing(tmp_path):
+    bundle = write_bundle_of("choices", tmp_path / "b.zip", task="nowhere:Task")
+    environment = Dream(bundle)
+    environment.reset(seed=1)
+    assert environment.step(1)[1] in (0.0, 4.0)
+
+
+def test_a_dream_is_at_most_as_long_as_an_episode_of_its_world(choices_bundle, random_bundle):
+    for bundle, horizon in ((choices_bundle, 200), (random_bundle, 1000)):
+        environment = Dream(bundle, end="1.0")  # no probability is above it
+        environment.reset(seed=1)
+        truncated = [environment.step(environment.action_space.sample())[2:4] for _ in range(horizon)]
+        assert truncated == [(False, False)] * (horizon - 1) + [(False, True)]
+
+
+def test_another_rule_of_the_end_may_be_given(choices_bundle):
+    environment = Dream(choices_bundle, end="0.0")
+    environment.reset(seed=1)
+    assert environment.step(1)[1:3] == (0.0, True)
+    with pytest.raises(UsageError, match="a dream ends at a probability from 0 to 1, or 'drawn', not 'never'"):
+        Dream(choices_bundle, end="never")
+
+
 @pytest.mark.parametrize("temperature", [0.0, -1.0, float("nan"), float("inf")])
 def test_an_invalid_temperature_is_refused(random_bundle, temperature):
     with pytest.raises(UsageError, match="temperature must be a positive number"):
@@ -76,5 +148,5 @@ def test_an_invalid_temperature_is_refused(random_bundle, temperature):
 def test_an_invalid_action_is_refused(random_bundle):
     environment = CarRacingDream(random_bundle)
     environment.reset(seed=1)
-    with pytest.raises(ValueError, match="three finite numbers"):
+    with pytest.raises(ValueError, match="3 finite numbers"):
         environment.step(np.array([np.nan, 0, 0]))

@@ -43,6 +43,35 @@ def test_rows_of_one_seed_share_their_noise_whichever_rows_still_dream():
     assert np.array_equal(later.normal[1], drawn(7, 2)[4])
 
 
+def bars_of(uniform):
+    return uniform.astype(np.float32)
+
+
+def test_drawn_ends_have_their_own_numbers_so_that_all_others_stay():
+    chance = NoiseSize(3, 4, 0.25)
+    plain, drawing = EpisodeNoise(7, chance), EpisodeNoise(7, chance, bars_of)
+    assert np.array_equal(plain.begin(BEGINNINGS).latent, drawing.begin(BEGINNINGS).latent)
+    bars = []
+    for _ in range(2 * BLOCK_STEPS):
+        without, draw = plain.next(), drawing.next()
+        assert without.bar is None
+        for name in ("uniform", "normal", "mask"):
+            assert np.array_equal(getattr(without, name), getattr(draw, name))
+        bars.append(draw.bar)
+    assert np.shape(bars) == (2 * BLOCK_STEPS, 1, 1)
+    assert len(np.unique(bars)) == 2 * BLOCK_STEPS
+
+
+def test_rows_of_one_seed_share_their_bars_too():
+    shared = SharedNoise(np.array([7, 8, 7]), NoiseSize(3, 4, 0.0), BEGINNINGS, bars_of)
+    alone = EpisodeNoise(7, NoiseSize(3, 4, 0.0), bars_of)
+    for rows in ([0, 1, 2], [1, 2], [2]):
+        found, bar = shared.next(np.array(rows)).bar, alone.next().bar
+        assert found.shape == (len(rows), 1)
+        for row, each in zip(rows, found, strict=True):
+            assert np.array_equal(each, bar[0]) == (row != 1)
+
+
 def test_dropout_keeps_the_mean_and_is_shared_too():
     chance = NoiseSize(3, 1000, 0.25)
     shared, alone = SharedNoise(np.array([7, 8]), chance, BEGINNINGS), EpisodeNoise(8, chance)

@@ -3,12 +3,14 @@ import dataclasses
 import numpy as np
 import pytest
 
+from dreamfleet.common.artifacts.world_facts import EndRule
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.dream.batch import DreamBatch
-from dreamfleet.worker.dream.environment import CarRacingDream, DreamPolicy
+from dreamfleet.worker.dream.environment import CarRacingDream, Dream, DreamPolicy
 from dreamfleet.worker.scoring import episode
 from dreamfleet.worker.scoring.episode import EpisodeConfig
+from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
@@ -38,6 +40,31 @@ def test_a_fitness_is_the_same_bits_alone_in_any_batch_and_in_any_order(dreaming
     assert dreaming.score(dreams[::-1])[::-1] == together
     assert [dreaming.score([dream])[0] for dream in dreams[:7]] == together[:7]
     assert dreaming.score(dreams[11:16]) == together[11:16]
+
+
+def test_in_any_world_a_fitness_is_the_same_bits_alone_in_any_batch_and_step_by_step(world_bundle):
+    dreamer = DreamBatch(world_bundle, spec(world_bundle))
+    dreams = [(vector, seed) for vector in candidates(world_bundle, 5) for seed in range(8)]
+    together = dreamer.score(dreams)
+    assert len(set(together)) > 4
+    assert dreamer.score(dreams[::-1])[::-1] == together
+    environment, policy = Dream(world_bundle, temperature=1.3, horizon=HORIZON), DreamPolicy(world_bundle)
+    for (vector, seed), found in zip(dreams, together, strict=True):
+        assert dreamer.score([(vector, seed)]) == [found]
+        assert episode.score(environment, policy, vector, EpisodeConfig(seed, HORIZON)) == found
+
+
+def test_a_run_dreams_in_a_described_world_and_its_host_class_is_of_the_drawn_ends_too(choices_bundle, monkeypatch):
+    asked = spec(choices_bundle, horizon=100)
+    scorer = Scorer(asked, choices_bundle)
+    assert Scorer(asked, choices_bundle).host_class == scorer.host_class
+    for vector in candidates(choices_bundle, 2):
+        score = scorer.score("score", vector, seed=3)
+        assert [score] == DreamBatch(choices_bundle, asked).score([(vector, 3)])
+        assert 1 < score.steps < 100
+    bars = EndRule.bars
+    monkeypatch.setattr(EndRule, "bars", lambda *given, **named: bars(*given, **named) * np.float32(0.2))
+    assert Scorer(asked, choices_bundle).host_class != scorer.host_class
 
 
 def test_the_environment_dreams_the_same_bits(dreaming, random_bundle):

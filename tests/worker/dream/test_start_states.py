@@ -7,7 +7,7 @@ from dreamfleet.common.artifacts.bundle import RECORDED_STATES, write_bundle
 from dreamfleet.common.errors import BundleError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.dream.batch import DreamBatch
-from dreamfleet.worker.dream.environment import CarRacingDream, CarRacingDreamVector, DreamPolicy
+from dreamfleet.worker.dream.environment import CarRacingDream, CarRacingDreamVector, Dream, DreamPolicy
 from dreamfleet.worker.dream.noise import EpisodeNoise
 from dreamfleet.worker.dream.start_states import StartStates
 from dreamfleet.worker.dream.world import DreamWorld
@@ -129,6 +129,13 @@ def test_the_environment_dreams_the_same_bits_with_any_memory(tmp_path, memory, 
     dreams = dreams_of(bundle, 2, range(6))
     environment, policy = CarRacingDream(bundle, horizon=HORIZON, recorded=0.5), DreamPolicy(bundle)
     assert [dreamt(environment, policy, *dream) for dream in dreams] == DreamBatch(bundle, spec(bundle)).score(dreams)
+
+
+def test_in_any_world_dreams_start_at_recorded_states_with_the_same_bits(world_bundle):
+    dreams = dreams_of(world_bundle, 2, range(8))
+    environment, policy = Dream(world_bundle, horizon=HORIZON, recorded=0.5), DreamPolicy(world_bundle)
+    found = DreamBatch(world_bundle, spec(world_bundle)).score(dreams)
+    assert [dreamt(environment, policy, *dream) for dream in dreams] == found
 
 
 @pytest.mark.parametrize(("memory", "reward"), [("rewarded", 0), ("rewarded first", 1)])
