@@ -178,7 +178,7 @@ def test_a_world_model_is_found_beside_its_controller_or_by_name(controller, ran
 
 
 def test_a_controller_that_does_not_fit_is_refused(random_bundle):
-    small = Controller(type(random_bundle.controller_shape)(4), np.zeros(15, np.float32), "car-racing", "ab" * 32)
+    small = Controller(type(random_bundle.controller_shape)(4, 3), np.zeros(15, np.float32), "car-racing", "ab" * 32)
     with pytest.raises(ControllerError, match="15 parameters"):
         find_bundle_of(small, str(random_bundle.path))
 
