@@ -96,6 +96,7 @@ def drive_episode(
     """Drive an episode of T steps: `picture` (T, side, side, 3) before each `action` (T, A), then `reward` (T,)."""
     random = np.random.default_rng([config.seed, number])
     task = find_world(*world)
+    config.check_for(task)
     name, policy = _driver(task, config, number, pilots, random)
     preprocessing = preprocessing_of_size(config.picture, world)
     begin = _begin_hook(task, config.anywhere, random)
@@ -126,7 +127,6 @@ def _driver(
     if pilots:
         pilot = pilots[number % len(pilots)]
         return DRIVER_NAME, pilot.policy(config.noise, config.spells, int(random.integers(2**63)))
-    config.check_for(task)
     if config.driver in (policies := source_policies(task)):
         policy = policies[config.driver](random)
         policy.begin(np.zeros(0, dtype=np.float32))

@@ -19,7 +19,7 @@ from dreamfleet.worker.scoring.rollout import FIRST_WORLD, OF_FIRST_WORLD, DataW
 from dreamfleet.worker.tasks import registry
 from dreamfleet.worker.tasks.api import Preprocessing, RecordableTask
 
-WORLD = FIRST_WORLD
+WORLD = FIRST_WORLD  # what `baselines` calls it
 BEGUN = "preset.json"  # what a data set was begun with
 BEGUN_BYTES = 10_000
 REMEDY = "choose another --data"
@@ -46,7 +46,8 @@ def preprocessing_of_size(size: int, world: DataWorld = OF_FIRST_WORLD) -> Prepr
     for each in known:
         if each.size == size:
             return each
-    raise UsageError(f"pictures are {' or '.join(str(each.size) for each in known)} pixels wide, not {size}")
+    sizes = " or ".join(str(each.size) for each in known)
+    raise UsageError(f"pictures are {sizes} pixels wide, not {size}: give --picture {sizes}")
 
 
 def load_begun(folder: Path) -> dict[str, Any]:
