@@ -118,8 +118,10 @@ def _import_run(args: argparse.Namespace) -> int:
     from dreamfleet.worker.training.data.collect import import_rollouts
     from dreamfleet.worker.training.data.dataset import existing_episodes
 
-    if args.controller or args.task or world_arguments(args):
-        raise UsageError("--from-run drives nothing: leave --controller and the world's flags out")
+    if args.controller:
+        raise UsageError("--from-run drives nothing: leave --controller out")
+    if args.task or world_arguments(args):
+        raise UsageError("the drives of --from-run say their world: leave --task and its flags out")
     with open_run(args.runs_dir, args.from_run) as stored:
         drives = stored.rollouts()
         if not drives:

@@ -206,7 +206,7 @@ def test_a_data_set_keeps_the_world_that_it_was_begun_in(tmp_path):
     for other in (("--task", "car-racing"), ("--task", "gym:CartPole-v1"), ("--skip", "3")):
         with pytest.raises(UsageError, match=r"holds data of gym:CartPole-v1 with {.*}, and this is .*: a data"):
             call(*words, *other)
-    with pytest.raises(UsageError, match="leave --controller and the world's flags out"):
+    with pytest.raises(UsageError, match="leave --task and its flags out"):
         call(*words, "--from-run", "night", "--task", "car-racing")
 
 
