@@ -72,7 +72,7 @@ def run_episode(
         idle = 0 if reward > 0 else idle + 1
         ended = bool(terminated or truncated)
         over = not ended and 0 < episode_config.patience <= idle
-        yield Transition(seen, action, reward, step, ended, over, info, bool(terminated))
+        yield Transition(seen, action, reward, step, ended, over, info, bool(terminated and not truncated))
         if ended or over:
             return
 
@@ -102,7 +102,7 @@ def score(
         steps = moment.step
         if rollout is not None:
             rollout.add(moment.seen, moment.action, moment.reward)
-            rollout.ended = moment.ended
+            rollout.ended, rollout.terminal = moment.ended, moment.terminal
         if on_transition is not None:
             on_transition(moment)
         on_step(steps)

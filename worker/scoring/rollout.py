@@ -3,19 +3,60 @@
 from __future__ import annotations
 
 import io
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dreamfleet.common.artifacts.bundle import Bundle
+
+FIRST_WORLD = "car-racing"  # the task of files that name none
+
+
+class DataWorld(NamedTuple):
+    """The world of data: a task's name, and the options under which it was recorded.
+
+    >>> world = DataWorld("gym:CartPole-v1", '{"observation": "render"}')
+    >>> DataWorld.parse(world.text) == world, DataWorld.parse("")
+    (True, DataWorld(task='car-racing', options=''))
+    """
+
+    task: str = FIRST_WORLD
+    options: str = ""  # as the task's `parse_options` writes them
+
+    @property
+    def text(self) -> str:
+        """The text that stands in a file, where the data are not of the first world."""
+        return f"{self.task}\n{self.options}"
+
+    @classmethod
+    def of(cls, bundle: Bundle) -> DataWorld:
+        """The world of the data that a bundle was trained on."""
+        facts = bundle.manifest.world
+        return cls(bundle.manifest.task, "" if facts is None else facts.options)
+
+    @classmethod
+    def parse(cls, text: str) -> DataWorld:
+        """The world of a file's text; an empty one is of the first world."""
+        task, _, options = text.partition("\n")
+        return cls(task or FIRST_WORLD, options)
+
+    def __str__(self) -> str:
+        return f"{self.task} with {self.options}" if self.options else self.task
+
+
+OF_FIRST_WORLD = DataWorld()
 
 
 class Rollout:
     """A recording that grows step by step; equal recordings give equal files."""
 
-    def __init__(self, driver: str, preprocessing: str) -> None:
+    def __init__(self, driver: str, preprocessing: str, world: DataWorld = OF_FIRST_WORLD) -> None:
         self.ended = False  # whether the environment ended it
+        self.terminal = False  # whether that was a death, and no limit
         self._driver = driver
         self._preprocessing = preprocessing
+        self._world = world
         self._pictures: list[NDArray[np.uint8]] = []
         self._actions: list[NDArray[np.float32]] = []
         self._rewards: list[float] = []
@@ -24,14 +65,20 @@ class Rollout:
         return len(self._actions)
 
     def add(self, picture: Any, action: Any, reward: float) -> None:
-        """Add a step: the picture before the action, the action, and its reward."""
+        """Add a step: the picture before the action, the action, and its reward.
+
+        So the picture after the last action is never recorded; in some worlds it is black.
+        """
         self._pictures.append(picture)
         self._actions.append(action)
         self._rewards.append(reward)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The T steps as arrays: `picture` (T, side, side, 3), `action` (T, actions), `reward` (T,), and metadata."""
-        return {
+        """The T steps as arrays: `picture` (T, side, side, 3), `action` (T, actions), `reward` (T,), and metadata.
+
+        `terminal` is there only where it differs from `ended`, and `world` only where it is not the first.
+        """
+        arrays: dict[str, NDArray[Any]] = {
             "picture": np.stack(self._pictures),
             "action": np.stack(self._actions),
             "reward": np.array(self._rewards, dtype=np.float32),
@@ -39,6 +86,11 @@ class Rollout:
             "driver": np.array(self._driver),
             "preprocessing": np.array(self._preprocessing),
         }
+        if self.terminal != self.ended:
+            arrays["terminal"] = np.array(self.terminal)
+        if self._world != OF_FIRST_WORLD:
+            arrays["world"] = np.array(self._world.text)
+        return arrays
 
     def to_bytes(self) -> bytes:
         """The recording as a compressed `.npz` file."""

@@ -19,7 +19,7 @@ from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, class_fro
 from dreamfleet.common.protocol.messages import Kind, TaskSpec
 from dreamfleet.worker.scoring.episode import EpisodeConfig, score
 from dreamfleet.worker.scoring.host_class_probe import REPEAT_LIMIT, HostClassProbe
-from dreamfleet.worker.scoring.rollout import Rollout
+from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld, Rollout
 from dreamfleet.worker.scoring.watched_policy import WatchedPolicy
 from dreamfleet.worker.tasks.api import (
     Assignment,
@@ -68,6 +68,7 @@ class Scorer:
         self._environment = task.make_environment(assignment)
         self._policy = task.make_policy(assignment)
         self._preprocessing = "" if bundle is None else bundle.manifest.preprocessing
+        self._data_world = OF_FIRST_WORLD if bundle is None else DataWorld.of(bundle)
 
     @property
     def observer(self) -> StepObserver | None:
@@ -119,7 +120,7 @@ class Scorer:
         spec: TaskSpec | None = None,
     ) -> tuple[Score, Rollout]:  # fmt: skip
         """Score and recording of an episode under the run's horizon and patience; `spec` as in `score`."""
-        rollout = Rollout(DRIVER_NAME, self._preprocessing)
+        rollout = Rollout(DRIVER_NAME, self._preprocessing, self._data_world)
         episode_config = self.episode_config("collect", seed, spec)
         return self._run_episode(0, parameters, episode_config, on_step, rollout), rollout
 

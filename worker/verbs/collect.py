@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import argparse
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.cli.presets import preset_help_text
+from dreamfleet.common.cli.world_flags import add_world_flags, world_arguments
 from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.host.resource_limits import usable_cores
 
 if TYPE_CHECKING:
+    from dreamfleet.worker.scoring.rollout import DataWorld
+    from dreamfleet.worker.training.data.collect_config import CollectConfig
     from dreamfleet.worker.training.data.pilot import Pilot
 
 SUMMARY = "collect training data for a world model: random drives, drives of controllers, or rollouts that a run kept"
@@ -27,6 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
     parser.add_argument("--data", type=Path, required=True, help="folder of the data set")
     parser.add_argument("--preset", help=preset_help_text("training"))
+    add_world_flags(parser)
     add_config_flags(parser, "drives", {name: each.collect for name, each in PRESETS.items()})
     parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one per core)")
     parser.add_argument(
@@ -53,20 +58,21 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.common.host.stop_signals import stop_on_signals
     from dreamfleet.worker.training.config_flags import apply_flags
     from dreamfleet.worker.training.data.collect import collect, missing_numbers
-    from dreamfleet.worker.training.data.data_folder import resolve_preset, store_preset
+    from dreamfleet.worker.training.data.data_folder import resolve_preset, resolve_world, store_preset
     from dreamfleet.worker.training.data.dataset import check_no_foreign_files, existing_episodes
     from dreamfleet.worker.training.presets import find_preset
 
     check_no_foreign_files(args.data)
-    preset = find_preset(resolve_preset(args.data, args.preset))
-    config, pilots = apply_flags(preset.collect, args), _load_pilots(args)
+    world = resolve_world(args.data, args.task, world_arguments(args))
+    preset = find_preset(resolve_preset(args.data, args.preset, world))
+    config, pilots = apply_flags(_fit_pictures(preset.collect, world), args), _load_pilots(args)
     frames = done = 0
     before = len(existing_episodes(args.data))
     total = before + len(missing_numbers(args.data, config))
     with progress_bar("collect", total, "episodes") as bar, stop_on_signals() as stop:
         bar.update(before)
-        store_preset(args.data, preset.name, config.seed)
-        with closing(collect(args.data, config, max(1, args.jobs), pilots)) as counts:
+        store_preset(args.data, preset.name, config.seed, world)
+        with closing(collect(args.data, config, max(1, args.jobs), pilots, world)) as counts:
             for count in counts:
                 frames, done = frames + count, done + 1
                 bar.update(before + done)
@@ -81,6 +87,14 @@ def run(args: argparse.Namespace) -> int:
     text = f"{args.data}: {done} episodes, {frames} frames new; {there} episodes in all"
     print_answer(args, text, data=args.data, new_episodes=done, new_frames=frames, episodes=there)
     return 0
+
+
+def _fit_pictures(config: CollectConfig, world: DataWorld) -> CollectConfig:
+    """The configuration with the pictures of a world that has only one size of them."""
+    from dreamfleet.worker.training.data.dataset import find_world
+
+    sizes = {each.size for each in find_world(*world).preprocessings.values()}
+    return replace(config, picture=sizes.pop()) if len(sizes) == 1 else config
 
 
 def _load_pilots(args: argparse.Namespace) -> tuple[Pilot, ...]:
@@ -106,6 +120,8 @@ def _import_run(args: argparse.Namespace) -> int:
 
     if args.controller:
         raise UsageError("--from-run drives nothing: leave --controller out")
+    if args.task or world_arguments(args):
+        raise UsageError("the drives of --from-run say their world: leave --task and its flags out")
     with open_run(args.runs_dir, args.from_run) as stored:
         drives = stored.rollouts()
         if not drives:

@@ -13,28 +13,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import hash_file
-from dreamfleet.common.errors import DatasetError, DreamfleetError, UsageError
+from dreamfleet.common.errors import DatasetError, DreamfleetError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.host.parent_death import exit_with_parent
 from dreamfleet.common.host.process_pool import map_in_processes
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.stop_signals import outlive_stop_signals
 from dreamfleet.worker.scoring.episode import EpisodeConfig, ResetHook, run_episode
-from dreamfleet.worker.scoring.rollout import Rollout, write_episode
+from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld, Rollout, write_episode
 from dreamfleet.worker.scoring.scorer import DRIVER_NAME
 from dreamfleet.worker.tasks.api import Policy, RecordableTask, TaskWithBeginnings
 from dreamfleet.worker.tasks.policy import ALL_DRIVERS, DriverPolicy
 from dreamfleet.worker.training.data.collect_config import CollectConfig, source_policies
 from dreamfleet.worker.training.data.data_folder import explain_folder_errors, explain_write_errors
 from dreamfleet.worker.training.data.dataset import (
+    REMEDY,
     check_pictures,
     episode_path,
     existing_episodes,
+    find_own_world,
     find_world,
+    kind_of,
     load_arrays,
     load_pictures,
     load_steps,
-    preprocessing_of,
     preprocessing_of_size,
 )
 from dreamfleet.worker.training.data.pilot import Pilot
@@ -45,22 +47,27 @@ def missing_numbers(folder: Path, config: CollectConfig) -> list[int]:
     return [number for number in range(config.episodes) if not episode_path(folder, number).exists()]
 
 
-def collect(folder: Path, config: CollectConfig, jobs: int, pilots: Sequence[Pilot] = ()) -> Generator[int, None, None]:
+def collect(
+    folder: Path, config: CollectConfig, jobs: int, pilots: Sequence[Pilot] = (),
+    world: DataWorld = OF_FIRST_WORLD,
+) -> Generator[int, None, None]:  # fmt: skip
     """Drive the missing episodes in `jobs` processes; yield the frames of each once it is written.
 
-    Random drivers drive, or `pilots` in turn. Before any drive it raises `DatasetError` if existing episodes have other
-    pictures, and `ControllerError` if a pilot does. When closed early, it waits until running drives are written.
+    Random drivers drive, or `pilots` in turn. Before any drive it raises `DatasetError` if existing episodes are of
+    another world or have other pictures, `ControllerError` if a pilot does, and `UsageError` if the world lacks what
+    `config` asks for. When closed early, it waits until running drives are written.
     """
-    check_pictures(existing_episodes(folder), config.picture)
+    config.check_for(find_world(*world))
+    check_pictures(existing_episodes(folder), config.picture, world)
     for pilot in pilots:
-        pilot.check(preprocessing_of_size(config.picture).name)
+        pilot.check(preprocessing_of_size(config.picture, world).name, world)
     numbers = missing_numbers(folder, config)
     with explain_folder_errors(folder):
         (folder / "episodes").mkdir(parents=True, exist_ok=True)
     if not numbers:
         return
     pin_thread_pools()
-    tasks = [(folder, config, number, tuple(pilots)) for number in numbers]
+    tasks = [(folder, config, number, tuple(pilots), world) for number in numbers]
     try:
         yield from map_in_processes(jobs, _start_process, (os.getpid(),), _collect_one, tasks)
     except BrokenProcessPool as error:
@@ -73,69 +80,68 @@ def _start_process(parent: int) -> None:
     os.environ["SDL_VIDEODRIVER"] = "dummy"
 
 
-def _collect_one(task: tuple[Path, CollectConfig, int, tuple[Pilot, ...]]) -> int:
-    folder, config, number, pilots = task
-    arrays = drive_episode(config, number, pilots)
+def _collect_one(task: tuple[Path, CollectConfig, int, tuple[Pilot, ...], DataWorld]) -> int:
+    folder, config, number, pilots, world = task
+    arrays = drive_episode(config, number, pilots, world)
     path = episode_path(folder, number)
     with explain_write_errors(path), atomic_write(path) as file:
         write_episode(file, arrays)
     return len(arrays["action"])
 
 
-def drive_episode(config: CollectConfig, number: int, pilots: Sequence[Pilot] = ()) -> dict[str, NDArray[Any]]:
-    """Drive an episode of T steps: `picture` (T, side, side, 3) before each `action` (T, 3), then `reward` (T,)."""
+def drive_episode(
+    config: CollectConfig, number: int, pilots: Sequence[Pilot] = (),
+    world: DataWorld = OF_FIRST_WORLD,
+) -> dict[str, NDArray[Any]]:  # fmt: skip
+    """Drive an episode of T steps: `picture` (T, side, side, 3) before each `action` (T, A), then `reward` (T,)."""
     random = np.random.default_rng([config.seed, number])
-    world = find_world()
-    name, policy = _driver(config, number, pilots, random)
-    preprocessing = preprocessing_of_size(config.picture)
-    begin = _begin_hook(world, config.anywhere, random)
-    environment = world.make_recorded(preprocessing.name)
-    episode_config = EpisodeConfig(int(random.integers(2**20, 2**31)), config.steps, config.patience)
-
-    rollout = Rollout(name, preprocessing.name)
-    for moment in run_episode(environment, policy, episode_config, begin):
-        rollout.add(moment.seen, moment.action, moment.reward)
-        rollout.ended = moment.ended
-    environment.close()
+    task = find_world(*world)
+    config.check_for(task)
+    name, policy = _driver(task, config, number, pilots, random)
+    preprocessing = preprocessing_of_size(config.picture, world)
+    begin = _begin_hook(task, config.anywhere, random)
+    environment = task.make_recorded(preprocessing.name)
+    try:
+        episode_config = EpisodeConfig(int(random.integers(2**20, 2**31)), config.steps, config.patience)
+        rollout = Rollout(name, preprocessing.name, world)
+        for moment in run_episode(environment, policy, episode_config, begin):
+            rollout.add(moment.seen, moment.action, moment.reward)
+            rollout.ended, rollout.terminal = moment.ended, moment.terminal
+    finally:
+        environment.close()  # a game of its own process would go on
     return rollout.arrays()
 
 
-def _begin_hook(world: RecordableTask, share: float, random: np.random.Generator) -> ResetHook | None:
-    """Begins this share of the drives at a random place; `UsageError` if the world has no such places."""
-    if not isinstance(world, TaskWithBeginnings):
-        if share:
-            raise UsageError(f"drives of task {world.name} begin at no random place: give --anywhere 0")
+def _begin_hook(task: RecordableTask, share: float, random: np.random.Generator) -> ResetHook | None:
+    """Begins this share of the drives at a random place; without such places there is nothing to draw."""
+    if not isinstance(task, TaskWithBeginnings):
         return None
-    begin = world.begin_anywhere
+    begin = task.begin_anywhere
     return lambda environment, observation: begin(environment, random) if random.random() < share else observation
 
 
 def _driver(
-    config: CollectConfig, number: int, pilots: Sequence[Pilot], random: np.random.Generator
+    task: RecordableTask, config: CollectConfig, number: int, pilots: Sequence[Pilot], random: np.random.Generator
 ) -> tuple[str, Policy]:
     """The driver of this episode: its name, and its policy with the episode begun."""
     if pilots:
         pilot = pilots[number % len(pilots)]
         return DRIVER_NAME, pilot.policy(config.noise, config.spells, int(random.integers(2**63)))
-    if config.driver in (policies := source_policies()):
+    if config.driver in (policies := source_policies(task)):
         policy = policies[config.driver](random)
         policy.begin(np.zeros(0, dtype=np.float32))
         return config.driver, policy
-    drivers = find_world().drivers
-    name = list(drivers)[number % len(drivers)] if config.driver == ALL_DRIVERS else config.driver
-    return name, DriverPolicy(drivers[name](random))
+    name = list(task.drivers)[number % len(task.drivers)] if config.driver == ALL_DRIVERS else config.driver
+    return name, DriverPolicy(task.drivers[name](random))
 
 
 def import_rollouts(folder: Path, rollouts: Sequence[Path]) -> Iterator[int]:
     """Copy the rollouts that the data set lacks, compared by their bytes, under the next numbers; yield their frames.
 
-    `DatasetError` before any copy if the pictures, the data set's included, have different preprocessings.
+    `DatasetError` before any copy if the drives, the data set's included, have different worlds or preprocessings.
     """
     there = existing_episodes(folder)
-    kinds = {preprocessing_of(path): path for path in (*there, *rollouts)}
-    if len(kinds) > 1:
-        found = " and ".join(f"{kind!r} ({path})" for kind, path in kinds.items())
-        raise DatasetError(f"a data set's pictures are of one kind, and these are {found}; choose another --data")
+    _check_one_kind(folder, [*there, *rollouts])
     sizes = {path.stat().st_size for path in rollouts if path.exists()}
     known = {hash_file(path) for path in there if path.stat().st_size in sizes}
     number = int(there[-1].stem) + 1 if there else 0
@@ -152,6 +158,20 @@ def import_rollouts(folder: Path, rollouts: Sequence[Path]) -> Iterator[int]:
             shutil.copyfileobj(source, target)
         number += 1
         yield frames
+
+
+def _check_one_kind(folder: Path, drives: Sequence[Path]) -> None:
+    """`DatasetError` names two drives, or the folder and a drive, that are of two worlds or have other pictures."""
+    kinds = {path: kind_of(path) for path in drives}
+    own = find_own_world(folder)
+    worlds = ({own: folder} if own else {}) | {world: path for path, (world, _) in kinds.items()}
+    if len(worlds) > 1:
+        found = " and ".join(f"of {world} ({path})" for world, path in worlds.items())
+        raise DatasetError(f"a data set has one world, and these are {found}; {REMEDY}")
+    pictures = {name: path for path, (_, name) in kinds.items()}
+    if len(pictures) > 1:
+        found = " and ".join(f"{name!r} ({path})" for name, path in pictures.items())
+        raise DatasetError(f"a data set's pictures are of one kind, and these are {found}; {REMEDY}")
 
 
 def _check_drive(path: Path) -> int:

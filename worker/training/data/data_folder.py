@@ -1,53 +1,58 @@
-"""The folder of a data set: the preset and seed it was begun with, and errors of writing there."""
+"""The folder of a data set: the preset, seed and world it was begun with, and errors of writing there."""
 
 from __future__ import annotations
 
 import errno
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import Any
 
 from dreamfleet.common.cli.presets import check_preset
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write, reporting_unwritable_folder
-from dreamfleet.common.files.regular_files import read_text
+from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld
+from dreamfleet.worker.tasks.api import TaskWithOptions
+from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.training.data.dataset import (
+    BEGUN,
+    REMEDY,
+    existing_episodes,
+    find_own_world,
+    find_world,
+    load_begun,
+    world_of_folder,
+)
+from dreamfleet.worker.training.presets import find_preset
 
-NAME = "preset.json"
-DEFAULT = "tiny"
-MOST_BYTES = 1000
 
-
-def store_preset(folder: Path, preset: str, seed: int) -> None:
-    """Store the preset and the seed of a new data set; do nothing for one that has rollouts already.
+def store_preset(folder: Path, preset: str, seed: int, world: DataWorld = OF_FIRST_WORLD) -> None:
+    """Store the preset, seed and world of a new data set; do nothing for one that has rollouts already.
 
     `DatasetError` if it cannot be written.
     """
-    path = folder / NAME
-    if not path.exists() and not any((folder / "episodes").glob("[0-9]*.npz")):
+    path = folder / BEGUN
+    if not path.exists() and not existing_episodes(folder):
+        own = {name: value for name, value in world._asdict().items() if value} if world != OF_FIRST_WORLD else {}
         with explain_folder_errors(folder), atomic_write(path) as file:
-            file.write(json.dumps({"preset": preset, "seed": seed}).encode())
+            file.write(json.dumps({"preset": preset, "seed": seed, **own}).encode())
 
 
 def load_preset(folder: Path) -> str | None:
     """The preset of a data set; `None` for old data sets, and for those without `collect`."""
-    path = folder / NAME
-    if not path.exists():
-        return None
+    begun = load_begun(folder)
     try:
-        stored = json.loads(read_text(path, MOST_BYTES))["preset"]
-        return check_preset("training", stored if isinstance(stored, str) else repr(stored))
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, UsageError) as error:
+        return check_preset("training", begun["preset"]) if begun else None
+    except UsageError as error:
         raise DatasetError(
-            f"{path} names no preset ({error}); write the one that collected the data into it"
+            f"{folder / BEGUN} names no preset ({error}); write the one that collected the data into it"
         ) from error
 
 
 def check_seed(folder: Path, seed: int) -> None:
     """`UsageError` if the data set was begun with another seed; old data sets have stored none."""
-    if load_preset(folder) is None:
-        return
-    own = json.loads(read_text(folder / NAME, MOST_BYTES)).get("seed", seed)
+    own = load_begun(folder).get("seed", seed)
     if own != seed:
         raise UsageError(
             f"{folder} was begun with --seed {own}, and this is --seed {seed}: give --seed {own} to go on with it, or "
@@ -55,15 +60,42 @@ def check_seed(folder: Path, seed: int) -> None:
         )
 
 
-def resolve_preset(folder: Path, given: str | None) -> str:
-    """The preset to use: the given one, or tiny; `UsageError` if the data set was begun with another."""
-    chosen, own = check_preset("training", given or DEFAULT), load_preset(folder)
+def resolve_world(folder: Path, task: str | None, arguments: Mapping[str, Any]) -> DataWorld:
+    """The world to collect in: the given task, or the data set's own, under the options in a verb's `arguments`.
+
+    Without any it is the data set's own. `UsageError` if the data set is of another, or the task has no such options.
+    """
+    own = find_own_world(folder)
+    if task is None and not arguments:
+        return own or OF_FIRST_WORLD
+    name, options = task or (own or OF_FIRST_WORLD).task, ""
+    found = find_task(name)
+    if isinstance(found, TaskWithOptions):
+        options = found.parse_options(arguments)
+    elif arguments:
+        raise UsageError(f"task {name} has no options: leave {', '.join(f'--{each}' for each in arguments)} out")
+    given = DataWorld(name, options)
+    if own not in (None, given):
+        raise UsageError(f"{folder} holds data of {own}, and this is {given}: a data set has one world; {REMEDY}")
+    return given
+
+
+def resolve_preset(folder: Path, given: str | None, world: DataWorld | None = None) -> str:
+    """The preset to use: the given one, or that of the world, which is the data set's own unless one is given.
+
+    `UsageError` if the data set was begun with another, or the preset is of another world.
+    """
+    world = world or world_of_folder(folder)
+    default = find_world(*world).world.preset
+    chosen, own = check_preset("training", given or default), load_preset(folder)
     if own not in (None, chosen):
-        reason = f"--preset {given} is another" if given else f"without --preset it would be {DEFAULT}"
+        reason = f"--preset {given} is another" if given else f"without --preset it would be {default}"
         raise UsageError(
             f"{folder} was begun with the preset {own}, and {reason}: give --preset {own}; for other layers on the "
             f"same drives, add flags or train in another folder that links to {folder / 'episodes'}"
         )
+    if (task := find_preset(chosen).task) not in ("", world.task):
+        raise UsageError(f"the preset {chosen} is of {task}, and the data are of {world}: give --preset {default}")
     return chosen
 
 
@@ -72,7 +104,7 @@ FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 def explain_folder_errors(folder: Path) -> AbstractContextManager[None]:
     """Raise an `OSError` as a `DatasetError` that asks for another data folder than `folder`."""
-    return reporting_unwritable_folder(folder, "choose another --data")
+    return reporting_unwritable_folder(folder, REMEDY)
 
 
 @contextmanager

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import DatasetError, UsageError
-from dreamfleet.common.files.archives import ArchiveLimits, Arrays, DamagedArchiveError, open_archive, read_arrays
-from dreamfleet.common.files.regular_files import open_regular
+from dreamfleet.common.files.archives import NPY, ArchiveLimits, Arrays, DamagedArchiveError, open_archive, parse_array
+from dreamfleet.common.files.regular_files import open_regular, read_text
+from dreamfleet.worker.scoring.rollout import FIRST_WORLD, OF_FIRST_WORLD, DataWorld
 from dreamfleet.worker.tasks import registry
 from dreamfleet.worker.tasks.api import Preprocessing, RecordableTask
 
-WORLD = "car-racing"  # the task of data sets
+WORLD = FIRST_WORLD  # what `baselines` calls it
+BEGUN = "preset.json"  # what a data set was begun with
+BEGUN_BYTES = 10_000
+REMEDY = "choose another --data"
 POOL_EPISODES = 48  # episodes whose frames are shuffled together
 POOL_FRAMES = 16_000  # most frames of a pool, unless one episode has more: 200 MB at 64x64, 440 MB at 96x96
 VALIDATION_EVERY = 20  # every 20th episode is held out, whole
@@ -23,18 +30,59 @@ OWN_MEMBERS = frozenset(("action.npy", "reward.npy", "ended.npy"))  # of every e
 LIMITS = ArchiveLimits(512 << 20)  # bytes of an episode: 19,000 pictures at 96x96
 
 
-def find_world(name: str = WORLD) -> RecordableTask:
-    """Find the task `name`; `UsageError` if it cannot be recorded."""
-    return registry.find_world(name)
+@lru_cache(maxsize=16)
+def find_world(name: str = FIRST_WORLD, options: str = "") -> RecordableTask:
+    """Find the task `name` under these options, once; `UsageError` if it cannot be recorded.
+
+    >>> find_world().world.score_word
+    'track'
+    """
+    return registry.find_world(name, options)
 
 
-def preprocessing_of_size(size: int, world: str = WORLD) -> Preprocessing:
+def preprocessing_of_size(size: int, world: DataWorld = OF_FIRST_WORLD) -> Preprocessing:
     """The world's preprocessing with pictures of `size` pixels; `UsageError` if there is none."""
-    known = find_world(world).preprocessings.values()
+    known = find_world(*world).preprocessings.values()
     for each in known:
         if each.size == size:
             return each
-    raise UsageError(f"pictures are {' or '.join(str(each.size) for each in known)} pixels wide, not {size}")
+    sizes = " or ".join(str(each.size) for each in known)
+    raise UsageError(f"pictures are {sizes} pixels wide, not {size}: give --picture {sizes}")
+
+
+def load_begun(folder: Path) -> dict[str, Any]:
+    """What a data set was begun with: `preset`, `seed`, and its world if that is not the first; empty if nothing is."""
+    path = folder / BEGUN
+    if not path.exists():
+        return {}
+    try:
+        begun = json.loads(read_text(path, BEGUN_BYTES))
+        if not all(isinstance(begun[name], str) for name in ("preset", *({"task", "options"} & set(begun)))):
+            raise TypeError(f"it holds {begun!r:.100}")
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise DatasetError(
+            f"{path} names no preset ({error}); write the one that collected the data into it"
+        ) from error
+    return dict(begun)
+
+
+def find_own_world(folder: Path) -> DataWorld | None:
+    """The world that a data set was begun in, or of its first drive; `None` for an empty folder."""
+    if begun := load_begun(folder):
+        return DataWorld(begun.get("task", FIRST_WORLD), begun.get("options", ""))
+    drives = (sorted((folder / kind).glob("[0-9]*.npz")) for kind in ("episodes", "encoded"))
+    return next((world_of_episode(paths[0]) for paths in drives if paths), None)
+
+
+def world_of_folder(folder: Path) -> DataWorld:
+    """The world of a data set; the first world for an empty folder."""
+    return find_own_world(folder) or OF_FIRST_WORLD
+
+
+def world_of_episode(path: Path) -> DataWorld:
+    """The world that an episode, or an encoded one, was driven in."""
+    found = load_arrays(path, optional=("world",)).get("world", "")
+    return DataWorld.parse(str(found))
 
 
 def episode_path(folder: Path, number: int) -> Path:
@@ -62,10 +110,15 @@ def split_held_out(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     return [path for path in paths if path not in set(held_out)], held_out
 
 
-def load_arrays(path: Path, *names: str) -> Arrays:
-    """Load the named arrays of an episode; `DatasetError` if the file is damaged or lacks one."""
+def load_arrays(path: Path, *names: str, optional: Sequence[str] = ()) -> Arrays:
+    """Load the named arrays of an episode, and the `optional` ones that it has.
+
+    `DatasetError` if the file is damaged or lacks a named one.
+    """
     try:
-        return read_arrays(path, LIMITS, names)
+        with open_regular(path, LIMITS.size) as file, open_archive(file, LIMITS) as archive:
+            wanted = (*names, *(name for name in optional if name + NPY in archive.names))
+            return {name: parse_array(archive.read(name + NPY), name) for name in wanted}
     except (OSError, DamagedArchiveError) as error:
         raise _damaged(path, error) from error
 
@@ -115,27 +168,41 @@ def check_whole(paths: Sequence[Path], *names: str) -> None:
             raise DatasetError(f"{path} lacks {', '.join(sorted(missing))}; {_remedy(path)}")
 
 
-def check_pictures(paths: Sequence[Path], size: int) -> None:
-    """`DatasetError` names the first episode with pictures of another preprocessing than that for `size`."""
-    wanted = preprocessing_of_size(size).name
-    for path in paths:
-        if (found := preprocessing_of(path)) != wanted:
+def check_pictures(paths: Sequence[Path], size: int, world: DataWorld | None = None) -> None:
+    """`DatasetError` names the first episode of another world, or with other pictures than its world's of `size`.
+
+    The world is that of the first episode, unless one is given.
+    """
+    kinds = {path: kind_of(path) for path in paths}
+    world = world or next((own for own, _ in kinds.values()), OF_FIRST_WORLD)
+    wanted = preprocessing_of_size(size, world).name
+    for path, (own, found) in kinds.items():
+        if own != world:
+            raise DatasetError(f"{path} is of {own}, and the data are of {world}: a data set has one world; {REMEDY}")
+        if found != wanted:
             raise DatasetError(
                 f"{path} holds pictures {found!r}, and {wanted!r} are wanted: a data set and its VAE have one kind; "
-                "choose another --data, or --picture"
+                f"{REMEDY}, or --picture"
             )
+
+
+def kind_of(path: Path) -> tuple[DataWorld, str]:
+    """The world of an episode, and the name of the preprocessing of its pictures."""
+    arrays = load_arrays(path, "preprocessing", optional=("world",))
+    return DataWorld.parse(str(arrays.get("world", ""))), str(arrays["preprocessing"])
 
 
 def preprocessing_of(path: Path) -> str:
     """The name of the preprocessing of an episode's pictures."""
-    return str(load_arrays(path, "preprocessing")["preprocessing"])
+    return kind_of(path)[1]
 
 
 def load_pictures(path: Path) -> NDArray[np.uint8]:
     """Load an episode's pictures `(T, side, side, 3)`; `DatasetError` if they do not match its preprocessing."""
-    arrays = load_arrays(path, "picture", "preprocessing")
+    arrays = load_arrays(path, "picture", "preprocessing", optional=("world",))
     pictures: NDArray[np.uint8] = arrays["picture"]
-    known = find_world().preprocessings.get(str(arrays["preprocessing"]))
+    world = DataWorld.parse(str(arrays.get("world", "")))
+    known = find_world(*world).preprocessings.get(str(arrays["preprocessing"]))
     fits = known is not None and pictures.ndim == 4 and pictures.shape[1:] == known.shape
     if not fits or not len(pictures) or pictures.dtype != np.uint8:
         raise DatasetError(f"{path} holds pictures of another preprocessing or shape; collect into an empty folder")
@@ -145,13 +212,16 @@ def load_pictures(path: Path) -> NDArray[np.uint8]:
 def load_steps(path: Path, *latents: str) -> Arrays:
     """Load `action` (T, actions), `reward` (T,), `ended` and the named `latents` (T, n) of an episode, as float32.
 
-    `DatasetError` if their types or lengths are wrong, or they are empty.
+    `terminal` is whether it ended with a death; episodes without one end with a death if they ended. `DatasetError` if
+    their types or lengths are wrong, or they are empty.
     """
-    arrays = load_arrays(path, "action", "reward", "ended", *latents)
-    ended, steps = arrays["ended"], len(arrays["reward"]) if arrays["reward"].ndim else 0
+    arrays = load_arrays(path, "action", "reward", "ended", *latents, optional=("terminal",))
+    arrays.setdefault("terminal", arrays["ended"])
+    steps = len(arrays["reward"]) if arrays["reward"].ndim else 0
     ranks = {"reward": 1, "action": 2, **dict.fromkeys(latents, 2)}
     fits = all(arrays[name].ndim == rank and len(arrays[name]) == steps for name, rank in ranks.items())
-    if not (steps and fits and ended.shape == () and ended.dtype.kind in "bu"):
+    flags = [arrays[name] for name in ("ended", "terminal")]
+    if not (steps and fits and all(each.shape == () and each.dtype.kind in "bu" for each in flags)):
         raise _damaged(path, DatasetError("its arrays are not of one drive"))
     if not all(arrays[name].dtype.kind == "f" for name in ranks):
         raise _damaged(path, DatasetError("its actions, rewards or latents are no floats"))
@@ -189,7 +259,13 @@ def _load_pool(paths: Sequence[Path]) -> NDArray[np.uint8]:
 
 
 def pad(sequences: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """Stack sequences `(T_i, ...)` of unequal length to `(N, max T, ...)`, padded with zeros."""
+    """Stack sequences `(T_i, ...)` of unequal length to `(N, max T, ...)`, padded with zeros.
+
+    `DatasetError` unless they agree in all but their length: NumPy would widen `(T, 1)` without a word.
+    """
+    if len(shapes := {each.shape[1:] for each in sequences}) > 1:
+        found = " and ".join(map(str, sorted(shapes)))
+        raise DatasetError(f"drives with steps of shapes {found} are not of one world or model; {REMEDY}")
     longest = max(len(sequence) for sequence in sequences)
     padded = np.zeros((len(sequences), longest, *sequences[0].shape[1:]), dtype=np.float32)
     for row, sequence in zip(padded, sequences, strict=True):

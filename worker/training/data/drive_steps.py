@@ -1,4 +1,4 @@
-"""Steps of recorded drives, found from their rewards: losses of the road, and beginnings of dreams for a bundle."""
+"""Steps of recorded drives: losses of the course, or deaths, and beginnings of dreams for a bundle."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 FIRST_START = 20  # first step of a drive at which a dream may begin; before it the recurrent state is almost empty
-LOSS_STEPS = 40  # steps without a positive reward that count as a loss of the road
+LOSS_STEPS = 40  # the first world's `lost_after`
 EARLIEST, LATEST = 60, 5  # bounds of the steps before a loss at which a dream may begin
 
 
@@ -24,7 +24,7 @@ class DriveStep(NamedTuple):
 
 @dataclass(frozen=True)
 class SampledSteps:
-    """Sampled steps: shortly before losses of the road, one per loss, and anywhere."""
+    """Sampled steps: shortly before losses of the course, one per loss, and anywhere."""
 
     before_losses: tuple[DriveStep, ...]
     anywhere: tuple[DriveStep, ...]
@@ -35,30 +35,47 @@ class SampledSteps:
         return tuple(sorted(self.before_losses + self.anywhere))
 
 
-def find_road_losses(rewards: Floats) -> list[int]:
-    """The steps at which a drive lost the road, by its rewards `(T,)` alone.
+def find_road_losses(rewards: Floats, lost_after: int = LOSS_STEPS, terminal: bool = False) -> list[int]:
+    """The steps at which a drive with rewards `(T,)` lost the course; `lost_after` is its world's.
 
-    A loss begins after a positive reward if none of the next `LOSS_STEPS` rewards, or more, is positive.
+    A loss begins after a positive reward if none of the next `lost_after` rewards, or more, is positive. If
+    `lost_after` is 0, a loss is the last step of a drive that is `terminal`: that ended with a death.
     """
+    if not lost_after:
+        return [len(rewards) - 1] if terminal else []
     paid = np.flatnonzero(rewards > 0)
     unpaid = np.diff(paid, append=len(rewards)) - 1
-    return [int(step) + 1 for step in paid[unpaid >= LOSS_STEPS]]
+    return [int(step) + 1 for step in paid[unpaid >= lost_after]]
 
 
-def on_road_mask(reward: Floats) -> NDArray[np.bool_]:
-    """Which steps of a drive `(T,)` have a positive reward within the next `LOSS_STEPS` steps: it is on the road."""
+def on_road_mask(reward: Floats, lost_after: int = LOSS_STEPS) -> NDArray[np.bool_]:
+    """Which steps of a drive `(T,)` have a positive reward within the next `lost_after` steps: it is on the course.
+
+    If `lost_after` is 0, all do.
+    """
+    if not lost_after:
+        return np.ones(len(reward), np.bool_)
     steps = np.arange(len(reward))
-    paid = np.where(reward > 0, steps, 2 * len(reward) + LOSS_STEPS)
+    paid = np.where(reward > 0, steps, 2 * len(reward) + lost_after)
     following = np.minimum.accumulate(paid[::-1])[::-1]
-    return np.asarray(following - steps < LOSS_STEPS)
+    return np.asarray(following - steps < lost_after)
 
 
-def sample_steps(drives: Sequence[Floats], count: int, random: np.random.Generator) -> SampledSteps:
+def sample_steps(
+    drives: Sequence[Floats], count: int, random: np.random.Generator, lost_after: int = LOSS_STEPS,
+    terminal: Sequence[bool] = (),
+) -> SampledSteps:  # fmt: skip
     """Sample `count` steps of drives with rewards `(T,)`, up to half of them before losses.
 
-    The others are uniform over all steps from `FIRST_START` on. There are fewer than `count` if the drives are short.
+    `lost_after` and each drive's `terminal`, empty for none, are those of `find_road_losses`. The others are uniform
+    over all steps from `FIRST_START` on. There are fewer than `count` if the drives are short.
     """
-    lost = [DriveStep(drive, step) for drive, rewards in enumerate(drives) for step in find_road_losses(rewards)]
+    deaths = terminal or [False] * len(drives)
+    lost = [
+        DriveStep(drive, step)
+        for drive, (rewards, dead) in enumerate(zip(drives, deaths, strict=True))
+        for step in find_road_losses(rewards, lost_after, bool(dead))
+    ]
     lost = [each for each in lost if each.step - LATEST >= FIRST_START]
     chosen = [lost[index] for index in random.permutation(len(lost))[: count // 2]]
     before = {DriveStep(drive, _shortly_before(step, random)) for drive, step in chosen}

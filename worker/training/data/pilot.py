@@ -10,7 +10,8 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ControllerError
 from dreamfleet.worker.scoring.actors import ControllerActor
 from dreamfleet.worker.scoring.disturbance import ActionBursts, Disturbance, DisturbedPolicy
-from dreamfleet.worker.training.data.dataset import WORLD, find_world
+from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld
+from dreamfleet.worker.training.data.dataset import find_world
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 
 
@@ -21,24 +22,25 @@ class Pilot:
     controller: Controller
     bundle: Bundle
 
-    def check(self, preprocessing: str) -> None:
-        """`ControllerError` unless its task is the data sets' world and its pictures have this preprocessing."""
-        manifest = self.bundle.manifest
+    def check(self, preprocessing: str, world: DataWorld = OF_FIRST_WORLD) -> None:
+        """`ControllerError` unless its task is the data set's world and its pictures have this preprocessing."""
         if self.controller.bundle != self.bundle.sha256:
             raise ControllerError(
                 f"the controller is of the world model {self.controller.bundle[:12]}..., not of {self.bundle.path}"
             )
-        if (manifest.task, manifest.preprocessing) != (WORLD, preprocessing):
+        own, seen = DataWorld.of(self.bundle), self.bundle.manifest.preprocessing
+        if (own, seen) != (world, preprocessing):
             raise ControllerError(
-                f"the controller sees {manifest.preprocessing!r} of {manifest.task}, and the data set holds "
-                f"{preprocessing!r} of {WORLD}: choose another --picture, or another --controller"
+                f"the controller sees {seen!r} of {own}, and the data set holds {preprocessing!r} of {world}: choose "
+                f"another --picture, or another --controller"
             )
 
     def policy(self, noise: float, bursts: float, seed: int) -> DisturbedPolicy:
         """The policy of one drive, with noise and bursts of tried actions by the seed."""
-        actions = find_world().world.actions
+        world = DataWorld.of(self.bundle)
+        actions = find_world(*world).world.actions
         if not isinstance(actions, Continuous):
-            raise ControllerError(f"{WORLD} has no continuous actions: its drives cannot be disturbed")
+            raise ControllerError(f"{world} has no continuous actions: its drives cannot be disturbed")
         actor = ControllerActor(
             self.controller, self.bundle, RecurrentState(self.bundle.for_controller(self.controller))
         )

@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from dreamfleet.worker.training.data.dataset import load_steps, pad
+from dreamfleet.common.errors import DatasetError
+from dreamfleet.worker.training.data.dataset import find_world, load_steps, pad, world_of_episode
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, reward_labels
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 
-FLIP = np.array([-1, 1, 1], dtype=np.float32)  # a mirrored drive steers the other way
 CHUNK_STEPS = 10_000  # steps per chunk: about 300 MB in a model
 
 
 @dataclass(frozen=True)
 class Rollouts:
-    """A batch `(N, T, ...)` of rollouts, padded; `mask` `(N, T)` is 1 where a step is real, `done` where one ended."""
+    """A batch `(N, T, ...)` of rollouts, padded; `mask` `(N, T)` is 1 where a step is real, `done` at a death."""
 
     mu: Tensor
     logvar: Tensor
@@ -43,20 +43,31 @@ class Rollouts:
 
 
 def load_rollouts(paths: Sequence[Path], mirrored: NDArray[np.bool_] | None = None) -> Rollouts:
-    """Load the rollouts of these episodes, mirrored where `mirrored` `(N,)` is true."""
+    """Load the rollouts of these episodes, mirrored where `mirrored` `(N,)` is true.
+
+    `DatasetError` if one is to be mirrored whose world has no mirror, or actions have different sizes.
+    """
     columns: dict[str, list[NDArray[np.float32]]] = {each.name: [] for each in fields(Rollouts)}
     for path, flip in zip(paths, np.zeros(len(paths), np.bool_) if mirrored is None else mirrored, strict=True):
         prefix = "mirrored_" if flip else ""
         arrays = load_steps(path, f"{prefix}mu", f"{prefix}logvar")
         columns["mu"].append(arrays[f"{prefix}mu"])
         columns["logvar"].append(arrays[f"{prefix}logvar"])
-        columns["action"].append(arrays["action"] * (FLIP if flip else FLIP**2))
+        columns["action"].append(_mirror(path, arrays["action"]) if flip else arrays["action"])
         columns["reward"].append(arrays["reward"])
         done = np.zeros(len(arrays["reward"]), dtype=np.float32)
-        done[-1] = arrays["ended"]
+        done[-1] = arrays["terminal"]
         columns["done"].append(done)
         columns["mask"].append(np.ones(len(arrays["reward"]), dtype=np.float32))
     return Rollouts(**{name: torch.from_numpy(pad(arrays)) for name, arrays in columns.items()})
+
+
+def _mirror(path: Path, action: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The actions `(T, A)` of the mirrored drive."""
+    world = world_of_episode(path)
+    if (mirror := find_world(*world).world.mirror) is None:
+        raise DatasetError(f"{path} has no mirrored drive: {world} has no mirror")
+    return mirror.apply(action)
 
 
 def done_labels(config: MDNRNNConfig, rollouts: Rollouts) -> Tensor:

@@ -75,7 +75,6 @@ def test_collecting_again_writes_only_what_is_missing_and_the_same(tmp_path):
         {"steps": 0},
         {"patience": -1},
         {"anywhere": 2},
-        {"driver": "ghost"},
         {"seed": -1},
         {"noise": -1},
         {"spells": 1.1},
@@ -196,7 +195,7 @@ def test_a_drive_that_a_full_disk_cannot_hold_is_named(monkeypatch, tmp_path):
     monkeypatch.setattr(module, "atomic_write", full)
     monkeypatch.setattr(module, "drive_episode", lambda *_: {"action": ()})
     with pytest.raises(DatasetError, match=r"cannot write .*000003\.npz: No space left on device"):
-        module._collect_one((tmp_path, None, 3, ()))
+        module._collect_one((tmp_path, None, 3, (), None))
 
 
 def test_drives_take_the_next_free_numbers_each_once(tmp_path):
