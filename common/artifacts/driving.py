@@ -12,7 +12,7 @@ from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, Variant
 from dreamfleet.common.artifacts.world_facts import WorldFacts
 from dreamfleet.common.errors import UsageError
 
-__all__ = ["Driving", "Variant", "WorldDriving", "parse_driving"]
+__all__ = ["Driving", "Variant", "WorldDriving", "parse_driving"]  # every world's options are among a variant's
 
 OPTION_HELP = {"decide_every": "a whole number from 1 to 50", "feedback": "none or last"}
 

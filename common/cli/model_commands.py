@@ -6,7 +6,7 @@ Each function returns the words behind `dreamfleet`. Of a flag that is given twi
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -15,6 +15,7 @@ from dreamfleet.common.errors import UsageError
 Words = tuple[str, ...]
 Model = Literal["vae", "mdnrnn"]
 MODELS: tuple[Model, ...] = ("vae", "mdnrnn")
+WORLD_FLAGS = ("task", "environment", "observation", "crop", "size", "skip", "difference")  # as `collect` has them
 
 
 def command(*parts: object) -> Words:
@@ -25,6 +26,24 @@ def command(*parts: object) -> Words:
 def options(**values: object) -> Words:
     """`--name value` of each value that is not None; `_` in a name is `-`."""
     return command(*(word for name, value in values.items() if value is not None for word in (_flag(name), value)))
+
+
+def world_flags(given: Mapping[str, object]) -> Words:
+    """The flags of `collect` that say which world a new data set is of: those of `given` that are set.
+
+    >>> world_flags({"task": "gym:ALE/Pong-v5", "skip": 4, "environment": ("mode=1",), "crop": None, "jobs": 2})
+    ('--task', 'gym:ALE/Pong-v5', '--environment', 'mode=1', '--skip', '4')
+    """
+    words: list[object] = []
+    for name in WORLD_FLAGS:
+        value = given.get(name)
+        if value is True:
+            words.append(_flag(name))
+        elif isinstance(value, (tuple, list)) and value:
+            words += [_flag(name), *value]
+        elif value:
+            words += [_flag(name), value]
+    return command(*words)
 
 
 def collect(
@@ -75,7 +94,7 @@ def worker(run: str, endpoint: str, slots: int, *more: object) -> Words:
 
 
 def evaluate(controller: Path, episodes: int, *more: object) -> Words:
-    """A controller on so many unseen tracks."""
+    """A controller on so many unseen seeds."""
     return command("evaluate", "--controller", controller, "--episodes", episodes, *more)
 
 

@@ -12,13 +12,37 @@ from dreamfleet.common.errors import UsageError
 
 Kind = Literal["run", "training", "baseline"]
 NAMES: dict[Kind, tuple[str, ...]] = {
-    "run": ("article", "dream", "frugal", "mixed", "notebook", "paper", "real"),
+    "run": (
+        "article",
+        "dream",
+        "frugal",
+        "mixed",
+        "notebook",
+        "paper",
+        "pixels",
+        "real",
+        "takecover",
+        "takecover-real",
+    ),
     "training": ("article", "attentive", "notebook", "paper", "pixels", "takecover", "tiny"),
     "baseline": ("learning", "notebook"),
 }
 VERBS: dict[Kind, str] = {
     "run": "coordinator and fork", "training": "collect and train", "baseline": "baseline train",
 }  # fmt: skip
+
+
+# Training presets of new data sets of these tasks, as their worlds name them; of all others it is `pixels`.
+DEFAULT_TRAINING = {"": "tiny", "car-racing": "tiny", "takecover": "takecover"}  # without a task it is the first
+
+
+def default_training_preset(task: str) -> str:
+    """The training preset of a new data set of a task; an empty text is the first world.
+
+    >>> default_training_preset(""), default_training_preset("gym:ALE/Pong-v5")
+    ('tiny', 'pixels')
+    """
+    return DEFAULT_TRAINING.get(task, "pixels")
 
 
 def check_preset(kind: Kind, name: str) -> str:

@@ -22,11 +22,13 @@ MAX_PART = 40 * 1024  # leaves room for the rest of the message
 MAX_PICTURE_SIDE = 256  # pixels of a live frame's picture
 MAX_UPLOAD = 32 << 20  # a rollout of 1000 steps has 12 MB (64x64) or 28 MB (96x96) uncompressed
 MAX_OPTIONS = 8_000  # characters; statuses and controllers contain them too
+MAX_END = 32  # characters of an end rule
 MAX_LEASES = 1024  # of one worker; a heartbeat lists them all and must stay under MAX_MESSAGE
 MAX_BATCHES = 2**53  # never reached
 MAX_SLOTS = 4096  # of one worker
 TAG_BYTES = 8
 MIN_TEMPERATURE, MAX_TEMPERATURE = 1e-3, 1e3  # of a dream
+OWN_END_VERSION = 10  # added to the world's version by runs with an end rule of their own: older workers refuse them
 
 
 Tag = Annotated[bytes, Length(TAG_BYTES, TAG_BYTES)]  # the first bytes of a digest, unique among one worker's jobs
@@ -66,6 +68,13 @@ class TaskSpec:
     version: Annotated[int, Between(1, 10**6)] = field(default=1, metadata=OPTIONAL)
     recorded: Share = field(default=0.0, metadata=OPTIONAL)  # share of dreams that begin at recorded states
     driven: bool = field(default=False, metadata=OPTIONAL)  # score a dream task in the real environment
+    # When dreams end, in place of the bundle's own rule: a text that `EndRule.parse` reads. Empty: the bundle's own.
+    end: Annotated[str, Length(0, MAX_END)] = field(default="", metadata=OPTIONAL)
+
+    @property
+    def world_version(self) -> int:
+        """Version of the world that is scored in, which controllers keep: `version` without `OWN_END_VERSION`."""
+        return self.version - OWN_END_VERSION if self.end else self.version
 
     def option(self, name: str, default: Any = None) -> Any:
         """The value of one of the task's options."""

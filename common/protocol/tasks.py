@@ -107,13 +107,16 @@ def _names_environment(name: str) -> bool:
     return bool(_ENVIRONMENT.search(name)) or name in getattr(sys.modules.get("gymnasium"), "registry", ())
 
 
+def is_shipped(name: str) -> bool:
+    """Whether this package has the task, or its family."""
+    point = registered_tasks().get(name.partition(":")[0])
+    return point is not None and point.dist is not None and point.dist.name == "dreamfleet"
+
+
 def is_self_describing(name: str) -> bool:
     """Whether a task needs no bundle; `UsageError` if the task cannot be loaded here."""
     if name.partition(":")[0] == GYM:
         return True
-    point = registered_tasks().get(name)
-    if point is not None and point.dist is not None and point.dist.name == "dreamfleet":
-        return False  # without importing a simulator
     try:
         return callable(getattr(load_task(name), "describe", None))
     except UsageError as error:

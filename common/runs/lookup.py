@@ -56,7 +56,7 @@ def find_evaluated_mean(name: str, runs_dir: Path, generation: int) -> tuple[Con
         spec, shape = run.spec, run.settings.controller
         provenance = {"run_uid": run.uid, "generation": generation}
         mean = Controller(
-            shape, run.evaluated_mean(generation), spec.task, spec.bundle, provenance, spec.options, spec.version
+            shape, run.evaluated_mean(generation), spec.task, spec.bundle, provenance, spec.options, spec.world_version
         )
         return mean, run.bundle_path
 

@@ -79,6 +79,7 @@ def _rows(
     yield "world model", f"SHA-256 `{spec.bundle}`" if spec.bundle else "none"
     yield "score", describe_score(_reported(run))
     warm = "" if spec.temperature is None else f", temperature {spec.temperature:g}"
+    warm += f", end {spec.end}" if spec.end else ""
     generations = plural(receipt.generations, "generation")
     if settings.stages:  # each has a horizon, a population and more of its own
         begun = begun_stages(settings, run.history(), run.evaluations())

@@ -30,15 +30,6 @@ class Point:
 
 
 @dataclass(frozen=True)
-class PublishedScore:
-    """A published score; `core_hours` is `None` if unknown."""
-
-    steps: float
-    score: float
-    core_hours: float | None = None
-
-
-@dataclass(frozen=True)
 class LearningCurve:
     """A run's evaluations, oldest first, and the confirmed score of the mean that it reports."""
 
@@ -62,16 +53,6 @@ class LearningCurve:
         found = (point for point, each in zip(points, run.evaluations(), strict=True)
                  if confirmed is not None and each.generation == confirmed.generation)  # fmt: skip
         return cls(run.name, _world(run), points, judged, next(found, None), total)
-
-
-# Ha and Schmidhuber's public log of their CarRacing experiment: the evaluated mean on 1024 tracks. Steps count
-# candidates only. Only the total time is known: 1119 hours on 64 cores.
-PAPER_SCORES = (
-    PublishedScore(2.6e7, 823),
-    PublishedScore(1.0e8, 867),
-    PublishedScore(7.8e8, 895),
-    PublishedScore(1.7e9, 900.5, 1119 * 64),
-)
 
 
 def _points(run: RunFolder) -> Iterator[Point]:

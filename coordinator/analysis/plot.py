@@ -21,11 +21,11 @@ from dreamfleet.common.runs.effort import Effort, format_steps
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import begun_stages, describe_steps, join_distinct
 from dreamfleet.common.runs.standard_error import format_with_error
-from dreamfleet.coordinator.analysis.learning import LearningCurve, PublishedScore
+from dreamfleet.coordinator.analysis.learning import LearningCurve
+from dreamfleet.coordinator.analysis.published import PublishedScores
 
 TITLE = 90  # characters in a line of the title
 KINDS = (".png", ".svg")
-PAPERS_NAME = "Ha & Schmidhuber 2018, their public log (1024 tracks; of its time the end alone is known)"
 REPEATABLE: dict[Any, str] = {"svg.hashsalt": "dreamfleet"}  # fixed identifiers in SVG files, instead of random ones
 
 
@@ -47,8 +47,10 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
     _save(figure, path)
 
 
-def plot_learning(curves: Sequence[LearningCurve], marks: Sequence[PublishedScore], path: Path) -> None:
+def plot_learning(curves: Sequence[LearningCurve], marks: PublishedScores | None, path: Path) -> None:
     """Plot evaluated scores over environment steps and over core-hours, with published scores as `marks`.
+
+    A published score of unknown steps is a horizontal line.
 
     Environment steps are all steps in reality: of candidates, kept rollouts, evaluations, and of the run that this one
     began from. The legend shows dreamt steps.
@@ -57,8 +59,13 @@ def plot_learning(curves: Sequence[LearningCurve], marks: Sequence[PublishedScor
     for curve, colour in zip(curves, PLOT_COLOURS * len(curves), strict=False):
         _draw_curve(over_steps, curve, colour, lambda effort: effort.steps)
         _draw_curve(over_hours, curve, colour, lambda effort: effort.core_hours)
-    _draw_marks(over_steps, [(each.steps, each.score) for each in marks])
-    _draw_marks(over_hours, [(each.core_hours, each.score) for each in marks if each.core_hours is not None])
+    if marks is not None:
+        for axes, name in ((over_steps, "steps"), (over_hours, "core_hours")):
+            spent = [(getattr(each, name), each.score) for each in marks.scores]
+            _draw_marks(axes, [(amount, score) for amount, score in spent if amount is not None], marks.source)
+        for level in (each.score for each in marks.scores if each.steps is None):
+            over_steps.axhline(level, linestyle="--", color="black", linewidth=1, label=marks.source)
+            over_hours.axhline(level, linestyle="--", color="black", linewidth=1)
     over_steps.set(xlabel="environment steps in reality, evaluations included", ylabel=_score_axis(curves))
     over_hours.set(xlabel="core-hours: time that slots worked on accepted results")
     for axes in (over_steps, over_hours):
@@ -109,10 +116,10 @@ def _draw_curve(axes: Any, curve: LearningCurve, colour: str, spent: Callable[[E
     )  # fmt: skip
 
 
-def _draw_marks(axes: Any, marks: Sequence[tuple[float, float]]) -> None:
+def _draw_marks(axes: Any, marks: Sequence[tuple[float, float]], source: str) -> None:
     if not marks:
         return
-    axes.plot(*zip(*marks, strict=True), "s--", color="black", markersize=5, linewidth=1, label=PAPERS_NAME)
+    axes.plot(*zip(*marks, strict=True), "s--", color="black", markersize=5, linewidth=1, label=source)
     for number, (spent, score) in enumerate(marks):  # alternate sides, so that labels do not overlap
         place = (0, 7 if number % 2 else -14)
         axes.annotate(f"{score:g}", (spent, score), place, textcoords="offset points", ha="center", fontsize=9)

@@ -112,6 +112,15 @@ def evolve(name: str, words: Sequence[str], local_fleet: LocalFleet, logs: Path,
         run.wait(stop, run.check_workers)
 
 
+def task_flags(*tasks: str) -> tuple[str, ...]:
+    """The flags by which a worker announces those of these tasks that it does not announce by itself.
+
+    >>> task_flags("dream", "gym:mine:Own-v0")
+    ('--task', 'gym:mine:Own-v0')
+    """
+    return tuple(word for task in dict.fromkeys(tasks) if ":" in task for word in ("--task", task))
+
+
 def has_begun(runs_dir: Path, name: str) -> bool:
     """Whether the run has a journal."""
     return path_exists(runs_dir / name / JOURNAL)

@@ -63,7 +63,7 @@ class ReportedMean:
         parameters = np.frombuffer(self.vector, dtype="<f4").astype(np.float32)
         spec = self.settings.task
         return Controller(
-            self.settings.controller, parameters, spec.task, spec.bundle, provenance, spec.options, spec.version
+            self.settings.controller, parameters, spec.task, spec.bundle, provenance, spec.options, spec.world_version
         )
 
 

@@ -153,8 +153,8 @@ def _resolve_new_settings(
 ) -> tuple[RunSettings, Bundle | None]:
     if start is not None and config.needs_no_bundle == (not start.bundle):
         config = start.apply_to(config)
-    config = check_environment(config, strict=strict)
     bundle = None if config.needs_no_bundle else find_bundle(config.bundle or DEFAULT_BUNDLE)
+    config = check_environment(config, bundle, strict=strict)
     settings = config.settings(bundle)
     if start is not None:
         start.check(settings)

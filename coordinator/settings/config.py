@@ -5,24 +5,44 @@ Each setting is one field. The bounds are in its annotation; `frozen_option` nam
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, Variant
+from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.artifacts.driving import Driving, Variant
 from dreamfleet.common.artifacts.subspace import Subspace
+from dreamfleet.common.artifacts.world_facts import EndRule
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.cli.key_values import parse_arguments
 from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
-from dreamfleet.common.protocol.messages import MAX_OPTIONS, Horizon, Patience, Share, TaskSpec, Temperature
-from dreamfleet.common.protocol.tasks import GYM, Description, check_task, describe_task, is_self_describing
+from dreamfleet.common.protocol.messages import (
+    MAX_OPTIONS,
+    OWN_END_VERSION,
+    Horizon,
+    Patience,
+    Share,
+    TaskSpec,
+    Temperature,
+)
+from dreamfleet.common.protocol.tasks import (
+    DREAM,
+    GYM,
+    Description,
+    check_task,
+    describe_task,
+    is_self_describing,
+    is_shipped,
+)
 from dreamfleet.common.runs.records import (
     STAGE_FIELDS,
     ConfirmationEpisodes,
@@ -42,7 +62,6 @@ from dreamfleet.coordinator.settings.task_options import (
 )
 
 DEFAULT_BUNDLE, NO_BUNDLE, NO_SUBSPACE = "tiny", "none", "none"
-DREAM = "dream"
 LARGEST_STEP = 1e6  # of sigma0: parameters travel in single precision
 Interval = Annotated[int, Between(0, 10**6)]  # generations; 0: never
 
@@ -57,9 +76,13 @@ class RunConfig:
     """What is frozen with a run."""
 
     preset: str | None = option(None, preset_help_text("run"))
-    task: str = frozen_option(TaskSpec, "car-racing", "what candidates are scored in; a worker must know it")
+    task: str | None = frozen_option(
+        TaskSpec, None, "what candidates are scored in; a worker must know it (default the world of the bundle)"
+    )
     bundle: str | None = option(
-        None, "the frozen world model: a shipped name, a file, or none (default tiny; none for gym:ENVIRONMENT)"
+        None,
+        "the frozen world model: a shipped name, a file, or none (default tiny; none for gym:ENVIRONMENT and other "
+        "tasks that need none)",
     )
     environment: tuple[str, ...] = option((), "KEY=VALUE arguments of gym:ENVIRONMENT; values as in JSON")
     normalise: bool = option(
@@ -70,8 +93,9 @@ class RunConfig:
     )
     variant: tuple[str, ...] = option(
         (),
-        "NAME=VALUE of how car-racing is driven: actions=discrete, pedals=half or one, pedal_shift=, decide_every=, "
-        "feedback=last, in its dream too, and time_cost=, offroad_cost= (docs/tasks.md)",
+        "NAME=VALUE of how controllers of a world model drive: decide_every=, feedback=last; and in car-racing "
+        "actions=discrete, pedals=half or one, pedal_shift=, in its dream too, time_cost=, offroad_cost= "
+        "(docs/tasks.md)",
     )
     controller: Literal["linear", "hidden"] = option("linear", "a linear map, or one with a layer of tanh units")
     hidden_units: Annotated[int, Between(1, 10**5)] = option(8, "units of a hidden controller's layer")
@@ -110,6 +134,12 @@ class RunConfig:
         0.0,
         "share of the dreams, 0 to 1, that begins where recorded drives were, with what the model remembered there; "
         "the bundle must hold such states",
+    )
+    end: str = frozen_option(
+        TaskSpec,
+        "",
+        "when a dream ends: drawn, at random with the predicted probability under its temperature, or above a "
+        "probability from 0 to 1 (default the bundle's own rule)",
     )
     driven: Share = frozen_option(
         RunSettings,
@@ -155,14 +185,20 @@ class RunConfig:
         check_bounds(self)
         if self.confirm_episodes == 1:
             raise UsageError("--confirm-episodes must be 0 or at least 2: one episode has no standard error")
-        check_task(self.task)
+        if self.task is not None:
+            check_task(self.task)
+        elif self.bundle == NO_BUNDLE:
+            raise UsageError(f"--bundle {NO_BUNDLE}: name what candidates are scored in with --task")
         if self.racing and self.episodes < 2:
             raise UsageError("--racing needs at least 2 episodes: there is no second half of one")
         if not 0 < self.sigma0 <= LARGEST_STEP:
             raise UsageError(f"--sigma0 must be a positive number of at most {LARGEST_STEP:g}, not {self.sigma0}")
-        for name in ("recorded", "driven"):
+        for name, nothing in {"recorded": "0", "driven": "0", "end": "''"}.items():
             if getattr(self, name) and self.task != DREAM:
-                raise UsageError(f"--{name} is of task {DREAM}, not of {self.task}: leave it out, or say 0")
+                other = self.task or (default_world() if self.bundle is None else "the world that it dreams of")
+                raise UsageError(f"--{name} is of task {DREAM}, not of {other}: leave it out, or say {nothing}")
+        if self.end:
+            EndRule.parse(self.end)
         if 0 < self.driven < 1:
             self._check_driven()
 
@@ -182,7 +218,9 @@ class RunConfig:
     @property
     def needs_no_bundle(self) -> bool:
         """Whether candidates are scored without a world model."""
-        return self.bundle == NO_BUNDLE or (self.bundle is None and is_self_describing(self.task))
+        if self.bundle is not None or self.task in (None, DREAM):
+            return self.bundle == NO_BUNDLE
+        return self.task != default_world() and is_self_describing(self.task)
 
     def settings(self, bundle: Bundle | None) -> RunSettings:
         """The settings to store in the journal; `config_values` is the inverse.
@@ -194,6 +232,8 @@ class RunConfig:
             with _naming_stage(1):
                 own = replace(self, **named, stages=stages)
             return own.settings(bundle)
+        if self.task is None and bundle is not None:
+            return replace(self, task=bundle.manifest.task).settings(bundle)
         spec, shape, packages = self._resolve_without_bundle() if bundle is None else self._resolve_with_bundle(bundle)
         if self.loaded_subspace is not None:
             _check_subspace(self.loaded_subspace, spec, shape)
@@ -226,35 +266,54 @@ class RunConfig:
         return self.hidden_units if self.controller == "hidden" else 0
 
     def _resolve_with_bundle(self, bundle: Bundle) -> tuple[TaskSpec, ControllerShape, tuple[str, ...]]:
-        if self.task.partition(":")[0] == GYM:
-            raise UsageError(f"{self.task} is scored without a world model: leave --bundle out, or give --bundle none")
+        self._check_world(bundle)
         if self.environment or self.normalise or self.task_options:
             raise UsageError("--environment, --normalise and --task-options are of tasks without a world model")
         if self.recorded:
             bundle.check_recorded()
-        variant = self._variant()
-        shape = bundle.with_controllers(bundle.shape_of(self.features, self._hidden, variant), variant).controller_shape
+        driving, facts = self._driving(bundle), bundle.manifest.world
+        shape = bundle.with_controllers(
+            bundle.shape_of(self.features, self._hidden, driving), driving
+        ).controller_shape  # fmt: skip
         own_shape = None if shape == bundle.default_shape else shape
-        return self._spec(bundle.sha256, own_shape, variant.options, variant.version), shape, NUMERIC_PACKAGES
+        end, own_end = self.end and EndRule.parse(self.end).text, (facts.end if facts else EndRule()).text
+        end = "" if end == own_end else end  # so that it scores as a run that names none
+        version = driving.version + (OWN_END_VERSION if end else 0)
+        spec = replace(self._spec(bundle.sha256, own_shape, driving.options, version), end=end)
+        return spec, shape, NUMERIC_PACKAGES if facts is None else facts.packages
+
+    def _check_world(self, bundle: Bundle) -> None:
+        """`UsageError` for a world model that the task surely cannot use; others may be of several tasks."""
+        task, world = str(self.task), bundle.manifest.task
+        if task in (DREAM, world):
+            return
+        if bundle.manifest.world is not None or is_shipped(task):
+            without = "; or without a world model: --bundle none" if task.partition(":")[0] == GYM else ""
+            raise UsageError(
+                f"{bundle.path.name} is a world model of {world}, and not of {task}: name one of that with --bundle"
+                f"{without}"
+            )
 
     def _spec(self, bundle: str, shape: ControllerShape | None, options: str, version: int) -> TaskSpec:
         values = frozen_values(TaskSpec, self)
         return TaskSpec(**values, bundle=bundle, controller=shape, options=options, version=version)
 
-    def _variant(self) -> Variant:
+    def _driving(self, bundle: Bundle) -> Driving:
         """How the run's controllers drive."""
         given, preset = (
             parse_arguments("--variant", each, "pedals=one") for each in (self.variant, self.preset_variant)
         )
-        variant = Variant.from_values(preset | given)
-        if not variant.is_default and self.task not in (CAR_RACING, DREAM):
-            raise UsageError(f"task {self.task} has no variants: {CAR_RACING} has, and its dream")
-        if (variant.time_cost or variant.offroad_cost) and self.task == DREAM:
-            cost = "time_cost" if variant.time_cost else "offroad_cost"
+        values, world = preset | given, bundle.manifest.task
+        driving = bundle.driving_of(json.dumps(values, sort_keys=True) if values else "")
+        if not driving.is_default and self.task not in (world, DREAM):
+            raise UsageError(f"task {self.task} has no variants: {world} has, and its dream")
+        costs = [each for each in driving.option_texts if each not in driving.without_costs.option_texts]
+        if costs and self.task == DREAM:
             raise UsageError(
-                f"{cost} is of candidates that drive: a dream knows of no lap and no road; name --variant without it"
+                f"{costs[0].partition('=')[0]} is of candidates that drive: a dream knows of no lap and no road; name "
+                "--variant without it"
             )
-        return variant
+        return driving
 
     def _resolve_without_bundle(self) -> tuple[TaskSpec, ControllerShape, tuple[str, ...]]:
         if self.temperature is not None or self.collect_every or self.variant:
@@ -265,6 +324,7 @@ class RunConfig:
             }
             named = " and ".join(flag for flag, is_given in given.items() if is_given)
             raise UsageError(f"{named}: only tasks with a world model take this; leave it out for {self.task}")
+        assert self.task is not None
         description = self.description or describe_task(self.task, self.description_options())
         options = description.options if self.task_options is None else self.task_options
         shape = ControllerShape(description.observations, description.outputs, self._hidden)
@@ -283,6 +343,12 @@ class RunConfig:
         arguments = parse_arguments("--environment", self.environment, "continuous=true")
         options: dict[str, Any] = {"environment": arguments} if arguments else {}
         return options | ({"normalise": True, "seed": self.seed} if self.normalise else {})
+
+
+@lru_cache
+def default_world() -> str:
+    """The task of the world model that a run has unless it names one."""
+    return find_bundle(DEFAULT_BUNDLE).manifest.task
 
 
 def frozen_values(record: type, source: Any) -> dict[str, Any]:

@@ -5,22 +5,23 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 
-from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING
+from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.cli.task_check import try_task
 from dreamfleet.common.errors import UsageError
-from dreamfleet.coordinator.settings.config import DREAM, RunConfig
+from dreamfleet.common.protocol.tasks import DREAM
+from dreamfleet.coordinator.settings.config import RunConfig
 
 log = logging.getLogger("dreamfleet.coordinator")
 
 
-def check_environment(config: RunConfig, *, strict: bool) -> RunConfig:
+def check_environment(config: RunConfig, bundle: Bundle | None, *, strict: bool) -> RunConfig:
     """The configuration with the task's description; `UsageError` if the environment cannot be scored.
 
     A task with a world model is not checked: its packages need not be on this host.
     """
     task = config.task
-    if not config.needs_no_bundle:
-        if task not in (CAR_RACING, DREAM):
+    if bundle is not None or task is None:
+        if bundle is not None and task not in (None, DREAM, bundle.manifest.task):
             log.info("%s is not checked here, as its runs need a world model: workers name what fails", task)
         return config
     log.info("checking %s: dry runs in child processes make, reset and step it", task)

@@ -30,6 +30,21 @@ REAL: dict[str, Any] = {
 }
 # Both pedals of these two sources are half down at an output of 0.
 HALF_PEDALS = ("pedals=half",)
+# Take Cover: a decision holds for 4 tics, so that 525 are the game's limit. Long searches find what the dream alone
+# allows, so each mean is looked at, and the confirmation chooses.
+TAKE_COVER: dict[str, Any] = {
+    "task": "dream",
+    "bundle": "takecover",
+    "population": 64,
+    "episodes": 16,
+    "sigma0": 0.1,
+    "covariance": "diagonal",
+    "horizon": 525,
+    "temperature": 1.15,
+    "evaluate_every": 15,
+    "evaluation_episodes": 100,
+    "confirm_episodes": 100,
+}
 # The settings of the sources, and what two cores do in minutes.
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {"population": 64, "episodes": 16, "sigma0": 0.1, "covariance": "full", "evaluation_episodes": 1024},
@@ -67,6 +82,32 @@ PRESETS: dict[str, dict[str, Any]] = {
         "confirm_episodes": 32,
     },
     "frugal": {"population": 32, "episodes": 2, "sigma0": 0.1, "covariance": "diagonal", "patience": 100},
+    # The dream of any world that a bundle describes.
+    "pixels": {
+        "task": "dream",
+        "population": 32,
+        "episodes": 8,
+        "sigma0": 0.1,
+        "covariance": "diagonal",
+        "temperature": 1.15,
+        "evaluate_every": 10,
+        "evaluation_episodes": 16,
+        "confirm_episodes": 32,
+    },
+    "takecover": TAKE_COVER,
+    # In the game itself, by what the world model sees and remembers.
+    "takecover-real": {
+        "task": "takecover",
+        "bundle": "takecover",
+        "population": 24,
+        "episodes": 4,
+        "sigma0": 0.06,
+        "covariance": "diagonal",
+        "horizon": 525,
+        "evaluate_every": 10,
+        "evaluation_episodes": 100,
+        "confirm_episodes": 100,
+    },
     "real": REAL,
     # Each candidate drives one track and dreams another: docs/dreams.md, "Some of reality in it".
     "mixed": {

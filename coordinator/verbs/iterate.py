@@ -8,7 +8,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.cli.config import add_flags, configured_values, load
 from dreamfleet.common.cli.global_config import add_global_flags, load_credentials
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
@@ -17,9 +16,10 @@ from dreamfleet.common.files.regular_files import is_file
 from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_signals
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
-from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, NetworkConfig, RunConfig
+from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, NetworkConfig, RunConfig, default_world
 
 if TYPE_CHECKING:
+    from dreamfleet.common.artifacts.bundle import Bundle
     from dreamfleet.common.host.stop_signals import Stop
     from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
     from dreamfleet.coordinator.experiments.iteration.ledger import IterationLedger
@@ -88,7 +88,8 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
     more = _common_run_flags(args)
     first, limits = parse_run_flags([*more, *config.flags_of_run(1)], args.sources, "iterate")
     later, _ = parse_run_flags([*more, *config.flags_of_run(2)], args.sources, "iterate")  # wrong flags end it now
-    settings = {**asdict(first), **asdict(limits), **dict.fromkeys(VARYING)}
+    task = first.task or config.task or default_world()
+    settings = {**asdict(first), **asdict(limits), **dict.fromkeys(VARYING), "task": task}
     if new:
         for run in (first, later):
             _check_run(config, run, layout)
@@ -101,7 +102,7 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
         raise UsageError("nothing would score: give --local slots here, or --listen for workers of other hosts")
     Network(args.listen, credentials=load_credentials(args, ("coordinator",))).check_open(insecure=_insecure(args))
     iteration = Iteration(
-        layout, config, ledger, lambda: _local_fleet(args, config, more, settings["task"]), stop, _network_flags(args)
+        layout, config, ledger, lambda: _local_fleet(args, config, more, task), stop, _network_flags(args)
     )
     if args.redo:
         if (phase := Phase.of(args.redo)).name == INIT:
@@ -122,13 +123,12 @@ def _common_run_flags(args: argparse.Namespace) -> tuple[str, ...]:
 
 def _check_run(config: IterateConfig, run: RunConfig, layout: IterationFolder) -> None:
     """Check that a round's run can begin, in the shipped world model or in that of `--init`."""
-    from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.coordinator.experiments.iteration.phases import find_init
     from dreamfleet.coordinator.settings.start import find_start
 
     run = replace(run, recorded=0.0)  # a bundle need not hold recorded states yet
     if not config.init:
-        settings = run.settings(find_bundle(DEFAULT_BUNDLE))
+        settings = run.settings(_stand_in(config))
     else:
         if is_file(Path(config.init)) and Path(config.init).is_relative_to(layout.root.resolve()):
             raise UsageError(f"--init {config.init} lies in the iteration's own folder: copy it elsewhere first")
@@ -136,16 +136,30 @@ def _check_run(config: IterateConfig, run: RunConfig, layout: IterationFolder) -
         settings = (start.apply_to(run) if config.go_on else run).settings(bundle)
         if config.go_on:
             start.check(settings)
-    if config.go_on and Variant.from_json(settings.task.options).feedback == "last":
+    if config.go_on and settings.task.option("feedback") == "last":
         raise UsageError(
             "--go-on fits a controller to the next model, and one with feedback=last cannot be: leave one out"
         )
 
 
-def _local_fleet(args: argparse.Namespace, config: IterateConfig, more: tuple[str, ...], task: str) -> LocalFleet:
-    from dreamfleet.coordinator.experiments.local_run import LocalFleet
+def _stand_in(config: IterateConfig) -> Bundle:
+    """A world model for what a run's settings must fit: the shipped one, as if it were of the iteration's world."""
+    from dreamfleet.common.artifacts.actions import one_hot
+    from dreamfleet.common.artifacts.bundle import Bundle
+    from dreamfleet.common.artifacts.bundle_store import find_bundle
+    from dreamfleet.common.artifacts.world_facts import WorldFacts
 
-    own = ("--task", task) if ":" in task else ()
+    shipped = find_bundle(DEFAULT_BUNDLE)
+    if config.task in ("", shipped.manifest.task):
+        return shipped
+    facts = WorldFacts.of(one_hot(shipped.manifest.actions), packages=(), horizon=1, frames_per_second=1)
+    return Bundle(shipped.path, shipped.sha256, replace(shipped.manifest, task=config.task, world=facts))
+
+
+def _local_fleet(args: argparse.Namespace, config: IterateConfig, more: tuple[str, ...], task: str) -> LocalFleet:
+    from dreamfleet.coordinator.experiments.local_run import LocalFleet, task_flags
+
+    own = task_flags(task, config.task)
     return LocalFleet.of(args.listen, config.local, more, own, args.global_config.join, insecure=_insecure(args))
 
 
@@ -203,6 +217,6 @@ def _print_results(args: argparse.Namespace, layout: IterationFolder, ledger: It
     print_rows(rows, right=tuple(rows[0])[1:])
     print(f"world model: {model}")
     if init := ledger.settings.get("init"):
-        print(f"it began with {init}, which was not judged on these tracks: `dreamfleet compare` shows which is better")
+        print(f"it began with {init}, which was not judged on these seeds: `dreamfleet compare` shows which is better")
     if best is not None:
         print(f"best controller: round {best['round']}'s, {summary.format_score(best['score'])}: {best['controller']}")

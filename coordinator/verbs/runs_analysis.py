@@ -192,9 +192,9 @@ def _draw_fitness(args: argparse.Namespace, out: Path) -> None:
 
 
 def _draw_learning(args: argparse.Namespace, out: Path) -> None:
-    from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING
-    from dreamfleet.coordinator.analysis.learning import PAPER_SCORES, LearningCurve
+    from dreamfleet.coordinator.analysis.learning import LearningCurve
     from dreamfleet.coordinator.analysis.plot import plot_learning
+    from dreamfleet.coordinator.analysis.published import PUBLISHED
 
     curves = []
     for name in dict.fromkeys(args.run_names):
@@ -204,8 +204,10 @@ def _draw_learning(args: argparse.Namespace, out: Path) -> None:
     if len(worlds) > 1:
         names = ", ".join(worlds)
         print(f"note: these runs are of the worlds {names}: their scores do not compare", file=sys.stderr)
-    near = max(each.total.steps for each in curves) >= NEAR_SHARE * PAPER_SCORES[0].steps
-    plot_learning(curves, PAPER_SCORES if near and worlds == [CAR_RACING] else (), out)
+    marks = PUBLISHED.get(worlds[0]) if len(worlds) == 1 else None
+    if marks is not None and max(each.total.steps for each in curves) < NEAR_SHARE * marks.first_steps:
+        marks = None
+    plot_learning(curves, marks, out)
 
 
 def configure_receipt(parser: argparse.ArgumentParser) -> None:

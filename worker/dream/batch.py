@@ -26,7 +26,7 @@ class DreamBatch:
         self._size = bundle.controller_shape.size
         self._horizon = spec.horizon
         self._observer: StepObserver | None = None
-        self._world = DreamWorld(bundle, spec.temperature or DEFAULT_TEMPERATURE, world, spec.recorded)
+        self._world = DreamWorld(bundle, spec.temperature or DEFAULT_TEMPERATURE, world, spec.recorded, spec.end)
 
     def watched(self, observer: StepObserver) -> DreamBatch:
         """A copy that passes steps to `observer`: those of the first episode that has not ended."""

@@ -210,9 +210,9 @@ def find_checked_world(assignment: Assignment) -> World:
     """The world that is scored in; `UsageError` if the task has another version on this host."""
     spec, task = assignment.spec, find_scored_task(assignment.spec.task, assignment.bundle)
     world = task.world_of(assignment)
-    if world.version != spec.version:
+    if world.version != spec.world_version:
         raise UsageError(
-            f"the run scores in version {spec.version} of task {spec.task}, here is version {world.version}: "
+            f"the run scores in version {spec.world_version} of task {spec.task}, here is version {world.version}: "
             "install the package version that the run was begun with"
         )
     return world

@@ -25,6 +25,7 @@ class Pipeline:
     data: Path
     scale: float = 1.0  # share of the drives, of each training's updates, and of those between its checkpoints
     seed: int = 0
+    world_flags: Words = ()  # of collect: which world a new data set is of
     collect_flags: str = ""
     vae_flags: str = ""
     mdnrnn_flags: str = ""
@@ -45,7 +46,7 @@ class Pipeline:
         train = partial(model_commands.train, seed=self.seed, preset=preset, device=device)
         return {
             COLLECT: model_commands.collect(
-                self.data, *collect_flags, preset=preset, seed=self.seed, episodes=drives, jobs=jobs
+                self.data, *self.world_flags, *collect_flags, preset=preset, seed=self.seed, episodes=drives, jobs=jobs
             ),
             VAE: train("vae", self.data, *self._train_flags(self.preset.vae, "vae_flags")),
             ENCODE: model_commands.encode(self.data),

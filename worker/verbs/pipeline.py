@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from dreamfleet.common.cli.model_commands import world_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.cli.verb_runner import InProcessRunner
+from dreamfleet.common.cli.world_flags import add_world_flags, world_arguments
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import interrupted_by_signals
 
@@ -22,6 +24,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--data", type=Path, required=True, help="folder of the data set; one that was begun is resumed"
     )
     parser.add_argument("--preset", help=preset_help_text("training"))
+    add_world_flags(parser)
     parser.add_argument(
         "--scale", type=float, default=1.0, metavar="SHARE",
         help="share of the preset's drives, of each training's updates, and of those between two of its checkpoints "
@@ -41,13 +44,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the stages, each of which does what is left of it."""
     from dreamfleet.common.files.atomic_write import check_output_path
-    from dreamfleet.worker.training.data.data_folder import check_seed, resolve_preset
+    from dreamfleet.worker.training.data.data_folder import check_seed, resolve_preset, resolve_world
     from dreamfleet.worker.training.pipeline import Pipeline
     from dreamfleet.worker.training.presets import find_preset
 
-    preset = find_preset(resolve_preset(args.data, args.preset))
+    world = resolve_world(args.data, args.task, world_arguments(args))
+    preset = find_preset(resolve_preset(args.data, args.preset, world))
     check_seed(args.data, args.seed)
-    flags = (args.collect_flags, args.vae_flags, args.mdnrnn_flags)
+    flags = (world_flags(vars(args)), args.collect_flags, args.vae_flags, args.mdnrnn_flags)
     source = Pipeline(preset, args.data, args.scale, args.seed, *flags)
     runner = InProcessRunner(source.stages(max(1, args.jobs), args.device, args.out))  # wrong flags end it here
     check_output_path(args.out or source.bundle)

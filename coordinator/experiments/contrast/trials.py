@@ -20,9 +20,9 @@ from dreamfleet.common.runs.records import best_evaluation
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.coordinator.experiments.contrast.config import Contrast, Trial
 from dreamfleet.coordinator.experiments.contrast.summary import TrialResult
-from dreamfleet.coordinator.experiments.local_run import LocalFleet, evolve, has_begun, has_ended
+from dreamfleet.coordinator.experiments.local_run import LocalFleet, evolve, has_begun, has_ended, task_flags
 
-# Parts of the data set that trials link to. Its preset is none: a kind's flags change the preset tiny.
+# Parts of the data set that trials link to. Its preset is none: a kind's flags change the preset of its world.
 SHARED = ("episodes", "encoded", "vae.safetensors")
 SETTINGS = "contrast.json"
 LOCK = "contrast.lock"
@@ -68,6 +68,8 @@ class Trials:
         if not has_ended(self._runs, trial.name):
             on_step(f"{trial.name}: evolve")
             local_fleet = self._local_fleet()
+            own = task_flags(Bundle.open(model).manifest.task)
+            local_fleet = replace(local_fleet, worker=(*local_fleet.worker, *own))
             words = self._run_command(trial, local_fleet)
             evolve(trial.name, words, local_fleet, self._trial_folder(trial) / "logs", self._stop)
         return self._outcome(trial)

@@ -67,7 +67,7 @@ class Commands:
             kept = ("--decoder-only",) if model == "vae" and config.vae == "decoder" else ()
             flags = (*flags, *options(continue_from=before), *kept)
         return model_commands.train(
-            model, self.layout.round(number), *flags, preset=config.preset, device=config.device,
+            model, self.layout.round(number), *flags, preset=config.training_preset, device=config.device,
             seed=self.seed(Phase(number, model)),
         )  # fmt: skip
 
@@ -100,7 +100,7 @@ class Commands:
         return command("subspace", bundle, "--data", self.layout.root, *views, "--out", path, "--json")
 
     def gate(self, number: int) -> dict[str, dict[str, Words]]:
-        """What is measured of the `old` and the `new` world model: `probe`, `losses`, or both.
+        """What is measured of the `old` and the `new` world model: `probe`, `losses`, `survival`.
 
         Both are probed on the same drives of the last round's optimum. For losses the optimum drives in the dream, so
         the new model gets it refitted.
@@ -112,9 +112,11 @@ class Commands:
         found: dict[str, dict[str, Words]] = {side: {} for side in sides}
         for side, (bundle, driver) in sides.items():
             if config.gate_drives:
-                found[side]["probe"] = _inspect_words(bundle, "--probe", optimum, config.gate_drives)
+                found[side]["probe"] = _inspect_words(bundle, "--probe", config.gate_drives, *_driven_by(optimum))
             if config.gate_losses:
-                found[side]["losses"] = _inspect_words(bundle, "--losses", driver, config.gate_losses)
+                found[side]["losses"] = _inspect_words(bundle, "--losses", config.gate_losses, *_driven_by(driver))
+            if config.survival_episodes:
+                found[side]["survival"] = _inspect_words(bundle, "--survival", config.survival_episodes)
         return found
 
     def begin_run(
@@ -136,13 +138,14 @@ class Commands:
     def _collect(self, episodes: int | None, *more: object) -> Words:
         config = self.config
         return model_commands.collect(
-            self.layout.root, *more, preset=config.preset, seed=config.seed, episodes=episodes,
-            steps=config.drive_steps, jobs=config.jobs,
+            self.layout.root, *config.world_flags, *more, preset=config.training_preset, seed=config.seed,
+            episodes=episodes, steps=config.drive_steps, jobs=config.jobs,
         )  # fmt: skip
 
 
-def _inspect_words(bundle: Path, figure: str, controller: Path, episodes: int) -> Words:
-    return command(
-        "inspect", bundle, figure, "--controller", controller, "--episodes", episodes, "--seed", GATE_SEED,
-        "--noise", GATE_NOISE, "--json",
-    )  # fmt: skip
+def _inspect_words(bundle: Path, figure: str, episodes: int, *more: object) -> Words:
+    return command("inspect", bundle, figure, "--episodes", episodes, "--seed", GATE_SEED, *more, "--json")
+
+
+def _driven_by(controller: Path) -> Words:
+    return command("--controller", controller, "--noise", GATE_NOISE)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dreamfleet.common.cli.config import option
-from dreamfleet.common.cli.model_commands import Words, split_flags
-from dreamfleet.common.cli.presets import NAMES, check_preset
+from dreamfleet.common.cli.model_commands import WORLD_FLAGS, Words, split_flags, world_flags
+from dreamfleet.common.cli.presets import NAMES, check_preset, default_training_preset
 from dreamfleet.common.errors import UsageError
 
 # They change no round that is finished, nor what it means; what `--run-flags` lead to is compared instead of them.
@@ -16,10 +16,11 @@ MOST_SEED = 2**31 - 1  # each round's training multiplies its own
 RUN_FLAGS = ("run_flags", "later_run_flags")
 # Flags of each training that iterate sets itself.
 RESERVED_FLAGS = ("--data", "--preset", "--device", "--seed", "--continue-from", "--new", "--summary", "--json")
+SURVIVAL_EPISODES = 40
 LEAST = {
     "rounds": 1, "drives": 2, "more_drives": 0, "own_drives": 0, "means": 1, "drive_steps": 1, "vae_updates": 1,
     "mdnrnn_updates": 1, "gate_drives": 0, "gate_losses": 0, "seed": 0, "local": 0, "jobs": 1,
-    "views": 0,
+    "views": 0, "gate_lives": 0,
 }  # fmt: skip
 
 
@@ -31,10 +32,19 @@ class IterateConfig:
         "", "controller to go on from, and with it its world model: a file, or one that ships (default none)"
     )
     rounds: int = option(5, "rounds in all: each makes a world model and evolves in its dream; more may follow later")
-    preset: str = option("tiny", f"training preset to begin with: {', '.join(NAMES['training'])}")
-    drives: int | None = option(
-        None, "random drives that the first round learns from (default the preset's, 620 of tiny)"
+    task: str = option(
+        "", "the world, such as gym:ENVIRONMENT (default car-racing); as `collect` takes this and these:"
     )
+    environment: tuple[str, ...] = option((), "KEY=VALUE arguments of the world; values as in JSON")
+    observation: str = option("", "picture among several, by its key; render: what is drawn")
+    crop: str = option("", "part of the picture that is seen, as top:bottom,left:right")
+    size: int | None = option(None, "height and width of the picture: 64 or 96")
+    skip: int | None = option(None, "steps of the world for which an action is held")
+    difference: bool = option(False, "show movement: grey now, grey before, their difference")
+    preset: str | None = option(
+        None, f"training preset to begin with: {', '.join(NAMES['training'])} (default the world's, such as tiny)"
+    )
+    drives: int | None = option(None, "random drives that the first round learns from (default the preset's)")
     more_drives: int = option(0, "random drives that each later round adds")
     own_drives: int = option(80, "drives of the last round's own means, or --init's, that each round adds")
     means: int = option(4, "means that drive these: the reported one, the last one, then the best evaluated ones")
@@ -65,7 +75,12 @@ class IterateConfig:
     )
     gate_drives: int = option(20, "drives of `inspect --probe` that a new world model is held to the old by; 0: none")
     gate_losses: int = option(30, "losses of `inspect --losses` that it is held to it by; 0: none")
-    seed: int = option(0, "makes the iteration: drives, training, populations and tracks follow from it")
+    gate_lives: int | None = option(
+        None,
+        "episodes of each fixed policy of `inspect --survival` that it is held to it by; 0: none (default 40 with "
+        "--task, else none)",
+    )
+    seed: int = option(0, "makes the iteration: drives, training, populations and seeds of episodes follow from it")
     local: int | None = option(None, "scoring processes here (default one a core, or none where --listen is given)")
     jobs: int | None = option(None, "processes that drive for the data set here (default one a core)")
     device: Literal["cpu", "cuda", "auto"] = option("cpu", "that trains: cpu, cuda, or auto")
@@ -75,7 +90,7 @@ class IterateConfig:
             value = getattr(self, name)
             if value is not None and value < least:
                 raise UsageError(f"--{name.replace('_', '-')} must be at least {least}, not {value}")
-        check_preset("training", self.preset)
+        check_preset("training", self.training_preset)
         if not 0 <= self.noise <= 10:
             raise UsageError(f"--noise must be from 0 to 10, not {self.noise}")
         if not 0 <= self.spells <= 1:
@@ -90,6 +105,21 @@ class IterateConfig:
             raise UsageError(f"--seed must be at most {MOST_SEED}, not {self.seed}")
         for name in ("vae_flags", "mdnrnn_flags", *RUN_FLAGS):
             self.flags(name)
+
+    @property
+    def training_preset(self) -> str:
+        """The preset of its data and trainings: by default that of its world."""
+        return self.preset or default_training_preset(self.task)
+
+    @property
+    def survival_episodes(self) -> int:
+        """Episodes of each policy by which a gate measures survival; 0: it does not."""
+        return (SURVIVAL_EPISODES if self.task else 0) if self.gate_lives is None else self.gate_lives
+
+    @property
+    def world_flags(self) -> Words:
+        """The flags of `collect` that say which world the data are of."""
+        return world_flags({name: getattr(self, name) for name in WORLD_FLAGS})
 
     def is_from_scratch(self, number: int) -> bool:
         """Whether a round has nothing before it: no world model, no controller."""

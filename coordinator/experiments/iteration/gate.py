@@ -1,8 +1,9 @@
 """Whether a new world model replaces the old one, by the figures of `inspect` for both.
 
-Two figures, of which more is better. *Knows*: the mean, over the quantities of the simulator's truth, of the R² of a
+Three figures, of which more is better. *Knows*: the mean, over the quantities of the simulator's truth, of the R² of a
 linear map from [z, h] on held-out drives. *Loses*: how many dreams begun shortly before real losses of the road lose it
 too, less how many do where reality loses nothing; reality's is 1. A dream that loses none, or all, has 0.
+*Survives*: how well the lengths of dreams of fixed policies agree with those of real episodes; 0 is best.
 
 A new model is refused if a figure that both have is clearly worse: lower by more than two standard errors of the
 difference, and by more than `MARGIN`. What could not be measured of both refuses nothing.
@@ -19,7 +20,7 @@ from dreamfleet.common.runs.standard_error import format_with_error
 
 MARGIN = 0.02
 ERRORS = 2.0
-KNOWS, LOSES = "knows", "loses"
+KNOWS, LOSES, SURVIVES = FIGURES = "knows", "loses", "survives"
 CALM = "no loss"  # as `inspect` names the beginnings behind which reality loses nothing
 
 
@@ -52,7 +53,7 @@ class GateDecision:
 
 def judge(old: Figures, new: Figures) -> GateDecision:
     """Compare the new model's figures with the old one's."""
-    both = {name: (before, after) for name in (KNOWS, LOSES)
+    both = {name: (before, after) for name in FIGURES
             if (before := old.get(name)) is not None and (after := new.get(name)) is not None}  # fmt: skip
     if not both:
         return GateDecision(True, "kept: nothing was measured of both")
@@ -64,8 +65,9 @@ def judge(old: Figures, new: Figures) -> GateDecision:
 
 
 def figures(measured: Mapping[str, Any]) -> dict[str, Figure | None]:
-    """The two figures of a model from the answers of `inspect --probe` and `inspect --losses`, where it has them."""
-    return {KNOWS: knows(measured.get("probe")), LOSES: loses(measured.get("losses"))}
+    """The figures of a model from the answers of `inspect --probe`, `--losses` and `--survival`, where it has them."""
+    found = {KNOWS: knows(measured.get("probe")), LOSES: loses(measured.get("losses"))}
+    return {**found, SURVIVES: survives(measured["survival"])} if "survival" in measured else found
 
 
 def knows(probe: Mapping[str, Any] | None) -> Figure | None:
@@ -90,6 +92,12 @@ def loses(losses: Mapping[str, Any] | None) -> Figure | None:
         return None
     errors = before["error"], begun[CALM]["error"]
     return None if None in errors else Figure(before["value"] - begun[CALM]["value"], math.hypot(*errors))
+
+
+def survives(survival: Mapping[str, Any]) -> Figure | None:
+    """Of `inspect --survival --json`; `None` of one episode, which has no standard error."""
+    found = survival.get("survival", {}).get("agreement")
+    return None if found is None or found["error"] is None else Figure(**found)
 
 
 def _mean(values: Iterable[float]) -> float:

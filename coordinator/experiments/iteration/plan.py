@@ -53,7 +53,7 @@ class PhasePlan:
             COLLECT: not (number == 1 or config.more_drives),
             TAKE: number == 1 or not self.collects,
             DRIVE: anew or not config.own_drives,
-            GATE: anew or not (config.gate_drives or config.gate_losses),
+            GATE: anew or not (config.gate_drives or config.gate_losses or config.survival_episodes),
         }
         return tuple(Phase(number, name) for name in ALL if not left_out.get(name))
 

@@ -56,10 +56,11 @@ class Iteration:
     def begin(self) -> None:
         """Check the files of finished phases, or a new iteration's training flags.
 
-        With `init` the first phase checks the flags, because they must fit the model that is there.
+        With `init` the first phase checks the flags, because they must fit the model that is there. Those of another
+        world than the first are checked once there are data of it, which presets must fit.
         """
         artefacts.check(self._layout, self.ledger)
-        if self.ledger.entries or self._config.init:
+        if self.ledger.entries or self._config.init or self._config.task:
             return
         commands = Commands(self._config, self._layout, self.ledger)
         for model in MODELS:

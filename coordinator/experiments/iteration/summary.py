@@ -7,7 +7,7 @@ from typing import Any
 
 from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.standard_error import format_with_error
-from dreamfleet.coordinator.experiments.iteration.gate import KNOWS, LOSES
+from dreamfleet.coordinator.experiments.iteration.gate import KNOWS, LOSES, SURVIVES
 from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
 from dreamfleet.coordinator.experiments.iteration.ledger import FinishedPhase, IterationLedger
 from dreamfleet.coordinator.experiments.iteration.plan import BUNDLE, DATA, EVOLVE, GATE, INIT, MDNRNN, VAE
@@ -48,7 +48,8 @@ def format_score(score: Mapping[str, Any] | None) -> str:
         return "not evaluated"
     provisional = "" if score["confirmed"] else ", provisional"
     error = score["error"] if score["episodes"] > 1 else None  # older ledgers have 0 for one track
-    return f"{format_with_error(score['mean'], error, 0)} on {plural(score['episodes'], 'track')}{provisional}"
+    episodes = plural(score["episodes"], score.get("word", "track"))
+    return f"{format_with_error(score['mean'], error, 0)} on {episodes}{provisional}"
 
 
 def describe_rounds(layout: IterationFolder, ledger: IterationLedger) -> list[dict[str, Any]]:
@@ -62,7 +63,7 @@ def table_rows(rounds: list[dict[str, Any]]) -> list[dict[str, object]]:
         {
             "round": each["round"], "drives": each["drives"], "frames": each["frames"],
             "nats": each["quality"].get("nats_per_dimension"), "reward AUC": each["quality"].get("reward_auc"),
-            KNOWS: _figure(each["gate"], KNOWS), LOSES: _figure(each["gate"], LOSES),
+            KNOWS: _figure(each["gate"], KNOWS), LOSES: _figure(each["gate"], LOSES), **_survival(each["gate"]),
             "model": _model_state(each), "score": each["score"] and format_score(each["score"]),
         }
         for each in rounds
@@ -100,6 +101,11 @@ def _figures(ledger: IterationLedger, number: int, phase: str) -> dict[str, Any]
 def _figure(gate: Mapping[str, Any] | None, name: str) -> str | None:
     found = gate and gate["new"].get(name)
     return format_with_error(found["value"], found["error"], 2) if found else None
+
+
+def _survival(gate: Mapping[str, Any] | None) -> dict[str, object]:
+    """The column of survival, where that was measured."""
+    return {SURVIVES: _figure(gate, SURVIVES)} if gate and SURVIVES in gate["new"] else {}
 
 
 def _model_state(row: Mapping[str, Any]) -> str | None:
