@@ -51,10 +51,11 @@ def dream_section(bundle: Bundle, drive: EncodedRollout, vae_view: VAEView) -> S
     for temperature in TEMPERATURES:
         dreamt = dream_latents(bundle, drive, temperature)[steps]
         rows.append((f"dream,\ntemperature\n{temperature}", vae_view.decode(dreamt)))
+    opening = f" The first {drive.opening} steps are the world's opening." if drive.opening else ""
     return Section(
         "dream", "A dream beside the drive",
         "The drive's own actions in the model's dream. It begins at the drive's first latent and sees nothing of the "
-        "drive afterwards. In the first 50 steps CarRacing's camera comes down.",
+        f"drive afterwards.{opening}",
         picture_grid(rows, [f"step {step}" for step in steps]),
     )  # fmt: skip
 
@@ -78,7 +79,7 @@ def reward_section(bundle: Bundle, drive: EncodedRollout) -> Section:
     axes[1, 0].set_xlabel("step of the drive", fontsize=FONT)
     return Section(
         "rewards", "What it thinks a step is worth",
-        "The reward head beside what CarRacing gave: on the drive itself, one step ahead, and in a dream (temperature "
+        "The reward head beside what the world gave: on the drive itself, one step ahead, and in a dream (temperature "
         "1) that only shares its actions.",
         render_png(figure),
     )  # fmt: skip
