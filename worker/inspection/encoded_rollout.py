@@ -45,6 +45,7 @@ class EncodedRollout:
     reward: NDArray[np.float64]
     description: str  # for captions
     opening: int = 0  # first steps that say little, such as while a camera moves
+    died: bool = False  # whether the last action ended it
 
     def __len__(self) -> int:
         return len(self.action)
@@ -148,4 +149,6 @@ def record_drive(
     mu, logvar = Encoder(bundle).encode(seen)
     actions, rewards = np.stack([moment.action for moment in moments]), np.array([each.reward for each in moments])
     opening = task.world_of(assignment).opening
-    return EncodedRollout(seen, mu, logvar, actions, rewards, f"a fresh drive by {driver}", opening)
+    return EncodedRollout(
+        seen, mu, logvar, actions, rewards, f"a fresh drive by {driver}", opening, moments[-1].terminal
+    )

@@ -17,6 +17,7 @@ from dreamfleet.worker.worldmodel.inference import DreamStep, RewardLabel
 Floats = NDArray[np.float32]
 STEPS = (0, 5, 10, 20, 50, 100, 200, 299)  # of a dream that are drawn
 TEMPERATURES = (0.5, 1.0)
+LEAST = 1e-4  # of the probabilities that are drawn
 
 
 def recurrent_states(bundle: Bundle, drive: EncodedRollout) -> Floats:
@@ -93,6 +94,32 @@ def _dreamt_rewards(world: DreamWorld, drive: EncodedRollout) -> list[float]:
         rewards.append(float(moment.reward[0]))
         latent, state = moment.latent, moment.state
     return rewards
+
+
+def ends_section(bundle: Bundle, drive: EncodedRollout) -> Section:
+    """Draw the predicted probability that each step of the drive is its last, on a logarithmic axis."""
+    model, zeros = DreamStep(bundle), np.zeros((1, bundle.manifest.latent), np.float32)
+    predicted = [
+        float(model.imagine(latent[None], action[None], state, zeros, zeros, 1.0, None).done[0])
+        for latent, action, state in zip(drive.mu, drive.action, recurrent_states(bundle, drive), strict=True)
+    ]
+    figure, axes = new_figure(2.8)
+    panel = axes[0, 0]
+    panel.plot(np.maximum(predicted, LEAST), color="tab:blue", linewidth=1.2)
+    if drive.died:
+        panel.axvline(len(drive) - 1, color="tab:red", linewidth=1.5, label="where it ended")
+        panel.legend(fontsize=FONT, loc="upper left")
+    panel.set_yscale("log")
+    panel.set_ylim(LEAST, 1.2)
+    panel.set_xlabel("step of the drive", fontsize=FONT)
+    panel.set_ylabel("predicted probability", fontsize=FONT)
+    panel.grid(alpha=0.3)
+    return Section(
+        "ends", "When it expects an end",
+        "The probability that the model gives each step of the drive to be the last, one step ahead. `inspect "
+        "--survival` measures whether dreams end as early as the world.",
+        render_png(figure),
+    )  # fmt: skip
 
 
 def attention_section(bundle: Bundle, drive: EncodedRollout) -> Section | None:

@@ -194,6 +194,8 @@ def _dream_sections(bundle: Bundle, driven: EncodedRollout, vae_view: VAEView) -
     yield mdnrnn_sections.dream_section(bundle, driven, vae_view)
     if bundle.manifest.models.get("mdnrnn", {}).get("reward", "none") != "none":
         yield mdnrnn_sections.reward_section(bundle, driven)
+    if bundle.manifest.models.get("mdnrnn", {}).get("done"):
+        yield mdnrnn_sections.ends_section(bundle, driven)
     if looked := mdnrnn_sections.attention_section(bundle, driven):
         yield looked
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 SUMMARY = "look into a world model: what it sees, keeps and dreams, and how it learnt, as one page, or as figures"
 EXTRAS = ("worker", "views")
-SECTIONS = 11  # at most, and one more a data folder
+SECTIONS = 12  # at most, and one more a data folder
 DRIVES, LOSSES, LIVES = 20, 30, 40
 FEWEST_DRIVES, FEWEST_LOSSES = 2, 4
 
