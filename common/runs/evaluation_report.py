@@ -16,7 +16,9 @@ from dreamfleet.common.runs.standard_error import format_with_error, score_digit
 from dreamfleet.common.serialization.optional_fields import OPTIONAL
 from dreamfleet.common.serialization.validation import Length, MalformedError, Seconds, from_plain_lenient
 
-SCORE_MARKS = (800, 900)  # scores of CarRacing whose exceeding share is reported
+GYMNASIUM = "gymnasium"  # the judge of worlds that gymnasium itself has
+FORMER_MARKS = (800.0, 900.0)  # of reports that name none: only drives with laps were compared with them
+MAX_MARKS = 8
 MIN_EPISODES_TO_SOLVE = 100  # customary number of episodes for gymnasium's threshold of solving an environment
 MAX_BYTES, MAX_EPISODES, MAX_SEED = 64 << 20, 10**5, 2**63
 Drives = Annotated[tuple[EpisodeResult, ...], Length(1, MAX_EPISODES)]
@@ -35,11 +37,13 @@ class EvaluationReport:
     version: str  # of dreamfleet
     seconds: Seconds
     drives: Drives
-    judge: str = "gymnasium"
-    #: mean score from which gymnasium calls the environment solved; `None` if it names none
+    judge: str = GYMNASIUM  # or the world whose environment judged
+    #: mean score from which the environment counts as solved; `None` if none is named
     threshold: float | None = field(default=None, metadata=OPTIONAL)
     #: episodes without a score; every statistic leaves them out
     failed: Annotated[tuple[FailedEpisode, ...], Length(0, MAX_EPISODES)] = field(default=(), metadata=OPTIONAL)
+    #: scores of which the share of episodes above them is reported
+    marks: Annotated[tuple[float, ...], Length(0, MAX_MARKS)] = field(default=FORMER_MARKS, metadata=OPTIONAL)
 
     @cached_property
     def results(self) -> EpisodeResults:
@@ -48,7 +52,10 @@ class EvaluationReport:
 
     def to_json(self) -> str:
         """One line of JSON: the statistics, then all fields."""
-        return json.dumps({**summary_figures(self.results), **asdict(self)}, allow_nan=False)
+        fields = asdict(self)
+        if self.marks == FORMER_MARKS:  # as ever, to the byte
+            del fields["marks"]
+        return json.dumps({**summary_figures(self.results, self.marks), **fields}, allow_nan=False)
 
     @property
     def description(self) -> str:
@@ -56,8 +63,8 @@ class EvaluationReport:
         failures = self.results.failure_text
         lines = (
             failures and f"{failures}; all figures are over the episodes with a score",
-            _describe_score(self.results),
-            _describe_driving(self.results),
+            self._describe_score,
+            ", ".join([*self._describe_marks(), *_describe_driving(self.results)]),
             self._describe_threshold,
             self._describe_origin,
         )
@@ -65,18 +72,38 @@ class EvaluationReport:
 
     @property
     def _describe_threshold(self) -> str:
-        """Whether gymnasium's threshold is reached, or the distance to it; empty if there is none."""
+        """Whether the threshold is reached, or the distance to it; empty if there is none."""
         if self.threshold is None:
             return ""
+        named = "gymnasium's threshold" if self.judge == GYMNASIUM else "the world's threshold"
         beyond, count = self.results.mean - self.threshold, len(self.drives)
         if beyond >= 0 and count >= MIN_EPISODES_TO_SOLVE and self.failed:
-            return f"{beyond:.1f} above gymnasium's threshold of {self.threshold:g} without the failed episodes"
+            return f"{beyond:.1f} above {named} of {self.threshold:g} without the failed episodes"
         if beyond >= 0 and count >= MIN_EPISODES_TO_SOLVE:
-            return f"solved: gymnasium's threshold is a mean of {self.threshold:g}"
+            return f"solved: {named} is a mean of {self.threshold:g}"
         few = "" if count >= MIN_EPISODES_TO_SOLVE else f", on fewer than {MIN_EPISODES_TO_SOLVE} seeds"
-        return (
-            f"{abs(beyond):.1f} {'above' if beyond >= 0 else 'below'} gymnasium's threshold of {self.threshold:g}{few}"
+        return f"{abs(beyond):.1f} {'above' if beyond >= 0 else 'below'} {named} of {self.threshold:g}{few}"
+
+    @property
+    def _describe_score(self) -> str:
+        found = self.results
+        score = format_with_error(found.mean, found.error)
+        judged = "by gymnasium's own environment" if self.judge == GYMNASIUM else f"in {self.judge}"
+        if found.std is None:
+            return f"{score} on one seed; judged {judged}"
+        digits = score_digits(found.mean, found.error)
+        worst, best, median, std = (
+            format_with_error(each, None, digits) for each in (found.worst, found.best, found.median, found.std)
         )
+        return (
+            f"{score} (standard error) on {len(found.drives)} seeds, {worst} to {best}, median {median}, standard "
+            f"deviation {std}; judged {judged}"
+        )
+
+    def _describe_marks(self) -> list[str]:
+        if self.marks == FORMER_MARKS and self.results.finished is None:
+            return []
+        return [f"above {mark:g}: {self.results.above(mark):.0%}" for mark in self.marks]
 
     @property
     def _describe_origin(self) -> str:
@@ -85,13 +112,13 @@ class EvaluationReport:
         return f"{made}; controller {self.controller[:12]}{model}; dreamfleet {self.version}"
 
 
-def summary_figures(results: EpisodeResults) -> dict[str, Any]:
+def summary_figures(results: EpisodeResults, marks: tuple[float, ...] = FORMER_MARKS) -> dict[str, Any]:
     """The statistics of episodes as JSON has them; `std`, `error`, `finished`, `speed` and `braking` may be `None`."""
     return {
         "n": len(results.drives), "mean": results.mean, "std": results.std, "error": results.error,
         "median": results.median, "least": results.worst, "most": results.best, "steps": results.steps,
         "finished": results.finished, "speed": results.speed, "braking": results.braking,
-        **{f"above_{mark}": results.above(mark) for mark in SCORE_MARKS},
+        **{f"above_{mark:g}": results.above(mark) for mark in marks},
         "scores": results.scores, "seeds": results.seeds,
     }  # fmt: skip
 
@@ -123,28 +150,13 @@ def _check_episodes(report: EvaluationReport) -> None:
         raise ValueError(f"a score is beyond ±{LARGEST_FITNESS:g}")
 
 
-def _describe_score(found: EpisodeResults) -> str:
-    score = format_with_error(found.mean, found.error)
-    if found.std is None:
-        return f"{score} on one seed; judged by gymnasium's own environment"
-    digits = score_digits(found.mean, found.error)
-    worst, best, median, std = (
-        format_with_error(each, None, digits) for each in (found.worst, found.best, found.median, found.std)
-    )
-    return (
-        f"{score} (standard error) on {len(found.drives)} seeds, {worst} to {best}, median {median}, standard "
-        f"deviation {std}; judged by gymnasium's own environment"
-    )
-
-
-def _describe_driving(found: EpisodeResults) -> str:
+def _describe_driving(found: EpisodeResults) -> list[str]:
     """The figures on driving that the environment reports; may be empty."""
     parts = []
     if found.finished is not None:
-        parts += [f"above {mark}: {found.above(mark):.0%}" for mark in SCORE_MARKS]
         parts.append(f"laps finished: {found.finished} of {len(found.drives)}")
     if found.speed is not None:
         parts.append(f"mean speed {found.speed:.1f}")
     if found.braking is not None:
         parts.append(f"brake on in {found.braking:.0%} of the steps")
-    return ", ".join(parts)
+    return parts

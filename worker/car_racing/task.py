@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -25,6 +25,10 @@ from dreamfleet.worker.tasks.policy import DriverPolicy
 from dreamfleet.worker.tasks.registry import preprocessing_for
 from dreamfleet.worker.worldmodel.policy import ModelPolicy
 
+if TYPE_CHECKING:
+    from dreamfleet.common.artifacts.trained_agent import TrainedAgent
+    from dreamfleet.worker.car_racing.agents import NetworkAgent
+
 ENVIRONMENT = "CarRacing-v3"
 WORLD = World(
     actions=STEERING_GAS_BRAKE,
@@ -36,6 +40,7 @@ WORLD = World(
     off_course="off_road",  # `OffRoadInfo` says so
     threshold=gymnasium.spec(ENVIRONMENT).reward_threshold,
     finish="lap_finished",  # gymnasium says so as an episode ends; one that runs out of time says nothing
+    judge="gymnasium",
     score_word="track",
     marks=(800, 900),
     mirror=Mirror(order=(0, 1, 2), signs=(-1, 1, 1)),  # steering
@@ -105,6 +110,12 @@ class CarRacingTask(Task):
     def truth(self, environment: gymnasium.Env[Any, Any]) -> dict[str, float]:
         """The simulator's state of car and road; `true_state` documents units and signs."""
         return read_true_state(environment.unwrapped)
+
+    def make_trained_agent(self, trained: TrainedAgent) -> NetworkAgent:
+        """The agent of a baseline's file; `ControllerError` if it cannot drive CarRacing."""
+        from dreamfleet.worker.car_racing.agents import NetworkAgent  # it imports this module
+
+        return NetworkAgent(trained)
 
     def preprocessing(self, bundle: Bundle) -> Preprocessing:
         """The preprocessing of the bundle's pictures; `BundleError` if this task has no such pictures."""

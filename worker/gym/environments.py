@@ -86,6 +86,7 @@ def describe_environment(environment: Environment, frames: int = 1) -> dict[str,
         "horizon": ENVIRONMENT_LIMIT if limited else -(-DEFAULT_MAX_STEPS // frames),
         "frames_per_second": max(1, round(rate / frames)),
         "threshold": spec.reward_threshold if spec else None,
+        "judge": "gymnasium" if is_gymnasiums(environment) else "",
     }
 
 

@@ -15,12 +15,11 @@ from dreamfleet.common.artifacts.actions import Continuous
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.seeds import VALIDATION
-from dreamfleet.worker.inspection.encoded_rollout import ZOOM
 from dreamfleet.worker.scoring.actors import Actor
 from dreamfleet.worker.scoring.disturbance import Disturbance, DisturbedPolicy
 from dreamfleet.worker.scoring.episode import EpisodeConfig, ResetHook, run_episode
 from dreamfleet.worker.tasks.api import Assignment, Task, TaskWithBeginnings, TaskWithTrueState
-from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.worldmodel.observation import join_features
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 
@@ -33,9 +32,9 @@ OFF, OFFSET = "off_road", "lateral_offset"  # columns of a world's true state: 1
 class DisturbedDriveConfig:
     """How drives are disturbed, and where they end.
 
-    `noise` is the standard deviation of the noise on each action, in halves of its range. The road is lost when the car
+    `noise` is that of `Disturbance`. The road is lost when the car
     is off it for `lasting` steps in a row; a drive ends `after` steps after the first of them. The first `opening`
-    steps are not measured, because CarRacing's camera zooms in. `anywhere` begins drives at a random place of their
+    steps are not measured: the world's `opening`. `anywhere` begins drives at a random place of their
     world, for drivers that do not get far.
     """
 
@@ -43,7 +42,7 @@ class DisturbedDriveConfig:
     steps: int = 1000
     lasting: int = 10
     after: int = 40
-    opening: int = ZOOM
+    opening: int = 0
     first_seed: int = VALIDATION.start
     anywhere: bool = False
 
@@ -116,7 +115,7 @@ def record_disturbed_drives(
     world gives no true state, or its actions are not continuous.
     """
     assignment = Assignment.of(bundle.manifest.task, bundle)
-    task = find_task(bundle.manifest.task)
+    task = task_of(bundle)
     if not isinstance(task, TaskWithTrueState):
         raise UsageError(f"task {task.name} gives no true state to compare with: give it a `truth` (docs/tasks.md)")
     if not isinstance(actions := task.world_of(assignment).actions, Continuous):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,30 +12,31 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.runs.seeds import VALIDATION
 from dreamfleet.worker.scoring.actors import check_same_pictures
+from dreamfleet.worker.scoring.disturbance import numbered_choices
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.api import Assignment, Continuous, Policy, RecordableTask, World
 from dreamfleet.worker.tasks.policy import DriverPolicy
-from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.worldmodel.inference import Encoder
 
 Floats = NDArray[np.float32]
 Pictures = NDArray[np.uint8]
-ZOOM = 50  # steps in which CarRacing's camera zooms in, the first second
 
 
 @dataclass(frozen=True)
 class DriveConfig:
-    """The track, the length and the driver of a drive."""
+    """The seed, the length and the driver of a drive."""
 
-    seed: int = 20_000  # a validation track
+    seed: int = VALIDATION.start
     steps: int = 300
     action: tuple[float, ...] = ()  # repeated at each step instead of any driver's
 
 
 @dataclass(frozen=True)
 class EncodedRollout:
-    """T steps: `picture` (T, side, side, 3) and its `mu`, `logvar` (T, latent); then `action` (T, 3), `reward` (T,)."""
+    """T steps: `picture` (T, side, side, 3) and its `mu`, `logvar` (T, latent); then `action` (T, A), `reward` (T,)."""
 
     picture: Pictures
     mu: Floats
@@ -42,6 +44,8 @@ class EncodedRollout:
     action: Floats
     reward: NDArray[np.float64]
     description: str  # for captions
+    opening: int = 0  # first steps that say little, such as while a camera moves
+    died: bool = False  # whether the last action ended it
 
     def __len__(self) -> int:
         return len(self.action)
@@ -59,8 +63,8 @@ class EncodedRollout:
 
     @property
     def most_informative_step(self) -> int:
-        """The step with the largest KL divergence; after the opening zoom if the drive is long enough."""
-        start = ZOOM if len(self) > ZOOM else 0
+        """The step with the largest KL divergence; after the opening if the drive is long enough."""
+        start = self.opening if len(self) > self.opening else 0
         return start + int(self._divergence[start:].sum(axis=1).argmax())
 
     @property
@@ -71,10 +75,15 @@ class EncodedRollout:
 
 
 class ConstantDriver:
-    """A driver that repeats one action; `UsageError` if the world has no such action."""
+    """A driver that repeats one action; `UsageError` if the world has no such action.
+
+    One of numbered choices is given by its number, from 0.
+    """
 
     def __init__(self, action: Sequence[float], world: World) -> None:
         actions, names = world.actions, world.action_names
+        if isinstance(actions, Continuous) and len(choices := numbered_choices(actions)):
+            action = _choice_of(action, choices, names).tolist()
         done = np.array(action, np.float64)
         if not isinstance(actions, Continuous) or done.shape != (actions.actions,):
             wanted = f"{', '.join(names)}: {len(names)} numbers" if names else "numbers, of a world with such actions"
@@ -82,7 +91,7 @@ class ConstantDriver:
         if not ((actions.low <= done) & (done <= actions.high)).all():
             bounds = ", ".join(
                 f"{name} from {low:g} to {high:g}"
-                for name, low, high in zip(names, actions.low, actions.high, strict=True)
+                for name, low, high in zip(names or count(1), actions.low, actions.high, strict=False)
             )
             raise UsageError(f"--action takes {bounds}, not {_format_action(action)}")
         self._done = done.astype(np.float32)
@@ -90,6 +99,17 @@ class ConstantDriver:
     def act(self) -> Floats:
         """The action."""
         return self._done
+
+
+def _choice_of(action: Sequence[float], choices: Floats, names: Sequence[str]) -> Floats:
+    if len(action) != 1 or action[0] not in range(len(choices)):
+        numbered = (
+            ", ".join(f"{number} {name}" for number, name in enumerate(names)) if len(names) == len(choices) else ""
+        )
+        wanted = numbered or f"0 to {len(choices) - 1}"
+        raise UsageError(f"--action takes one number of a choice, {wanted}, not {_format_action(action)}")
+    choice: Floats = choices[int(action[0])]
+    return choice
 
 
 def _format_action(action: Sequence[float]) -> str:
@@ -106,12 +126,12 @@ def record_drive(
     if own is not None:
         check_same_pictures(own, bundle)
     assignment = Assignment.of(bundle.manifest.task, own or bundle)
-    task, driver = find_task(bundle.manifest.task), "the controller"
+    task, driver = task_of(bundle), "the controller"
     policy: Policy = task.make_policy(assignment)
     if config.action:
         driver, policy = (
             f"one action alone, {_format_action(config.action)}",
-            DriverPolicy(ConstantDriver(config.action, task.world)),
+            DriverPolicy(ConstantDriver(config.action, task.world_of(assignment))),
         )
     elif controller is not None:
         policy.begin(controller.parameters)
@@ -121,9 +141,14 @@ def record_drive(
     else:
         raise UsageError(f"task {bundle.manifest.task} has no driver: look at a run, whose controller drives")
     environment = task.make_environment(assignment)
-    moments = list(run_episode(environment, policy, EpisodeConfig(config.seed, config.steps)))
-    environment.close()
+    try:
+        moments = list(run_episode(environment, policy, EpisodeConfig(config.seed, config.steps)))
+    finally:
+        environment.close()
     seen = np.stack([moment.seen for moment in moments])
     mu, logvar = Encoder(bundle).encode(seen)
     actions, rewards = np.stack([moment.action for moment in moments]), np.array([each.reward for each in moments])
-    return EncodedRollout(seen, mu, logvar, actions, rewards, f"a fresh drive by {driver}")
+    opening = task.world_of(assignment).opening
+    return EncodedRollout(
+        seen, mu, logvar, actions, rewards, f"a fresh drive by {driver}", opening, moments[-1].terminal
+    )

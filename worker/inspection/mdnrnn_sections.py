@@ -17,6 +17,7 @@ from dreamfleet.worker.worldmodel.inference import DreamStep, RewardLabel
 Floats = NDArray[np.float32]
 STEPS = (0, 5, 10, 20, 50, 100, 200, 299)  # of a dream that are drawn
 TEMPERATURES = (0.5, 1.0)
+LEAST = 1e-4  # of the probabilities that are drawn
 
 
 def recurrent_states(bundle: Bundle, drive: EncodedRollout) -> Floats:
@@ -51,10 +52,11 @@ def dream_section(bundle: Bundle, drive: EncodedRollout, vae_view: VAEView) -> S
     for temperature in TEMPERATURES:
         dreamt = dream_latents(bundle, drive, temperature)[steps]
         rows.append((f"dream,\ntemperature\n{temperature}", vae_view.decode(dreamt)))
+    opening = f" The first {drive.opening} steps are the world's opening." if drive.opening else ""
     return Section(
         "dream", "A dream beside the drive",
         "The drive's own actions in the model's dream. It begins at the drive's first latent and sees nothing of the "
-        "drive afterwards. In the first 50 steps CarRacing's camera comes down.",
+        f"drive afterwards.{opening}",
         picture_grid(rows, [f"step {step}" for step in steps]),
     )  # fmt: skip
 
@@ -78,7 +80,7 @@ def reward_section(bundle: Bundle, drive: EncodedRollout) -> Section:
     axes[1, 0].set_xlabel("step of the drive", fontsize=FONT)
     return Section(
         "rewards", "What it thinks a step is worth",
-        "The reward head beside what CarRacing gave: on the drive itself, one step ahead, and in a dream (temperature "
+        "The reward head beside what the world gave: on the drive itself, one step ahead, and in a dream (temperature "
         "1) that only shares its actions.",
         render_png(figure),
     )  # fmt: skip
@@ -92,6 +94,32 @@ def _dreamt_rewards(world: DreamWorld, drive: EncodedRollout) -> list[float]:
         rewards.append(float(moment.reward[0]))
         latent, state = moment.latent, moment.state
     return rewards
+
+
+def ends_section(bundle: Bundle, drive: EncodedRollout) -> Section:
+    """Draw the predicted probability that each step of the drive is its last, on a logarithmic axis."""
+    model, zeros = DreamStep(bundle), np.zeros((1, bundle.manifest.latent), np.float32)
+    predicted = [
+        float(model.imagine(latent[None], action[None], state, zeros, zeros, 1.0, None).done[0])
+        for latent, action, state in zip(drive.mu, drive.action, recurrent_states(bundle, drive), strict=True)
+    ]
+    figure, axes = new_figure(2.8)
+    panel = axes[0, 0]
+    panel.plot(np.maximum(predicted, LEAST), color="tab:blue", linewidth=1.2)
+    if drive.died:
+        panel.axvline(len(drive) - 1, color="tab:red", linewidth=1.5, label="where it ended")
+        panel.legend(fontsize=FONT, loc="upper left")
+    panel.set_yscale("log")
+    panel.set_ylim(LEAST, 1.2)
+    panel.set_xlabel("step of the drive", fontsize=FONT)
+    panel.set_ylabel("predicted probability", fontsize=FONT)
+    panel.grid(alpha=0.3)
+    return Section(
+        "ends", "When it expects an end",
+        "The probability that the model gives each step of the drive to be the last, one step ahead. `inspect "
+        "--survival` measures whether dreams end as early as the world.",
+        render_png(figure),
+    )  # fmt: skip
 
 
 def attention_section(bundle: Bundle, drive: EncodedRollout) -> Section | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,6 +10,7 @@ from pathlib import Path
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.bundle_store import find_bundle, shipped_names
 from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.artifacts.world_facts import DRAWN, EndRule, RewardFacts
 from dreamfleet.common.errors import BundleError, JournalError, MissingExtraError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write, reporting_unwritable_folder
 from dreamfleet.common.files.regular_files import is_file
@@ -23,6 +24,9 @@ from dreamfleet.worker.inspection.tables import measured_rows
 from dreamfleet.worker.inspection.training_curves import MODELS, TrainingCurves, load_trainings
 from dreamfleet.worker.inspection.vae_sections import own_pictures
 from dreamfleet.worker.inspection.vae_view import CHECKPOINT, VAEView, held_out_drive
+from dreamfleet.worker.tasks.api import Preprocessing
+from dreamfleet.worker.tasks.registry import task_of
+from dreamfleet.worker.training.data.dataset import find_world
 
 PAGE = "index.html"
 UNITS = {  # units of the quality figures, by a part of their names, and which values are good
@@ -123,7 +127,7 @@ def sections_of(
 ) -> Iterator[Section]:
     """Yield the sections of the page one by one as they are drawn."""
     if pictures:
-        yield own_pictures(_find_vae_view(subject, data), pictures)
+        yield own_pictures(_find_vae_view(subject, data), pictures, _preprocessings(subject))
     if subject.bundle is not None:
         yield from _bundle_sections(subject.bundle, subject, config)
     else:
@@ -138,6 +142,12 @@ def _find_vae_view(subject: InspectionSubject, data: Sequence[Path]) -> VAEView:
     if not data:
         raise UsageError("--picture needs a VAE, and this run has none: name a bundle, or a training's --data")
     return VAEView.of_folder(data[0])
+
+
+def _preprocessings(subject: InspectionSubject) -> Collection[Preprocessing]:
+    """Those of the subject's world."""
+    task = find_world() if subject.bundle is None else task_of(subject.bundle)
+    return tuple(getattr(task, "preprocessings", {}).values())
 
 
 def _vae_sections(data: Sequence[Path], config: DriveConfig) -> Iterator[Section]:
@@ -184,6 +194,8 @@ def _dream_sections(bundle: Bundle, driven: EncodedRollout, vae_view: VAEView) -
     yield mdnrnn_sections.dream_section(bundle, driven, vae_view)
     if bundle.manifest.models.get("mdnrnn", {}).get("reward", "none") != "none":
         yield mdnrnn_sections.reward_section(bundle, driven)
+    if bundle.manifest.models.get("mdnrnn", {}).get("done"):
+        yield mdnrnn_sections.ends_section(bundle, driven)
     if looked := mdnrnn_sections.attention_section(bundle, driven):
         yield looked
 
@@ -193,11 +205,24 @@ def _with_unit(name: str, value: object) -> str:
     return next((f"{value} ({unit})" for known, unit in UNITS.items() if known in name), str(value))
 
 
+def _reward_text(reward: RewardFacts) -> str:
+    cost = f" - {reward.cost:g}" if reward.cost else ""
+    return f"{reward.gain:g} x {reward.source}{cost}"
+
+
+def _end_text(end: EndRule) -> str:
+    weighted = f", its odds divided by {end.odds_weight:g}" if end.odds_weight != 1 else ""
+    if end.kind == DRAWN:
+        return f"as often as it predicts{weighted}"
+    return f"where an end is likelier than {end.at:g}"
+
+
 def manifest_facts(bundle: Bundle) -> list[tuple[str, str]]:
     """The facts in a bundle's manifest: sizes, models, origin, and quality figures on held-out drives."""
     manifest, provenance = bundle.manifest, bundle.manifest.provenance
     model, quality = manifest.models.get("mdnrnn", {}), provenance.get("quality", {})
     rows = [
+        ("task", manifest.task),
         ("pictures", " x ".join(str(size) for size in manifest.picture)),
         ("latents", str(manifest.latent)),
         ("hidden units", str(manifest.hidden)),
@@ -205,6 +230,9 @@ def manifest_facts(bundle: Bundle) -> list[tuple[str, str]]:
         ("attention window", str(model.get("window", 0) or "none")),
         ("recorded states", str(bundle.recorded_count or "none")),
     ]
+    if (world := manifest.world) is not None:
+        rows += [("options", world.options or "none"), ("reward of a dream", _reward_text(world.reward))]
+        rows += [("a dream ends", _end_text(world.end))]
     rows += [(name, str(provenance[name])) for name in DRIVEN if name in provenance]
     if isinstance(quality, dict):
         rows += [(f"quality: {name}", _with_unit(name, value)) for name, value in quality.items()]

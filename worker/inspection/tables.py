@@ -10,6 +10,7 @@ from dreamfleet.worker.inspection.knowledge import Knowledge
 from dreamfleet.worker.inspection.likeness import RareFrequency
 from dreamfleet.worker.inspection.probe import Estimate
 from dreamfleet.worker.inspection.road_losses import CALM, RoadLossComparison
+from dreamfleet.worker.inspection.survival import Survival
 
 BEGUN = {"0 steps before": "at the loss", CALM: "where nothing is lost"}  # clearer words for some beginnings
 HELD = {"z": "z", "zh": "[z, h]"}
@@ -34,8 +35,8 @@ def knowledge_rows(knowledge: Knowledge) -> list[dict[str, str]]:
 def knowledge_text(knowledge: Knowledge) -> str:
     """Describe the rows of `knowledge_rows`."""
     return (
-        f"R² ± standard error on held-out drives; {knowledge.drives} drives, {knowledge.steps} steps on the road; "
-        "deviations in the world's own units, of CarRacing metres, radians and seconds"
+        f"R² ± standard error on held-out drives; {knowledge.drives} drives, {knowledge.steps} steps, none off a road; "
+        "deviations in the units of the world's true state (docs/tasks.md)"
     )
 
 
@@ -56,6 +57,29 @@ def likeness_rows(compared: Sequence[RareFrequency]) -> list[dict[str, str]]:
         | {WHERE[where]: str(share) for where, share in each.found.items()}
         for each in compared
     ]
+
+
+def survival_rows(found: Survival) -> list[dict[str, str]]:
+    """A row per policy: how many steps it lives in reality and in dreams, and the dreamt share of the real ones."""
+    return [
+        {
+            "policy": each.policy,
+            "reality": str(each.real),
+            "dream": str(each.dreamt),
+            "dream / reality": str(each.ratio),
+        }
+        | {"cut, reality": f"{each.real_cut:.0%}", "cut, dream": f"{each.dreamt_cut:.0%}"}
+        for each in found.policies
+    ]
+
+
+def survival_text(found: Survival, episodes: int, temperature: float) -> str:
+    """Describe the rows of `survival_rows`."""
+    return (
+        f"mean steps ± standard error of {episodes} real and {episodes} dreamt episodes each, cut at {found.limit}; "
+        f"temperature {temperature:g}, end {found.end}; agreement {found.agreement} (0: equally long everywhere, "
+        "-0.69: twice or half as long)"
+    )
 
 
 LIKENESS = (
@@ -79,6 +103,8 @@ def measured_rows(measured: Any) -> Iterator[tuple[str, str]]:
             yield f"R² of {each['quantity']}, linear on [z, h]", _estimate(each["found"]["zh_linear"])
         for each in measured.get("losses", {}).get("begun", ()):
             yield f"road lost in dreams begun {each['begun']}", _estimate(each["figures"]["lost"]["dream"])
+        for each in measured.get("survival", {}).get("policies", ()):
+            yield f"lives in dreams, of its real life: {each['policy']}", _estimate(each["ratio"])
         for each in measured.get("likeness", {}).get("quantities", ()):
             yield f"dreamt share of {each['quantity']} above {each['rare']:.3g}", _estimate(each["found"]["dream"])
 

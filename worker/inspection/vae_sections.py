@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from dreamfleet.worker.inspection.charts import FONT, draw_heatmap, new_figure, 
 from dreamfleet.worker.inspection.encoded_rollout import EncodedRollout
 from dreamfleet.worker.inspection.page import Section
 from dreamfleet.worker.inspection.vae_view import VAEView
-from dreamfleet.worker.training.data.dataset import find_world
+from dreamfleet.worker.tasks.api import Preprocessing
 
 SHOWN = 8  # pictures per row, latents per table
 TRAVERSED = np.linspace(-3, 3, 7)
@@ -85,16 +85,19 @@ def samples(vae_view: VAEView) -> Section:
     return Section(
         "samples", "Latents out of nothing",
         "The decoder's pictures of random latents: where the latents of real pictures lie, N(0, 1) looks like the "
-        "track; far from them it need not.",
+        "world; far from them it need not.",
         picture_grid(rows, [""] * SHOWN),
     )  # fmt: skip
 
 
-def own_pictures(vae_view: VAEView, paths: Sequence[Path]) -> Section:
-    """Draw the user's own pictures as the VAE sees and decodes them; `UsageError` for an unreadable file."""
+def own_pictures(vae_view: VAEView, paths: Sequence[Path], known: Collection[Preprocessing] = ()) -> Section:
+    """Draw the user's own pictures as the VAE sees and decodes them; `UsageError` for an unreadable file.
+
+    `known` are the preprocessings of the VAE's world.
+    """
     if len(paths) > MOST:
         raise UsageError(f"--picture takes {MOST} files at most, not {len(paths)}")
-    seen = np.stack([fit_picture(_read(path), vae_view.side) for path in paths])
+    seen = np.stack([fit_picture(_read(path), vae_view.side, known) for path in paths])
     decoded = vae_view.decode(vae_view.encode(seen)[0])
     error = np.square((decoded.astype(np.float64) - seen) / 255).sum(axis=(1, 2, 3))
     named = ", ".join(f"{truncate(path.name, 60)} {each:.1f}" for path, each in zip(paths, error, strict=True))
@@ -108,12 +111,11 @@ def own_pictures(vae_view: VAEView, paths: Sequence[Path]) -> Section:
     )  # fmt: skip
 
 
-def fit_picture(picture: Pictures, side: int) -> Pictures:
-    """Fit a picture `(height, width, 3)` to a VAE's `(side, side, 3)`."""
+def fit_picture(picture: Pictures, side: int, known: Collection[Preprocessing] = ()) -> Pictures:
+    """Fit a picture `(height, width, 3)` to a VAE's `(side, side, 3)`; `known` as in `own_pictures`."""
     if picture.shape[:2] == (side, side):
         return picture
-    known = find_world().preprocessings.values()
-    observed = max(each.shape for each in known)  # the largest is the raw observation
+    observed = max((each.shape for each in known), default=None)  # the largest is the raw observation
     wanted = next((each for each in known if each.size == side), None)
     if picture.shape == observed and wanted is not None:
         return wanted.picture(picture)

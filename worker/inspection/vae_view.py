@@ -64,6 +64,7 @@ def held_out_drive(folder: Path, vae_view: VAEView, config: DriveConfig) -> Enco
     from dreamfleet.worker.training.data.dataset import (
         check_pictures,
         episode_paths,
+        find_world,
         load_pictures,
         load_steps,
         split_held_out,
@@ -74,4 +75,5 @@ def held_out_drive(folder: Path, vae_view: VAEView, config: DriveConfig) -> Enco
     seen, steps = load_pictures(path)[: config.steps], load_steps(path)
     mu, logvar = vae_view.encode(seen)
     action, reward = (steps[name][: len(seen)] for name in ("action", "reward"))
-    return EncodedRollout(seen, mu, logvar, action, reward.astype(np.float64), f"drive {path.stem}, which is held out")
+    about, opening = f"drive {path.stem}, which is held out", find_world().world.opening
+    return EncodedRollout(seen, mu, logvar, action, reward.astype(np.float64), about, opening)

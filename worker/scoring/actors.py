@@ -13,7 +13,7 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.worker.tasks.api import Policy, RecordableTask, TaskWithPolicies
 from dreamfleet.worker.tasks.policy import ALL_DRIVERS, DriverPolicy
-from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.worldmodel.inference import Controllers
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 
@@ -73,11 +73,16 @@ def make_controller_actor(controller: Controller, own: Bundle, bundle: Bundle, w
 
 def check_same_pictures(own: Bundle, bundle: Bundle) -> None:
     """`ControllerError` unless the world models `own` and `bundle` see the same pictures of the same task."""
-    if (own.manifest.task, own.manifest.preprocessing) != (bundle.manifest.task, bundle.manifest.preprocessing):
+    if _pictures_of(own) != _pictures_of(bundle):
         raise ControllerError(
             f"the controller sees {own.manifest.preprocessing} of {own.manifest.task}, {bundle.manifest.name} "
             f"{bundle.manifest.preprocessing} of {bundle.manifest.task}: choose one that sees the same"
         )
+
+
+def _pictures_of(bundle: Bundle) -> tuple[str, str, str]:
+    manifest = bundle.manifest
+    return manifest.task, manifest.world.options if manifest.world else "", manifest.preprocessing
 
 
 def make_driver_actors(bundle: Bundle, name: str) -> Callable[[int], Actor]:
@@ -85,7 +90,7 @@ def make_driver_actors(bundle: Bundle, name: str) -> Callable[[int], Actor]:
 
     The names are those of `dreamfleet collect --driver`; `UsageError` lists them for an unknown one.
     """
-    task = find_task(bundle.manifest.task)
+    task = task_of(bundle)
     drivers = list(task.drivers.items()) if isinstance(task, RecordableTask) else []
     policies = task.policies if isinstance(task, TaskWithPolicies) else {}
     known = (*((ALL_DRIVERS,) if drivers else ()), *dict(drivers), *policies)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import gymnasium
 import numpy as np
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.trained_agent import TrainedAgent
+from dreamfleet.common.errors import ControllerError
 from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.worker.car_racing.agents import NetworkAgent
 from dreamfleet.worker.scoring.scorer import find_checked_world
 from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, Assignment, Policy, Task, TaskWithTrueState, World
-from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.tasks.registry import find_scored_task, find_task, known_tasks
 
 Floats = NDArray[np.float32]
 Policies = Callable[[int], Policy]
@@ -67,17 +67,37 @@ class Agent(Protocol):
         """A function that reads the true state behind the last observation; `None` if the task has none."""
 
 
+@runtime_checkable
+class TaskWithTrainedAgents(Protocol):
+    """Optional: a task in which trained agents drive.
+
+    >>> isinstance(find_task("car-racing"), TaskWithTrainedAgents)
+    True
+    """
+
+    def make_trained_agent(self, trained: TrainedAgent, /) -> Agent:
+        """The agent of a file; `ControllerError` if it cannot drive in this task."""
+
+
 def make_agent(controller: Controller | TrainedAgent, bundle: Bundle | None = None) -> Agent:
     """The agent of a controller, with its world model if it has one, or of a trained agent's file.
 
     `ControllerError`, `BundleError` or `UsageError` if it does not fit the tasks and packages of this host.
     """
     if isinstance(controller, TrainedAgent):
-        return NetworkAgent(controller)
+        return _make_trained_agent(controller)
     fitting = None if bundle is None else bundle.for_controller(controller)
     agent = EvolvedAgent(controller.sha256, make_evaluation_spec(controller, bundle), controller.parameters, fitting)
     find_checked_world(agent.assignment)
     return agent
+
+
+def _make_trained_agent(trained: TrainedAgent) -> Agent:
+    task = find_task(trained.task) if trained.task in known_tasks() else None  # other names could load any code
+    if not isinstance(task, TaskWithTrainedAgents):
+        seen = f"the agent sees {trained.manifest.preprocessing!r} of {trained.task!r}"
+        raise ControllerError(f"{seen}, and no task of this name takes trained agents here")
+    return task.make_trained_agent(trained)
 
 
 def make_evaluation_spec(controller: Controller, bundle: Bundle | None) -> TaskSpec:
@@ -140,7 +160,7 @@ class EvolvedAgent:
 
     @property
     def _task(self) -> Task:
-        return find_task(self.task)
+        return find_scored_task(self.task, self.bundle)
 
     @property
     def _reality(self) -> Task:

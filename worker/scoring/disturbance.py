@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -13,16 +14,36 @@ from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 
 Floats = NDArray[np.float32]
 CORRELATION = 0.9  # of the noise from step to step; at 50 steps a second it changes sign within about 0.2 s
-SHORTEST, LONGEST = 3, 15  # steps of a burst: 0.06 to 0.3 s at 50 steps a second
+SHORTEST, LONGEST = 3, 15  # steps of a burst or of another choice: 0.06 to 0.3 s at 50 steps a second
+MEAN_LENGTH = (SHORTEST + LONGEST) / 2
 
 
 class Disturbance:
-    """First-order autoregressive noise on actions, a pure function of the seed."""
+    """What disturbs a drive, a pure function of the seed: noise on numbers, and sometimes another one of choices."""
 
     def __init__(self, seed: int, actions: Continuous, noise: float) -> None:
-        """`noise` is the standard deviation, as a fraction of half an action's range."""
-        self._random = np.random.default_rng(seed)
+        """`noise` is the standard deviation, in halves of an action's range; of choices the share of steps pushed."""
         self._actions = actions
+        random = np.random.default_rng(seed)
+        self._source: _OtherChoices | _CorrelatedNoise = _CorrelatedNoise(random, actions, noise)
+        if len(choices := numbered_choices(actions)):
+            share = min(noise, 1.0)
+            self._source = _OtherChoices(random, choices, share / (share + MEAN_LENGTH * (1 - share)))
+
+    def next(self) -> Floats:
+        """The push `(1, actions)` of the next step: noise, or the choice that replaces another; zeros: none."""
+        return self._source.next()
+
+    def apply(self, chosen: Floats, push: Floats) -> Floats:
+        """The chosen actions under the `push`, as `add_disturbance`."""
+        return add_disturbance(self._actions, chosen, push)
+
+
+class _CorrelatedNoise:
+    """First-order autoregressive noise."""
+
+    def __init__(self, random: np.random.Generator, actions: Continuous, noise: float) -> None:
+        self._random = random
         self._scale = noise * (np.array(actions.high) - np.array(actions.low)) / 2
         self._value = np.zeros(actions.actions)
 
@@ -33,16 +54,46 @@ class Disturbance:
         push: Floats = (self._value * self._scale).astype(np.float32)[None]
         return push
 
-    def apply(self, chosen: Floats, push: Floats) -> Floats:
-        """The chosen actions with the noise `push`, as `add_disturbance`."""
-        return add_disturbance(self._actions, chosen, push)
+
+class _OtherChoices:
+    """Sometimes a choice that is held for some steps, and zeros at the other steps."""
+
+    def __init__(self, random: np.random.Generator, choices: Floats, chance: float) -> None:
+        """`chance` is the probability, at each step without a choice, that one begins."""
+        self._random, self._chance = random, chance
+        self._choices = choices[choices.any(axis=1)]  # a row of zeros would be no push
+        self._left = 0
+
+    def next(self) -> Floats:
+        """The choice `(1, actions)` of the next step, or zeros."""
+        random = self._random
+        begins, length = random.random(), int(random.integers(SHORTEST, LONGEST, endpoint=True))
+        number = int(random.integers(len(self._choices)))
+        if not self._left and begins < self._chance:
+            self._left, self._choice = length, self._choices[number]
+        if not self._left:
+            return np.zeros_like(self._choices[:1])
+        self._left -= 1
+        choice: Floats = self._choice[None]
+        return choice
+
+
+@lru_cache
+def numbered_choices(actions: Continuous) -> Floats:
+    """The choices `(n, actions)` of numbered actions, which are rows of ones and zeros; none of other actions."""
+    rows = np.array(actions.choices, np.float32).reshape(-1, actions.actions)
+    return rows if np.isin(rows, (0, 1)).all() else rows[:0]
 
 
 def add_disturbance(actions: Continuous, chosen: Floats, push: Floats) -> Floats:
-    """Add the noise `push` to chosen actions `(rows, actions)`, within their bounds.
+    """The chosen actions `(rows, actions)` with the noise `push` added, within their bounds.
 
-    An action that rests at a bound stays there; noise on an unused brake would slow down every drive.
+    An action that rests at a bound stays there; noise on an unused brake would slow down every drive. Of numbered
+    choices the push replaces the chosen one, if it is not zero.
     """
+    if len(numbered_choices(actions)):
+        pushed: Floats = np.where(push.any(axis=1, keepdims=True), push, chosen)
+        return pushed
     low, high = np.array(actions.low, np.float32), np.array(actions.high, np.float32)
     resting = (chosen <= low) | (chosen >= high)
     done: Floats = np.where(resting, chosen, np.clip(chosen + push, low, high))
@@ -53,11 +104,14 @@ class ActionBursts:
     """Sometimes replaces an action that rests at a bound, which noise leaves alone, by a random value for some steps.
 
     Value and length of a burst are uniformly distributed. The bursts depend only on the seed and the chosen actions.
+    Of numbered choices a burst is another choice.
     """
 
     def __init__(self, seed: int, actions: Continuous, chance: float) -> None:
         """`chance` is the probability, at each step and for each resting action, that a burst starts."""
-        self._random = np.random.default_rng([seed, 1])
+        self._random, self._actions = np.random.default_rng([seed, 1]), actions
+        choices = numbered_choices(actions)
+        self._other = _OtherChoices(self._random, choices, chance) if len(choices) else None
         self._low, self._high = np.array(actions.low, np.float32), np.array(actions.high, np.float32)
         self._chance = chance
         self._value = np.zeros(actions.actions, np.float32)
@@ -65,6 +119,8 @@ class ActionBursts:
 
     def apply(self, chosen: Floats, done: Floats) -> Floats:
         """The next actions `(1, actions)`: those `done`, or bursts in their place; `chosen` are before any noise."""
+        if self._other is not None:
+            return add_disturbance(self._actions, done, self._other.next())
         random, count = self._random, len(self._value)
         begins, lengths = random.random(count), random.integers(SHORTEST, LONGEST, count, endpoint=True)
         values = random.uniform(self._low, self._high).astype(np.float32)

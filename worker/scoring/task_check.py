@@ -208,10 +208,10 @@ def _describe_pictures(name: str, environment: Any) -> list[str]:
     shape = getattr(environment.observation_space, "shape", None) or ()
     if len(shape) < PICTURE_DIMENSIONS:
         return []
-    better = "task car-racing drives this track on a world model" if "CarRacing" in name else (
-        "a world model, or a wrapper, could make few numbers of it (docs/tasks.md)"
-    )  # fmt: skip
-    return [f"it observes pictures of shape {tuple(shape)}, and the controller has a weight for each value: {better}"]
+    return [
+        f"it observes pictures of shape {tuple(shape)}, and the controller has a weight for each value: a world model "
+        f"makes few numbers of them (`dreamfleet pipeline --task {name}`)"
+    ]
 
 
 def main() -> None:

@@ -179,6 +179,7 @@ class World(metaclass=FormerFields):
     off_course: str = ""  # key of the environment's `info`: whether this step left the course; empty: there is none
     threshold: float | None = None  # mean score at which gymnasium considers the world solved; `None`: unknown
     finish: str = ""  # key of the environment's `info`: whether the course was driven to its end; empty: there is none
+    judge: str = ""  # "gymnasium" where reported scores are of its own unmodified environment
     score_word: str = "seed"  # what a scored seed is called: "track", "game"
     marks: tuple[float, ...] = ()  # scores to compare with: reports say what share of the episodes exceeds each
     mirror: Mirror | None = None  # the action in a left-right mirrored picture; `None`: such pictures show no drive

@@ -1,4 +1,4 @@
-"""Drawing one step of a drive as one frame: the track, and beside it what the model sees, decodes and dreams."""
+"""Drawing one step of a drive as one frame: the world, and beside it what the model sees, decodes and dreams."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ import numpy as np
 import pygame
 from numpy.typing import NDArray
 
+from dreamfleet.worker.scoring.disturbance import numbered_choices
+from dreamfleet.worker.tasks.api import Actions, Continuous, Discrete
+
 SIDE = 192  # pixels of the small pictures: three times or twice their size
 MARGIN, LABEL, GAP = 8, 22, 10
 BACKGROUND, INK, FAINT = (18, 20, 24), (235, 235, 235), (150, 155, 165)
-PEDALS = ("gas", "brake")
 COLOURS = ((120, 170, 255), (110, 210, 120), (240, 110, 100))
 MAX_BARS, BAR, MIN_WIDTH = 3, 122, 600  # bars of actions; pixels of a bar, and of a world's picture
+FEWEST_SMOOTHED = 64  # pixels of the shorter side; fewer are drawn as squares
 
 Frame = NDArray[np.uint8]
 Corner = tuple[int, int]
@@ -75,23 +78,37 @@ class DriveFrame:
 class Board:
     """A surface with methods that draw pictures, text and bars of actions."""
 
-    def __init__(self, size: tuple[int, int], actions: tuple[str, ...] = ()) -> None:
-        """`actions` are the labels of the bars."""
+    def __init__(self, size: tuple[int, int], names: tuple[str, ...] = (), actions: Actions | None = None) -> None:
+        """`names` are those of the actions, and `actions` gives the ends of their bars; by default -1 and 1."""
         pygame.font.init()
-        self._actions = actions
+        self._names, self._actions = names, actions
         self._large = pygame.font.Font(None, 30)
         self._small = pygame.font.Font(None, 22)
         self._surface = pygame.Surface(size)
 
     def _draw_action(self, action: NDArray[Any], right: int, top: int) -> None:
-        """Draw bars of a continuous action, left of `right`; of a discrete action its number."""
-        if action.dtype.kind in "iu":
-            self._text(f"action {int(action[0])}", (right - 16 - BAR, top), self._small, FAINT)
+        """Draw bars of a continuous action, left of `right`; of one of several choices its name."""
+        if (choice := choice_name(action, self._names, self._actions)) is not None:
+            label = "action "
+            left = right - 16 - max(BAR, self._small.size(label + choice)[0])
+            self._text(label, (left, top), self._small, FAINT)
+            self._text(choice, (left + self._small.size(label)[0], top), self._small, INK)
             return
         shown = action[:MAX_BARS]
-        names = self._actions or tuple(f"action {index}" for index in range(len(shown)))
+        names = self._names or tuple(f"action {index}" for index in range(len(shown)))
         for index, (name, value) in enumerate(zip(names, shown, strict=False)):
-            self._bar(name, COLOURS[index], float(value), (right - (len(shown) - index) * BAR, top))
+            low, high = -1.0, 1.0
+            if isinstance(self._actions, Continuous):
+                low, high = self._actions.low[index], self._actions.high[index]
+            self._bar(name, COLOURS[index], (float(value), low, high), (right - (len(shown) - index) * BAR, top))
+
+    def _fitted(self, picture: Frame, corner: Corner, room: tuple[int, int]) -> None:
+        """Draw a picture as large as `room` allows, in its middle; pixels stay visible where they are few."""
+        height, width = picture.shape[:2]
+        scale = min(room[0] / width, room[1] / height)
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        place = corner[0] + (room[0] - size[0]) // 2, corner[1] + (room[1] - size[1]) // 2
+        self._picture(picture, place, size, smooth=min(height, width) >= FEWEST_SMOOTHED)
 
     def _picture(self, picture: Frame, corner: Corner, size: tuple[int, int], *, smooth: bool = False) -> None:
         """Draw a picture at `size`: smoothed, or with visible pixels."""
@@ -102,23 +119,29 @@ class Board:
     def _text(self, text: str, corner: Corner, font: pygame.font.Font, colour: tuple[int, int, int]) -> None:
         self._surface.blit(font.render(text, True, colour), corner)
 
-    def _bar(self, name: str, colour: tuple[int, int, int], value: float, corner: Corner) -> None:
-        """Draw a bar from its middle, or, for a pedal, from its left end."""
+    def _bar(
+        self, name: str, colour: tuple[int, int, int], value_between: tuple[float, float, float], corner: Corner
+    ) -> None:
+        """Draw a value between its least and most: from the left end if it is never below 0, else from the middle."""
         left, top = corner
-        pedal = name in PEDALS
-        self._text(f"{name} {value:.2f}" if pedal else f"{name} {value:+.2f}", corner, self._small, FAINT)
+        value, low, high = value_between
+        from_left = low >= 0
+        self._text(f"{name} {value:.2f}" if from_left else f"{name} {value:+.2f}", corner, self._small, FAINT)
         box = pygame.Rect(left, top + 22, 106, 14)
         pygame.draw.rect(self._surface, (45, 48, 56), box)
-        start = box.left if pedal else box.centerx
-        length = round(float(np.clip(value, -1, 1)) * (box.width if pedal else box.width / 2))
+        start = box.left if from_left else box.centerx
+        share = (value - low) / max(high - low, 1e-9) if from_left else value / max(-low, high, 1e-9)
+        length = round(float(np.clip(share, -1, 1)) * (box.width if from_left else box.width / 2))
         pygame.draw.rect(self._surface, colour, (min(start, start + length), box.top, abs(length), box.height))
 
 
 class Canvas(Board):
     """Draws frames of a recorded drive."""
 
-    def __init__(self, seed: int, layout: FrameLayout = AWAKE, actions: tuple[str, ...] = ()) -> None:
-        super().__init__(layout.size, actions)
+    def __init__(
+        self, seed: int, layout: FrameLayout = AWAKE, names: tuple[str, ...] = (), actions: Actions | None = None
+    ) -> None:
+        super().__init__(layout.size, names, actions)
         self._seed = seed
         self._layout = layout
 
@@ -126,7 +149,7 @@ class Canvas(Board):
         """The frame `(height, width, 3)`."""
         width, height = self._layout.track
         self._surface.fill(BACKGROUND)
-        self._picture(moment.track, (MARGIN, MARGIN), self._layout.track, smooth=True)
+        self._fitted(moment.track, (MARGIN, MARGIN), self._layout.track)
         if moment.pictures is not None:
             self._draw_model(moment.pictures)
         self._text(f"score {moment.score:7.1f}", (12, height + 24), self._large, INK)
@@ -142,6 +165,27 @@ class Canvas(Board):
             left, top = self._layout.track[0] + 20, MARGIN + row * (LABEL + SIDE + GAP)
             self._text(label, (left, top), self._small, FAINT)
             self._picture(picture, (left, top + LABEL), (SIDE, SIDE))
+
+
+def choice_name(action: NDArray[Any], names: tuple[str, ...], actions: Actions | None) -> str | None:
+    """The name of the choice that an action is, else its number; `None` if actions are no numbered choices.
+
+    A choice of several parts has the names of all of them.
+
+    >>> from dreamfleet.worker.tasks.api import one_hot
+    >>> choice_name(np.array([0, 1, 0], np.float32), ("stay", "left", "right"), one_hot(3))
+    'left'
+    """
+    if action.dtype.kind in "iu":
+        number = int(action[0])
+        index = number - actions.first if isinstance(actions, Discrete) else number
+        return names[index] if 0 <= index < len(names) else str(number)
+    if not isinstance(actions, Continuous) or not len(choices := numbered_choices(actions)):
+        return None
+    if len(names) == len(action):
+        return " ".join(name for name, value in zip(names, action, strict=True) if value) or "none"
+    found = np.flatnonzero((choices == action).all(axis=1))
+    return str(found[0]) if len(found) else "none"
 
 
 def pixels(surface: pygame.Surface) -> Frame:

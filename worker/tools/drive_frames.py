@@ -103,7 +103,9 @@ class FramePainter:
         """Draw the frame of a step."""
         picture = self._picture()
         if self._canvas is None:
-            self._canvas = Canvas(self._seed, layout or plain_layout(picture), self._world.action_names)
+            self._canvas = Canvas(
+                self._seed, layout or plain_layout(picture), self._world.action_names, self._world.actions
+            )
         self._on_frame(self._canvas.draw(DriveFrame(picture, np.atleast_1d(np.asarray(action)), step, score, pictures)))
 
     def _picture(self) -> NDArray[np.uint8]:

@@ -1,4 +1,4 @@
-"""Evaluating agents on unseen tracks, in gymnasium's own unmodified environment."""
+"""Evaluating agents on unseen seeds, in the environment that their task's reported scores come from."""
 
 from __future__ import annotations
 
@@ -40,10 +40,12 @@ def evaluate(agent: Agent, seeds: tuple[int, ...], jobs: int) -> Iterator[Episod
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     # In this process, so that a script needs no `if __name__ == "__main__"`; Ctrl-C interrupts it.
     driver = _Driver(agent, (Exception, SystemExit))
-    for number, seed in enumerate(seeds):
-        found = driver.drive(seed)
-        yield driver.drive(seed) if number and has_failed(found) else found
-    driver.close()
+    try:
+        for number, seed in enumerate(seeds):
+            found = driver.drive(seed)
+            yield driver.drive(seed) if number and has_failed(found) else found
+    finally:
+        driver.close()
 
 
 def has_failed(episode: Episode) -> bool:
@@ -87,11 +89,12 @@ def run_evaluation(
     for each in evaluate_in_processes(agent, seeds, jobs):
         episodes.append(each)
         on_episode(episodes)
-    results = EpisodeResults.of(episodes)
+    results, world = EpisodeResults.of(episodes), agent.world
     return EvaluationReport(
         name, agent.sha256, agent.task, agent.reality, agent.bundle.sha256 if agent.bundle else "",
-        fingerprint(agent.world.packages), package_version("dreamfleet") or "", perf_counter() - began,
-        results.drives, threshold=agent.threshold, failed=results.failed,
+        fingerprint(world.packages), package_version("dreamfleet") or "", perf_counter() - began,
+        results.drives, judge=world.judge or agent.reality, threshold=agent.threshold, failed=results.failed,
+        marks=tuple(map(float, world.marks)),
     )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.monitoring.live import LiveFrame
 from dreamfleet.common.printable import truncate
 from dreamfleet.worker.dream.parallel_dream import DreamContinuation, can_dream
+from dreamfleet.worker.tasks.api import Actions
 from dreamfleet.worker.tools.canvas import BACKGROUND, FAINT, INK, Board, Frame, pixels
 from dreamfleet.worker.worldmodel.inference import Decoder
 
@@ -21,7 +22,7 @@ EDGE, LABEL, BIG, SMALL = 16, 22, 340, 163  # pixels: margin, a line of text, th
 STRIP = EDGE + LABEL + BIG + 10  # top of the row of dreamt pictures
 FOOT = STRIP + LABEL + SMALL + 16  # top of the text
 WHOLE = SIZE[0] - 2 * EDGE, FOOT - EDGE - LABEL - 10  # the space of a picture alone
-AHEAD = (10, 25, 50, 100)  # dreamt steps that are shown: after two seconds a dream has left the real track
+AHEAD = (10, 25, 50, 100)  # dreamt steps that are shown; a dream leaves reality within some
 NAME = 28  # characters of a name that fit
 Corner = tuple[int, int]
 
@@ -72,9 +73,11 @@ class LiveDreamer:
 class LiveCanvas(Board):
     """Draws live frames of one run, all of the same size."""
 
-    def __init__(self, run: str, actions: tuple[str, ...] = (), dreamer: LiveDreamer | None = None) -> None:
-        """`actions` are the labels of the bars; without a `dreamer` only observations are drawn."""
-        super().__init__(SIZE, actions)
+    def __init__(
+        self, run: str, names: tuple[str, ...] = (), dreamer: LiveDreamer | None = None, actions: Actions | None = None
+    ) -> None:
+        """`names` and `actions` are as in `Board`; without a `dreamer` only observations are drawn."""
+        super().__init__(SIZE, names, actions)
         self._run, self._dreamer = run, dreamer
 
     def draw(self, live: LiveFrame) -> CaptionedFrame:

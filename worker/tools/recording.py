@@ -34,20 +34,22 @@ def record(
     With a world model, the video also shows what the model sees, decodes and, if it can, dreams. If `stop()` turns
     true, the video ends early, after at least one step.
     """
-    environment = agent.make_evaluation_environment("rgb_array")
     policy: Any = agent.make_policies()(seed)
     policy.begin(agent.parameters)
     config, bundle = replace(dreaming or ParallelDreamConfig(), seed=seed), agent.bundle
     model_view = None if bundle is None else WorldModelView(bundle, policy, agent.parameters, config)
     score = 0.0
-    with episode_errors(seed), Video(out, agent.world.frames_per_second) as video:
-        painter = FramePainter(environment, agent.world, seed, video.add)
-        for moment in run_episode(environment, FilmedPolicy(policy, painter, model_view), EpisodeConfig(seed, steps)):
-            score += moment.reward
-            on_step(moment.step)
-            if stop():
-                break
-    environment.close()
+    environment = agent.make_evaluation_environment("rgb_array")
+    try:
+        with episode_errors(seed), Video(out, agent.world.frames_per_second) as video:
+            filmed = FilmedPolicy(policy, FramePainter(environment, agent.world, seed, video.add), model_view)
+            for moment in run_episode(environment, filmed, EpisodeConfig(seed, steps)):
+                score += moment.reward
+                on_step(moment.step)
+                if stop():
+                    break
+    finally:
+        environment.close()
     return score
 
 

@@ -17,7 +17,7 @@ def add_video_flags(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that both verbs take."""
     parser.add_argument(
         "--seed", type=int, nargs="+", default=[TEST.start], metavar="N",
-        help=f"seed of the track (default {TEST.start}); with several seeds there is one video each, drive-N.mp4",
+        help=f"seed of the episode (default {TEST.start}); with several seeds there is one video each, drive-N.mp4",
     )  # fmt: skip
     parser.add_argument("--steps", type=int, default=1000, help="steps at most (default 1000)")
     parser.add_argument("--out", type=Path, default=Path("drive.mp4"), help="the video to write (default drive.mp4)")

@@ -1,4 +1,4 @@
-"""`dreamfleet evaluate`: a controller on unseen tracks."""
+"""`dreamfleet evaluate`: a controller on unseen seeds."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from dreamfleet.worker.scoring.agents import Agent
     from dreamfleet.worker.tools.evaluation import Episode
 
-SUMMARY = "judge a controller on unseen seeds, in gymnasium's own unmodified environment"
+SUMMARY = "judge a controller on unseen seeds, in whole episodes of the world itself"
 EXTRAS = ("worker",)
 
 

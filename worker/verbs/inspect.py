@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 SUMMARY = "look into a world model: what it sees, keeps and dreams, and how it learnt, as one page, or as figures"
 EXTRAS = ("worker", "views")
-SECTIONS = 11  # at most, and one more a data folder
-DRIVES, LOSSES = 20, 30
+SECTIONS = 12  # at most, and one more a data folder
+DRIVES, LOSSES, LIVES = 20, 30, 40
 FEWEST_DRIVES, FEWEST_LOSSES = 2, 4
 
 
@@ -45,12 +45,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="pictures of your own, PNG or JPEG: what the bundle's VAE, else that of --data, sees and decodes of them",
     )  # fmt: skip
     first = VALIDATION.start
-    parser.add_argument("--seed", type=int, default=first, help=f"the (first) track that is driven (default {first})")
+    parser.add_argument("--seed", type=int, default=first, help=f"the (first) seed that is driven (default {first})")
     parser.add_argument("--steps", type=int, default=300, help="steps of the page's drive (default 300)")
     parser.add_argument(
         "--action", type=float, nargs="+", metavar="N",
-        help="the page's drive does this at each step, instead of a driver: of CarRacing steering, gas and brake, "
-        "such as --action -0.01 1 0",
+        help="the page's drive does this at each step, instead of a driver: a number for each part of an action, such "
+        "as steering, gas and brake --action -0.01 1 0, or the number of a choice, from 0",
     )  # fmt: skip
     figures = parser.add_argument_group("figures, printed instead of the page")
     figures.add_argument("--probe", action="store_true", help="how much of the simulator's truth [z, h] holds")
@@ -58,17 +58,27 @@ def configure(parser: argparse.ArgumentParser) -> None:
     figures.add_argument(
         "--likeness", action="store_true", help="whether rare events of drives are as frequent in dreams"
     )
+    figures.add_argument(
+        "--survival", action="store_true",
+        help="whether fixed policies, and the --controller, live as long in dreams as in reality",
+    )  # fmt: skip
     parser.add_argument("--controller", help="who drives: a file, a run, or one that ships (default the run's own)")
     figures.add_argument(
-        "--driver", help="who drives for --probe, from anywhere: of CarRacing those of `collect --driver`, which are "
-        "random, held, ornstein-uhlenbeck, random-walk, uniform, pushed and network",
+        "--driver", help="who drives for --probe, from anywhere where the world can: one of `collect --driver`",
     )  # fmt: skip
     figures.add_argument(
         "--episodes", type=int, help=f"drives of --probe and --likeness (default {DRIVES}, at least {FEWEST_DRIVES}), "
-        f"losses of --losses (default {LOSSES}, at least {FEWEST_LOSSES})",
+        f"losses of --losses (default {LOSSES}, at least {FEWEST_LOSSES}), episodes of each policy of --survival "
+        f"(default {LIVES})",
     )  # fmt: skip
-    figures.add_argument("--noise", type=float, default=0.3, help="added to actions, of half their range (default 0.3)")
+    figures.add_argument(
+        "--noise", type=float, default=0.3,
+        help="added to actions, in halves of their range; of choices the share of steps with another (default 0.3)",
+    )  # fmt: skip
     figures.add_argument("--temperature", type=float, help="of the dreams (default the run's, else 1.0)")
+    figures.add_argument(
+        "--end", default="", help="when dreams of --survival end: drawn, or above a probability (default the bundle's)"
+    )
     add_global_flags(parser, "runs_dir")
     add_json_flag(parser)
 
@@ -76,11 +86,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write the page and print its path, or measure and print figures."""
     os.environ["SDL_VIDEODRIVER"] = "dummy"
-    if args.probe or args.losses or args.likeness:
+    if args.end and not args.survival:
+        raise UsageError("--end is of the dreams of --survival: give that too")
+    if args.probe or args.losses or args.likeness or args.survival:
         if args.picture:
-            raise UsageError("--picture is of the page: leave --probe, --losses and --likeness out")
+            raise UsageError("--picture is of the page: leave --probe, --losses, --likeness and --survival out")
         if args.action:
-            raise UsageError("--action is of the page: leave --probe, --losses and --likeness out")
+            raise UsageError("--action is of the page: leave --probe, --losses, --likeness and --survival out")
         return _measure(args)
     if args.driver:
         raise UsageError("--driver drives for figures: give --probe too")
@@ -113,15 +125,24 @@ def _draw_page(args: argparse.Namespace) -> int:
 
 def _measure(args: argparse.Namespace) -> int:
     pin_thread_pools()  # of NumPy, which is not loaded yet
+    from dreamfleet.worker.dream.world import world_of
     from dreamfleet.worker.inspection.disturbed_rollouts import DisturbedDriveConfig
+    from dreamfleet.worker.tasks.api import TaskWithBeginnings
+    from dreamfleet.worker.tasks.registry import task_of
 
     _check_figure_flags(args)
     with ExitStack() as held:
         subject = _open_measured_subject(args, held)
         bundle, driving = _choose_driver(args, subject)
-        config = DisturbedDriveConfig(args.noise, first_seed=args.seed, anywhere=bool(driving.driver))
+        task = task_of(bundle)
+        config = DisturbedDriveConfig(
+            args.noise, first_seed=args.seed, opening=world_of(bundle).opening,
+            anywhere=bool(driving.driver) and isinstance(task, TaskWithBeginnings),
+        )  # fmt: skip
         found: dict[str, Any] = {"bundle": bundle.sha256, "noise": args.noise, "first_seed": args.seed}
         found["driver"] = driving.driver or (driving.controller and driving.controller.sha256)
+        if args.survival:
+            found["survival"] = _measure_survival(args, bundle, driving, _temperature(args, subject))
         if args.probe:
             found["probe"] = _measure_probe(args, bundle, driving, config)
         if args.likeness:
@@ -148,6 +169,27 @@ def _measure_probe(
         print_rows(rows, right=tuple(rows[0])[1:])
         print(knowledge_text(known))
     return asdict(known)
+
+
+def _measure_survival(
+    args: argparse.Namespace, bundle: Bundle, driving: DriverChoice, temperature: float
+) -> dict[str, Any]:
+    from dreamfleet.common.cli.progress import progress_bar
+    from dreamfleet.worker.dream.world import world_of
+    from dreamfleet.worker.inspection.survival import SurvivalConfig, fixed_drivers, measure_survival
+    from dreamfleet.worker.inspection.tables import survival_rows, survival_text
+    from dreamfleet.worker.tasks.registry import task_of
+
+    episodes = LIVES if args.episodes is None else args.episodes
+    wanted = SurvivalConfig(episodes, args.seed, temperature, args.end)
+    policies = len(fixed_drivers(task_of(bundle), world_of(bundle))) + (driving.controller is not None)
+    with progress_bar("survival", 2 * policies, "policies") as bar:
+        found = measure_survival(bundle, driving.controller, wanted, bar.update)
+    if not args.json:
+        rows = survival_rows(found)
+        print_rows(rows, right=tuple(rows[0])[1:])
+        print(survival_text(found, episodes, temperature))
+    return {"episodes": episodes, "temperature": temperature, **asdict(found)}
 
 
 def _measure_likeness(
@@ -207,6 +249,8 @@ def _check_figure_flags(args: argparse.Namespace) -> None:
         raise UsageError(f"--episodes must be at least {fewest} {what}, not {args.episodes}")
     if args.seed < 0 or not 0 <= args.noise <= 10:
         raise UsageError("--seed must be at least 0, --noise from 0 to 10")
+    if args.driver and args.survival:
+        raise UsageError("--survival measures all drivers: leave --driver out")
     if args.controller and args.driver:
         raise UsageError("one drives: give --controller or --driver")
 
@@ -247,6 +291,6 @@ def _choose_driver(args: argparse.Namespace, subject: InspectionSubject) -> tupl
         raise UsageError("give a bundle or a run to measure, or a --controller that has a world model")
     if args.driver:
         return bundle, DriverChoice(driver=args.driver)
-    if controller is None:
+    if controller is None and (args.probe or args.losses or args.likeness or not args.survival):
         raise UsageError("nobody drives: give --controller, or for --probe a --driver")
     return bundle, DriverChoice(controller, own)

@@ -18,8 +18,10 @@ from dreamfleet.common.runs.seeds import TEST
 
 if TYPE_CHECKING:
     from dreamfleet.common.artifacts.bundle import Bundle
+    from dreamfleet.common.artifacts.world_facts import WorldFacts
     from dreamfleet.common.monitoring.client import Client
     from dreamfleet.common.protocol.messages import TaskSpec
+    from dreamfleet.worker.tasks.api import World
     from dreamfleet.worker.tools.frame_sinks import SendFrame
     from dreamfleet.worker.tools.live_sources import Driver
     from dreamfleet.worker.tools.live_view import CaptionedFrame
@@ -36,7 +38,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_run_argument(parser)
     whom = parser.add_mutually_exclusive_group()
     whom.add_argument("--worker", metavar="NAME", help="what this worker scores (default: the busiest worker's)")
-    whom.add_argument("--best", action="store_true", help="drive the run's best mean so far here, track after track")
+    whom.add_argument("--best", action="store_true", help="drive the run's best mean so far here, seed after seed")
     whom.add_argument(
         "--controller", help="no run: a file, a run on this disk, one that ships, or a trained agent's file"
     )
@@ -50,7 +52,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help=f"end after so many seconds of pictures (default: {LONGEST} in files, else when you close it)",
     )
     parser.add_argument(
-        "--seed", type=int, default=TEST.start, help=f"of --best and --controller: first track (default {TEST.start})"
+        "--seed", type=int, default=TEST.start, help=f"of --best and --controller: first seed (default {TEST.start})"
     )
     parser.add_argument("--out", help="no window: an .mp4, a folder for PNGs, or - for a stream of JPEGs")
     parser.add_argument("--bundle", help="of --controller: the world model (default: the one that it names)")
@@ -150,20 +152,25 @@ def _worker_pictures(args: argparse.Namespace, client: Client) -> Iterator[Itera
             )
             assert bundle is not None  # it is never stopped
             fitting = bundle.with_options(spec.controller, spec.options)
-            glass = LiveCanvas(view.run, _action_names(spec, fitting), LiveDreamer(fitting, args.temperature))
+            dreamer, world = LiveDreamer(fitting, args.temperature), _find_world(spec, fitting)
+            glass = LiveCanvas(view.run, dreamer=dreamer)
+            if world is not None:
+                glass = LiveCanvas(view.run, world.action_names, dreamer, world.actions)
         print(f"watching run {view.run}; its workers: {view.status.workers.present}", file=sys.stderr)
         yield worker_frames(view, glass, args.fps)
         if view.is_over:
             print(f"run {view.run} {view.status.state}: {one_line(view.status.why)}", file=sys.stderr)
 
 
-def _action_names(spec: TaskSpec, bundle: Bundle) -> tuple[str, ...]:
-    """The world's action names; empty for a task that is not registered here, as its name could load any code."""
+def _find_world(spec: TaskSpec, bundle: Bundle) -> World | WorldFacts | None:
+    """The world, as its bundle describes it; else of a registered task, as other names could load any code."""
+    if bundle.manifest.world is not None:
+        return bundle.manifest.world
     from dreamfleet.worker.tasks.api import Assignment
     from dreamfleet.worker.tasks.registry import find_task, known_tasks
 
     known = {spec.task, bundle.manifest.task} <= set(known_tasks())
-    return find_task(spec.task).world_of(Assignment(spec, bundle)).action_names if known else ()
+    return find_task(spec.task).world_of(Assignment(spec, bundle)) if known else None
 
 
 def _drive_pictures(args: argparse.Namespace, driver: Callable[[], Driver]) -> Iterator[CaptionedFrame]:

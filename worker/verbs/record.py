@@ -9,7 +9,7 @@ from functools import partial
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.worker.tools.video_cli import add_video_flags, record_videos, video_paths
 
-SUMMARY = "record drives as mp4s: the track, what the model sees, what it decodes, what it dreams"
+SUMMARY = "record drives as mp4s: the world, what the model sees, what it decodes, what it dreams"
 EXTRAS = ("worker", "views")
 
 

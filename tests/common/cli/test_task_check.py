@@ -87,7 +87,9 @@ def test_gymnasiums_checker_only_warns(fault, code):
 def test_pictures_are_hinted_at():
     found = try_task("gym:CarRacing-v3", {})
     assert found.fault == ""
-    assert "task car-racing drives this track on a world model" in found.warnings[0]
+    assert (
+        "a world model makes few numbers of them (`dreamfleet pipeline --task gym:CarRacing-v3`)" in found.warnings[0]
+    )
 
 
 linux = pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="Linux")

@@ -233,3 +233,22 @@ def test_reproduction_is_to_the_bit_on_equal_hosts_and_within_two_standard_error
     assert found.is_reproduced == holds
     assert says in found.description
     assert found.description.startswith("tiny: ")
+
+
+def test_a_report_of_another_world_names_its_judge_and_its_marks(tmp_path):
+    report = scored(700, 800, threshold=750.0, judge="dodge", marks=(750.0,))
+    (tmp_path / "report.json").write_text(report.to_json())
+    assert read_evaluation_report(tmp_path / "report.json") == report
+    plain = json.loads(report.to_json())
+    assert (plain["above_750"], plain["marks"]) == (0.5, [750.0])
+    assert "above_800" not in plain
+    score, marks, threshold, _ = report.description.splitlines()
+    assert score.endswith("; judged in dodge")
+    assert marks == "above 750: 50%"
+    assert threshold == "0.0 above the world's threshold of 750, on fewer than 100 seeds"
+
+
+def test_the_first_worlds_report_says_what_it_always_said():
+    assert "marks" not in json.loads(JUDGEMENT.to_json())
+    assert "judged by gymnasium's own environment" in JUDGEMENT.description
+    assert "above" not in scored(700, 800).description, "a report without laps was never compared with marks"

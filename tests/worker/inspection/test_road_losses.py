@@ -22,7 +22,7 @@ from dreamfleet.worker.inspection.tables import knowledge_rows, loss_rows
 from dreamfleet.worker.scoring.actors import ControllerActor
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 
-CONFIG, DRIVEN = RoadLossConfig(losses=6, before=(20, 0), dreams=2), DisturbedDriveConfig()
+CONFIG, DRIVEN = RoadLossConfig(losses=6, before=(20, 0), dreams=2), DisturbedDriveConfig(opening=50)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from dreamfleet.worker.inspection.page_builder import InspectionSubject, write_p
 from dreamfleet.worker.inspection.vae_sections import fit_picture
 from dreamfleet.worker.inspection.vae_view import VAEView, held_out_drive
 from dreamfleet.worker.training import train_vae
-from dreamfleet.worker.training.data.dataset import preprocessing_of_size
+from dreamfleet.worker.training.data.dataset import find_world, preprocessing_of_size
 from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
@@ -98,7 +98,8 @@ def test_own_pictures_are_looked_at_by_a_bundle_or_a_training(folder, tmp_path):
 
 def test_an_observation_is_prepared_as_on_a_drive_and_any_other_picture_cut_square():
     seen = np.random.default_rng(0).integers(0, 255, (96, 96, 3), dtype=np.uint8)
-    assert np.array_equal(fit_picture(seen, 64), preprocessing_of_size(64).picture(seen))
+    known = find_world("car-racing").preprocessings.values()
+    assert np.array_equal(fit_picture(seen, 64, known), preprocessing_of_size(64).picture(seen))
     assert fit_picture(seen, 96) is seen
     wide = np.zeros((10, 30, 3), np.uint8)
     wide[:, 10:20, 0], wide[:5, :, 1] = 200, 100

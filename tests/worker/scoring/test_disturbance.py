@@ -3,11 +3,17 @@
 import numpy as np
 import pytest
 
-from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
+from dreamfleet.common.artifacts.actions import FIVE_CHOICES, STEERING_GAS_BRAKE, one_hot
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.runs.lookup import find_controller
 from dreamfleet.worker.scoring.actors import ControllerActor
-from dreamfleet.worker.scoring.disturbance import ActionBursts, Disturbance, DisturbedPolicy, add_disturbance
+from dreamfleet.worker.scoring.disturbance import (
+    ActionBursts,
+    Disturbance,
+    DisturbedPolicy,
+    add_disturbance,
+    numbered_choices,
+)
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 
 
@@ -40,6 +46,36 @@ def test_a_burst_replaces_a_resting_action_for_some_steps():
     assert np.array_equal(done, drive(4))
     assert not np.array_equal(done, drive(5))
     assert (ActionBursts(0, STEERING_GAS_BRAKE, 0.0).apply(chosen, chosen) == chosen).all()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3, 1.0, 5.0])
+def test_of_choices_the_noise_is_the_share_of_steps_with_another(noise):
+    actions, chosen = one_hot(3), np.array([[1, 0, 0]], np.float32)
+    one, other = (Disturbance(4, actions, noise) for _ in range(2))
+    pushes = np.concatenate([one.next() for _ in range(20_000)])
+    assert np.array_equal(pushes, np.concatenate([other.next() for _ in range(20_000)]))
+    assert pushes.any(axis=1).mean() == pytest.approx(min(noise, 1), abs=0.03)
+    assert {tuple(each) for each in pushes.tolist()} <= {(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)}
+    done = np.concatenate([one.apply(chosen, push[None]) for push in pushes])
+    assert (done.sum(axis=1) == 1).all(), "never a mixture of choices"
+    assert np.array_equal(done[~pushes.any(axis=1)], np.repeat(chosen, (~pushes.any(axis=1)).sum(), axis=0))
+
+
+def test_a_push_of_choices_is_held_and_a_burst_is_one():
+    chosen = np.array([[1, 0, 0]], np.float32)
+    bursts = ActionBursts(0, one_hot(3), 0.02)
+    done = np.concatenate([bursts.apply(chosen, chosen) for _ in range(5000)])
+    tried = done[:, 0] == 0
+    assert 0.05 < tried.mean() < 0.2
+    changes = np.flatnonzero(np.diff(done.argmax(axis=1))) + 1
+    assert np.diff(changes)[tried[changes[:-1]]].min() >= 3
+    assert (done.sum(axis=1) == 1).all()
+
+
+def test_choices_of_numbers_are_disturbed_as_numbers():
+    assert not len(numbered_choices(FIVE_CHOICES)), "the car takes every steering between its choices"
+    assert not len(numbered_choices(STEERING_GAS_BRAKE))
+    assert len(numbered_choices(one_hot(3))) == 3
 
 
 class Recorder(DisturbedPolicy):
