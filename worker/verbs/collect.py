@@ -66,6 +66,7 @@ def run(args: argparse.Namespace) -> int:
     world = resolve_world(args.data, args.task, world_arguments(args))
     preset = find_preset(resolve_preset(args.data, args.preset, world))
     config, pilots = apply_flags(_fit_pictures(preset.collect, world), args), _load_pilots(args)
+    config.check_for(world)  # a refused command begins no data set
     frames = done = 0
     before = len(existing_episodes(args.data))
     total = before + len(missing_numbers(args.data, config))

@@ -248,11 +248,18 @@ def test_a_preset_is_of_the_data_sets_world(tmp_path):
         world_of_folder(tmp_path)
 
 
+@pytest.mark.parametrize("flags", [("--driver", "ghost"), ("--picture", "96"), ("--anywhere", "0.5")])
+def test_a_refused_command_begins_no_data_set(tmp_path, flags):
+    with pytest.raises(UsageError):
+        call("--data", str(tmp_path), "--task", DODGE_TASK, *flags)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("config", "error"),
     [
         (CollectConfig(driver="ghost", anywhere=0.0), "--driver must be one of random, held, uniform, not 'ghost'"),
-        (CollectConfig(), "begin at no random place: give --anywhere 0"),
+        (CollectConfig(anywhere=0.5), "begin at no random place: give --anywhere 0"),
         (CollectConfig(picture=96, anywhere=0.0), "pictures are 64 pixels wide, not 96: give --picture 64"),
     ],
 )
