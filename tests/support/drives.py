@@ -4,22 +4,25 @@ from dataclasses import replace
 
 import numpy as np
 
+from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD
 from dreamfleet.worker.training.data.dataset import episode_path, preprocessing_of_size
 
 
-def write_drive(folder, number, steps=12, picture=64):
-    """One episode of noise under a moving bar, with a tile now and then."""
+def write_drive(folder, number, steps=12, picture=64, world=OF_FIRST_WORLD, actions=3, **more):
+    """One episode of noise under a moving bar, with a tile now and then; `more` are further arrays, or other ones."""
     random = np.random.default_rng(number)
     pictures = random.integers(0, 60, (steps, picture, picture, 3), dtype=np.uint8)
     for step in range(steps):
         pictures[step, :, (3 * step + number) % picture] = 255
     path = episode_path(folder, number)
     path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(
-        path, picture=pictures, action=random.uniform(0, 1, (steps, 3)).astype(np.float32),
-        reward=np.where(np.arange(steps) % 3 == 0, 3.4, -0.1).astype(np.float32), ended=np.array(False),
-        driver=np.array("held"), preprocessing=np.array(preprocessing_of_size(picture).name),
-    )  # fmt: skip
+    arrays = {
+        "picture": pictures, "action": random.uniform(0, 1, (steps, actions)).astype(np.float32),
+        "reward": np.where(np.arange(steps) % 3 == 0, 3.4, -0.1).astype(np.float32), "ended": np.array(False),
+        "driver": np.array("held"), "preprocessing": np.array(preprocessing_of_size(picture, world).name),
+    }  # fmt: skip
+    named = {} if world == OF_FIRST_WORLD else {"world": np.array(world.text)}
+    np.savez_compressed(path, **arrays | named | more)
     return path
 
 

@@ -23,7 +23,7 @@ from safetensors import safe_open
 
 from dreamfleet import find_bundle, find_controller
 from dreamfleet.common.artifacts.bundle import MANIFEST, write_bundle
-from dreamfleet.common.artifacts.car_racing_variants import DEFAULT_VARIANT, Variant
+from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, DEFAULT_VARIANT, Variant
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES, fingerprint
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.evaluation_report import read_evaluation_report
@@ -134,8 +134,9 @@ def manifest_text(bundle):
 
 
 def bundles(folder):
-    """Graphs, manifest and file of world models with the presets' layers and with every kind of head."""
-    layers = {name: (each.vae_layers, each.mdnrnn_layers) for name, each in PRESETS.items()}
+    """Graphs, manifest and file of world models with its presets' layers and with every kind of head."""
+    own = {name: each for name, each in PRESETS.items() if each.task == CAR_RACING}
+    layers = {name: (each.vae_layers, each.mdnrnn_layers) for name, each in own.items()}
     layers |= {f"small {name}": (SMALL_VAE, each) for name, each in LAYERS.items()}
     found = {name: made_bundle(folder / f"{name}.zip", *each) for name, each in layers.items()}
     return {

@@ -66,6 +66,7 @@ def run(args: argparse.Namespace) -> int:
     world = resolve_world(args.data, args.task, world_arguments(args))
     preset = find_preset(resolve_preset(args.data, args.preset, world))
     config, pilots = apply_flags(_fit_pictures(preset.collect, world), args), _load_pilots(args)
+    config.check_for(world)  # a refused command begins no data set
     frames = done = 0
     before = len(existing_episodes(args.data))
     total = before + len(missing_numbers(args.data, config))
@@ -118,8 +119,10 @@ def _import_run(args: argparse.Namespace) -> int:
     from dreamfleet.worker.training.data.collect import import_rollouts
     from dreamfleet.worker.training.data.dataset import existing_episodes
 
-    if args.controller or args.task or world_arguments(args):
-        raise UsageError("--from-run drives nothing: leave --controller and the world's flags out")
+    if args.controller:
+        raise UsageError("--from-run drives nothing: leave --controller out")
+    if args.task or world_arguments(args):
+        raise UsageError("the drives of --from-run say their world: leave --task and its flags out")
     with open_run(args.runs_dir, args.from_run) as stored:
         drives = stored.rollouts()
         if not drives:

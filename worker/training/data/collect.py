@@ -48,16 +48,15 @@ def missing_numbers(folder: Path, config: CollectConfig) -> list[int]:
 
 
 def collect(
-    folder: Path, config: CollectConfig, jobs: int, pilots: Sequence[Pilot] = (),
-    world: DataWorld = OF_FIRST_WORLD,
-) -> Generator[int, None, None]:  # fmt: skip
+    folder: Path, config: CollectConfig, jobs: int, pilots: Sequence[Pilot] = (), world: DataWorld = OF_FIRST_WORLD
+) -> Generator[int, None, None]:
     """Drive the missing episodes in `jobs` processes; yield the frames of each once it is written.
 
     Random drivers drive, or `pilots` in turn. Before any drive it raises `DatasetError` if existing episodes are of
     another world or have other pictures, `ControllerError` if a pilot does, and `UsageError` if the world lacks what
     `config` asks for. When closed early, it waits until running drives are written.
     """
-    config.check_for(find_world(*world))
+    config.check_for(world)
     check_pictures(existing_episodes(folder), config.picture, world)
     for pilot in pilots:
         pilot.check(preprocessing_of_size(config.picture, world).name, world)
@@ -90,12 +89,12 @@ def _collect_one(task: tuple[Path, CollectConfig, int, tuple[Pilot, ...], DataWo
 
 
 def drive_episode(
-    config: CollectConfig, number: int, pilots: Sequence[Pilot] = (),
-    world: DataWorld = OF_FIRST_WORLD,
-) -> dict[str, NDArray[Any]]:  # fmt: skip
+    config: CollectConfig, number: int, pilots: Sequence[Pilot] = (), world: DataWorld = OF_FIRST_WORLD
+) -> dict[str, NDArray[Any]]:
     """Drive an episode of T steps: `picture` (T, side, side, 3) before each `action` (T, A), then `reward` (T,)."""
     random = np.random.default_rng([config.seed, number])
     task = find_world(*world)
+    config.check_for(world)
     name, policy = _driver(task, config, number, pilots, random)
     preprocessing = preprocessing_of_size(config.picture, world)
     begin = _begin_hook(task, config.anywhere, random)
@@ -126,7 +125,6 @@ def _driver(
     if pilots:
         pilot = pilots[number % len(pilots)]
         return DRIVER_NAME, pilot.policy(config.noise, config.spells, int(random.integers(2**63)))
-    config.check_for(task)
     if config.driver in (policies := source_policies(task)):
         policy = policies[config.driver](random)
         policy.begin(np.zeros(0, dtype=np.float32))

@@ -9,9 +9,10 @@ import numpy as np
 
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.scoring.rollout import DataWorld
 from dreamfleet.worker.tasks.api import Policy, RecordableTask, TaskWithBeginnings, TaskWithPolicies
 from dreamfleet.worker.tasks.policy import ALL_DRIVERS
-from dreamfleet.worker.training.data.dataset import find_world
+from dreamfleet.worker.training.data.dataset import find_world, preprocessing_of_size
 
 MAX_NOISE = 10.0  # in halves of an action's range
 
@@ -51,8 +52,10 @@ class CollectConfig:
         if not 0 <= self.spells <= 1:
             raise UsageError(f"--spells must be from 0 to 1, not {self.spells}")
 
-    def check_for(self, task: RecordableTask) -> None:
-        """`UsageError` if the task has no such driver, or no random places to begin at."""
+    def check_for(self, world: DataWorld) -> None:
+        """`UsageError` if the world has no such driver or pictures, or no random places to begin at."""
+        preprocessing_of_size(self.picture, world)
+        task = find_world(*world)
         if self.driver not in (known := (ALL_DRIVERS, *known_drivers(task))):
             raise UsageError(f"--driver must be one of {', '.join(known)}, not {self.driver!r}")
         if self.anywhere and not isinstance(task, TaskWithBeginnings):

@@ -19,7 +19,7 @@ from dreamfleet.worker.scoring.rollout import FIRST_WORLD, OF_FIRST_WORLD, DataW
 from dreamfleet.worker.tasks import registry
 from dreamfleet.worker.tasks.api import Preprocessing, RecordableTask
 
-WORLD = FIRST_WORLD
+WORLD = FIRST_WORLD  # what `baselines` calls it
 BEGUN = "preset.json"  # what a data set was begun with
 BEGUN_BYTES = 10_000
 REMEDY = "choose another --data"
@@ -46,7 +46,8 @@ def preprocessing_of_size(size: int, world: DataWorld = OF_FIRST_WORLD) -> Prepr
     for each in known:
         if each.size == size:
             return each
-    raise UsageError(f"pictures are {' or '.join(str(each.size) for each in known)} pixels wide, not {size}")
+    sizes = " or ".join(str(each.size) for each in known)
+    raise UsageError(f"pictures are {sizes} pixels wide, not {size}: give --picture {sizes}")
 
 
 def load_begun(folder: Path) -> dict[str, Any]:
@@ -70,7 +71,11 @@ def find_own_world(folder: Path) -> DataWorld | None:
     if begun := load_begun(folder):
         return DataWorld(begun.get("task", FIRST_WORLD), begun.get("options", ""))
     drives = (sorted((folder / kind).glob("[0-9]*.npz")) for kind in ("episodes", "encoded"))
-    return next((world_of_episode(paths[0]) for paths in drives if paths), None)
+    first = next((paths[0] for paths in drives if paths), None)
+    if first is None:
+        return None
+    _check_own_file(first)
+    return world_of_episode(first)
 
 
 def world_of_folder(folder: Path) -> DataWorld:
@@ -151,8 +156,13 @@ def check_no_foreign_files(folder: Path) -> None:
         except OSError as error:
             raise DatasetError(f"{place} cannot be read ({error.strerror}): choose another --data") from error
         for name in names:
-            if not name.startswith(".") and not is_own_file(place / name):
-                raise DatasetError(f"{place / name} is damaged, or of another program; {_remedy(place / name)}")
+            if not name.startswith("."):
+                _check_own_file(place / name)
+
+
+def _check_own_file(path: Path) -> None:
+    if not is_own_file(path):
+        raise DatasetError(f"{path} is damaged, or of another program; {_remedy(path)}")
 
 
 def check_whole(paths: Sequence[Path], *names: str) -> None:

@@ -1,0 +1,289 @@
+"""The world of a data set: what is collected in it, how it is named, and that two of them never mix."""
+
+import argparse
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
+from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.runs.lookup import find_controller
+from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
+from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld, write_episode
+from dreamfleet.worker.scoring.scorer import Scorer
+from dreamfleet.worker.tasks.policy import DriverPolicy
+from dreamfleet.worker.training.data.collect import collect, drive_episode, import_rollouts
+from dreamfleet.worker.training.data.collect_config import CollectConfig
+from dreamfleet.worker.training.data.data_folder import load_preset, resolve_preset, resolve_world, store_preset
+from dreamfleet.worker.training.data.dataset import (
+    check_pictures,
+    episode_path,
+    existing_episodes,
+    find_own_world,
+    find_world,
+    load_pictures,
+    load_steps,
+    pad,
+    preprocessing_of_size,
+    world_of_episode,
+    world_of_folder,
+)
+from dreamfleet.worker.training.data.pilot import Pilot
+from dreamfleet.worker.training.data.rollouts import load_rollouts
+from dreamfleet.worker.verbs import collect as verb
+from tests.support.bundles import write_world_bundle
+from tests.support.drives import write_drive
+from tests.support.pixel_world import DODGE, DODGE_TASK, DodgeTask
+
+# SWIG warns as Box2D is imported, and an error there kills the process.
+pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
+TASK, GYM = DataWorld(DODGE_TASK), DataWorld(DODGE)
+LIMITED = DataWorld(DODGE, '{"environment": {"max_episode_steps": 5}}')
+CART = DataWorld("gym:CartPole-v1", '{"observation": "render", "skip": 2}')
+PLAIN = CollectConfig(episodes=3, steps=60, seed=5, anywhere=0.0, patience=0)
+
+
+@pytest.fixture(autouse=True)
+def no_display(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+
+
+def call(*words):
+    parser = argparse.ArgumentParser()
+    verb.configure(parser)
+    return verb.run(parser.parse_args([*words, "--jobs", "1"]))
+
+
+def write(folder, number, arrays):
+    path = episode_path(folder, number)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as file:
+        write_episode(file, arrays)
+    return path
+
+
+@pytest.mark.parametrize("world", [OF_FIRST_WORLD, TASK, GYM])
+def test_a_drive_in_any_world_is_a_function_of_seed_and_number_and_says_its_world(world, tmp_path):
+    config = CollectConfig(steps=4, seed=5, anywhere=0.0)
+    first = drive_episode(config, 1, world=world)
+    drive_episode(config, 2, world=world)
+    again = drive_episode(config, 1, world=world)
+    assert all(np.array_equal(first[name], again[name]) for name in first | again)
+    path = write(tmp_path, 0, first)
+    assert load_pictures(path).shape == (4, 64, 64, 3)
+    assert load_steps(path)["action"].shape == (4, 3)
+    assert str(first["driver"]) in find_world(*world).drivers
+    assert world_of_episode(path) == world_of_folder(tmp_path) == find_own_world(tmp_path) == world
+    assert ("world" in first) == (world != OF_FIRST_WORLD)
+
+
+def test_a_death_is_told_from_a_limit(tmp_path):
+    dead, limited, cut = (
+        drive_episode(config, 0, world=world)
+        for config, world in ((PLAIN, GYM), (PLAIN, LIMITED), (CollectConfig(steps=3, anywhere=0.0), GYM))
+    )
+    assert [bool(each["ended"]) for each in (dead, limited, cut)] == [True, True, False]
+    assert ["terminal" in each for each in (dead, limited, cut)] == [False, True, False]
+    paths = [write(tmp_path, number, each) for number, each in enumerate((dead, limited, cut))]
+    assert [bool(load_steps(path)["terminal"]) for path in paths] == [True, False, False]
+    encoded = [encoded_drive(tmp_path, number, path) for number, path in enumerate(paths)]
+    done = load_rollouts(encoded).done
+    assert done.sum(dim=1).tolist() == [1, 0, 0]
+    assert done[0, len(dead["reward"]) - 1] == 1
+    assert dead["picture"].reshape(len(dead["picture"]), -1).max(axis=1).min() > 0, "the black picture after a death"
+
+
+def encoded_drive(folder, number, path, **more):
+    """The encoded episode of a drive, with noise as its latents."""
+    steps, target = load_steps(path), folder / "encoded" / f"{number:06d}.npz"
+    target.parent.mkdir(exist_ok=True)
+    noise = np.random.default_rng(number).standard_normal((len(steps["reward"]), 4)).astype(np.float32)
+    named = dict.fromkeys(("mu", "logvar", "mirrored_mu", "mirrored_logvar"), noise)
+    kept = {} if world_of_episode(path) == OF_FIRST_WORLD else {"world": np.array(world_of_episode(path).text)}
+    np.savez(target, **steps, **named, **kept, **more)
+    return target
+
+
+class BothFlags(gymnasium.Wrapper):
+    """Ends with a death and a limit at once, as ViZDoom's own time limit does."""
+
+    def step(self, action):
+        observation, reward, _, _, info = super().step(action)
+        return observation, reward, True, True, info
+
+
+def test_an_end_with_both_flags_is_a_limit():
+    task = DodgeTask()
+    driver = DriverPolicy(task.drivers["uniform"](np.random.default_rng(1)))
+    with BothFlags(task.make_recorded("box-64")) as environment:
+        (moment,) = run_episode(environment, driver, EpisodeConfig(1, 10))
+    assert (moment.ended, moment.terminal) == (True, False)
+
+
+class Failing(gymnasium.Wrapper):
+    """Fails at its first step, and remembers that it was closed."""
+
+    closed = 0
+
+    def step(self, action):
+        raise RuntimeError("the game is gone")
+
+    def close(self):
+        Failing.closed += 1
+        super().close()
+
+
+class FailingTask(DodgeTask):
+    """The test world, failing."""
+
+    name = f"{__name__}:FailingTask"
+
+    def make_recorded(self, preprocessing, render_mode=None):
+        return Failing(super().make_recorded(preprocessing, render_mode))
+
+
+def test_an_environment_is_closed_whatever_happens(monkeypatch):
+    monkeypatch.setenv("DREAMFLEET_TRUST", __name__)
+    with pytest.raises(RuntimeError, match="the game is gone"):
+        drive_episode(PLAIN, 0, world=DataWorld(FailingTask.name))
+    assert Failing.closed == 1
+
+
+def test_a_mirrored_drive_has_its_worlds_mirrored_actions_and_no_action_is_widened(tmp_path):
+    left = np.tile(np.array([0, 1, 0], np.float32), (12, 1))
+    dodge = encoded_drive(tmp_path, 0, write_drive(tmp_path, 0, world=TASK, action=left))
+    car = encoded_drive(tmp_path, 1, write_drive(tmp_path, 1, action=left - 0.5))
+    batch = load_rollouts([dodge, car], np.array([True, True])).action
+    assert batch[0, 0].tolist() == [0, 0, 1]
+    assert batch[1, 0].tolist() == [0.5, 0.5, -0.5]
+    narrow = encoded_drive(tmp_path, 2, write_drive(tmp_path, 2, actions=1))
+    with pytest.raises(UsageError, match=r"3 columns does not fit actions of shape \(12, 1\)"):
+        load_rollouts([narrow], np.array([True]))
+    for paths in ([car, narrow], [narrow, car]):
+        with pytest.raises(DatasetError, match=r"steps of shapes \(1,\) and \(3,\) are not of one world"):
+            load_rollouts(paths)
+    with pytest.raises(DatasetError, match="not of one world"):
+        pad([left, left[:, :1]])
+    still = encoded_drive(tmp_path, 3, write_drive(tmp_path, 3, world=GYM._replace(options='{"skip": 2}')))
+    load_rollouts([still])
+    with pytest.raises(DatasetError, match=r"has no mirrored drive: gym:.* with {\"skip\": 2} has no mirror"):
+        load_rollouts([still], np.array([True]))
+
+
+def test_two_worlds_never_mix(tmp_path):
+    data, run = tmp_path / "data", tmp_path / "run"
+    car = write_drive(data, 0)
+    dodge, skipped = write_drive(run, 0, world=TASK), write_drive(run, 1, world=GYM)
+    with pytest.raises(DatasetError, match=rf"000000\.npz is of car-racing, and the data are of {DODGE_TASK}"):
+        list(collect(data, PLAIN, 1, world=TASK))
+    for folder, drives in ((data, [dodge]), (tmp_path / "new", [dodge, skipped])):
+        with pytest.raises(DatasetError, match=r"has one world, and these are of .* \(.*\) and of .*npz\)"):
+            list(import_rollouts(folder, drives))
+    with pytest.raises(DatasetError, match=rf"is of {DODGE_TASK}, and the data are of car-racing"):
+        check_pictures([car, dodge], 64)
+    store_preset(tmp_path / "begun", "pixels", 0, GYM)
+    with pytest.raises(DatasetError, match=r"of gym:.*Dodge-v0 \(.*begun\) and of car-racing"):
+        list(import_rollouts(tmp_path / "begun", [car]))
+    assert list(import_rollouts(tmp_path / "new", [dodge])) == [12]
+    assert world_of_folder(tmp_path / "new") == TASK
+
+
+def test_a_data_set_keeps_the_world_that_it_was_begun_in(tmp_path):
+    words = ("--data", str(tmp_path), "--episodes", "2", "--steps", "3")
+    options = ("--observation", "render", "--size", "96", "--skip", "2")
+    assert call(*words, "--task", "gym:CartPole-v1", *options) == 0
+    stored = json.loads((tmp_path / "preset.json").read_text())
+    assert stored.pop("options") == '{"observation": "render", "size": 96, "skip": 2}'
+    assert stored == {"preset": "pixels", "seed": 0, "task": "gym:CartPole-v1"}
+    assert call(*words, "--task", "gym:CartPole-v1", *options) == call(*words) == 0
+    for path in existing_episodes(tmp_path):
+        assert load_pictures(path).shape[1:] == (96, 96, 3)
+        assert load_steps(path)["reward"].tolist() == [2, 2, 2][: len(load_steps(path)["reward"])]
+    for other in (("--task", "car-racing"), ("--task", "gym:CartPole-v1"), ("--skip", "3")):
+        with pytest.raises(UsageError, match=r"holds data of gym:CartPole-v1 with {.*}, and this is .*: a data"):
+            call(*words, *other)
+    with pytest.raises(UsageError, match="leave --task and its flags out"):
+        call(*words, "--from-run", "night", "--task", "car-racing")
+
+
+@pytest.mark.parametrize(
+    ("task", "arguments", "error"),
+    [
+        (None, {"skip": 2}, "task car-racing has no options: leave --skip out"),
+        (DODGE_TASK, {"size": 96, "crop": "0:9,0:9"}, "has no options: leave --size, --crop out"),
+        ("takecover", {"size": 96}, "knows no option size"),
+        ("gym:CartPole-v1", {"crop": "half"}, "a crop is top:bottom,left:right"),
+        ("ghost", {}, "ghost"),
+    ],
+)
+def test_a_world_without_such_options_is_refused(tmp_path, task, arguments, error):
+    with pytest.raises(UsageError, match=error):
+        resolve_world(tmp_path, task, arguments)
+
+
+def test_without_flags_a_new_data_set_is_of_the_first_world(tmp_path):
+    assert resolve_world(tmp_path, None, {}) == world_of_folder(tmp_path) == OF_FIRST_WORLD
+    assert resolve_world(tmp_path, "takecover", {"skip": 1}).options == '{"environment": {"tics": 1}}'
+    assert find_own_world(tmp_path) is None
+
+
+def test_a_preset_is_of_the_data_sets_world(tmp_path):
+    store_preset(tmp_path, "pixels", 3, CART)
+    assert (world_of_folder(tmp_path), load_preset(tmp_path)) == (CART, "pixels")
+    assert resolve_preset(tmp_path, None) == resolve_preset(tmp_path, "pixels") == "pixels"
+    with pytest.raises(UsageError, match="begun with the preset pixels, and --preset tiny is another"):
+        resolve_preset(tmp_path, "tiny")
+    new = tmp_path / "new"
+    assert resolve_preset(new, None, TASK) == "pixels"
+    assert resolve_preset(new, None, DataWorld("takecover")) == "takecover"
+    for preset, world, own in (("tiny", TASK, "car-racing"), ("takecover", OF_FIRST_WORLD, "takecover")):
+        with pytest.raises(UsageError, match=f"preset {preset} is of {own}, and the data are of {world}: give"):
+            resolve_preset(new, preset, world)
+    (tmp_path / "preset.json").write_text('{"preset": "pixels", "task": 5}')
+    with pytest.raises(DatasetError, match="names no preset"):
+        world_of_folder(tmp_path)
+
+
+@pytest.mark.parametrize("flags", [("--driver", "ghost"), ("--picture", "96"), ("--anywhere", "0.5")])
+def test_a_refused_command_begins_no_data_set(tmp_path, flags):
+    with pytest.raises(UsageError):
+        call("--data", str(tmp_path), "--task", DODGE_TASK, *flags)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("config", "error"),
+    [
+        (CollectConfig(driver="ghost", anywhere=0.0), "--driver must be one of random, held, uniform, not 'ghost'"),
+        (CollectConfig(anywhere=0.5), "begin at no random place: give --anywhere 0"),
+        (CollectConfig(picture=96, anywhere=0.0), "pictures are 64 pixels wide, not 96: give --picture 64"),
+    ],
+)
+def test_what_a_world_lacks_is_refused_before_any_drive(tmp_path, config, error):
+    with pytest.raises(UsageError, match=error):
+        list(collect(tmp_path, config, 1, world=TASK))
+    assert not (tmp_path / "episodes").exists()
+
+
+def test_a_controller_of_another_world_drives_for_no_data_set(tmp_path):
+    pilot = Pilot(find_controller("tiny", tmp_path)[0], find_bundle("tiny"))
+    with pytest.raises(ControllerError, match=rf"of car-racing, and the data set holds 'box-64' of {DODGE_TASK}"):
+        list(collect(tmp_path, PLAIN, 1, (pilot,), TASK))
+
+
+def test_a_runs_rollouts_say_the_world_of_its_world_model(tmp_path):
+    facts = DodgeTask.world.facts(RewardFacts("survival"), EndRule())
+    bundle = write_world_bundle(tmp_path / "dodge.zip", facts)
+    scorer = Scorer(TaskSpec(DODGE_TASK, bundle.sha256, horizon=3, patience=0), bundle)
+    try:
+        shape = bundle.controller_shape
+        _, rollout = scorer.collect(np.zeros(shape.size, np.float32), seed=2**20)
+    finally:
+        scorer.close()
+    path = write(tmp_path, 0, rollout.arrays())
+    assert world_of_episode(path) == DataWorld.of(bundle) == TASK
+    assert load_pictures(path).shape == (3, *preprocessing_of_size(64, TASK).shape)
