@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -28,22 +29,25 @@ from dreamfleet.common.artifacts.bundle import (
     BundleManifest,
     write_bundle,
 )
-from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.artifacts.world_facts import WorldFacts
+from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import read_regular
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
 from dreamfleet.worker.training.data.data_folder import explain_write_errors
 from dreamfleet.worker.training.data.dataset import (
-    WORLD,
     episode_paths,
     find_world,
     load_arrays,
     preprocessing_of_size,
     split_held_out,
+    world_of_folder,
 )
+from dreamfleet.worker.training.dream_facts import RecordedRewards, Source, describe_world
 from dreamfleet.worker.training.encode import ENCODED, latents_encoder_hash
 from dreamfleet.worker.training.recorded_states import compute_recorded_states
 from dreamfleet.worker.worldmodel.export import (
@@ -75,17 +79,25 @@ def record_quality(folder: Path, figures: dict[str, float]) -> None:
 
 
 def assemble(
-    folder: Path, out: Path, name: str, *, with_weights: bool, recorded: int = 0, measured: Sequence[Path] = ()
-) -> Bundle:
+    folder: Path, out: Path, name: str, *, with_weights: bool, recorded: int = 0, measured: Sequence[Path] = (),
+    reward: Source | None = None, end: str | None = None,
+) -> Bundle:  # fmt: skip
     """Build the bundle of a data folder with trained models, with at most `recorded` states of its drives.
 
     `measured` are files of `inspect --json` on the same bundle without them; `DatasetError` if on another bundle.
+    `reward` and `end` say how dreams pay and end, as in `describe_world`; CarRacing's bundle says neither.
     """
     measurements = [(path, *_load_measurements(path)) for path in measured]
     vae, rnn, vae_config, rnn_config = _load_models(folder)
     configs = vae_config, rnn_config
-    provenance = _make_provenance(folder)
-    parts = export_graphs(vae, rnn, initial_latents(folder), *configs)
+    provenance, world, facts = _make_provenance(folder), world_of_folder(folder), None
+    if world != OF_FIRST_WORLD:
+        rewards = RecordedRewards.load(episode_paths(folder))
+        facts = describe_world(world, rewards, rnn_config, reward, end)
+        provenance |= _describe_drives(folder, rewards, facts)
+    elif reward or end:
+        raise UsageError(f"{world} knows how its dreams pay and end: leave --reward and --end out")
+    parts = export_graphs(vae, rnn, initial_latents(folder), *configs, facts)
     if recorded:
         found = compute_recorded_states(folder, recorded)
         if states := len(found.states):
@@ -98,7 +110,8 @@ def assemble(
         )
     if measurements:
         with TemporaryDirectory() as aside:
-            bare = write_bundle(Path(aside) / out.name, make_manifest(name, provenance, *configs), parts).sha256
+            manifest = make_manifest(name, provenance, *configs, world, facts)
+            bare = write_bundle(Path(aside) / out.name, manifest, parts).sha256
         for path, of, _ in measurements:
             if of != bare:
                 raise DatasetError(
@@ -107,7 +120,7 @@ def assemble(
                 )
         provenance["measured"] = [figures for *_, figures in measurements]
     with explain_write_errors(out):
-        return write_bundle(out, make_manifest(name, provenance, *configs), parts)
+        return write_bundle(out, make_manifest(name, provenance, *configs, world, facts), parts)
 
 
 def _load_models(folder: Path) -> tuple[Weights, Weights, VAEConfig, MDNRNNConfig]:
@@ -137,6 +150,17 @@ def _make_provenance(folder: Path) -> dict[str, Any]:
     }
 
 
+def _describe_drives(folder: Path, rewards: RecordedRewards, facts: WorldFacts) -> dict[str, Any]:
+    """What the provenance of a world that is described says besides."""
+    drivers = Counter(str(load_arrays(path, "driver")["driver"]) for path in episode_paths(folder))
+    packages = sorted({"dreamfleet", "torch", *facts.packages})
+    return {
+        "drivers": dict(sorted(drivers.items())),
+        "deaths": rewards.deaths,
+        "versions": {package: package_version(package) for package in packages},
+    }
+
+
 def _load_measurements(path: Path) -> tuple[object, dict[str, Any]]:
     """The SHA-256 of the bundle that a file of `inspect --json` measured, and its figures."""
     try:
@@ -152,13 +176,14 @@ def _load_measurements(path: Path) -> tuple[object, dict[str, Any]]:
 
 
 def make_manifest(
-    name: str, provenance: dict[str, Any], vae: VAEConfig = PAPER, rnn: MDNRNNConfig = REWARDED
-) -> BundleManifest:
-    """Make the manifest of these models."""
-    preprocessing = preprocessing_of_size(vae.picture)
+    name: str, provenance: dict[str, Any], vae: VAEConfig = PAPER, rnn: MDNRNNConfig = REWARDED,
+    world: DataWorld = OF_FIRST_WORLD, facts: WorldFacts | None = None,
+) -> BundleManifest:  # fmt: skip
+    """Make the manifest of these models of a data set's world, with what it says of that world."""
+    preprocessing = preprocessing_of_size(vae.picture, world)
     return BundleManifest(
         name=name,
-        task=WORLD,
+        task=world.task,
         preprocessing=preprocessing.name,
         picture=preprocessing.shape,
         latent=vae.latent,
@@ -166,6 +191,7 @@ def make_manifest(
         actions=rnn.actions,
         provenance=provenance,
         models={"vae": to_dict(vae), "mdnrnn": to_dict(rnn)},
+        world=facts,
     )
 
 
@@ -175,19 +201,23 @@ def export_graphs(
     initial: NDArray[np.float32],
     vae_config: VAEConfig = PAPER,
     rnn_config: MDNRNNConfig = REWARDED,
+    facts: WorldFacts | None = None,
 ) -> dict[str, bytes]:
-    """Make the parts of a bundle, by name."""
-    actions = find_world().world.actions
-    if not isinstance(actions, Continuous) or actions.output_indices:
-        raise DatasetError(f"world models need continuous actions with one output each; those of {WORLD} are not")
-    return {
+    """Make the parts of a bundle, by name; those of a world that is described have no graph with a controller."""
+    parts = {
         ENCODER: export_encoder(vae, vae_config),
         DECODER: export_decoder(vae, vae_config),
-        POLICY: export_policy(vae, rnn, vae_config, rnn_config, actions),
         DREAM_GRAPH: export_dream(rnn, rnn_config),
+        INITIAL_LATENTS_PART: _npy(initial),
+    }
+    if facts is not None:
+        return parts
+    actions = find_world().world.actions
+    assert isinstance(actions, Continuous)
+    return parts | {
+        POLICY: export_policy(vae, rnn, vae_config, rnn_config, actions),
         LINEAR_CONTROLLER: export_controller(actions, hidden=False),
         LAYERED_CONTROLLER: export_controller(actions, hidden=True),
-        INITIAL_LATENTS_PART: _npy(initial),
     }
 
 

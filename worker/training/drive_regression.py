@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import DatasetError
+from dreamfleet.worker.scoring.rollout import DataWorld
 from dreamfleet.worker.training.data.dataset import (
     check_whole,
     episode_paths,
+    kind_of,
     load_pictures,
     load_steps,
     pad,
-    preprocessing_of,
 )
 from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, RewardLabel
 from dreamfleet.worker.worldmodel.observation import join_features
@@ -122,12 +123,16 @@ def last_drives(folder: Path, count: int) -> list[Path]:
     return episode_paths(folder)[-count:]
 
 
-def check_drives(paths: Sequence[Path], preprocessing: str) -> None:
-    """`DatasetError` for a damaged drive, or one whose pictures have another preprocessing."""
+def check_drives(paths: Sequence[Path], bundle: Bundle) -> None:
+    """`DatasetError` for a damaged drive, or one of another world or other pictures than the bundle's."""
     check_whole(paths, "picture", "preprocessing", "action", "reward", "ended")
+    world, seen = DataWorld.of(bundle), bundle.manifest.preprocessing
     for path in paths:
-        if (found := preprocessing_of(path)) != preprocessing:
-            raise DatasetError(f"{path} holds pictures {found!r}, and the world model sees {preprocessing!r}")
+        own, found = kind_of(path)
+        if own != world:
+            raise DatasetError(f"{path} is of {own}, and the world model of {world}")
+        if found != seen:
+            raise DatasetError(f"{path} holds pictures {found!r}, and the world model sees {seen!r}")
 
 
 def load_in_batches(paths: Sequence[Path], actions: int) -> Iterator[tuple[int, list[DriveArrays]]]:

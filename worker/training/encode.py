@@ -23,10 +23,12 @@ from dreamfleet.worker.training.data.dataset import (
     check_pictures,
     check_whole,
     episode_paths,
+    find_world,
     load_arrays,
     load_pictures,
     load_steps,
     preprocessing_of_size,
+    world_of_folder,
 )
 from dreamfleet.worker.training.train_vae import CHECKPOINT
 from dreamfleet.worker.worldmodel.export import export_encoder
@@ -34,6 +36,7 @@ from dreamfleet.worker.worldmodel.inference import open_graph
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 
 ENCODED = "encoded"
+COPIED = ("terminal", "world")  # arrays that some drives have
 BATCH = 100  # pictures
 ENCODER = ("encoder.", "mu.", "logvar.")  # prefixes of its weights' names
 
@@ -58,13 +61,13 @@ def encode(folder: Path) -> Iterator[int]:
         if len(drive["action"]) != len(pictures):
             raise DatasetError(f"{path} holds {len(pictures)} pictures and another number of actions; delete it")
         mu, logvar = encode_pictures(pictures)
-        mirrored = dict[str, Any]()
+        more: dict[str, Any] = load_arrays(path, optional=COPIED)
         if mirrors:
             found = encode_pictures(np.ascontiguousarray(pictures[:, :, ::-1]))
-            mirrored = dict(zip(("mirrored_mu", "mirrored_logvar"), found, strict=True))
+            more |= zip(("mirrored_mu", "mirrored_logvar"), found, strict=True)
         with explain_write_errors(target), atomic_write(target) as file:
             np.savez(
-                file, mu=mu, logvar=logvar, **mirrored, action=drive["action"], reward=drive["reward"],
+                file, mu=mu, logvar=logvar, **more, action=drive["action"], reward=drive["reward"],
                 ended=drive["ended"], vae=np.array(vae),
             )  # fmt: skip
         yield len(pictures)
@@ -89,7 +92,8 @@ def latents_encoder_hash(folder: Path) -> str:
 
 def encodes_mirrored(folder: Path) -> bool:
     """Whether mirrored pictures of the folder's VAE can occur in a drive."""
-    return preprocessing_of_size(load_config(folder / CHECKPOINT, VAEConfig).picture).mirrors
+    size, world = load_config(folder / CHECKPOINT, VAEConfig).picture, world_of_folder(folder)
+    return preprocessing_of_size(size, world).mirrors and find_world(*world).world.mirror is not None
 
 
 def encoder_hash(folder: Path) -> str:

@@ -24,7 +24,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.tasks.api import World
-from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.training.data.drive_steps import FIRST_START, on_road_mask
 from dreamfleet.worker.training.drive_regression import (
     HELD_OUT_EVERY,
@@ -89,7 +89,9 @@ def make_targets(world: World, columns: int) -> list[PredictionTarget]:
     actions, found = world.actions, []
     for column in range(columns):
         name = world.action_names[column] if column < len(world.action_names) else f"action {column + 1}"
-        both = isinstance(actions, Continuous) and actions.low[column] < 0 < actions.high[column]
+        both = (
+            isinstance(actions, Continuous) and not actions.choices and actions.low[column] < 0 < actions.high[column]
+        )
         windows = ACTION_WINDOWS if both else (NEXT_WINDOW,)
         found += [PredictionTarget(_feature_name(name, window), column, window) for window in windows]
         found += [
@@ -109,14 +111,15 @@ def find_subspace(
 
     `DatasetError` for damaged drives or other pictures or actions; `UsageError` if no target is predictable.
     """
-    check_drives(paths, bundle.manifest.preprocessing)
+    check_drives(paths, bundle)
     extractor = FeatureExtractor(bundle)
-    targets = make_targets(find_task(bundle.manifest.task).world, bundle.manifest.actions)
+    world = task_of(bundle).world
+    targets = make_targets(world, bundle.manifest.actions)
     split, later = SplitSums(), SplitSums()
     for first, drives in load_in_batches(paths, bundle.manifest.actions):
         features = extractor.features(drives, extractor.encode_drives(drives))
         for row, drive in enumerate(drives):
-            on, wanted = _mask_and_targets(drive, targets)
+            on, wanted = _mask_and_targets(drive, targets, world.lost_after)
             seen = features[row, : len(on)]
             split.add(first + row, LeastSquaresSums.of(seen[on], wanted[on]))
             if views and on.any():
@@ -147,11 +150,13 @@ def find_subspace(
     return SubspaceResult(_standardise(whole, solved, names, bundle), tuple(scores), len(paths), whole.steps)
 
 
-def _mask_and_targets(drive: DriveArrays, targets: Sequence[PredictionTarget]) -> tuple[NDArray[np.bool_], Doubles]:
+def _mask_and_targets(
+    drive: DriveArrays, targets: Sequence[PredictionTarget], lost_after: int
+) -> tuple[NDArray[np.bool_], Doubles]:
     """The mask `(T,)` of usable steps, and the targets' values `(T, targets)`."""
     columns = np.concatenate([drive.action, drive.reward[:, None]], axis=1).astype(np.float64)
     sums = np.concatenate([np.zeros((1, columns.shape[1])), np.cumsum(columns, axis=0)])
-    on = on_road_mask(drive.reward)
+    on = on_road_mask(drive.reward, lost_after)
     on[:FIRST_START] = False
     on[max(len(on) - ACTION_WINDOWS[-1][1], 0) :] = False
     return on, np.stack([each.values(sums) for each in targets], axis=1)

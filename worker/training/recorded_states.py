@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from dreamfleet.worker.training.checkpoint import load_checkpoint, load_config
-from dreamfleet.worker.training.data.dataset import episode_paths, load_steps
+from dreamfleet.worker.training.data.dataset import episode_paths, find_world, load_steps, world_of_folder
 from dreamfleet.worker.training.data.drive_steps import DriveStep, sample_steps
 from dreamfleet.worker.training.data.rollouts import load_rollouts, teacher_force
 from dreamfleet.worker.training.encode import ENCODED
@@ -29,7 +29,7 @@ SEED = 0
 class RecordedStates:
     """States `(N, 2 * latent + state)` in half precision: mu, logvar and the recurrent state before the action.
 
-    `before_losses` of them lie shortly before a loss of the road.
+    `before_losses` of them lie shortly before a loss of the course, or a death.
     """
 
     states: NDArray[np.float16]
@@ -40,7 +40,10 @@ def compute_recorded_states(folder: Path, count: int) -> RecordedStates:
     """Compute at most `count` states of a folder's encoded drives by its MDN-RNN; equal folders give equal states."""
     paths, model = episode_paths(folder, ENCODED), MDNRNN(load_config(folder / CHECKPOINT, MDNRNNConfig))
     load_checkpoint(folder / CHECKPOINT, model, None)
-    drawn = sample_steps([load_steps(path)["reward"] for path in paths], count, np.random.default_rng(SEED))
+    drives, random = [load_steps(path) for path in paths], np.random.default_rng(SEED)
+    rewards, deaths = ([drive[name] for drive in drives] for name in ("reward", "terminal"))
+    lost_after = find_world(*world_of_folder(folder)).world.lost_after
+    drawn = sample_steps(rewards, count, random, lost_after, [bool(each) for each in deaths])
     with on_one_thread(), torch.no_grad():
         rows = [row for part in _batch_by_drive(drawn.all) for row in _states(paths, model, part)]
     width = 2 * model.config.latent + model.config.state

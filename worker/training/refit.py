@@ -16,11 +16,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.actions import Continuous
+from dreamfleet.common.artifacts.actions import one_hot
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, ENCODER, Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ControllerError, UsageError
-from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.scoring.rollout import DataWorld
+from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.training.data.drive_steps import on_road_mask
 from dreamfleet.worker.training.drive_regression import (
     FeatureExtractor,
@@ -60,9 +61,9 @@ def refit(
     if all(own.read(part) == bundle.read(part) for part in (ENCODER, DREAM_GRAPH)):
         return RefitResult(replace(controller, bundle=bundle.sha256), 0, 0, ())
     _check_compatible(controller, own, bundle, paths)
-    fitted = bundle.with_controllers(
-        bundle.shape_of(_feature_set(controller, own), controller.shape.hidden, controller.variant), controller.variant
-    )
+    driving = bundle.driving_of(controller.options)
+    shape = bundle.shape_of(_feature_set(controller, own), controller.shape.hidden, driving)
+    fitted, lost_after = bundle.with_options(shape, controller.options), task_of(own).world.lost_after
     old, new = FeatureExtractor(own.for_controller(controller)), FeatureExtractor(fitted)
     lowest, highest = output_bounds(controller, own)
     same_encoder = own.read(ENCODER) == bundle.read(ENCODER)
@@ -75,7 +76,7 @@ def refit(
             new.features(drives, latent if same_encoder else new.encode_drives(drives)),
         )
         for row, drive in enumerate(drives):
-            on = on_road_mask(drive.reward)
+            on = on_road_mask(drive.reward, lost_after)
             wanted = before[row, : len(on)][on].astype(np.float64) @ weights.T.astype(np.float64) + biases
             sums = LeastSquaresSums.of(after[row, : len(on)][on], np.clip(wanted, lowest, highest))
             split.add(first + row, sums)
@@ -101,12 +102,10 @@ def output_bounds(controller: Controller, own: Bundle) -> tuple[Doubles, Doubles
     """
     outputs = controller.shape.layers[0][0]
     lowest, highest = np.full(outputs, -TANH_BOUND), np.full(outputs, TANH_BOUND)
-    actions = (
-        controller.variant.controls if not controller.variant.is_default else find_task(own.manifest.task).world.actions
-    )
-    if isinstance(actions, Continuous) and actions.choices and not controller.shape.hidden:
+    actions = own.driving_of(controller.options).controls
+    if actions.choices and not controller.shape.hidden:
         return lowest * np.inf, highest * np.inf
-    if controller.shape.hidden or not isinstance(actions, Continuous) or actions.output_indices:
+    if controller.shape.hidden or actions.output_indices:
         return lowest, highest
     for output, (scale, shift, low, high) in enumerate(
         zip(actions.scale, actions.shift, actions.low, actions.high, strict=True)
@@ -125,11 +124,10 @@ def output_bounds(controller: Controller, own: Bundle) -> tuple[Doubles, Doubles
 
 def output_names(controller: Controller, own: Bundle) -> tuple[str, ...]:
     """Names for the outputs of a controller's first layer: the actions' names if they correspond one to one."""
-    names, count = find_task(own.manifest.task).world.action_names, controller.shape.layers[0][0]
-    plain = controller.variant.is_default or not (
-        controller.variant.controls.output_indices or controller.variant.controls.choices
-    )
-    if plain and not controller.shape.hidden and len(names) == count:
+    names, count = task_of(own).world.action_names, controller.shape.layers[0][0]
+    actions = own.driving_of(controller.options).controls
+    is_named = not actions.output_indices and actions.choices in ((), one_hot(actions.actions).choices)
+    if is_named and not controller.shape.hidden and len(names) == count:
         return names
     return tuple(f"output {number + 1}" for number in range(count))
 
@@ -139,12 +137,12 @@ def _feature_set(controller: Controller, own: Bundle) -> str:
 
 
 def _check_compatible(controller: Controller, own: Bundle, bundle: Bundle, paths: Sequence[Path]) -> None:
-    sees = [(each.manifest.task, each.manifest.preprocessing) for each in (own, bundle)]
-    if sees[0] != sees[1]:
+    (world, seen), (other, shown) = ((DataWorld.of(each), each.manifest.preprocessing) for each in (own, bundle))
+    if (world, seen) != (other, shown):
         raise ControllerError(
-            f"the controller sees {sees[0][1]!r} of {sees[0][0]}, and {bundle.manifest.name} {sees[1][1]!r} of "
-            f"{sees[1][0]}: no drive shows both"
+            f"the controller sees {seen!r} of {world}, and {bundle.manifest.name} {shown!r} of {other}: no drive shows "
+            "both"
         )
-    if controller.variant.extra_features:
+    if own.driving_of(controller.options).extra_features:
         raise UsageError("it looks at its own last choices, which no recorded drive holds: it cannot be refitted")
-    check_drives(paths, sees[0][1])
+    check_drives(paths, own)

@@ -27,6 +27,15 @@ def configure_bundle(parser: argparse.ArgumentParser) -> None:
         "--measured", type=Path, nargs="+", default=[], metavar="FILE",
         help="answers of `inspect --json` (--probe, --losses, ...) about this world model, to keep in its manifest",
     )  # fmt: skip
+    parser.add_argument(
+        "--reward", choices=("survival", "label", "value"),
+        help="what a dreamt step earns: survival, or the label or the value that is predicted (default: by the data)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--end", metavar="RULE",
+        help="where dreams end: at a predicted probability from 0 to 1, or drawn, by chance (default drawn where the "
+        "reward is survival, else 0.5)",
+    )  # fmt: skip
     add_json_flag(parser)
 
 
@@ -39,7 +48,7 @@ def write_bundle(args: argparse.Namespace) -> int:
     check_output_path(args.out)
     bundle = assemble(
         args.data, args.out, args.out.stem, with_weights=args.with_weights, recorded=args.recorded,
-        measured=args.measured,
+        measured=args.measured, reward=args.reward, end=args.end,
     )  # fmt: skip
     size = bundle.path.stat().st_size / 1e6
     parameters = bundle.controller_shape.size

@@ -1,0 +1,224 @@
+"""A world that says what docs/worlds.md asks for, from its drives to a world model that candidates evolve in."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.bundle import (
+    DECODER,
+    DREAM_GRAPH,
+    ENCODER,
+    INITIAL_LATENTS_PART,
+    RECORDED_STATES,
+    Bundle,
+)
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
+from dreamfleet.common.cli.command_line import main
+from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.worker.dream.world import DreamWorld
+from dreamfleet.worker.scoring.rollout import DataWorld
+from dreamfleet.worker.scoring.scorer import Scorer
+from dreamfleet.worker.tasks.registry import task_of
+from dreamfleet.worker.training import train_mdnrnn, train_vae
+from dreamfleet.worker.training.assemble import assemble
+from dreamfleet.worker.training.data.collect import collect
+from dreamfleet.worker.training.data.collect_config import CollectConfig
+from dreamfleet.worker.training.data.dataset import episode_paths, load_arrays
+from dreamfleet.worker.training.encode import encode
+from dreamfleet.worker.training.fit_subspace import find_subspace, make_targets
+from dreamfleet.worker.training.presets import TrainConfig
+from dreamfleet.worker.training.refit import output_bounds, output_names, refit
+from dreamfleet.worker.training.unbundle import unbundle
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.policy import ModelPolicy
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+from tests.support.bundles import write_random_bundle
+from tests.support.drives import write_drive
+from tests.support.pixel_world import DODGE_TASK, DodgeTask
+
+DRIVES, STATES = 24, 30
+FEW = TrainConfig(updates=2, batch=4, rate=1e-3, validate_every=1)
+EYES = VAEConfig(latent=4, channels=(2, 2, 2, 2))
+MEMORY = MDNRNNConfig(latent=4, hidden=6, reward="none", done=True, done_weight=3.0)
+CARS = MDNRNNConfig(latent=4, hidden=6)
+
+
+def ignore(*_):
+    pass
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Drives of the test world, and models that learnt from them for two updates."""
+    folder = tmp_path_factory.mktemp("dodge")
+    config = CollectConfig(episodes=DRIVES, steps=60, anywhere=0.0, patience=0, driver="held")
+    assert len(list(collect(folder, config, 1, world=DataWorld(DODGE_TASK)))) == DRIVES
+    train(folder)
+    return folder
+
+
+def train(folder, **more):
+    train_vae.train_vae(folder, replace(FEW, **more), ignore, EYES, new=True)
+    assert len(list(encode(folder))) == DRIVES
+    train_mdnrnn.train_mdnrnn(folder, replace(FEW, **more), ignore, MEMORY, new=True)
+
+
+@pytest.fixture(scope="module")
+def bundle(folder):
+    return assemble(folder, folder / "dodge.zip", "dodge", with_weights=False, recorded=STATES)
+
+
+def rewards(folder):
+    return [load_arrays(path, "reward")["reward"] for path in episode_paths(folder)]
+
+
+def deaths(folder):
+    """The lengths of the drives that ended with a death."""
+    ended = [load_arrays(path, "ended")["ended"] for path in episode_paths(folder)]
+    return [len(reward) for reward, died in zip(rewards(folder), ended, strict=True) if died]
+
+
+def test_the_bundle_describes_its_world_and_holds_no_graph_with_a_controller(folder, bundle):
+    manifest = bundle.manifest
+    assert (manifest.task, manifest.preprocessing, manifest.actions) == (DODGE_TASK, "box-64", 3)
+    assert manifest.world == DodgeTask.world.facts(RewardFacts("survival", 1.0), EndRule("drawn", odds_weight=3.0))
+    assert set(manifest.parts) == {ENCODER, DECODER, DREAM_GRAPH, INITIAL_LATENTS_PART, RECORDED_STATES}
+    provenance = manifest.provenance
+    assert (provenance["drivers"], provenance["deaths"]) == ({"held": DRIVES}, len(deaths(folder)))
+    assert set(provenance["versions"]) == {"dreamfleet", "torch", *DodgeTask.world.packages}
+    again = assemble(folder, folder / "again.zip", "dodge", with_weights=False, recorded=STATES)
+    assert again.sha256 == bundle.sha256
+
+
+def test_encoded_drives_say_what_the_drives_say_and_are_mirrored_where_the_world_is(folder):
+    for drive, latents in zip(episode_paths(folder), episode_paths(folder, "encoded"), strict=True):
+        for name in ("world", "action", "reward", "ended"):
+            assert np.array_equal(load_arrays(drive, name)[name], load_arrays(latents, name)[name])
+        assert "mirrored_mu" in load_arrays(latents, "mirrored_mu")
+
+
+class Unmirrored(DodgeTask):
+    """The same world, in which a mirrored picture shows nothing."""
+
+    world = replace(DodgeTask.world, mirror=None)
+
+
+def write_made_up_drive(folder, number, task=DODGE_TASK, steps=120):
+    """A drive whose action follows from how bright the picture is, cut by a limit."""
+    phase = np.arange(steps) / 15 + number
+    path = write_drive(folder, number, steps)
+    with np.load(path) as drive:
+        arrays = dict(drive)
+    arrays["picture"][:] = (127 + 100 * np.sin(phase)).astype(np.uint8)[:, None, None, None]
+    arrays["action"] = np.eye(3, dtype=np.float32)[np.digitize(np.sin(phase), (-0.3, 0.3))]
+    np.savez(path, **{**arrays, "world": DataWorld(task).text, "ended": True, "terminal": False})
+    return path
+
+
+def test_what_some_drives_alone_say_is_copied_and_without_a_mirror_no_picture_is_mirrored(folder, tmp_path):
+    shutil.copy(folder / train_vae.CHECKPOINT, tmp_path)
+    for number in range(2):
+        write_made_up_drive(tmp_path, number, f"{__name__}:Unmirrored")
+    assert len(list(encode(tmp_path))) == 2
+    with np.load(tmp_path / "encoded" / "000000.npz") as latents:
+        assert (bool(latents["ended"]), bool(latents["terminal"])) == (True, False)
+        assert str(latents["world"]) == f"{__name__}:Unmirrored\n"
+        assert "mirrored_mu" not in latents
+
+
+def test_up_to_half_of_the_recorded_states_lie_before_deaths(folder, bundle):
+    late = sum(length >= 26 for length in deaths(folder))
+    assert bundle.recorded_count == STATES
+    assert bundle.manifest.provenance["recorded"] == {"states": STATES, "before_losses": min(late, STATES // 2)}
+
+
+def parameters_of(bundle, seed=0):
+    return np.random.default_rng(seed).normal(size=bundle.controller_shape.size).astype(np.float32)
+
+
+def test_a_controller_drives_by_it_in_the_world_and_in_its_dream(bundle):
+    parameters = parameters_of(bundle)
+    scorer = Scorer(TaskSpec(DODGE_TASK, bundle.sha256, horizon=60, patience=0), bundle)
+    score = scorer.score("score", parameters, 3)
+    assert score.fitness == score.steps > 0
+    policy, environment = ModelPolicy(bundle), task_of(bundle).make_recorded("box-64")
+    policy.begin(parameters)
+    observation, _ = environment.reset(seed=3)
+    for _ in range(5):
+        action = policy.act(observation)
+        assert action.tolist() in np.eye(3).tolist()
+        observation, *_ = environment.step(action)
+    dream = Scorer(TaskSpec("dream", bundle.sha256, horizon=60, patience=0, recorded=0.5), bundle)
+    together = dream.score_all([("score", parameters, seed) for seed in (1, 2, 3)], ignore)
+    assert together[1] == dream.score("score", parameters, 2)
+    for each in together:
+        assert each.fitness in (each.steps, each.steps - 1), "the last step of a life pays nothing"
+    assert DreamWorld(bundle, 1.0).bars is not None, "its ends are drawn"
+
+
+@pytest.mark.parametrize("hidden", [0, 5])
+def test_a_controller_is_fitted_to_another_model_of_the_world(folder, bundle, tmp_path, hidden):
+    shutil.copytree(folder / "episodes", tmp_path / "episodes")
+    train(tmp_path, seed=1)
+    other = assemble(tmp_path, tmp_path / "other.zip", "other", with_weights=False)
+    shape = bundle.shape_of("zh", hidden)
+    drawn = np.random.default_rng(3).normal(size=shape.size).astype(np.float32)
+    before = Controller(shape, drawn, DODGE_TASK, bundle.sha256)
+    assert np.isinf(output_bounds(before, bundle)).all() == (not hidden), "choices are compared, wherever they lie"
+    assert output_names(before, bundle)[0] == ("output 1" if hidden else "stay")
+    found = refit(before, bundle, other, episode_paths(folder), ignore)
+    assert (found.controller.bundle, found.controller.shape) == (other.sha256, shape)
+    assert found.steps == sum(map(len, rewards(folder))), "no step is off the course"
+    held = refit(replace(before, options='{"decide_every": 4}'), bundle, other, episode_paths(folder), ignore)
+    assert np.array_equal(held.controller.parameters, found.controller.parameters)
+    with pytest.raises(DatasetError, match=r"is of car-racing, and the world model of tests"):
+        refit(before, bundle, other, [write_drive(tmp_path / "others", 0)], ignore)
+    with pytest.raises(ControllerError, match="no drive shows both"):
+        refit(before, bundle, write_random_bundle(tmp_path / "cars.zip", vae=EYES, rnn=CARS), [], ignore)
+
+
+def test_features_of_it_predict_actions_that_are_chosen(folder, bundle, tmp_path):
+    names = [each.name for each in make_targets(DodgeTask.world, 3)]
+    assert names[:3] == ["stay 0-5", "left 0-5", "right 0-5"], "one window each: none goes both ways"
+    with pytest.raises(UsageError, match="are too few"):
+        find_subspace(bundle, episode_paths(folder), ignore)
+    found = find_subspace(bundle, [write_made_up_drive(tmp_path, number) for number in range(15)], ignore)
+    assert {"stay 0-5", "right 0-5"} <= set(found.subspace.names)
+    assert not [name for name in found.subspace.names if name.startswith("|")], "a choice has no sign"
+
+
+def test_the_verb_takes_another_reward_and_end_of_any_world_but_the_first(folder, tmp_path, capsys):
+    out = tmp_path / "b.zip"
+    command = ["bundle", "--data", str(folder), "--out", str(out), "--json"]
+    assert main([*command, "--end", "0.25"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    made = Bundle.open(out)
+    assert (printed["sha256"], made.manifest.world.end) == (made.sha256, EndRule(at=0.25, odds_weight=3.0))
+    assert main([*command, "--reward", "value"]) == 2
+    assert "is not what this MDN-RNN predicts" in capsys.readouterr().err
+
+
+def test_its_models_go_on_training_elsewhere(folder, bundle, tmp_path):
+    unbundle(bundle, tmp_path)
+    shutil.copytree(folder / "episodes", tmp_path / "episodes")
+    assert len(list(encode(tmp_path))) == DRIVES
+    train_mdnrnn.train_mdnrnn(tmp_path, replace(FEW, updates=1), ignore, MEMORY)
+    assert assemble(tmp_path, tmp_path / "b.zip", "b", with_weights=True).manifest.world == bundle.manifest.world
+
+
+def test_a_fleet_evolves_in_its_dream_and_drives_in_the_world(processes, bundle):
+    coordinator = processes.coordinator(
+        "--preset", "dream", "--bundle", bundle.path, "--population", 4, "--episodes", 2, "--generations", 2,
+        "--evaluate-every", 1, "--evaluation-episodes", 2, "--confirm-episodes", 2, "--recorded", 0.5,
+    )  # fmt: skip
+    processes.worker("--task", DODGE_TASK)
+    assert coordinator.finish()[0] == 0, "".join(coordinator.lines)
+    with open_run(processes.runs, "test") as run:
+        assert [each.episodes for each in run.evaluations()] == [2, 2]
+        assert Controller.load(run.controller_path).bundle == bundle.sha256
