@@ -205,7 +205,8 @@ def test_it_goes_on_where_it_stopped_to_the_same_bundle(tmp_path, monkeypatch, c
 def test_the_world_is_passed_to_collect_alone():
     world = ("--task", "takecover", "--skip", "1")
     stages = Pipeline(PRESETS["takecover"], Path("data"), world_flags=world).stages(2, "cpu")
-    assert "collect --data data --task takecover --skip 1 --preset takecover" in " ".join(stages["collect"])
+    assert "--preset takecover" in " ".join(stages["collect"])
+    assert "--task takecover --skip 1" in " ".join(stages["collect"])
     assert not any("--task" in words for name, words in stages.items() if name != "collect")
 
 

@@ -141,8 +141,8 @@ def test_flags_that_the_iteration_sets_itself_are_refused(flags):
 def test_the_world_of_the_data_is_passed_to_collect_alone_and_names_the_preset():
     made = commands(task="gym:ALE/Pong-v5", environment=("mode=1",), crop="0:160,0:160", skip=4, difference=True)
     assert said(made.collect(1)) == (
-        "collect --data data --task gym:ALE/Pong-v5 --environment mode=1 --crop 0:160,0:160 --skip 4 --difference "
-        "--preset pixels --seed 0 --json"
+        "collect --data data --preset pixels --seed 0 --task gym:ALE/Pong-v5 --environment mode=1 "
+        "--crop 0:160,0:160 --skip 4 --difference --json"
     )
     others = (made.train(1, "vae"), made.encode(1), made.bundle(1), made.import_kept(2), made.begin_run(1, (), ()))
     assert not any("gym:ALE/Pong-v5" in words for words in others)
