@@ -9,8 +9,8 @@ SOURCES := pyproject.toml constraints.txt $(wildcard worker/car_racing/native/*)
 .PHONY: demo test test-doom test-newest slow setup check wheel long box2d-py simulate chaos weekend fuzz sanitize bundle worker-size \
   stranger reproduce reproduce-evolution lock audit sbom structure clean
 
-demo: $(VENV)/.demo  ## evolve a controller here, judge it, plot it, record it
-	$(BIN)/dreamfleet demo $(ARGS)
+demo: $(VENV)/.demo $(if $(filter takecover,$(WORLD)),$(VENV)/.demo-doom)  ## evolve a controller here (WORLD=takecover: there), judge it, plot it, record it
+	$(BIN)/dreamfleet demo $(if $(WORLD),--world $(WORLD)) $(ARGS)
 
 test: $(VENV)/.dev  ## every test that ends within seconds: under ten minutes
 	$(BIN)/pytest -m "not slow and not long" --numprocesses 2 --dist worksteal $(ARGS)
@@ -39,6 +39,10 @@ $(VENV)/bin/python:
 
 $(VENV)/.demo: $(VENV)/bin/python $(SOURCES)
 	$(PIP) --editable '.[worker,views,dashboard]'
+	touch $@
+
+$(VENV)/.demo-doom: $(VENV)/.demo
+	$(PIP) --editable '.[worker,views,dashboard,doom]'
 	touch $@
 
 $(VENV)/.dev: $(VENV)/bin/python $(SOURCES)

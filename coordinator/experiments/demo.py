@@ -10,16 +10,18 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from dreamfleet.common.artifacts.bundle_store import shipped_names
 from dreamfleet.common.cli import model_commands
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.cli.model_commands import options
@@ -41,6 +43,7 @@ from dreamfleet.common.runs.records import best_evaluation
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.common.runs.standard_error import format_with_error, standard_error
+from dreamfleet.coordinator.experiments.demo_plans import FIRST_WORLD, PLANS, DemoPlan, find_plan, plan_defaults
 from dreamfleet.coordinator.experiments.local_run import LocalRun
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE
 
@@ -54,37 +57,41 @@ DREAM_EVALUATIONS, REAL_EVALUATIONS = (
 )  # generations between evaluations, tracks of each, of a confirmation
 SUBSPACE_SIGMA0, FULL_SIGMA0 = 0.3, 0.1  # first step sizes from zero: in a subspace, and of all parameters
 SUBSPACE_SIGMA0_AFTER_DREAM, FULL_SIGMA0_AFTER_DREAM = 0.15, 0.06  # the same after a dream
-# In reality candidates drive one track each until a mean drives well, for so many steps at most: far from a good driver
-# more generations help more than more tracks, and large steps more than small ones.
-ABLE_SCORE, QUICK_STEPS = 800, 700_000
-LATE_SIGMA0 = 0.06  # step size in a subspace from there on
-OFFROAD_COST = (
-    "offroad_cost=2"  # by candidates in reality: driving on grass predicts losses that one track may not show
-)
+LATE_SIGMA0 = 0.06  # step size in a subspace once a mean is able
+
+
+def _option_of_plan(name: str, text: str) -> Any:
+    """An option whose default is the world's plan's."""
+    return option(None, f"{text} (default {plan_defaults(name)})")
 
 
 @dataclass(frozen=True)
 class DemoConfig:
     """How long and how large; the defaults suit two cores."""
 
-    dream_minutes: float = option(0.5, "dream for so long first; 0: not at all")
-    minutes: float = option(4.5, "then evolve in reality for so long; 0: not at all")
-    temperature: float = option(1.5, "of the dream")
-    population: int = option(24, "candidates a generation in reality")
-    episodes: int = option(4, f"episodes a candidate in reality, after one each until a mean drives {ABLE_SCORE}")
-    horizon: int = option(1000, "steps of an episode at most in reality")
-    patience: int = option(100, "cut an episode after so many steps without reward in reality")
+    world: str = option(FIRST_WORLD, f"the world: {', '.join(PLANS)}")
+    dream_minutes: float | None = _option_of_plan("dream_minutes", "dream for so long first; 0: not at all")
+    minutes: float | None = _option_of_plan("minutes", "then evolve in reality for so long; 0: not at all")
+    temperature: float | None = _option_of_plan("temperature", "of the dream")
+    population: int | None = _option_of_plan("population", "candidates a generation in reality")
+    episodes: int | None = _option_of_plan(
+        "episodes", "episodes a candidate in reality, after one each until a mean is able"
+    )
+    horizon: int | None = _option_of_plan("horizon", "steps of an episode at most in reality")
+    patience: int | None = _option_of_plan(
+        "patience", "cut an episode after so many steps without reward in reality; 0: never"
+    )
     sigma0: float | None = option(
         None,
         f"first step size from zero (default {SUBSPACE_SIGMA0} in a subspace, else {FULL_SIGMA0}); "
         f"after a dream {SUBSPACE_SIGMA0_AFTER_DREAM} and {FULL_SIGMA0_AFTER_DREAM}",
     )
-    bundle: str = option("tiny", "the frozen world model: a shipped name or a file")
+    bundle: str | None = _option_of_plan("bundle", "the frozen world model: a shipped name or a file")
     subspace: str | None = option(
         None, "the few features that both searches keep to; none: all parameters (default the bundle's, if one ships)"
     )
     seed: int = option(1, "makes the runs")
-    tracks: int = option(16, "unseen tracks that the outcome is judged on")
+    tracks: int = option(16, "unseen tracks, or seeds of the world, that the outcome is judged on")
     workers: int = option(0, "worker processes; 0: one a core")
     port: int = option(7447, "port of the embedded router")
     page: bool = option(
@@ -92,10 +99,26 @@ class DemoConfig:
     )
 
     def __post_init__(self) -> None:
-        if min(self.minutes, self.dream_minutes) < 0 or self.tracks < 1 or self.workers < 0:
+        plan = self.plan
+        if min(plan.minutes, plan.dream_minutes) < 0 or self.tracks < 1 or self.workers < 0:
             raise UsageError("--minutes and --workers must not be negative, --tracks at least 1")
-        if not self.minutes and not self.dream_minutes:
+        if not plan.minutes and not plan.dream_minutes:
             raise UsageError("--minutes and --dream-minutes cannot both be 0: nothing would evolve")
+
+    @property
+    def plan(self) -> DemoPlan:
+        """The world's plan with what is given here; `UsageError` for a world without one."""
+        names = {each.name for each in fields(DemoPlan)}
+        given = {name: value for name, value in vars(self).items() if name in names and value is not None}
+        return replace(find_plan(self.world), **given)
+
+    def check_bundle(self) -> None:
+        """`UsageError` if the world's own world model is wanted and does not ship."""
+        if self.bundle is None and self.plan.bundle not in shipped_names():
+            raise UsageError(
+                f"the world model of {self.world} does not ship yet: make one with `dreamfleet pipeline --task "
+                f"{self.world} --data DIR`, and name it with --bundle DIR/{self.plan.preset}.zip"
+            )
 
 
 @dataclass(frozen=True)
@@ -112,7 +135,7 @@ class Demo:
     """One demonstration run in `runs_dir`."""
 
     def __init__(self, config: DemoConfig, name: str, runs_dir: Path) -> None:
-        self._config = config
+        self._config, self._plan = config, config.plan
         self._runs_dir = runs_dir
         self._demo_runs = plan_runs(config, name, runs_dir)
         self._endpoint = f"tcp/127.0.0.1:{config.port}"
@@ -128,15 +151,20 @@ class Demo:
         folder = self._runs_dir / best.run
         controller = folder / CONTROLLER
         self._print(
-            f"judging run {best.run}'s controller on unseen tracks, whole episodes, in gymnasium's own environment"
+            f"judging run {best.run}'s controller on unseen {self._plan.word}s, whole episodes, in {self._plan.judge}"
         )
         drives = self._judge(controller)
         self._console.print(self._table(best, drives))
         for demo_run in self._demo_runs:
             self._plot(demo_run)
-        track, score = median_drive(drives)
-        self._print(f"recording the median of these drives ({score:.0f} on track {track}), and what the model dreams")
-        run_verb_to_end("record", "--controller", controller, "--out", folder / VIDEO, "--steps", 1000, "--seed", track)
+        if self._plan.random_score is not None:
+            times = fmean(drives.values()) / self._plan.random_score
+            self._print(f"random play has {self._plan.random_score:.0f}: this is {times:.1f} times as much")
+        seed, score = median_drive(drives)
+        what = f"{score:.0f} on {self._plan.word} {seed}"
+        self._print(f"recording the median of these drives ({what}), and what the model dreams")
+        steps = self._plan.video_steps
+        run_verb_to_end("record", "--controller", controller, "--out", folder / VIDEO, "--steps", steps, "--seed", seed)
         self._print_next_steps(folder)
 
     def _show_page(self, stack: ExitStack) -> None:
@@ -163,7 +191,8 @@ class Demo:
 
     def _table(self, chosen: DemoRun, drives: Mapping[int, float]) -> Table:
         """Each run's best evaluation and confirmed score, and the chosen one's score on unseen tracks."""
-        table = Table("run", "its best evaluation", "confirmed on fresh tracks", "on unseen tracks", box=None)
+        words = f"{self._plan.word}s"
+        table = Table("run", "its best evaluation", f"confirmed on fresh {words}", f"on unseen {words}", box=None)
         for demo_run in self._demo_runs:
             with open_run(self._runs_dir, demo_run.run) as run:
                 best, confirmed = best_evaluation(run.evaluations()), run.confirmation()
@@ -183,7 +212,7 @@ class Demo:
             (logs / SCHEDULE).write_text(demo_run.schedule, encoding="utf-8")
             flags = {**flags, "schedule": logs / SCHEDULE}
         words = model_commands.begin_run(
-            demo_run.run, self._runs_dir, (self._endpoint,), *options(**flags), world_model=self._config.bundle,
+            demo_run.run, self._runs_dir, (self._endpoint,), *options(**flags), world_model=self._plan.bundle,
             as_json=False,
         )  # fmt: skip
         with LocalRun(demo_run.run, words, logs) as run, self._connect(run.coordinator) as client:
@@ -253,31 +282,31 @@ def plan_runs(config: DemoConfig, name: str, runs_dir: Path) -> tuple[DemoRun, .
     """The demonstration's runs, in order."""
     from dreamfleet.common.runs.lookup import shipped_subspace_name
 
-    found = []
-    subspace = (shipped_subspace_name(config.bundle) or NO_SUBSPACE) if config.subspace is None else config.subspace
+    found, plan = [], config.plan
+    subspace = (shipped_subspace_name(plan.bundle) or NO_SUBSPACE) if config.subspace is None else config.subspace
     few = subspace != NO_SUBSPACE
     search: dict[str, object] = {"subspace": subspace, "covariance": "full"} if few else {}
     sigma0 = (SUBSPACE_SIGMA0 if few else FULL_SIGMA0) if config.sigma0 is None else config.sigma0
     reality: dict[str, object] = {
-        **search, "population": config.population, "horizon": config.horizon,
-        "patience": config.patience, "sigma0": sigma0, "seed": config.seed, "minutes": config.minutes,
-        "variant": OFFROAD_COST, **_evaluation_flags(*REAL_EVALUATIONS),
+        **search, "population": plan.population, "horizon": plan.horizon,
+        "patience": plan.patience, "sigma0": sigma0, "seed": config.seed, "minutes": plan.minutes,
+        "variant": plan.variant or None, **_evaluation_flags(*REAL_EVALUATIONS),
     }  # fmt: skip
-    if config.dream_minutes:
+    if plan.dream_minutes:
         dream = check_run_name(f"{name}-dream")
         flags = {
-            **search, "preset": "dream", "temperature": config.temperature, "sigma0": sigma0, "seed": config.seed,
-            "minutes": config.dream_minutes, **_evaluation_flags(*DREAM_EVALUATIONS),
+            **search, "preset": plan.preset, "temperature": plan.temperature, "sigma0": sigma0, "seed": config.seed,
+            "minutes": plan.dream_minutes, **_evaluation_flags(*DREAM_EVALUATIONS),
         }  # fmt: skip
-        found.append(DemoRun(dream, f"evolving in the dream for {config.dream_minutes:g} minutes", flags))
+        found.append(DemoRun(dream, f"evolving in the dream for {plan.dream_minutes:g} minutes", flags))
         reality |= {
             "init": runs_dir / dream / CONTROLLER,
             "sigma0": SUBSPACE_SIGMA0_AFTER_DREAM if few else FULL_SIGMA0_AFTER_DREAM,
         }
-    if config.minutes:
+    if plan.minutes:
         schedule = (
-            f"[[stage]]\nscore = {ABLE_SCORE}\nsteps = {QUICK_STEPS}\nepisodes = 1\n\n"
-            f"[[stage]]\nepisodes = {config.episodes}\n" + (f"sigma0 = {LATE_SIGMA0}\n" if few else "")
+            f"[[stage]]\nscore = {plan.able_score}\nsteps = {plan.quick_steps}\nepisodes = 1\n\n"
+            f"[[stage]]\nepisodes = {plan.episodes}\n" + (f"sigma0 = {LATE_SIGMA0}\n" if few else "")
         )
-        found.append(DemoRun(name, f"evolving in reality for {config.minutes:g} minutes", reality, schedule))
+        found.append(DemoRun(name, f"evolving in reality for {plan.minutes:g} minutes", reality, schedule))
     return tuple(found)

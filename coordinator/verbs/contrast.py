@@ -28,8 +28,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of the trials; one that was begun is resumed")
     parser.add_argument(
         "--kind", nargs=2, action="append", default=[], metavar=("NAME", "FLAGS"),
-        help="a kind by its flags of `train mdnrnn`, with the preset of the world, as one text; the others are compared "
-        f"with the first (default {shown})",
+        help="a kind by its flags of `train mdnrnn`, with the world's preset, as one text; the others are compared "
+        f"compared with the first (default {shown})",
     )  # fmt: skip
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS), help="of each kind (default 1 2 3)")
     parser.add_argument(

@@ -27,10 +27,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 @interrupted_by_signals()
 def run(args: argparse.Namespace) -> int:
     """Play the demonstration."""
-    for package in ("av", "gymnasium", "matplotlib", "onnxruntime"):
+    config = load(DemoConfig, "demo", **args.sources)
+    config.check_bundle()
+    for package in ("av", "gymnasium", "matplotlib", "onnxruntime", *config.plan.packages):
         if find_spec(package) is None:  # now rather than after minutes of evolution
             raise ModuleNotFoundError(name=package)
-    config = load(DemoConfig, "demo", **args.sources)
     os.environ["DREAMFLEET_JOIN"] = ""  # the demo stays on this host, even if its user is in a fleet
     name = check_run_name(args.run_name or f"demo-{datetime.now():%m%d-%H%M%S}")
     Demo(config, name, args.runs_dir).play()

@@ -30,7 +30,6 @@ from dreamfleet.common.runs.evaluation_report import read_evaluation_report
 from dreamfleet.common.runs.lookup import find_subspace
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.coordinator.settings.config import RunConfig
-from dreamfleet.coordinator.settings.presets import PRESETS as RUN_PRESETS
 from dreamfleet.coordinator.settings.presets import find_preset
 from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.scoring.rollout import write_episode
@@ -66,6 +65,7 @@ DRIVES = {
     "whole": (replace(STEPS, picture=96), 3),
     "impatient": (replace(STEPS, anywhere=0.0, patience=5), 4),
 }
+FIRST_RUN_PRESETS = ("article", "dream", "frugal", "mixed", "notebook", "paper", "real")
 SMALL_VAE = VAEConfig(latent=4, channels=(2, 2, 2, 2))
 SMALL = MDNRNNConfig(latent=4, hidden=8, mixtures=2)
 LAYERS = {
@@ -261,7 +261,7 @@ def settings(folder):
         with open_run(processes.runs, "test") as run:
             journalled = run.fact("settings")
     found = {}
-    for name in RUN_PRESETS:
+    for name in FIRST_RUN_PRESETS:
         config = RunConfig(**find_preset(name))
         if config.subspace is not None:
             config = replace(config, loaded_subspace=find_subspace(config.subspace))

@@ -112,9 +112,9 @@ class Commands:
         found: dict[str, dict[str, Words]] = {side: {} for side in sides}
         for side, (bundle, driver) in sides.items():
             if config.gate_drives:
-                found[side]["probe"] = _inspect_words(bundle, "--probe", config.gate_drives, *_driven_by(optimum))
+                found[side]["probe"] = _inspect_words(bundle, "--probe", config.gate_drives, optimum)
             if config.gate_losses:
-                found[side]["losses"] = _inspect_words(bundle, "--losses", config.gate_losses, *_driven_by(driver))
+                found[side]["losses"] = _inspect_words(bundle, "--losses", config.gate_losses, driver)
             if config.survival_episodes:
                 found[side]["survival"] = _inspect_words(bundle, "--survival", config.survival_episodes)
         return found
@@ -143,9 +143,8 @@ class Commands:
         )  # fmt: skip
 
 
-def _inspect_words(bundle: Path, figure: str, episodes: int, *more: object) -> Words:
-    return command("inspect", bundle, figure, "--episodes", episodes, "--seed", GATE_SEED, *more, "--json")
-
-
-def _driven_by(controller: Path) -> Words:
-    return command("--controller", controller, "--noise", GATE_NOISE)
+def _inspect_words(bundle: Path, figure: str, episodes: int, controller: Path | None = None) -> Words:
+    """The measurement of a world model; without a controller that of fixed policies alone."""
+    noise = None if controller is None else GATE_NOISE
+    more = options(controller=controller, episodes=episodes, seed=GATE_SEED, noise=noise)
+    return command("inspect", bundle, figure, *more, "--json")

@@ -66,7 +66,7 @@ class IterationLedger:
     @classmethod
     def begin(cls, config: IterateConfig, run: Mapping[str, Any]) -> IterationLedger:
         """The ledger of an iteration that has done nothing yet."""
-        return cls(asdict(config), _plain(run))
+        return cls(_plain(asdict(config)), _plain(run))
 
     @property
     def finished(self) -> tuple[Phase, ...]:
@@ -110,7 +110,8 @@ class IterationLedger:
 
     def with_settings(self, config: IterateConfig, run: Mapping[str, Any], folder: Path) -> IterationLedger:
         """With changed settings; `UsageError` names those that differ and may not change."""
-        wanted, begun = asdict(config), {**asdict(IterateConfig()), **self.settings}  # what is newer was its default
+        wanted = _plain(asdict(config))
+        begun = {**_plain(asdict(IterateConfig())), **self.settings}  # what is newer was its default
         known = {name: value for name, value in run.items() if name in self.run}
         differing = [*_differing(begun, wanted, CHANGEABLE), *_differing(self.run, known)]
         if differing:

@@ -37,7 +37,7 @@ def test_a_runs_controller_is_as_configured_and_journalled(random_bundle, flags,
     assert RunConfig(**again).settings(random_bundle) == settings
 
 
-@pytest.mark.parametrize("name", sorted(PRESETS))
+@pytest.mark.parametrize("name", sorted(PRESETS.keys() - {"takecover", "takecover-real", "pixels"}))
 def test_a_preset_of_a_run_is_one_that_can_begin_and_be_configured_again(name):
     bundle = find_bundle("tiny")
     preset = dict(PRESETS[name])

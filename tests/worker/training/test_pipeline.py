@@ -202,6 +202,14 @@ def test_it_goes_on_where_it_stopped_to_the_same_bundle(tmp_path, monkeypatch, c
         assert made(tmp_path / "stopped", "article").sha256 == made(tmp_path / "whole", "article").sha256
 
 
+def test_the_world_is_passed_to_collect_alone():
+    world = ("--task", "takecover", "--skip", "1")
+    stages = Pipeline(PRESETS["takecover"], Path("data"), world_flags=world).stages(2, "cpu")
+    assert "--preset takecover" in " ".join(stages["collect"])
+    assert "--task takecover --skip 1" in " ".join(stages["collect"])
+    assert not any("--task" in words for name, words in stages.items() if name != "collect")
+
+
 def test_a_share_of_every_amount_is_rounded_up():
     stages = Pipeline(PRESETS["notebook"], Path("data"), scale=0.02).stages(2, "cpu")
     assert "--episodes 20" in " ".join(stages["collect"])

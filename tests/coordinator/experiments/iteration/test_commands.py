@@ -136,3 +136,25 @@ def test_flags_that_the_iteration_sets_itself_are_refused(flags):
     with pytest.raises(UsageError, match="which iterate sets itself"):
         IterateConfig(vae_flags=flags)
     assert IterateConfig(run_flags=flags)
+
+
+def test_the_world_of_the_data_is_passed_to_collect_alone_and_names_the_preset():
+    made = commands(task="gym:ALE/Pong-v5", environment=("mode=1",), crop="0:160,0:160", skip=4, difference=True)
+    assert said(made.collect(1)) == (
+        "collect --data data --preset pixels --seed 0 --task gym:ALE/Pong-v5 --environment mode=1 "
+        "--crop 0:160,0:160 --skip 4 --difference --json"
+    )
+    others = (made.train(1, "vae"), made.encode(1), made.bundle(1), made.import_kept(2), made.begin_run(1, (), ()))
+    assert not any("gym:ALE/Pong-v5" in words for words in others)
+    assert "--preset takecover" in said(commands(task="takecover").train(1, "mdnrnn"))
+    assert "--preset tiny" in said(commands(task="takecover", preset="tiny").collect(1))
+
+
+def test_a_gate_of_other_worlds_measures_survival_too():
+    gate = commands(*ROUND_2, entry(2, "bundle"), task="takecover", gate_drives=0, gate_losses=0).gate(2)
+    assert said(gate["new"]["survival"]) == (
+        "inspect data/rounds/02/round-2.zip --survival --episodes 40 --seed 50000 --json"
+    )
+    assert gate["old"].keys() == {"survival"}
+    assert "survival" not in commands(*ROUND_2, entry(2, "bundle")).gate(2)["old"]
+    assert commands(*ROUND_2, entry(2, "bundle"), gate_lives=9).config.survival_episodes == 9

@@ -2,7 +2,7 @@
 
 import pytest
 
-from dreamfleet.coordinator.experiments.iteration.gate import KNOWS, LOSES, Figure, figures, judge
+from dreamfleet.coordinator.experiments.iteration.gate import KNOWS, LOSES, SURVIVES, Figure, figures, judge
 
 
 def both(knows=(0.8, 0.01), loses=(0.1, 0.02)):
@@ -62,3 +62,12 @@ def test_the_figures_are_those_that_inspect_answers():
 )  # fmt: skip
 def test_a_figure_without_both_kinds_of_beginnings_is_none(losses):
     assert figures({"losses": losses}) == {KNOWS: None, LOSES: None}
+
+
+def test_a_model_whose_dreams_live_less_as_reality_does_is_refused():
+    answers = [{"survival": {"survival": {"agreement": {"value": value, "error": 0.01}}}} for value in (-0.1, -0.7)]
+    better, worse = (figures(each) for each in answers)
+    assert better[SURVIVES] == Figure(-0.1, 0.01)
+    assert judge(worse, better).kept
+    assert judge(better, worse).why == "survives -0.10 ± 0.01 -> -0.70 ± 0.01: refused, clearly worse in survives"
+    assert figures({"survival": {"failed": "it predicts no ends"}})[SURVIVES] is None

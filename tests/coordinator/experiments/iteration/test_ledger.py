@@ -92,3 +92,13 @@ def test_what_changes_no_finished_round_is_taken(changes, tmp_path):
     taken = begun.with_settings(IterateConfig(**changes), RUN, tmp_path)
     assert taken.settings == {**begun.settings, **changes}
     assert taken.entries == begun.entries
+
+
+def test_a_world_that_is_kept_is_the_same_when_it_is_read(tmp_path):
+    config = IterateConfig(task="gym:Some-v0", environment=("mode=1",), skip=4)
+    begun = IterationLedger.from_json(IterationLedger.begin(config, RUN).to_json())
+    again = IterateConfig(**begun.settings)
+    assert again.world_flags == config.world_flags
+    assert begun.with_settings(again, RUN, tmp_path).settings["task"] == "gym:Some-v0"
+    with pytest.raises(UsageError, match="was begun with task gym:Some-v0, not gym:Other-v0"):
+        begun.with_settings(replace(again, task="gym:Other-v0"), RUN, tmp_path)

@@ -1,0 +1,142 @@
+"""Runs in worlds that a bundle describes: nothing of the world is on this host."""
+
+from dataclasses import replace
+
+import pytest
+
+from dreamfleet.common.artifacts.actions import one_hot
+from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts, WorldFacts
+from dreamfleet.common.errors import ControllerError, UsageError
+from dreamfleet.common.protocol.messages import OWN_END_VERSION, TaskSpec
+from dreamfleet.common.runs.records import RunSettings
+from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.coordinator.experiments.demo import DemoConfig
+from dreamfleet.coordinator.service.main import RunRequest, _resolve_settings
+from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig, RunConfig, config_values
+from dreamfleet.coordinator.settings.presets import find_preset
+from dreamfleet.coordinator.settings.start import StartPoint
+from tests.support.bundles import write_world_bundle
+from tests.support.dreams import ABOUT, DRAWN, MODELS, VAE, WORLDS, write_bundle_of
+
+ABSENT = "a.package.that.is.not.here:Task"
+
+
+@pytest.fixture
+def bundle(tmp_path):
+    facts = replace(WORLDS["choices"], packages=("numpy", "onnxruntime", "absent-simulator"), version=3)
+    return write_world_bundle(tmp_path / "b.zip", facts, ABSENT, vae=VAE, rnn=MODELS["choices"])
+
+
+def settings_of(bundle, **flags):
+    return RunConfig(bundle=str(bundle.path), **flags).settings(bundle)
+
+
+def test_a_run_begins_without_the_worlds_package_and_can_be_configured_again(bundle, tmp_path):
+    config = RunConfig(bundle=str(bundle.path), task="dream", variant=("decide_every=4", "feedback=last"))
+    request = RunRequest("run", tmp_path, config, LimitsConfig(), NetworkConfig())
+    settings, found = _resolve_settings(request, tmp_path / "run")
+    assert found.sha256 == bundle.sha256
+    assert settings.packages == ("numpy", "onnxruntime", "absent-simulator")
+    assert settings.task.version == 3
+    assert settings.task.options == '{"decide_every": 4, "feedback": "last"}'
+    assert settings.controller == ControllerShape(3 + 4 + 2 * 3, 3)
+    assert RunSettings.from_json(settings.to_json()) == settings
+    assert RunConfig(**config_values(settings, bundle.path)).settings(bundle) == settings
+
+
+def test_without_a_task_it_is_the_bundles_own_world(bundle, random_bundle):
+    assert settings_of(bundle).task.task == ABSENT
+    assert settings_of(random_bundle).task.task == "car-racing"
+    with pytest.raises(UsageError, match="--bundle none: name what candidates are scored in with --task"):
+        RunConfig(bundle="none")
+
+
+@pytest.mark.parametrize(("world", "actions"), [("choices", 3), ("one number", 1)])
+def test_controllers_have_the_outputs_of_the_world(tmp_path, world, actions):
+    bundle = write_bundle_of(world, tmp_path / "b.zip")
+    assert settings_of(bundle, task="dream").controller == ControllerShape(7, actions)
+    assert settings_of(bundle, task="dream", features="z").controller == ControllerShape(3, actions)
+
+
+def test_a_task_that_ships_and_needs_no_world_model_gets_none_by_default():
+    assert RunConfig(task="takecover").needs_no_bundle
+    for other in ({"task": "car-racing"}, {"task": "dream"}, {}, {"task": "takecover", "bundle": "b.zip"}):
+        assert not RunConfig(**other).needs_no_bundle
+
+
+@pytest.mark.parametrize("task", ["takecover", "gym:CartPole-v1"])
+def test_a_world_model_of_another_world_is_refused(bundle, random_bundle, task):
+    for each, world in ((bundle, ABSENT), (random_bundle, "car-racing")):
+        with pytest.raises(UsageError, match=f"is a world model of {world}, and not of {task}: name one of that"):
+            settings_of(each, task=task)
+
+
+def test_a_gymnasium_environment_is_scored_with_a_world_model_of_its_own(tmp_path):
+    bundle = write_bundle_of("choices", tmp_path / "b.zip", task="gym:Some-v0")
+    assert settings_of(bundle, task="gym:Some-v0") == settings_of(bundle)
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        ({"variant": ("pedals=one",)}, "knows no option pedals: known are decide_every, feedback"),
+        ({"variant": ("decide_every=0",)}, "decide_every must be a whole number from 1 to 50"),
+        ({"task": "dream", "end": "soon"}, "a dream ends at a probability from 0 to 1, or 'drawn', not 'soon'"),
+        ({"task": "dream", "end": "1.5"}, "a dream ends at a probability from 0 to 1"),
+        ({"end": "drawn"}, "--end is of task dream, not of the world that it dreams of: leave it out, or say ''"),
+    ],
+)
+def test_what_the_world_does_not_have_is_refused(bundle, flags, says):
+    with pytest.raises(UsageError, match=says):
+        settings_of(bundle, **flags)
+
+
+def test_an_end_rule_of_the_runs_own_is_another_version_which_older_workers_refuse(bundle):
+    assert bundle.manifest.world.end == DRAWN
+    plain, own = settings_of(bundle, task="dream"), settings_of(bundle, task="dream", end="0.250")
+    assert (own.task.end, own.task.version, own.task.world_version) == ("0.25", 3 + OWN_END_VERSION, 3)
+    assert RunSettings.from_json(own.to_json()) == own
+    assert RunConfig(**config_values(own, bundle.path)).settings(bundle) == own
+    assert own.task.digest("score", b"x", (1,)) != plain.task.digest("score", b"x", (1,))
+    assert own.task.with_overrides(temperature=2.0).end == "0.25"
+    assert settings_of(bundle, task="dream", end="drawn") == plain, "the bundle's own rule is no rule of the run's own"
+
+
+def test_a_dream_of_the_first_world_may_have_an_end_too(random_bundle):
+    plain = settings_of(random_bundle, task="dream")
+    assert "end" not in to_dict(plain.task)
+    assert settings_of(random_bundle, task="dream", end="0.5") == plain
+    assert settings_of(random_bundle, task="dream", end="drawn").task.version == 1 + OWN_END_VERSION
+
+
+def test_a_start_that_drives_otherwise_is_refused_in_any_world(bundle):
+    settings = settings_of(bundle, task="dream", variant=("decide_every=4",))
+    shape = settings.controller
+    held = StartPoint([0.0] * shape.size, bundle.sha256, "run night", '{"decide_every": 4}')
+    held.check(settings)
+    assert held.apply_to(RunConfig(bundle=str(bundle.path))).variant == ("decide_every=4",)
+    with pytest.raises(ControllerError, match="its parameters mean something else"):
+        held.check(settings_of(bundle, task="dream"))
+
+
+@pytest.mark.parametrize("name", ["takecover", "takecover-real", "pixels"])
+def test_presets_of_other_worlds_begin_on_their_bundles(tmp_path, name):
+    facts = WorldFacts.of(one_hot(3), reward=RewardFacts("survival", gain=4.0), end=EndRule("drawn"), **ABOUT)
+    bundle = write_world_bundle(tmp_path / "b.zip", facts, "takecover", vae=VAE, rnn=MODELS["choices"])
+    preset = find_preset(name) | {"bundle": str(bundle.path)}
+    settings = RunConfig(**preset).settings(bundle)
+    assert RunConfig(**config_values(settings, bundle.path)).settings(bundle) == settings
+
+
+def test_a_demonstration_whose_world_model_does_not_ship_says_what_to_do():
+    DemoConfig().check_bundle()
+    DemoConfig(world="takecover", bundle="mine.zip").check_bundle()
+    with pytest.raises(UsageError, match=r"does not ship yet: make one with `dreamfleet pipeline --task takecover"):
+        DemoConfig(world="takecover").check_bundle()
+    with pytest.raises(UsageError, match="--world must be one of car-racing, takecover, not 'moon'"):
+        DemoConfig(world="moon")
+
+
+def test_the_words_of_an_earlier_specification_stand():
+    assert to_dict(TaskSpec("dream", "", 10, 0)).keys() == {"task", "bundle", "horizon", "patience"}
