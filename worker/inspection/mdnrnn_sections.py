@@ -108,7 +108,7 @@ def ends_section(bundle: Bundle, drive: EncodedRollout) -> Section:
     panel.plot(np.maximum(predicted, LEAST), color="tab:blue", linewidth=1.2)
     if drive.died:
         panel.axvline(len(drive) - 1, color="tab:red", linewidth=1.5, label="where it ended")
-        panel.legend(fontsize=FONT, loc="upper left")
+        panel.legend(fontsize=FONT, loc="lower left", bbox_to_anchor=(0, 1))
     panel.set_yscale("log")
     panel.set_ylim(LEAST, 1.2)
     panel.set_xlabel("step of the drive", fontsize=FONT)
