@@ -116,8 +116,8 @@ def efforts_query(begun: Sequence[BegunStage]) -> str:
 
 def _connect_read_only(path: Path, *, rolled_back: bool = False) -> tuple[sqlite3.Connection, int]:
     """An open journal and its schema version."""
-    # On a read-only disk SQLite cannot create the shared-memory file; nobody writes the journal there either.
-    immutable = "" if os.access(path.parent, os.W_OK) else "&immutable=1"
+    # In a read-only folder SQLite cannot create the shared-memory file. It needs none where no write-ahead log is left.
+    immutable = "" if os.access(path.parent, os.W_OK) or _has_log(path) else "&immutable=1"
     try:
         check_regular(path)  # SQLite would block on a pipe
         connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{immutable}", uri=True)
@@ -136,6 +136,14 @@ def _connect_read_only(path: Path, *, rolled_back: bool = False) -> tuple[sqlite
         raise
 
 
+def _has_log(path: Path) -> bool:
+    """Whether a write-ahead log holds what is not in the journal's file yet."""
+    try:
+        return Path(f"{path}-wal").stat().st_size > 0
+    except OSError:
+        return False
+
+
 def _roll_back(path: Path) -> None:
     """Roll back a transaction that a killed coordinator left in a rollback journal; a read-only connection cannot."""
     with suppress(sqlite3.Error), closing(sqlite3.connect(path, timeout=5)) as connection:
@@ -151,5 +159,7 @@ def _describe_with_remedy(error: Exception, path: Path) -> str:
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
     if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_IOERR) and (problem := lock_problem(path.parent)):
         return f"{one_line(str(error))}; {problem}"
+    if code == sqlite3.SQLITE_CANTOPEN and _has_log(path):
+        return f"its last part is in {path.name}-wal, which cannot be read in a read-only folder: copy the folder first"
     what = "end the program that keeps it locked" if _is_locked(error) else "restore it from a copy"
     return f"{one_line(str(error))}; {what}"

@@ -55,15 +55,31 @@ class FailureJudge:
         """The job that failed most often, if all hosts that are here have failed and none of them has ever scored.
 
         R8: all open jobs must have failed, or with `at_once` ten of them while the run has no score from anywhere.
-        Before that, a host that works may still show itself.
+        Before that, a host that works may still show itself. Ten failures of one job where none has scored are enough,
+        too, for each end of a worker may bring a host with a new name.
         """
         failures = self._jobs.failures
+        for each in failures:
+            if len(each.history) >= HOST_ATTEMPTS and not any(one.host in self.working_hosts for one in each.history):
+                return each
         if not self._present_hosts() or self.has_hope or not _is_pausing(failures):
             return None
         is_early = at_once and not self.working_hosts and len(failures) >= ENOUGH_JOBS
         if not is_early and len(failures) < len(self._jobs):
             return None
         return max(failures, key=lambda each: len(each.history))
+
+    @property
+    def awaits_proof(self) -> bool:
+        """Whether only suspects are open, and an idle host is here that has not scored yet, while others have."""
+        idle = {host_of(name) for name, each in self._members.items() if each.has_been_ready and not each.leases}
+        suspects = all(each.is_suspect for each in self._jobs.values())
+        return bool(self.working_hosts and self._jobs and suspects and idle - self.working_hosts)
+
+    @property
+    def has_failed_proof(self) -> bool:
+        """Whether a job that was scored before is wanted again and failed."""
+        return any(self._jobs[each.work.job.digest].is_proof for each in self._jobs.failures)
 
     @property
     def has_hope(self) -> bool:

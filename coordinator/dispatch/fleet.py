@@ -281,7 +281,8 @@ class Fleet:
 
     def _plan(self, now: float) -> dict[str, list[Work]]:
         """The work that each member is given now."""
-        given = assign_jobs(self.jobs, self.members, now, drain_background=self.drain_background)
+        working = self.failure_judge.working_hosts
+        given = assign_jobs(self.jobs, self.members, working, now, drain_background=self.drain_background)
         if not self.jobs.queue_length:
             for move in self._speculation.plan(self.jobs, self.members, given, now):
                 self._apply_move(move, given, now)

@@ -59,7 +59,7 @@ class PendingJob:
     @property
     def is_suspect(self) -> bool:
         """Whether it may be what ended the workers that held it."""
-        return len(self.lost_with) >= SUSPECT_LOSSES
+        return len(self.lost_with) >= SUSPECT_LOSSES and not self.is_proof
 
     @property
     def avoided_workers(self) -> Set[str]:
@@ -234,7 +234,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         is the failure of that one and not of its company.
         """
         pending = self._pending[digest]
-        is_failure = pending.is_suspect
+        is_failure = pending.is_suspect or pending.is_proof
         pending.lost_with.append(worker)
         if is_failure:
             self._add_attempt(digest, Attempt(worker, WORKER_ENDED), now)

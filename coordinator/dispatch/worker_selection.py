@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
+from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob, PendingJobs
 from dreamfleet.coordinator.jobs.work import Work
@@ -89,7 +90,12 @@ class WorkerSelection:
 
 
 def assign_jobs(
-    jobs: PendingJobs, members: Mapping[str, Member], now: float, *, drain_background: bool
+    jobs: PendingJobs,
+    members: Mapping[str, Member],
+    working_hosts: Collection[str],
+    now: float,
+    *,
+    drain_background: bool,
 ) -> dict[str, list[Work]]:
     """Take queued jobs one by one and choose a member with credit for each; the work by member.
 
@@ -105,7 +111,7 @@ def assign_jobs(
         if (next_job := jobs.next(slots, idle=idle, drain_background=drain_background)) is None:
             break
         pending = jobs[next_job.digest]
-        free = loads.keys() - jobs.holders_of_suspects() if pending.is_suspect else loads.keys()
+        free = _without_suspects(loads, jobs, working_hosts) if pending.is_suspect else loads
         eligible = _eligible_workers(pending, free, members)
         if not eligible:
             passed_over.append(next_job.digest)
@@ -124,6 +130,15 @@ def assign_jobs(
     for digest in passed_over:
         jobs.enqueue(digest)
     return given
+
+
+def _without_suspects(names: Iterable[str], jobs: PendingJobs, working_hosts: Collection[str]) -> list[str]:
+    """Which of these members may be given a suspect.
+
+    R8: those that hold no other one, on hosts that have scored, if there were any.
+    """
+    busy = jobs.holders_of_suspects()
+    return [name for name in names if name not in busy and (not working_hosts or host_of(name) in working_hosts)]
 
 
 def _eligible_workers(pending: PendingJob, free: Collection[str], members: Mapping[str, Member]) -> list[str]:

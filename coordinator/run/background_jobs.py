@@ -64,6 +64,11 @@ class BackgroundJobs:
         return found if found is not None and found.covers(self.evaluations.best) else None
 
     @property
+    def confirmation_failed(self) -> bool:
+        """Whether every episode of the last round failed, so that there is no confirmed score."""
+        return self._confirmation is not None and self._confirmation.failed
+
+    @property
     def confirming(self) -> tuple[int, int]:
         """Episodes of the confirmation's open round: (done, wanted)."""
         return (0, 0) if self._confirmation is None else self._confirmation.progress

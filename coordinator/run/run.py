@@ -181,7 +181,8 @@ class Run:
             return False
         if self.stalled is not None:
             self.stalled, self.fleet.paused = None, self.paused is not None
-            self.fleet.notes.append("the journal can be written again: the run goes on")
+            goes_on = "the run goes on" if self.paused is None else f"the run stays paused: {self.paused}"
+            self.fleet.notes.append(f"the journal can be written again: {goes_on}")
         return True
 
     def _take_lock(self) -> bool:
@@ -214,9 +215,8 @@ class Run:
 
     def keep_paused(self) -> None:
         """Stay paused if the coordinator is started again before somebody resumes the run."""
-        if self._take_lock():
-            self._journal.set_fact(PAUSED, BY_HAND)
-            self.commit()
+        self._journal.set_fact(PAUSED, BY_HAND)  # kept until it can be written
+        self.commit()
 
     def pause(self, why: str) -> None:
         """Stop dispatching until the run is resumed."""
@@ -257,12 +257,14 @@ class Run:
             return
         if is_judged and (failure := judge.find_broken_fleet(at_once=self.failure_limit.share < 1)) is not None:
             proof = self.generations.find_scored(self.generation)
-            if proof is None or not self.fleet.jobs.offer_proof(proof):
+            if proof is None or judge.has_failed_proof or not self.fleet.jobs.offer_proof(proof):
                 self.pause(
                     f"no host that is here has ever scored, and every job that it tried failed, such as {failure}; "
                     f"another host, or `dreamfleet resume`, tries them again{OTHER_SEEDS if proof is None else ''}"
                 )
-                self._lacks_host = True
+                self._lacks_host = not judge.has_hope
+        elif is_judged and judge.awaits_proof and (proof := self.generations.find_scored(self.generation)) is not None:
+            self.fleet.jobs.offer_proof(proof)
         elif not is_judged and (failure := judge.find_pausing()) is not None:
             self.pause(f"{failure}; `dreamfleet resume` tries it again")
 
@@ -390,6 +392,8 @@ class Run:
             self.fleet.notes.append(self.background_jobs.round_description)
             self.fleet.jobs.offer(work)
         else:
+            if self.background_jobs.confirmation_failed:
+                self.fleet.notes.append("no confirmed score: the episodes failed on every fresh seed")
             self._end()
 
     def _begin_ending(self, reason: str) -> None:

@@ -88,7 +88,7 @@ class Rerun:
         `UsageError` where another run lies there, such as the first one itself, or this version would begin another.
         """
         if not path_exists(folder / JOURNAL):
-            return self._config(), {}
+            return self._config(), {"failure_limit": 1.0}  # the first run went on, whatever failed
         start = self.receipt.start and self.receipt.start.mean
         with open_run(folder.parent, folder.name) as stored:
             if stored.uid and stored.uid == self.controller.provenance.get("run_uid"):

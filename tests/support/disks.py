@@ -50,5 +50,21 @@ def small_disk(path, megabytes):
         disk.remove()
 
 
+@contextmanager
+def read_only_view(folder, path):
+    """The same files at `path`, where nobody can write, while `folder` stays writable; `None` without the right."""
+    path.mkdir()
+    try:
+        _run("mount", "--bind", folder, path)
+        _run("mount", "-o", "remount,bind,ro", path)
+    except (OSError, subprocess.CalledProcessError):
+        yield None
+        return
+    try:
+        yield path
+    finally:
+        _run("umount", "--lazy", path)
+
+
 def _run(*words):
     subprocess.run(list(map(str, words)), check=True, capture_output=True)

@@ -2,6 +2,8 @@
 
 import itertools
 import json
+import sqlite3
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +11,7 @@ import pytest
 
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.common.runs.seeds import training_seed
+from dreamfleet.common.runs.seeds import CONFIRMING_OFFSET, training_seed
 from dreamfleet.coordinator.run.run import BY_HAND
 from dreamfleet.coordinator.settings.config import LimitsConfig
 from tests.coordinator.run.test_run import SETTINGS as TWO
@@ -409,6 +411,10 @@ def test_an_evaluation_counts_its_scored_episodes_and_one_without_any_ends(faili
     none = failing("none", settings=settings, fails=lambda job: job.kind == "evaluate", limit=1.0)
     assert none.run.ended
     assert none.story()[3:] == ([], None)
+    late = failing("late", settings=settings, fails=lambda job: job.episode >= CONFIRMING_OFFSET)
+    assert late.run.ended
+    with RunFolder(late.path) as folder:
+        assert any("no confirmed score" in each.text for each in folder.events())
 
 
 def test_racing_goes_on_without_the_failed_ones(failing):
@@ -451,8 +457,15 @@ def test_time_without_workers_or_paused_is_no_time_of_the_run(tmp_path, random_b
 
 def test_a_pause_by_hand_outlives_its_coordinator(tmp_path, random_bundle):
     bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: False)
-    bench.run.pause(BY_HAND)
-    bench.run.keep_paused()
+    bench.journal.set_patience(0.05)
+    with closing(sqlite3.connect(bench.path / "journal.sqlite")) as other:
+        other.execute("BEGIN IMMEDIATE")
+        bench.run.pause(BY_HAND)
+        bench.run.keep_paused()
+        assert bench.run.stalled
+    bench.now += 10.0
+    bench.run.tick(bench.now)
+    assert bench.run.commit()
     bench.restart()
     assert bench.run.paused == BY_HAND
     bench.run.resume()
@@ -464,16 +477,24 @@ def test_a_pause_by_hand_outlives_its_coordinator(tmp_path, random_bundle):
 
 
 class Lethal(Failing):
-    """A bench whose workers end without a word on the jobs of `fails`; another life of each joins after that."""
+    """A bench whose workers end without a word on the jobs of `fails`; another life of each joins after that.
 
-    lives = itertools.count(16)
+    With `new_names` it comes on a host of another name, as in a cloud.
+    """
+
+    new_names = False
+
+    def begin(self):
+        self.lives = itertools.count(16)
+        super().begin()
 
     def answer_one(self, name, job):
         if name not in self.hosts:  # it ended on a job before
             return
         if self.fails(job):
             self.run.fleet.handle_departure(name, self.now)
-            life = f"{name.partition('/')[0]}/{next(self.lives):08x}"
+            number = next(self.lives)
+            life = f"pod{number}/{number:08x}" if self.new_names else f"{name.partition('/')[0]}/{number:08x}"
             self.hosts[self.hosts.index(name)] = life
             self.run.admission.admit(self.request(life), self.now)
         else:
@@ -489,6 +510,23 @@ def test_an_episode_that_ends_its_worker_counts_as_failed_and_its_company_does_n
         facts = folder.failures()
     assert {each.candidate for each in facts} == {3}
     assert all("its worker ended without a word" in each.error for each in facts)
+    bench.journal.close()
+
+
+def test_an_episode_that_ends_workers_on_hosts_of_ever_new_names_counts_as_failed_too(tmp_path, random_bundle):
+    bench = Lethal(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate == 3)
+    bench.new_names = True
+    bench.serve(turns=3000)
+    assert bench.run.ended
+    assert [each.failed for each in bench.run.history.rows] == [1] * GENERATIONS
+    bench.journal.close()
+
+
+def test_a_run_whose_every_episode_ends_its_worker_pauses(tmp_path, random_bundle):
+    bench = Lethal(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: True)
+    bench.new_names = True
+    bench.serve(turns=3000)
+    assert "no host that is here has ever scored" in bench.run.paused
     bench.journal.close()
 
 

@@ -1,4 +1,5 @@
 import os
+import shutil
 import sqlite3
 
 import numpy as np
@@ -15,6 +16,7 @@ from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.jobs.work import vector_bytes
 from dreamfleet.coordinator.storage.journal import Journal
+from tests.support.disks import read_only_view
 from tests.support.samples import SPEC
 
 SETTINGS = RunSettings(SPEC, ControllerShape(1, 3), 2, 1, 0.1, "diagonal", 1, 5, 2)
@@ -225,3 +227,17 @@ def test_huge_texts_are_read_in_part(journal, folder):
     with RunFolder(folder) as run:
         assert [len(each.text) for each in run.events()][1:] == [1000]
         assert [len(each.error) for each in run.failures()] == [1000]
+
+
+def test_a_read_only_view_of_a_live_run_shows_what_is_in_its_write_ahead_log(folder, journal, tmp_path):
+    fill(journal)
+    with read_only_view(folder.parent, tmp_path.parent / "view") as view:
+        if view is None:
+            pytest.skip("this host does not let us mount")
+        with RunFolder(view / "night") as seen:
+            assert len(seen.history()) == 1
+        shutil.copy(folder / "journal.sqlite-wal", tmp_path / "log")
+        journal.close()
+        shutil.move(tmp_path / "log", folder / "journal.sqlite-wal")
+        with pytest.raises(JournalError, match="copy the folder first"):
+            RunFolder(view / "night").history()
