@@ -43,6 +43,14 @@ def no_graphics():
     assert not maps.exists() or "libLLVM" not in maps.read_text()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def trusted_tests():
+    """Processes that tests start find the tasks of tests, also those that fixtures of a module start."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DREAMFLEET_TRUST", "tests.support")
+        yield
+
+
 @pytest.fixture(scope="session")
 def random_bundle(tmp_path_factory):
     return write_random_bundle(tmp_path_factory.mktemp("bundle") / "random.zip")
@@ -58,4 +66,4 @@ def processes(tmp_path):
 def private_folders(tmp_path, monkeypatch):
     monkeypatch.setenv("DREAMFLEET_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("DREAMFLEET_RUNS_DIR", str(tmp_path / "runs"))
-    monkeypatch.setenv("DREAMFLEET_TRUST", "tests.support")  # its tasks are found by processes that tests start
+    monkeypatch.setenv("DREAMFLEET_TRUST", "tests.support")  # again: a test may have trusted more
