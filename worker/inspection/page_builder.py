@@ -26,7 +26,7 @@ from dreamfleet.worker.inspection.vae_sections import own_pictures
 from dreamfleet.worker.inspection.vae_view import CHECKPOINT, VAEView, held_out_drive
 from dreamfleet.worker.tasks.api import Preprocessing
 from dreamfleet.worker.tasks.registry import task_of
-from dreamfleet.worker.training.data.dataset import find_world
+from dreamfleet.worker.training.data.dataset import find_world, world_of_folder
 
 PAGE = "index.html"
 UNITS = {  # units of the quality figures, by a part of their names, and which values are good
@@ -127,7 +127,7 @@ def sections_of(
 ) -> Iterator[Section]:
     """Yield the sections of the page one by one as they are drawn."""
     if pictures:
-        yield own_pictures(_find_vae_view(subject, data), pictures, _preprocessings(subject))
+        yield own_pictures(_find_vae_view(subject, data), pictures, _preprocessings(subject, data))
     if subject.bundle is not None:
         yield from _bundle_sections(subject.bundle, subject, config)
     else:
@@ -144,9 +144,9 @@ def _find_vae_view(subject: InspectionSubject, data: Sequence[Path]) -> VAEView:
     return VAEView.of_folder(data[0])
 
 
-def _preprocessings(subject: InspectionSubject) -> Collection[Preprocessing]:
-    """Those of the subject's world."""
-    task = find_world() if subject.bundle is None else task_of(subject.bundle)
+def _preprocessings(subject: InspectionSubject, data: Sequence[Path]) -> Collection[Preprocessing]:
+    """Those of the world of the subject, or of its data."""
+    task = find_world(*world_of_folder(data[0])) if subject.bundle is None else task_of(subject.bundle)
     return tuple(getattr(task, "preprocessings", {}).values())
 
 

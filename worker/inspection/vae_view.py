@@ -68,6 +68,7 @@ def held_out_drive(folder: Path, vae_view: VAEView, config: DriveConfig) -> Enco
         load_pictures,
         load_steps,
         split_held_out,
+        world_of_folder,
     )
 
     _, (path, *_) = split_held_out(episode_paths(folder))
@@ -75,5 +76,5 @@ def held_out_drive(folder: Path, vae_view: VAEView, config: DriveConfig) -> Enco
     seen, steps = load_pictures(path)[: config.steps], load_steps(path)
     mu, logvar = vae_view.encode(seen)
     action, reward = (steps[name][: len(seen)] for name in ("action", "reward"))
-    about, opening = f"drive {path.stem}, which is held out", find_world().world.opening
+    about, opening = f"drive {path.stem}, which is held out", find_world(*world_of_folder(folder)).world.opening
     return EncodedRollout(seen, mu, logvar, action, reward.astype(np.float64), about, opening)
