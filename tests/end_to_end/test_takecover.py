@@ -62,7 +62,7 @@ def test_any_fleet_gives_the_same_bits_and_the_verbs_take_the_run(processes):
     code, out, err = processes.call("replay", "one", *runs, "--candidate", "1/3")
     assert (code, out.count("same bits")) == (0, 2), err
     code, out, err = processes.call("evaluate", "--controller", "one", *runs, "--episodes", 3)
-    assert (code, "below gymnasium's threshold of 750" in out) == (0, True), err
+    assert (code, "below the world's threshold of 750" in out) == (0, True), err
     for verb, more in (("record", ("--steps", 5)), ("live", ("--seconds", 1))):
         video = processes.folder / f"{verb}.mp4"
         code, out, err = processes.call(verb, "--controller", "one", *runs, *more, "--out", video)
