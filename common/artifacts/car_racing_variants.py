@@ -6,13 +6,13 @@ default variant has the same specification as runs from before there were varian
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
 from typing import Any, Literal
 
 from dreamfleet.common.artifacts.actions import FIVE_CHOICES, STEERING_AND_HALVES, STEERING_GAS_BRAKE, Continuous
+from dreamfleet.common.artifacts.task_options import check_options, read_options, write_options
 from dreamfleet.common.errors import UsageError
 
 CAR_RACING = "car-racing"  # the task; its dream has the same options
@@ -61,8 +61,7 @@ class Variant:
     @classmethod
     def from_values(cls, names: Mapping[str, Any]) -> Variant:
         """The variant with these option values; `UsageError` for an unknown name or an invalid value."""
-        if unknown := sorted(set(names) - set(OPTION_HELP)):
-            raise UsageError(f"{CAR_RACING} knows no option {', '.join(unknown)}: known are {', '.join(OPTION_HELP)}")
+        check_options(CAR_RACING, names, OPTION_HELP)
         found = cls(**names)
         shift, time, offroad = map(float, (found.pedal_shift, found.time_cost, found.offroad_cost))
         return replace(found, pedal_shift=shift, time_cost=time, offroad_cost=offroad)
@@ -70,7 +69,7 @@ class Variant:
     @property
     def options(self) -> str:
         """The options that differ from the defaults as canonical JSON; empty for the default variant."""
-        return json.dumps(self._non_default, sort_keys=True) if self._non_default else ""
+        return write_options(self._non_default)
 
     @property
     def option_texts(self) -> tuple[str, ...]:
@@ -120,13 +119,7 @@ class Variant:
 
 @lru_cache
 def _parse_options(options: str) -> Variant:
-    try:
-        names = json.loads(options or "{}")
-        if not isinstance(names, dict):
-            raise TypeError("it is no object")
-    except (ValueError, TypeError, RecursionError) as error:
-        raise UsageError(f"{CAR_RACING}'s options must be a JSON object, not {options!r:.200}") from error
-    return Variant.from_values(names)
+    return Variant.from_values(read_options(CAR_RACING, options, OPTION_HELP))
 
 
 def _within(value: Any, low: float, high: float) -> bool:

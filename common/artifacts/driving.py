@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Any, Literal, Protocol
 
 from dreamfleet.common.artifacts.actions import Continuous
 from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, Variant
+from dreamfleet.common.artifacts.task_options import read_options, write_options
 from dreamfleet.common.artifacts.world_facts import WorldFacts
 from dreamfleet.common.errors import UsageError
 
@@ -104,7 +104,7 @@ class WorldDriving:
     @property
     def options(self) -> str:
         """The options that differ from the defaults as canonical JSON; empty if none does."""
-        return json.dumps(self._non_default, sort_keys=True) if self._non_default else ""
+        return write_options(self._non_default)
 
     @property
     def option_texts(self) -> tuple[str, ...]:
@@ -118,9 +118,10 @@ class WorldDriving:
 
     @property
     def _non_default(self) -> dict[str, Any]:
-        values = {"decide_every": self.decide_every, "feedback": self.feedback}
-        defaults = {"decide_every": 1, "feedback": "none"}
-        return {name: value for name, value in values.items() if value != defaults[name]}
+        values = {
+            each.name: (getattr(self, each.name), each.default) for each in fields(self) if each.name in OPTION_HELP
+        }
+        return {name: value for name, (value, default) in values.items() if value != default}
 
 
 def parse_driving(task: str, facts: WorldFacts | None, options: str) -> Driving:
@@ -142,12 +143,4 @@ def parse_driving(task: str, facts: WorldFacts | None, options: str) -> Driving:
 
 @lru_cache
 def _parse_options(task: str, facts: WorldFacts, options: str) -> WorldDriving:
-    try:
-        names = json.loads(options or "{}")
-        if not isinstance(names, dict):
-            raise TypeError("it is no object")
-    except (ValueError, TypeError, RecursionError) as error:
-        raise UsageError(f"{task}'s options must be a JSON object, not {options!r:.200}") from error
-    if unknown := sorted(set(names) - set(OPTION_HELP)):
-        raise UsageError(f"{task} knows no option {', '.join(unknown)}: known are {', '.join(OPTION_HELP)}")
-    return WorldDriving(facts, **names)
+    return WorldDriving(facts, **read_options(task, options, OPTION_HELP))

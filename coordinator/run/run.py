@@ -13,7 +13,6 @@ from datetime import UTC, datetime
 from math import nan
 
 from dreamfleet.common.errors import NotWritableNowError
-from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.messages import Job, Result
 from dreamfleet.common.protocol.result_bounds import MAX_SECONDS
@@ -31,6 +30,7 @@ from dreamfleet.coordinator.run.admission import WorkerAdmission
 from dreamfleet.coordinator.run.background_jobs import BackgroundJobs
 from dreamfleet.coordinator.run.failure_limit import FailureLimit
 from dreamfleet.coordinator.run.generations import Generations
+from dreamfleet.coordinator.run.stop_reason import find_stop_reason
 from dreamfleet.coordinator.run.work_clock import WorkClock
 from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
@@ -361,26 +361,7 @@ class Run:
         return f"stage {stage.number} of {len(self._agenda.stages)} ({stage.description})"
 
     def _stop_reason(self, generation: Generation) -> str | None:
-        """Why the run ends before `generation` is scored; `None` if it continues."""
-        if generation.is_one_point:
-            return f"converged: generation {generation.number} is one point; fork the run with a larger --sigma0"
-        return self._reached_limit()
-
-    def _reached_limit(self) -> str | None:
-        """The first limit that is reached, in words; `None` if none is. The cost does not grow with the run."""
-        limits, evaluations = self.limits, self.background_jobs.evaluations
-        if limits.generations and len(self.history) >= limits.generations:
-            return plural(len(self.history), "generation")
-        if limits.steps and self.history.steps >= limits.steps:
-            return f"{self.history.steps} environment steps"
-        if limits.minutes and self.history.seconds >= 60 * limits.minutes:
-            return f"{plural(limits.minutes, 'minute')} in which it could work"
-        best = evaluations.best
-        if limits.target is not None and best is not None and best.mean >= limits.target and best.is_sound:
-            return f"the mean of generation {best.generation} reached {best.mean:.1f}"
-        if best is not None and limits.parted and self.background_jobs.have_fallen_behind(limits.parted):
-            return f"the evaluated mean fell behind generation {best.generation}'s"
-        return None
+        return find_stop_reason(self.limits, self.history, self.background_jobs, generation)
 
     def _finish(self) -> None:
         """Once a limit is reached and no background job is left: confirm the reported mean, then end the run."""

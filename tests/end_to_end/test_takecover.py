@@ -2,7 +2,6 @@
 
 import os
 import signal
-import tempfile
 from contextlib import suppress
 from pathlib import Path
 from time import monotonic, sleep
@@ -19,16 +18,6 @@ from tests.support.processes import DEADLINE
 pytestmark = [pytest.mark.slow, pytest.mark.needs_doom]
 RUN = ("--task", "takecover", "--bundle", "none", "--horizon", 525)
 ROUNDS = 13  # of four kills each
-
-
-@pytest.fixture
-def temporary(tmp_path, monkeypatch):
-    """The folder of temporary files, of this process and of those that it starts."""
-    folder = tmp_path / "temporary"
-    folder.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    monkeypatch.setenv("TMPDIR", str(folder))
-    return folder
 
 
 def evolve(processes, name, workers):

@@ -16,6 +16,7 @@ from gymnasium.wrappers import AddRenderObservation, TransformObservation
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import Continuous
+from dreamfleet.common.artifacts.task_options import write_options
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
@@ -85,8 +86,7 @@ class PixelOptions:
     @property
     def text(self) -> str:
         """The options that differ from their defaults as canonical JSON; empty if none does."""
-        plain = to_dict(self)
-        return json.dumps(plain, sort_keys=True) if plain else ""
+        return write_options(to_dict(self))
 
     @property
     def rows_and_columns(self) -> Crop | None:

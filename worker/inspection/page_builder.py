@@ -35,6 +35,8 @@ UNITS = {  # units of the quality figures, by a part of their names, and which v
     "nats_per_dimension": "of the next latent: the less, the better",
     "latent_error": "root mean square, in the latents' spread: 0 is exact, 1 as bad as their mean",
     "auc": "0.5 is chance, 1 exact",
+    "brier": "mean squared error of the probability of the end: the less, the better",
+    "calibration": "mean probability of the end over the share of steps that ended: 1 is right",
 }
 DRIVEN = ("episodes", "frames", "held_out_episodes")  # counts in a bundle's provenance
 

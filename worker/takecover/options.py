@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
+from dreamfleet.common.artifacts.task_options import check_options, read_options, write_options
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.takecover.game import HEIGHT, LIMIT, TICS_PER_SECOND, WIDTH
 from dreamfleet.worker.tasks.pictures import Crop
@@ -18,6 +18,7 @@ OPTION_HELP = {
     "crop": f"TOP:BOTTOM,LEFT:RIGHT of a picture of {HEIGHT} rows and {WIDTH} columns",
 }
 FLAGS = {"skip": "tics", "crop": "crop"}  # of any world, and what they are here
+KNOWN = ("environment", *FLAGS)
 _CROP = re.compile(r"(\d{1,3}):(\d{1,3}),(\d{1,3}):(\d{1,3})", re.ASCII)
 
 
@@ -46,13 +47,7 @@ class TakeCoverOptions:
     @classmethod
     def parse(cls, text: str) -> TakeCoverOptions:
         """The options in a JSON object as `text` gives it; an empty text names none."""
-        try:
-            given = json.loads(text or "{}")
-            if not isinstance(given, dict):
-                raise TypeError("it is no object")
-        except (ValueError, TypeError, RecursionError) as error:
-            raise UsageError(f"takecover's options must be a JSON object, not {text!r:.200}") from error
-        return cls.of(given)
+        return cls.of(read_options("takecover", text, KNOWN))
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> TakeCoverOptions:
@@ -61,8 +56,7 @@ class TakeCoverOptions:
         >>> TakeCoverOptions.of({"environment": {"actions": "thirds"}, "skip": 1}).text
         '{"environment": {"actions": "thirds", "tics": 1}}'
         """
-        if unknown := sorted(set(given) - {"environment", *FLAGS}):
-            raise UsageError(f"takecover knows no option {', '.join(unknown)}: write --environment tics=1")
+        check_options("takecover", given, KNOWN)
         values = given.get("environment") or {}
         if not isinstance(values, Mapping) or (unknown := sorted(set(values) - set(OPTION_HELP))):
             named = ", ".join(unknown) or repr(values)
@@ -73,7 +67,7 @@ class TakeCoverOptions:
     def text(self) -> str:
         """The options that differ from the defaults as canonical JSON; empty if none does."""
         changed = {each.name: value for each in fields(self) if (value := getattr(self, each.name)) != each.default}
-        return json.dumps({"environment": changed}, sort_keys=True) if changed else ""
+        return write_options({"environment": changed} if changed else {})
 
     @property
     def horizon(self) -> int:

@@ -1,5 +1,3 @@
-import tempfile
-
 import pytest
 
 from tests.support.doom import use_fake
@@ -14,13 +12,3 @@ def fake_doom(monkeypatch):
 def doom(request, monkeypatch):
     if request.param == "stand-in":
         use_fake(monkeypatch)
-
-
-@pytest.fixture
-def temporary(tmp_path, monkeypatch):
-    """The folder of temporary files, of this process and of those that it starts."""
-    folder = tmp_path / "temporary"
-    folder.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    monkeypatch.setenv("TMPDIR", str(folder))
-    return folder
