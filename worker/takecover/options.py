@@ -58,8 +58,9 @@ class TakeCoverOptions:
         """
         check_options("takecover", given, KNOWN)
         values = given.get("environment") or {}
-        if not isinstance(values, Mapping) or (unknown := sorted(set(values) - set(OPTION_HELP))):
-            named = ", ".join(unknown) or repr(values)
+        unknown = sorted(set(values) - set(OPTION_HELP)) if isinstance(values, Mapping) else [repr(values)]
+        if unknown:
+            named = ", ".join(unknown)
             raise UsageError(f"takecover knows no argument {named:.200}: known are {', '.join(OPTION_HELP)}")
         return cls(**{**{name: given[flag] for flag, name in FLAGS.items() if flag in given}, **values})
 
