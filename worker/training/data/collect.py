@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import AbstractContextManager, contextmanager
+from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,6 +43,10 @@ from dreamfleet.worker.training.data.dataset import (
     preprocessing_of_size,
 )
 from dreamfleet.worker.training.data.pilot import Pilot
+
+Environment = gymnasium.Env[Any, Any]
+EnvironmentFor = Callable[[RecordableTask, str], AbstractContextManager[Environment]]
+_kept: tuple[Environment, Finalize] | None = None  # in a process of the pool
 
 
 def missing_numbers(folder: Path, config: CollectConfig) -> list[int]:
@@ -81,16 +88,46 @@ def _start_process(parent: int) -> None:
 
 def _collect_one(task: tuple[Path, CollectConfig, int, tuple[Pilot, ...], DataWorld]) -> int:
     folder, config, number, pilots, world = task
-    arrays = drive_episode(config, number, pilots, world)
+    arrays = drive_episode(config, number, pilots, world, kept_environment)
     path = episode_path(folder, number)
     with explain_write_errors(path), atomic_write(path) as file:
         write_episode(file, arrays)
     return len(arrays["action"])
 
 
+@contextmanager
+def fresh_environment(task: RecordableTask, preprocessing: str) -> Iterator[Environment]:
+    """An environment for one drive."""
+    environment = task.make_recorded(preprocessing)
+    try:
+        yield environment
+    finally:
+        environment.close()  # a game of its own process would go on
+
+
+@contextmanager
+def kept_environment(task: RecordableTask, preprocessing: str) -> Iterator[Environment]:
+    """This process's environment for all its drives: some games take longer to start than a drive takes.
+
+    It is closed when a drive fails, and as the process ends. A process drives in one world and preprocessing.
+    """
+    global _kept  # noqa: PLW0603 - a process of the pool has no other memory
+    if _kept is None:
+        environment = task.make_recorded(preprocessing)
+        _kept = environment, Finalize(None, environment.close, exitpriority=1)
+    environment, close = _kept
+    try:
+        yield environment
+    except BaseException:
+        _kept = None
+        close()
+        raise
+
+
 def drive_episode(
-    config: CollectConfig, number: int, pilots: Sequence[Pilot] = (), world: DataWorld = OF_FIRST_WORLD
-) -> dict[str, NDArray[Any]]:
+    config: CollectConfig, number: int, pilots: Sequence[Pilot] = (), world: DataWorld = OF_FIRST_WORLD,
+    environment_for: EnvironmentFor = fresh_environment,
+) -> dict[str, NDArray[Any]]:  # fmt: skip
     """Drive an episode of T steps: `picture` (T, side, side, 3) before each `action` (T, A), then `reward` (T,)."""
     random = np.random.default_rng([config.seed, number])
     task = find_world(*world)
@@ -98,15 +135,12 @@ def drive_episode(
     name, policy = _driver(task, config, number, pilots, random)
     preprocessing = preprocessing_of_size(config.picture, world)
     begin = _begin_hook(task, config.anywhere, random)
-    environment = task.make_recorded(preprocessing.name)
-    try:
-        episode_config = EpisodeConfig(int(random.integers(2**20, 2**31)), config.steps, config.patience)
-        rollout = Rollout(name, preprocessing.name, world)
+    episode_config = EpisodeConfig(int(random.integers(2**20, 2**31)), config.steps, config.patience)
+    rollout = Rollout(name, preprocessing.name, world)
+    with environment_for(task, preprocessing.name) as environment:
         for moment in run_episode(environment, policy, episode_config, begin):
             rollout.add(moment.seen, moment.action, moment.reward)
             rollout.ended, rollout.terminal = moment.ended, moment.terminal
-    finally:
-        environment.close()  # a game of its own process would go on
     return rollout.arrays()
 
 

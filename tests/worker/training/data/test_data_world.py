@@ -16,7 +16,13 @@ from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld, write_episode
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tasks.policy import DriverPolicy
-from dreamfleet.worker.training.data.collect import collect, drive_episode, import_rollouts
+from dreamfleet.worker.training.data import collect as module
+from dreamfleet.worker.training.data.collect import (
+    collect,
+    drive_episode,
+    import_rollouts,
+    kept_environment,
+)
 from dreamfleet.worker.training.data.collect_config import CollectConfig
 from dreamfleet.worker.training.data.data_folder import load_preset, resolve_preset, resolve_world, store_preset
 from dreamfleet.worker.training.data.dataset import (
@@ -72,13 +78,34 @@ def test_a_drive_in_any_world_is_a_function_of_seed_and_number_and_says_its_worl
     first = drive_episode(config, 1, world=world)
     drive_episode(config, 2, world=world)
     again = drive_episode(config, 1, world=world)
-    assert all(np.array_equal(first[name], again[name]) for name in first | again)
+    assert drive_equal(first, again)
     path = write(tmp_path, 0, first)
     assert load_pictures(path).shape == (4, 64, 64, 3)
     assert load_steps(path)["action"].shape == (4, 3)
     assert str(first["driver"]) in find_world(*world).drivers
     assert world_of_episode(path) == world_of_folder(tmp_path) == find_own_world(tmp_path) == world
     assert ("world" in first) == (world != OF_FIRST_WORLD)
+
+
+def test_a_process_keeps_its_environment_until_a_drive_fails(monkeypatch):
+    monkeypatch.setattr(module, "_kept", None)
+    task, name = find_world(*GYM), preprocessing_of_size(64, GYM).name
+    with kept_environment(task, name) as first, kept_environment(task, name) as second:
+        assert second is first
+    closed = []
+    monkeypatch.setattr(type(first.unwrapped), "close", lambda _self: closed.append(1))
+    with pytest.raises(ValueError, match="a simulator fails"), kept_environment(task, name):
+        raise ValueError("a simulator fails")
+    assert closed == [1]
+    with kept_environment(task, name) as third:
+        assert third is not first
+    assert drive_equal(
+        drive_episode(PLAIN, 1, world=GYM, environment_for=kept_environment), drive_episode(PLAIN, 1, world=GYM)
+    )
+
+
+def drive_equal(first, second):
+    return all(np.array_equal(first[name], second[name]) for name in first | second)
 
 
 def test_a_death_is_told_from_a_limit(tmp_path):
