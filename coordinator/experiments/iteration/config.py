@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.cli.model_commands import WORLD_FLAGS, Words, split_flags, world_flags
 from dreamfleet.common.cli.presets import NAMES, check_preset, default_training_preset
@@ -33,7 +34,7 @@ class IterateConfig:
     )
     rounds: int = option(5, "rounds in all: each makes a world model and evolves in its dream; more may follow later")
     task: str = option(
-        "", "the world, such as gym:ENVIRONMENT (default car-racing); as `collect` takes this and these:"
+        "", f"the world, such as gym:ENVIRONMENT (default {FIRST_WORLD}); as `collect` takes this and these:"
     )
     environment: tuple[str, ...] = option((), "KEY=VALUE arguments of the world; values as in JSON")
     observation: str = option("", "picture among several, by its key; render: what is drawn")

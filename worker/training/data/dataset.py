@@ -20,7 +20,6 @@ from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld
 from dreamfleet.worker.tasks import registry
 from dreamfleet.worker.tasks.api import Preprocessing, RecordableTask
 
-WORLD = FIRST_WORLD  # what `baselines` calls it
 BEGUN = "preset.json"  # what a data set was begun with
 BEGUN_BYTES = 10_000
 REMEDY = "choose another --data"
