@@ -1,6 +1,7 @@
 """The structure that architecture.md describes: what must not grow again."""
 
-from deploy.structure import SIDES, class_names, floors, names_outside_rooms, room_arrows, sources
+from deploy.structure import SIDES, WORLDS, class_names, floors, names_outside_rooms, room_arrows, sources
+from dreamfleet.common.worlds import shipped
 
 MOST_FILES = 20  # in a folder
 # Files that name a world outside its rooms. This list may only shrink.
@@ -40,3 +41,5 @@ def test_no_world_is_named_outside_its_room():
     named = names_outside_rooms()
     assert named - NAMING_WORLDS.keys() == set(), "name it in its room, or ask the task or common/worlds for the fact"
     assert NAMING_WORLDS.keys() - named == set(), "no longer needed"
+    for world in shipped.WORLDS:
+        assert any(name.search(world) for name in WORLDS), f"{world} has no rooms in deploy/structure.py"
