@@ -14,8 +14,18 @@ from dreamfleet.common.errors import UsageError
 CHANGEABLE = frozenset({"rounds", "local", "jobs", "device", "run_flags"})
 MOST_SEED = 2**31 - 1  # each round's training multiplies its own
 RUN_FLAGS = ("run_flags", "later_run_flags")
-# Flags of each training that iterate sets itself.
-RESERVED_FLAGS = ("--data", "--preset", "--device", "--seed", "--continue-from", "--new", "--summary", "--json")
+# Flags of trainings and `bundle` that iterate sets itself.
+RESERVED_FLAGS = (
+    "--data",
+    "--preset",
+    "--device",
+    "--seed",
+    "--continue-from",
+    "--new",
+    "--summary",
+    "--json",
+    "--out",
+)
 SURVIVAL_EPISODES = 40
 LEAST = {
     "rounds": 1, "drives": 2, "more_drives": 0, "own_drives": 0, "means": 1, "drive_steps": 1, "vae_updates": 1,
@@ -60,6 +70,7 @@ class IterateConfig:
     )
     vae_flags: str = option("", 'flags of `train vae` in every round, as one text: "--updates 900 --batch 50"')
     mdnrnn_flags: str = option("", "flags of `train mdnrnn` in every round")
+    bundle_flags: str = option("", "flags of `bundle` in every round, such as --reward value")
     run_flags: str = option(
         "--generations 32", "flags of each round's `coordinator`, whose preset is dream unless another is named"
     )
@@ -103,7 +114,7 @@ class IterateConfig:
             raise UsageError("--views are beside the features of --subspace: give that too")
         if self.seed > MOST_SEED:
             raise UsageError(f"--seed must be at most {MOST_SEED}, not {self.seed}")
-        for name in ("vae_flags", "mdnrnn_flags", *RUN_FLAGS):
+        for name in ("vae_flags", "mdnrnn_flags", "bundle_flags", *RUN_FLAGS):
             self.flags(name)
 
     @property
