@@ -20,6 +20,13 @@ SIDES = ("common", "coordinator", "worker")
 # Words that a reader has to read twice; `style` in CONTRIBUTING.md says what to write instead.
 RIDDLES = re.compile(r"\b(tell|tells|telling|told|untold|whoever|whomever)\b|\b(?:is|are|was|were|be|been) had\b")
 LONG_FILE = 400
+# The worlds that ship: what names each of them, and its rooms, the files and folders in which that may stand.
+WORLDS = {
+    re.compile("car.?racing", re.IGNORECASE): (
+        "worker/car_racing", "common/worlds/car_racing.py", "common/artifacts/car_racing_variants.py",
+    ),
+    re.compile("take.?cover|doom", re.IGNORECASE): ("worker/takecover", "common/worlds/takecover.py"),
+}  # fmt: skip
 
 
 def sources(*folders: str) -> list[Path]:
@@ -87,6 +94,25 @@ def riddles(path: Path) -> list[tuple[int, str]]:
         plain = token.type in (tokenize.NAME, tokenize.COMMENT, tokenize.STRING)
         if plain and RIDDLES.search(words):
             found += [(token.start[0], match.group()) for match in RIDDLES.finditer(words)]
+    return found
+
+
+def words_of(path: Path) -> Iterator[str]:
+    """The names and the texts in a Python file's code: no comments, and no texts that stand alone, as docstrings do."""
+    tree = ast.parse((ROOT / path).read_text())
+    alone = {node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if node not in alone:
+            yield from (value for _, value in ast.iter_fields(node) if isinstance(value, str))
+
+
+def names_outside_rooms() -> set[str]:
+    """The files that name a world outside its rooms."""
+    found = set()
+    for path in sources(*SIDES):
+        foreign = [name for name, rooms in WORLDS.items() if not any(path.is_relative_to(room) for room in rooms)]
+        if any(name.search(word) for word in (str(path), *words_of(path)) for name in foreign):
+            found.add(str(path))
     return found
 
 

@@ -1,8 +1,19 @@
 """The structure that architecture.md describes: what must not grow again."""
 
-from deploy.structure import SIDES, class_names, floors, room_arrows, sources
+from deploy.structure import SIDES, WORLDS, class_names, floors, names_outside_rooms, room_arrows, sources
+from dreamfleet.common.worlds import shipped
 
 MOST_FILES = 20  # in a folder
+# Files that name a world outside its rooms. This list may only shrink.
+NAMING_WORLDS = {
+    "common/worlds/shipped.py": "the one list of the worlds that ship",
+    "common/artifacts/driving.py": "the one default: files that name no world are CarRacing's, and have its variants",
+    "common/host/packages.py": "packages and extras, as pyproject.toml names them",
+    "worker/health.py": "doctor asks it where gymnasium may be absent, which CarRacing's room imports",
+    "worker/dream/__init__.py": "an environment's former name, which notebooks and agents of others use",
+    "worker/bench/environment.py": "compares our CarRacing with gymnasium's, by the episode loop above its room",
+    "worker/baselines/agents.py": "baselines without a world model are agents of CarRacing, trained by rooms above its",
+}
 
 
 def test_no_room_imports_a_room_above_it():
@@ -24,3 +35,11 @@ def test_a_folder_is_read_at_a_glance():
     for path in sources(*SIDES):
         counts[str(path.parent)] = counts.get(str(path.parent), 0) + (path.name != "__init__.py")
     assert max(counts.values()) <= MOST_FILES, counts
+
+
+def test_no_world_is_named_outside_its_room():
+    named = names_outside_rooms()
+    assert named - NAMING_WORLDS.keys() == set(), "name it in its room, or ask the task or common/worlds for the fact"
+    assert NAMING_WORLDS.keys() - named == set(), "no longer needed"
+    for world in shipped.WORLDS:
+        assert any(name.search(world) for name in WORLDS), f"{world} has no rooms in deploy/structure.py"

@@ -12,8 +12,15 @@ from dreamfleet.common.artifacts.task_options import read_options, write_options
 from dreamfleet.common.artifacts.world_facts import WorldFacts
 from dreamfleet.common.errors import UsageError
 
-__all__ = ["Driving", "Variant", "WorldDriving", "parse_driving"]  # every world's options are among a variant's
+__all__ = [
+    "FIRST_WORLD",
+    "Driving",
+    "Variant",
+    "WorldDriving",
+    "parse_driving",
+]  # every world's options are among a variant's
 
+FIRST_WORLD = CAR_RACING  # the task of files that name none, and the default
 OPTION_HELP = {"decide_every": "a whole number from 1 to 50", "feedback": "none or last"}
 
 
@@ -136,8 +143,8 @@ def parse_driving(task: str, facts: WorldFacts | None, options: str) -> Driving:
     if facts is not None:
         return _parse_options(task, facts, options)
     variant = Variant.from_json(options)
-    if task != CAR_RACING and not variant.is_default:
-        raise UsageError(f"{variant.options} are options of {CAR_RACING}")
+    if task != FIRST_WORLD and not variant.is_default:
+        raise UsageError(f"{variant.options} are options of {FIRST_WORLD}")
     return variant
 
 

@@ -67,9 +67,9 @@ def encode(data: Path) -> Words:
     return command("encode", "--data", data, "--json")
 
 
-def bundle(data: Path, out: Path) -> Words:
+def bundle(data: Path, out: Path, *more: object) -> Words:
     """The models in `data` as one file."""
-    return command("bundle", "--data", data, "--out", out, "--json")
+    return command("bundle", "--data", data, "--out", out, "--json", *more)
 
 
 def begin_run(

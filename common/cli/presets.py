@@ -8,32 +8,22 @@ from __future__ import annotations
 
 from typing import Literal
 
+from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.worlds.shipped import WORLDS
 
 Kind = Literal["run", "training", "baseline"]
+# Worlds that ship have presets of their own; `pixels` is of any world, and the other trainings here are of the first.
+_OF_RUNS = [name for world in WORLDS.values() for name in world.run_presets]
+_OF_TRAININGS = [name for world in WORLDS.values() for name in world.training_presets]
 NAMES: dict[Kind, tuple[str, ...]] = {
-    "run": (
-        "article",
-        "dream",
-        "frugal",
-        "mixed",
-        "notebook",
-        "paper",
-        "pixels",
-        "real",
-        "takecover",
-        "takecover-real",
-    ),
-    "training": ("article", "attentive", "notebook", "paper", "pixels", "takecover", "tiny"),
+    "run": tuple(sorted(("pixels", *_OF_RUNS))),
+    "training": tuple(sorted(("article", "attentive", "notebook", "paper", "pixels", "tiny", *_OF_TRAININGS))),
     "baseline": ("learning", "notebook"),
 }
 VERBS: dict[Kind, str] = {
     "run": "coordinator and fork", "training": "collect and train", "baseline": "baseline train",
 }  # fmt: skip
-
-
-# Training presets of new data sets of these tasks, as their worlds name them; of all others it is `pixels`.
-DEFAULT_TRAINING = {"": "tiny", "car-racing": "tiny", "takecover": "takecover"}  # without a task it is the first
 
 
 def default_training_preset(task: str) -> str:
@@ -42,7 +32,8 @@ def default_training_preset(task: str) -> str:
     >>> default_training_preset(""), default_training_preset("gym:ALE/Pong-v5")
     ('tiny', 'pixels')
     """
-    return DEFAULT_TRAINING.get(task, "pixels")
+    world = WORLDS.get(task or FIRST_WORLD)
+    return world.default_training if world else "pixels"
 
 
 def check_preset(kind: Kind, name: str) -> str:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli.key_values import ENVIRONMENT_EXAMPLE, parse_arguments
+from dreamfleet.common.worlds.shipped import WORLDS
 
 ENVIRONMENT = "environment"
 
@@ -13,8 +15,8 @@ ENVIRONMENT = "environment"
 def add_world_flags(parser: argparse.ArgumentParser) -> None:
     """Add `--task` and a flag for each option of pictures; one that is not given is `None`."""
     group = parser.add_argument_group("the world, of a new data set")
-    group.add_argument("--task", metavar="TASK", help="the world: car-racing, takecover, gym:ENVIRONMENT or "
-                       "module:Task (default the data set's, of a new one car-racing)")  # fmt: skip
+    group.add_argument("--task", metavar="TASK", help=f"the world: {', '.join(WORLDS)}, gym:ENVIRONMENT or "
+                       f"module:Task (default the data set's, of a new one {FIRST_WORLD})")  # fmt: skip
     group.add_argument(
         f"--{ENVIRONMENT}", nargs="+", metavar="KEY=VALUE", help="arguments of the world; values as in JSON"
     )

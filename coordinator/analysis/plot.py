@@ -21,8 +21,8 @@ from dreamfleet.common.runs.effort import Effort, format_steps
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import begun_stages, describe_steps, join_distinct
 from dreamfleet.common.runs.standard_error import format_with_error
+from dreamfleet.common.worlds.profile import PublishedScores
 from dreamfleet.coordinator.analysis.learning import LearningCurve
-from dreamfleet.coordinator.analysis.published import PublishedScores
 
 TITLE = 90  # characters in a line of the title
 KINDS = (".png", ".svg")

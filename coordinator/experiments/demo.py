@@ -22,6 +22,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dreamfleet.common.artifacts.bundle_store import shipped_names
+from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli import model_commands
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.cli.model_commands import options
@@ -43,7 +44,8 @@ from dreamfleet.common.runs.records import best_evaluation
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.common.runs.standard_error import format_with_error, standard_error
-from dreamfleet.coordinator.experiments.demo_plans import FIRST_WORLD, PLANS, DemoPlan, find_plan, plan_defaults
+from dreamfleet.common.worlds.profile import DemoPlan
+from dreamfleet.coordinator.experiments.demo_plans import PLANS, find_plan, plan_defaults
 from dreamfleet.coordinator.experiments.local_run import LocalRun
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE
 

@@ -1,79 +1,14 @@
-"""What the demonstration does in each world: how long, how large, and what its words are."""
+"""What the demonstration does in each world that has one: how long, how large, and what its words are."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.worlds.profile import DemoPlan
+from dreamfleet.common.worlds.shipped import WORLDS
 
-
-@dataclass(frozen=True, kw_only=True)
-class DemoPlan:
-    """A demonstration in one world: a run in the dream, and one in reality from the dream's best mean.
-
-    In reality candidates have one episode each until a mean reaches `able_score`, for `quick_steps` at most: far from
-    there more generations help more than more episodes, and large steps more than small ones.
-    """
-
-    bundle: str  # the world model, a shipped name or a file
-    preset: str  # of the run in the dream
-    dream_minutes: float
-    minutes: float
-    temperature: float
-    population: int
-    episodes: int
-    horizon: int
-    patience: int
-    able_score: float
-    quick_steps: int
-    variant: str = ""  # of the run in reality: NAME=VALUE, or none
-    word: str = "seed"  # a scored seed
-    judge: str  # what the outcome is judged in
-    video_steps: int
-    random_score: float | None = None  # of random play
-    packages: tuple[str, ...] = ()  # that the world needs beside the demonstration's own
-
-
-FIRST_WORLD = "car-racing"
-PLANS: dict[str, DemoPlan] = {
-    FIRST_WORLD: DemoPlan(
-        bundle="tiny",
-        preset="dream",
-        dream_minutes=0.5,
-        minutes=4.5,
-        temperature=1.5,
-        population=24,
-        episodes=4,
-        horizon=1000,
-        patience=100,
-        able_score=800,
-        quick_steps=700_000,
-        # To drive on grass predicts losses that one track may not show.
-        variant="offroad_cost=2",
-        word="track",
-        judge="gymnasium's own environment",
-        video_steps=1000,
-    ),
-    # Not measured yet: no world model of it ships.
-    "takecover": DemoPlan(
-        bundle="takecover",
-        preset="takecover",
-        dream_minutes=3.0,
-        minutes=1.5,
-        temperature=1.15,
-        population=24,
-        episodes=4,
-        horizon=525,
-        patience=0,
-        able_score=750,
-        quick_steps=100_000,
-        word="game",
-        judge="the game, 4 tics a decision",
-        video_steps=525,
-        random_score=366,
-        packages=("vizdoom",),
-    ),
-}
+PLANS: dict[str, DemoPlan] = {name: world.demo for name, world in WORLDS.items() if world.demo}
 
 
 def find_plan(world: str) -> DemoPlan:

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, get_args, get_type_hints
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.controller import ControllerShape
-from dreamfleet.common.artifacts.driving import Driving, Variant
+from dreamfleet.common.artifacts.driving import FIRST_WORLD, Driving, Variant
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.artifacts.world_facts import EndRule
 from dreamfleet.common.cli.config import option
@@ -93,7 +93,7 @@ class RunConfig:
     )
     variant: tuple[str, ...] = option(
         (),
-        "NAME=VALUE of how controllers of a world model drive: decide_every=, feedback=last; and in car-racing "
+        f"NAME=VALUE of how controllers of a world model drive: decide_every=, feedback=last; and in {FIRST_WORLD} "
         "actions=discrete, pedals=half or one, pedal_shift=, in its dream too, time_cost=, offroad_cost= "
         "(docs/tasks.md)",
     )

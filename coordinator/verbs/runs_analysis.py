@@ -192,9 +192,9 @@ def _draw_fitness(args: argparse.Namespace, out: Path) -> None:
 
 
 def _draw_learning(args: argparse.Namespace, out: Path) -> None:
+    from dreamfleet.common.worlds.shipped import WORLDS
     from dreamfleet.coordinator.analysis.learning import LearningCurve
     from dreamfleet.coordinator.analysis.plot import plot_learning
-    from dreamfleet.coordinator.analysis.published import PUBLISHED
 
     curves = []
     for name in dict.fromkeys(args.run_names):
@@ -204,7 +204,8 @@ def _draw_learning(args: argparse.Namespace, out: Path) -> None:
     if len(worlds) > 1:
         names = ", ".join(worlds)
         print(f"note: these runs are of the worlds {names}: their scores do not compare", file=sys.stderr)
-    marks = PUBLISHED.get(worlds[0]) if len(worlds) == 1 else None
+    world = WORLDS.get(worlds[0]) if len(worlds) == 1 else None
+    marks = world.published if world else None
     if marks is not None and max(each.total.steps for each in curves) < NEAR_SHARE * marks.first_steps:
         marks = None
     plot_learning(curves, marks, out)

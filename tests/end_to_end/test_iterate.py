@@ -335,6 +335,8 @@ def test_what_cannot_be_gone_on_from_is_refused_before_anything_is_driven(proces
         (("--run-flags", "--generations 1 --bundle tiny"), "--bundle in --run-flags: iterate sets them for each run"),
         (("--run-flags", "--generations 1 --sigma0 -1"), "--sigma0 must be a positive number"),
         (("--vae-flags", "--updates 0"), "--vae-flags: --updates must be at least 1"),
+        (("--bundle-flags", "--reward luck"), "argument --reward: invalid choice: 'luck'"),
+        (("--bundle-flags", "--end 7"), "a dream ends at a probability from 0 to 1"),
         (
             ("--vae-flags", "--error-factor 4", "--mdnrnn-flags", "--z-factor 0"),
             "--mdnrnn-flags: --z-factor must be from",

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from onnx import TensorProto
 
+from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.artifacts.trained_agent import AgentManifest, TrainedAgent
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.host.packages import package_version
@@ -17,7 +18,7 @@ from dreamfleet.worker.baselines.presets import DRQN
 from dreamfleet.worker.baselines.progress import parse_progress
 from dreamfleet.worker.baselines.train import CHECKPOINT
 from dreamfleet.worker.training.checkpoint import load_checkpoint, load_config
-from dreamfleet.worker.training.data.dataset import WORLD, preprocessing_of_size
+from dreamfleet.worker.training.data.dataset import preprocessing_of_size
 from dreamfleet.worker.worldmodel.mdnrnn_graph import Weights, lstm
 from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
 
@@ -43,7 +44,7 @@ def export_agent(folder: Path) -> TrainedAgent:
     choices = tuple(tuple(map(float, each)) for each in config.table)
     manifest = AgentManifest(
         DRQN,
-        WORLD,
+        FIRST_WORLD,
         preprocessing_of_size(config.picture).name,
         choices,
         config.frame_skip,

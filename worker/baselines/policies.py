@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import FIVE_CHOICES, STEERING_GAS_BRAKE
-from dreamfleet.worker.car_racing.frame_skip_policy import FrameSkipPolicy
+from dreamfleet.worker.tasks.frame_skip_policy import FrameSkipPolicy
 
 if TYPE_CHECKING:
     from dreamfleet.worker.baselines.network import Memory, QNetwork

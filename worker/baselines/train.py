@@ -33,12 +33,11 @@ from dreamfleet.worker.baselines.progress import (
     parse_progress,
 )
 from dreamfleet.worker.baselines.replay_buffer import Episode, ReplayBuffer, first_in_replay
-from dreamfleet.worker.car_racing.agents import NO_PARAMETERS
-from dreamfleet.worker.car_racing.native_check import make_car_racing
 from dreamfleet.worker.scoring.episode import EpisodeConfig, Transition, run_episode
+from dreamfleet.worker.tasks.policy import NO_PARAMETERS
 from dreamfleet.worker.training.checkpoint import load_checkpoint, save_checkpoint
 from dreamfleet.worker.training.data.data_folder import explain_write_errors
-from dreamfleet.worker.training.data.dataset import preprocessing_of_size
+from dreamfleet.worker.training.data.dataset import find_world, preprocessing_of_size
 from dreamfleet.worker.training.torch_setup import on_one_thread
 from dreamfleet.worker.training.training_state import disable_triton_after_mesa, resume_command
 
@@ -97,7 +96,7 @@ class AgentTraining:
         else:
             self.save()
             shutil.rmtree(folder / "replay", ignore_errors=True)
-        self._environment = make_car_racing(preprocessing=preprocessing_of_size(layers.picture).name)
+        self._environment = find_world().make_recorded(preprocessing_of_size(layers.picture).name)
 
     @property
     def episodes(self) -> int:

@@ -14,6 +14,7 @@ import zenoh
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.messages import Intervals, Job, TaskSpec
 from dreamfleet.common.transport.session import Network, open_session
@@ -29,10 +30,10 @@ from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task
 
 RUN, WORKER = "bench", "bench/00000000"
-TASKS = {"car-racing": 1, "dream": 256}  # jobs per turn
+TASKS = {FIRST_WORLD: 1, "dream": 256}  # jobs per turn
 HORIZON = 200  # steps of an episode: a turn takes some tenths of a second, long enough for a few frames
 SEED = 2**20
-ADMISSION = Admission(RUN, "0" * 32, 1, "bench", TaskSpec("car-racing", "", HORIZON, 0), Intervals())
+ADMISSION = Admission(RUN, "0" * 32, 1, "bench", TaskSpec(FIRST_WORLD, "", HORIZON, 0), Intervals())
 Figures = dict[str, Any]
 Floats = NDArray[np.float32]
 

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
 from dreamfleet.common.artifacts.trained_agent import NETWORK, TrainedAgent
 from dreamfleet.common.errors import ControllerError
-from dreamfleet.worker.car_racing.frame_skip_policy import FrameSkipPolicy
 from dreamfleet.worker.car_racing.preprocessing import PREPROCESSINGS, find_preprocessing
 from dreamfleet.worker.car_racing.task import WORLD, CarRacingTask, make_reference_environment
 from dreamfleet.worker.tasks.api import Policy, World
+from dreamfleet.worker.tasks.frame_skip_policy import FrameSkipPolicy
+from dreamfleet.worker.tasks.policy import NO_PARAMETERS
 from dreamfleet.worker.worldmodel.inference import open_untrusted_graph
 
 Floats = NDArray[np.float32]
-NO_PARAMETERS = np.zeros(0, np.float32)  # of agents without any
 
 
 class PictureAgent(ABC):

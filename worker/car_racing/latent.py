@@ -18,7 +18,7 @@ Floats = NDArray[np.float32]
 
 
 class CarRacingLatent(gymnasium.Env[Floats, Floats]):
-    """Gymnasium's CarRacing with the observations and actions of `CarRacingDream`: latent `(latent,)`, actions `(3,)`.
+    """Gymnasium's CarRacing with the observations and actions of `Dream`: latent `(latent,)`, actions `(3,)`.
 
     The latent is the encoder's mean; with `features` `zh` the MDN-RNN's hidden state follows it. Both equal what
     controllers see, to the bit. Rewards, ends and `info` are gymnasium's. With `native` our module draws the picture

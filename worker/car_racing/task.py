@@ -28,6 +28,7 @@ from dreamfleet.worker.worldmodel.policy import ModelPolicy
 if TYPE_CHECKING:
     from dreamfleet.common.artifacts.trained_agent import TrainedAgent
     from dreamfleet.worker.car_racing.agents import NetworkAgent
+    from dreamfleet.worker.car_racing.scene import CarRacingScene
 
 ENVIRONMENT = "CarRacing-v3"
 WORLD = World(
@@ -116,6 +117,12 @@ class CarRacingTask(Task):
         from dreamfleet.worker.car_racing.agents import NetworkAgent  # it imports this module
 
         return NetworkAgent(trained)
+
+    def make_scene(self, steps: int) -> CarRacingScene:
+        """The track on a screen, for a person who drives."""
+        from dreamfleet.worker.car_racing.scene import CarRacingScene  # pygame, which scoring needs not
+
+        return CarRacingScene(steps)
 
     def preprocessing(self, bundle: Bundle) -> Preprocessing:
         """The preprocessing of the bundle's pictures; `BundleError` if this task has no such pictures."""

@@ -194,9 +194,6 @@ class VectorDream(gymnasium.vector.VectorEnv[Floats, Any, Any]):
         self._steps[index] = 0
 
 
-CarRacingDream, CarRacingDreamVector = Dream, VectorDream  # by these names CarRacing's dreams are known
-
-
 class DreamPolicy:
     """A controller in a dream environment: it observes latents, and its memory advances as the dream's does."""
 

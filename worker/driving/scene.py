@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import gymnasium
 import numpy as np
 import pygame
 
 from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.worker.car_racing.native_check import make_car_racing
-from dreamfleet.worker.car_racing.preprocessing import BOX
-from dreamfleet.worker.dream.environment import CarRacingDream
+from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.dream.environment import Dream
+from dreamfleet.worker.tasks.registry import find_task
 
 WIDTH = 640  # pixels of a dream's picture on a screen
 
 
 class Scene(Protocol):
-    """An environment that takes CarRacing's actions, with its picture."""
+    """An environment that takes steering, gas and brake, with its picture."""
 
     name: str
     scale: float  # from the picture to a suitable size on a screen
@@ -27,20 +27,24 @@ class Scene(Protocol):
         """The current picture."""
 
 
-class CarRacingScene:
-    """CarRacing, drawn by gymnasium at its full size of 1000x800."""
+@runtime_checkable
+class TaskWithScene(Protocol):
+    """Optional: a task in whose world a person drives, by steering, gas and brake.
 
-    name, scale = "CarRacing", 1.0
+    >>> isinstance(find_task("car-racing"), TaskWithScene)
+    True
+    """
 
-    def __init__(self, steps: int) -> None:
-        self.environment = make_car_racing(preprocessing=BOX.name, render_mode="rgb_array", max_episode_steps=steps)
+    def make_scene(self, steps: int) -> Scene:
+        """A new scene, which ends after so many steps at most."""
 
-    def surface(self) -> pygame.Surface:
-        """Gymnasium's own surface; `render` returns a smaller copy."""
-        self.environment.render()
-        inner: Any = self.environment.unwrapped
-        drawn: pygame.Surface = inner.surf
-        return drawn
+
+def make_scene(task: str, steps: int) -> Scene:
+    """The scene of a task's world; `UsageError` if nobody drives in it by hand."""
+    found = find_task(task)
+    if not isinstance(found, TaskWithScene):
+        raise UsageError(f"nobody drives by hand in {task}")
+    return found.make_scene(steps)
 
 
 class DreamScene:
@@ -50,7 +54,7 @@ class DreamScene:
 
     def __init__(self, bundle: Bundle, temperature: float, steps: int) -> None:
         self.scale = WIDTH / bundle.manifest.picture[1]
-        self.environment: gymnasium.Env[Any, Any] = CarRacingDream(bundle, temperature, steps, "rgb_array")
+        self.environment: gymnasium.Env[Any, Any] = Dream(bundle, temperature, steps, "rgb_array")
 
     def surface(self) -> pygame.Surface:
         """The decoded latent."""

@@ -26,7 +26,7 @@ from dreamfleet.worker.inspection.probe import Estimate
 from dreamfleet.worker.scoring.disturbance import numbered_choices
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.api import Assignment, Driver, Task, World
-from dreamfleet.worker.tasks.policy import DriverPolicy
+from dreamfleet.worker.tasks.policy import NO_PARAMETERS, DriverPolicy
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.tools.canvas import choice_name
 
@@ -35,7 +35,6 @@ DriverMaker = Callable[[np.random.Generator], Driver]
 LONGEST = 3000  # steps at which episodes of worlds without a shorter limit are cut, real and dreamt
 MOST_CHOICES = 8
 CONTROLLER = "controller"  # the name of its row
-NO_PARAMETERS = np.zeros(0, np.float32)
 
 
 @dataclass(frozen=True)

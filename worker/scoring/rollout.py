@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle
-
-FIRST_WORLD = "car-racing"  # the task of files that name none
+from dreamfleet.common.artifacts.driving import FIRST_WORLD
 
 
 class DataWorld(NamedTuple):

@@ -12,6 +12,7 @@ from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.errors import ControllerError
 
 Floats = NDArray[np.float32]
+NO_PARAMETERS = np.zeros(0, np.float32)  # of agents without any
 ALL_DRIVERS = "random"  # as a driver's name: all drivers of a task in turn
 
 

@@ -13,7 +13,16 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.training.presets import TrainConfig, TrainingPreset
 
 COLLECT, VAE, ENCODE, MDNRNN, BUNDLE = STAGES = ("collect", "train.vae", "encode", "train.mdnrnn", "bundle")
-RESERVED_FLAGS = ("--data", "--preset", "--seed", "--json", "--new", "--summary", "--from-run")  # set for each stage
+RESERVED_FLAGS = (
+    "--data",
+    "--preset",
+    "--seed",
+    "--json",
+    "--new",
+    "--summary",
+    "--from-run",
+    "--out",
+)  # set for each stage
 LEAST_DRIVES = 2  # one for training, one held out
 
 
@@ -29,6 +38,7 @@ class Pipeline:
     collect_flags: str = ""
     vae_flags: str = ""
     mdnrnn_flags: str = ""
+    bundle_flags: str = ""
 
     def __post_init__(self) -> None:
         if not 0 < self.scale <= 1:
@@ -51,7 +61,7 @@ class Pipeline:
             VAE: train("vae", self.data, *self._train_flags(self.preset.vae, "vae_flags")),
             ENCODE: model_commands.encode(self.data),
             MDNRNN: train("mdnrnn", self.data, *self._train_flags(self.preset.mdnrnn, "mdnrnn_flags")),
-            BUNDLE: model_commands.bundle(self.data, out or self.bundle),
+            BUNDLE: model_commands.bundle(self.data, out or self.bundle, *self._split_flags("bundle_flags")),
         }
 
     def _train_flags(self, config: TrainConfig, name: str) -> Words:

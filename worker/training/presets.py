@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, get_type_hints
 
+from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.cli.presets import check_preset
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.worlds.shipped import WORLDS
 from dreamfleet.worker.training.data.collect_config import CollectConfig
 from dreamfleet.worker.worldmodel import mdnrnn_config, vae_config
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
@@ -62,7 +65,7 @@ class TrainingPreset:
     mdnrnn: TrainConfig
     vae_layers: VAEConfig = vae_config.PAPER
     mdnrnn_layers: MDNRNNConfig = mdnrnn_config.REWARDED
-    task: str = "car-racing"
+    task: str = FIRST_WORLD
 
 
 # About 12 minutes on two cores. More data or updates made a VAE distinguish pictures better but dream worse, while an
@@ -108,27 +111,27 @@ PAPER = TrainingPreset(
 )
 # Half of the paper's channels, so that a bundle is small enough to ship. Things of a few pixels, such as a ball, decide
 # many games; an error of theirs counts more.
-SMALL_EYES = VAEConfig(channels=(16, 32, 64, 128), pixel_weight=3.0)
 PIXELS = TrainingPreset(
     name="pixels",
     collect=CollectConfig(episodes=400, steps=1000, anywhere=0.0, patience=0),
     vae=TrainConfig(updates=1500, batch=100, rate=1e-3),
     mdnrnn=TrainConfig(updates=500, batch=16, rate=1e-3),
-    vae_layers=SMALL_EYES,
+    vae_layers=VAEConfig(channels=(16, 32, 64, 128), pixel_weight=3.0),
     mdnrnn_layers=MDNRNNConfig(reward="value", reward_scale=0, done=True, done_weight=3.0),
     task="",
 )
-# 525 decisions of 4 tics are the game's limit of 2,100 tics. To survive is the reward, and its end the done head's.
-TAKECOVER = TrainingPreset(
-    name="takecover",
-    collect=CollectConfig(episodes=4000, steps=525, driver="held", anywhere=0.0, patience=0),
-    vae=TrainConfig(updates=2500, batch=100, rate=1e-3),
-    mdnrnn=TrainConfig(updates=1200, batch=32, rate=1e-3),
-    vae_layers=replace(SMALL_EYES, latent=64),
-    mdnrnn_layers=MDNRNNConfig(latent=64, reward="none", done=True, done_weight=3.0),
-    task="takecover",
+
+
+def _preset_of_world(task: str, name: str, given: Mapping[str, Mapping[str, Any]]) -> TrainingPreset:
+    """A preset that a world gives as mappings."""
+    kinds = get_type_hints(TrainingPreset)
+    return TrainingPreset(name=name, task=task, **{each: kinds[each](**values) for each, values in given.items()})
+
+
+OF_WORLDS = tuple(
+    _preset_of_world(world.task, *each) for world in WORLDS.values() for each in world.training_presets.items()
 )
-PRESETS = {each.name: each for each in (TINY, NOTEBOOK, ARTICLE, ATTENTIVE, PAPER, PIXELS, TAKECOVER)}
+PRESETS = {each.name: each for each in (TINY, NOTEBOOK, ARTICLE, ATTENTIVE, PAPER, PIXELS, *OF_WORLDS)}
 
 
 def find_preset(name: str) -> TrainingPreset:

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from dreamfleet.common.artifacts.bundle import MAX_RECORDED_STATES
+from dreamfleet.common.artifacts.world_facts import EndRule
 from dreamfleet.common.cli.command_line import SimpleVerb
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
@@ -32,11 +33,16 @@ def configure_bundle(parser: argparse.ArgumentParser) -> None:
         help="what a dreamt step earns: survival, or the label or the value that is predicted (default: by the data)",
     )  # fmt: skip
     parser.add_argument(
-        "--end", metavar="RULE",
+        "--end", type=_end_rule, metavar="RULE",
         help="where dreams end: at a predicted probability from 0 to 1, or drawn, by chance (default drawn where the "
         "reward is survival, else 0.5)",
     )  # fmt: skip
     add_json_flag(parser)
+
+
+def _end_rule(text: str) -> str:
+    EndRule.parse(text)
+    return text
 
 
 def write_bundle(args: argparse.Namespace) -> int:

@@ -14,7 +14,7 @@ BUNDLE, TEMPERATURE = "tiny", 1.0
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("--dream", action="store_true", help="drive in the dream instead of in CarRacing")
+    parser.add_argument("--dream", action="store_true", help="drive in the dream instead of on the track")
     parser.add_argument("--bundle", help=f"the world model that dreams: a file, or one that ships (default {BUNDLE})")
     parser.add_argument("--temperature", type=float, help=f"of the dream (default {TEMPERATURE})")
     parser.add_argument("--seed", type=int, help="the track, or the dream (default a new one each time)")
@@ -30,8 +30,9 @@ def run(args: argparse.Namespace) -> int:
     if not args.dream and (args.bundle is not None or args.temperature is not None):
         raise UsageError("--bundle and --temperature are of a dream: add --dream")
     from dreamfleet.common.artifacts.bundle_store import find_bundle
+    from dreamfleet.common.artifacts.driving import FIRST_WORLD
     from dreamfleet.worker.driving.loop import DrivingConfig, drive, random_seed
-    from dreamfleet.worker.driving.scene import CarRacingScene, DreamScene, Scene
+    from dreamfleet.worker.driving.scene import DreamScene, Scene, make_scene
 
     config = DrivingConfig(random_seed() if args.seed is None else args.seed, args.steps, args.scale)
     scene: Scene
@@ -39,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
         temperature = TEMPERATURE if args.temperature is None else args.temperature
         scene = DreamScene(find_bundle(args.bundle or BUNDLE), temperature, config.steps)
     else:
-        scene = CarRacingScene(config.steps)
+        scene = make_scene(FIRST_WORLD, config.steps)
     for driven in drive(scene, config):
         text = f"score {driven.score:.1f} in {driven.steps} steps, seed {config.seed}"
         print_answer(args, text, score=driven.score, steps=driven.steps, seed=config.seed)

@@ -15,7 +15,7 @@ from dreamfleet.common.host.stop_signals import interrupted_by_signals
 
 SUMMARY = "make a preset's world model: collect, train vae, encode, train mdnrnn, bundle; run again, it resumes"
 EXTRAS = ("train",)
-EXAMPLES = {"collect": "--steps 200", "vae": "--batch 50", "mdnrnn": "--hidden 128"}
+EXAMPLES = {"collect": "--steps 200", "vae": "--batch 50", "mdnrnn": "--hidden 128", "bundle": "--reward value"}
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     world = resolve_world(args.data, args.task, world_arguments(args))
     preset = find_preset(resolve_preset(args.data, args.preset, world))
     check_seed(args.data, args.seed)
-    flags = (world_flags(vars(args)), args.collect_flags, args.vae_flags, args.mdnrnn_flags)
+    flags = (world_flags(vars(args)), args.collect_flags, args.vae_flags, args.mdnrnn_flags, args.bundle_flags)
     source = Pipeline(preset, args.data, args.scale, args.seed, *flags)
     runner = InProcessRunner(source.stages(max(1, args.jobs), args.device, args.out))  # wrong flags end it here
     check_output_path(args.out or source.bundle)

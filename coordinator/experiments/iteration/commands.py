@@ -85,7 +85,8 @@ class Commands:
 
     def bundle(self, number: int) -> Words:
         """A round's models as one file."""
-        return model_commands.bundle(self.layout.round(number), self.layout.bundle(number))
+        flags = self.config.flags("bundle_flags")
+        return model_commands.bundle(self.layout.round(number), self.layout.bundle(number), *flags)
 
     def refit(self, number: int, path: Path) -> Words:
         """The last round's optimum fitted to this round's new world model."""

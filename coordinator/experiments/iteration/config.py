@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.cli.model_commands import WORLD_FLAGS, Words, split_flags, world_flags
 from dreamfleet.common.cli.presets import NAMES, check_preset, default_training_preset
@@ -14,8 +15,18 @@ from dreamfleet.common.errors import UsageError
 CHANGEABLE = frozenset({"rounds", "local", "jobs", "device", "run_flags"})
 MOST_SEED = 2**31 - 1  # each round's training multiplies its own
 RUN_FLAGS = ("run_flags", "later_run_flags")
-# Flags of each training that iterate sets itself.
-RESERVED_FLAGS = ("--data", "--preset", "--device", "--seed", "--continue-from", "--new", "--summary", "--json")
+# Flags of trainings and `bundle` that iterate sets itself.
+RESERVED_FLAGS = (
+    "--data",
+    "--preset",
+    "--device",
+    "--seed",
+    "--continue-from",
+    "--new",
+    "--summary",
+    "--json",
+    "--out",
+)
 SURVIVAL_EPISODES = 40
 LEAST = {
     "rounds": 1, "drives": 2, "more_drives": 0, "own_drives": 0, "means": 1, "drive_steps": 1, "vae_updates": 1,
@@ -33,7 +44,7 @@ class IterateConfig:
     )
     rounds: int = option(5, "rounds in all: each makes a world model and evolves in its dream; more may follow later")
     task: str = option(
-        "", "the world, such as gym:ENVIRONMENT (default car-racing); as `collect` takes this and these:"
+        "", f"the world, such as gym:ENVIRONMENT (default {FIRST_WORLD}); as `collect` takes this and these:"
     )
     environment: tuple[str, ...] = option((), "KEY=VALUE arguments of the world; values as in JSON")
     observation: str = option("", "picture among several, by its key; render: what is drawn")
@@ -60,6 +71,7 @@ class IterateConfig:
     )
     vae_flags: str = option("", 'flags of `train vae` in every round, as one text: "--updates 900 --batch 50"')
     mdnrnn_flags: str = option("", "flags of `train mdnrnn` in every round")
+    bundle_flags: str = option("", "flags of `bundle` in every round, such as --reward value")
     run_flags: str = option(
         "--generations 32", "flags of each round's `coordinator`, whose preset is dream unless another is named"
     )
@@ -103,7 +115,7 @@ class IterateConfig:
             raise UsageError("--views are beside the features of --subspace: give that too")
         if self.seed > MOST_SEED:
             raise UsageError(f"--seed must be at most {MOST_SEED}, not {self.seed}")
-        for name in ("vae_flags", "mdnrnn_flags", *RUN_FLAGS):
+        for name in ("vae_flags", "mdnrnn_flags", "bundle_flags", *RUN_FLAGS):
             self.flags(name)
 
     @property

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from dreamfleet.common.cli.model_commands import MODELS, Model, Words
-from dreamfleet.common.cli.verb_runner import ProcessRunner
+from dreamfleet.common.cli.verb_runner import InProcessRunner, ProcessRunner
 from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
 from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.host.stop_signals import Stop
@@ -22,7 +22,7 @@ from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
 from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
 from dreamfleet.coordinator.experiments.iteration.ledger import FinishedPhase, IterationLedger
 from dreamfleet.coordinator.experiments.iteration.phases import PhaseRunner
-from dreamfleet.coordinator.experiments.iteration.plan import Phase, PhasePlan
+from dreamfleet.coordinator.experiments.iteration.plan import BUNDLE, Phase, PhasePlan
 from dreamfleet.coordinator.experiments.local_run import LocalFleet
 
 log = logging.getLogger("dreamfleet.coordinator.iterate")
@@ -54,15 +54,16 @@ class Iteration:
         self.ledger.save(self._layout.ledger)
 
     def begin(self) -> None:
-        """Check the files of finished phases, or a new iteration's training flags.
+        """Check the flags of `bundle`, and the files of finished phases or a new iteration's training flags.
 
         With `init` the first phase checks the flags, because they must fit the model that is there. Those of another
         world than the first are checked once there are data of it, which presets must fit.
         """
+        commands = Commands(self._config, self._layout, self.ledger)
+        InProcessRunner({BUNDLE: commands.bundle(1)})  # parses them
         artefacts.check(self._layout, self.ledger)
         if self.ledger.entries or self._config.init or self._config.task:
             return
-        commands = Commands(self._config, self._layout, self.ledger)
         for model in MODELS:
             if getattr(self._config, f"{model}_flags"):
                 self._check_flags(commands.check_training(model), model)

@@ -10,12 +10,12 @@ from dreamfleet.common.cli import command_line
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.effort import START_EFFORT, Effort
 from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.worlds.shipped import WORLDS
 from dreamfleet.coordinator.analysis.learning import LearningCurve, Point
 from dreamfleet.coordinator.analysis.plot import plot_learning
-from dreamfleet.coordinator.analysis.published import PUBLISHED
 
 FIRST, LAST = Effort(10**5, 10**4, 0, 10**9), Effort(2 * 10**5, 9 * 10**4, 0, 3 * 10**9)
-PAPERS_NAME = PUBLISHED["car-racing"].source
+PAPERS_NAME = WORLDS["car-racing"].published.source
 LOOK = Point(FIRST, 310.0, 80.0)
 CURVE = LearningCurve("night", "car-racing", (LOOK,), Point(LAST, 680.0, 20.0), LOOK, LAST)
 
@@ -87,7 +87,7 @@ def test_of_several_runs_one_without_evaluations_is_refused(runs, capsys):
 def test_a_picture_names_runs_axes_and_published_marks_and_equal_ones_are_equal_files(tmp_path):
     paths = [tmp_path / "a.svg", tmp_path / "b.svg"]
     for path in paths:
-        plot_learning([CURVE], PUBLISHED["car-racing"], path)
+        plot_learning([CURVE], WORLDS["car-racing"].published, path)
     assert paths[0].read_bytes() == paths[1].read_bytes()
     text = html.unescape(paths[0].read_text())  # letters are shapes, and what they spell stands beside them
     for said in ("night: 290k steps in reality", "environment steps in reality", "core-hours", PAPERS_NAME, "823"):
@@ -95,9 +95,9 @@ def test_a_picture_names_runs_axes_and_published_marks_and_equal_ones_are_equal_
 
 
 def test_a_published_score_whose_steps_are_unknown_is_a_line_across_both_pictures(tmp_path):
-    plot_learning([CURVE], PUBLISHED["takecover"], tmp_path / "a.svg")
+    plot_learning([CURVE], WORLDS["takecover"].published, tmp_path / "a.svg")
     text = html.unescape((tmp_path / "a.svg").read_text())
-    assert PUBLISHED["takecover"].source in text
+    assert WORLDS["takecover"].published.source in text
     assert "night: 290k steps in reality" in text
 
 

@@ -24,10 +24,11 @@ from dreamfleet.worker.baselines.learning_config import LearningConfig
 from dreamfleet.worker.baselines.network import Networks
 from dreamfleet.worker.baselines.policies import QPolicy
 from dreamfleet.worker.baselines.train import CHECKPOINT, train_drqn
-from dreamfleet.worker.car_racing.agents import NO_PARAMETERS, NetworkPolicy
+from dreamfleet.worker.car_racing.agents import NetworkPolicy
 from dreamfleet.worker.car_racing.native_check import make_car_racing
 from dreamfleet.worker.scoring.agents import make_agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
+from dreamfleet.worker.tasks.policy import NO_PARAMETERS
 from dreamfleet.worker.tools import agent_evaluator, evaluation
 from dreamfleet.worker.training.checkpoint import save_checkpoint
 from dreamfleet.worker.worldmodel.inference import open_graph

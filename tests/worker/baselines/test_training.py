@@ -18,7 +18,7 @@ from dreamfleet.worker.baselines.network import Networks
 from dreamfleet.worker.baselines.policies import QPolicy
 from dreamfleet.worker.baselines.presets import LEARNING, NOTEBOOK
 from dreamfleet.worker.baselines.train import CHECKPOINT, CURVE, train_drqn
-from dreamfleet.worker.car_racing.agents import NO_PARAMETERS
+from dreamfleet.worker.tasks.policy import NO_PARAMETERS
 from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights, save_checkpoint
 from dreamfleet.worker.verbs import baseline
 

@@ -8,7 +8,7 @@ from gymnasium.utils.env_checker import check_env
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.car_racing import LATENT
 from dreamfleet.worker.car_racing.latent import CarRacingLatent
-from dreamfleet.worker.dream.environment import CarRacingDream
+from dreamfleet.worker.dream.environment import Dream
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
@@ -42,7 +42,7 @@ def drive(environment, actions):
 def test_gymnasium_accepts_it_and_the_dream_has_its_spaces(small, features):
     made = gymnasium.make(LATENT, bundle=small, features=features)
     check_env(made.unwrapped, skip_render_check=True)  # gymnasium's own renders
-    dream = CarRacingDream(small, features=features)
+    dream = Dream(small, features=features)
     assert made.observation_space == dream.observation_space
     assert made.action_space == dream.action_space
 
@@ -95,6 +95,6 @@ def test_what_is_no_action_or_no_features_is_refused(small):
     with pytest.raises(ValueError, match="three finite numbers"):
         environment.step(np.array([0, np.nan, 0]))
     environment.close()
-    for make in (CarRacingLatent, CarRacingDream):
+    for make in (CarRacingLatent, Dream):
         with pytest.raises(UsageError, match="features are z or zh, not 'h'"):
             make(small, features="h")

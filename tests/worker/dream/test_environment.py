@@ -6,7 +6,7 @@ from gymnasium.utils.env_checker import check_env
 from dreamfleet.common.artifacts.actions import one_hot
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.dream import CAR_RACING_ENVIRONMENT, ENVIRONMENT
-from dreamfleet.worker.dream.environment import CarRacingDream, CarRacingDreamVector, Dream, VectorDream, to_rows
+from dreamfleet.worker.dream.environment import Dream, VectorDream, to_rows
 from dreamfleet.worker.worldmodel.inference import DreamStep
 from tests.support.dreams import ACTIONS, WORLDS, write_bundle_of
 
@@ -29,7 +29,7 @@ def test_gymnasium_accepts_the_dream_of_any_world(world, world_bundle):
 
 
 def test_a_dream_is_a_function_of_seed_and_actions(random_bundle):
-    environment = CarRacingDream(random_bundle, horizon=5)
+    environment = Dream(random_bundle, horizon=5)
 
     def dream(seed):
         latents = [environment.reset(seed=seed)[0]]
@@ -45,7 +45,7 @@ def test_a_dream_is_a_function_of_seed_and_actions(random_bundle):
 
 
 def test_the_hidden_state_behind_the_latent_is_what_a_controller_remembers(random_bundle):
-    environment, memory = CarRacingDream(random_bundle, features="zh"), DreamStep(random_bundle)
+    environment, memory = Dream(random_bundle, features="zh"), DreamStep(random_bundle)
     size, state = random_bundle.manifest.latent, memory.zero_state(1)
     seen, _ = environment.reset(seed=3)
     for _ in range(4):
@@ -61,8 +61,8 @@ def test_vectorised_dreams_equal_single_ones(random_bundle, features):
         CAR_RACING_ENVIRONMENT, num_envs=3, bundle=random_bundle, vectorization_mode="vector_entry_point", horizon=4,
         features=features,
     )  # fmt: skip
-    assert isinstance(many.unwrapped, CarRacingDreamVector)
-    single = [CarRacingDream(random_bundle, horizon=4, features=features) for _ in range(3)]
+    assert isinstance(many.unwrapped, VectorDream)
+    single = [Dream(random_bundle, horizon=4, features=features) for _ in range(3)]
     latents, _ = many.reset(seed=10)
     assert np.array_equal(latents, np.stack([each.reset(seed=10 + index)[0] for index, each in enumerate(single)]))
     for _ in range(4):
@@ -142,11 +142,11 @@ def test_another_rule_of_the_end_may_be_given(choices_bundle):
 @pytest.mark.parametrize("temperature", [0.0, -1.0, float("nan"), float("inf")])
 def test_an_invalid_temperature_is_refused(random_bundle, temperature):
     with pytest.raises(UsageError, match="temperature must be a positive number"):
-        CarRacingDream(random_bundle, temperature=temperature)
+        Dream(random_bundle, temperature=temperature)
 
 
 def test_an_invalid_action_is_refused(random_bundle):
-    environment = CarRacingDream(random_bundle)
+    environment = Dream(random_bundle)
     environment.reset(seed=1)
     with pytest.raises(ValueError, match="3 finite numbers"):
         environment.step(np.array([np.nan, 0, 0]))

@@ -7,7 +7,7 @@ from dreamfleet.common.artifacts.world_facts import EndRule
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.dream.batch import DreamBatch
-from dreamfleet.worker.dream.environment import CarRacingDream, Dream, DreamPolicy
+from dreamfleet.worker.dream.environment import Dream, DreamPolicy
 from dreamfleet.worker.scoring import episode
 from dreamfleet.worker.scoring.episode import EpisodeConfig
 from dreamfleet.worker.scoring.scorer import Scorer
@@ -68,7 +68,7 @@ def test_a_run_dreams_in_a_described_world_and_its_host_class_is_of_the_drawn_en
 
 
 def test_the_environment_dreams_the_same_bits(dreaming, random_bundle):
-    environment = CarRacingDream(random_bundle, temperature=1.3, horizon=HORIZON)
+    environment = Dream(random_bundle, temperature=1.3, horizon=HORIZON)
     for vector, seed in zip(candidates(random_bundle, 3), (5, 6, 7), strict=True):
         (batched,) = dreaming.score([(vector, seed)])
         assert episode.score(environment, DreamPolicy(random_bundle), vector, EpisodeConfig(seed, HORIZON)) == batched
@@ -83,7 +83,7 @@ def test_a_variant_dreams_the_same_bits_alone_in_any_batch_and_step_by_step(rand
     assert len({score.fitness for score in together}) == len(dreams)
     assert dreamer.score(dreams[::-1])[::-1] == together
     assert dreamer.score(dreams[5:12]) == together[5:12]
-    environment = CarRacingDream(bundle, temperature=1.3, horizon=HORIZON)
+    environment = Dream(bundle, temperature=1.3, horizon=HORIZON)
     for dream, found in zip(dreams[:4], together[:4], strict=True):
         assert dreamer.score([dream]) == [found]
         assert episode.score(environment, DreamPolicy(bundle), dream[0], EpisodeConfig(dream[1], HORIZON)) == found
@@ -102,7 +102,7 @@ def test_rows_that_end_do_not_change_the_others(tmp_path):
 
 def test_with_dropout_scores_have_the_same_bits_too(tmp_path):
     bundle = write_random_bundle(tmp_path / "b.zip", rnn=MDNRNNConfig(dropout=0.3))
-    dreamer, environment = DreamBatch(bundle, spec(bundle)), CarRacingDream(bundle, temperature=1.3, horizon=HORIZON)
+    dreamer, environment = DreamBatch(bundle, spec(bundle)), Dream(bundle, temperature=1.3, horizon=HORIZON)
     dreams = [(vector, seed) for vector in candidates(bundle, 3) for seed in (1, 2)]
     together = dreamer.score(dreams)
     assert [dreamer.score([dream])[0] for dream in dreams] == together

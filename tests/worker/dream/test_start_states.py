@@ -7,7 +7,7 @@ from dreamfleet.common.artifacts.bundle import RECORDED_STATES, write_bundle
 from dreamfleet.common.errors import BundleError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.dream.batch import DreamBatch
-from dreamfleet.worker.dream.environment import CarRacingDream, CarRacingDreamVector, Dream, DreamPolicy
+from dreamfleet.worker.dream.environment import Dream, DreamPolicy, VectorDream
 from dreamfleet.worker.dream.noise import EpisodeNoise
 from dreamfleet.worker.dream.start_states import StartStates
 from dreamfleet.worker.dream.world import DreamWorld
@@ -127,7 +127,7 @@ def test_the_environment_dreams_the_same_bits_with_any_memory(tmp_path, memory, 
     bundle = write_random_bundle(tmp_path / "b.zip", vae=SMALL, rnn=rnn, recorded=states(5, SMALL, rnn))
     bundle = bundle if variant == "plain" else bundle.with_controllers(None, VARIANTS[variant])
     dreams = dreams_of(bundle, 2, range(6))
-    environment, policy = CarRacingDream(bundle, horizon=HORIZON, recorded=0.5), DreamPolicy(bundle)
+    environment, policy = Dream(bundle, horizon=HORIZON, recorded=0.5), DreamPolicy(bundle)
     assert [dreamt(environment, policy, *dream) for dream in dreams] == DreamBatch(bundle, spec(bundle)).score(dreams)
 
 
@@ -141,15 +141,15 @@ def test_in_any_world_dreams_start_at_recorded_states_with_the_same_bits(world_b
 @pytest.mark.parametrize(("memory", "reward"), [("rewarded", 0), ("rewarded first", 1)])
 def test_an_empty_memory_holds_the_reward_that_training_began_with(tmp_path, memory, reward):
     bundle = write_random_bundle(tmp_path / "b.zip", vae=SMALL, rnn=MEMORIES[memory])
-    _, info = CarRacingDream(bundle).reset(seed=1)
+    _, info = Dream(bundle).reset(seed=1)
     assert info["memory"].tolist() == [*[0] * 8, reward]
     assert np.array_equal(info["memory"], RecurrentState(bundle).state[0, :9]), "as in reality"
 
 
 def test_vectorised_dreams_start_and_restart_as_single_ones(bundle):
     action = np.array([0.1, 0.5, 0.0], np.float32)
-    many = CarRacingDreamVector(6, bundle, horizon=3, recorded=0.5)
-    single = [CarRacingDream(bundle, horizon=3, recorded=0.5) for _ in range(6)]
+    many = VectorDream(6, bundle, horizon=3, recorded=0.5)
+    single = [Dream(bundle, horizon=3, recorded=0.5) for _ in range(6)]
     latents, info = many.reset(seed=10)
     assert info["_memory"].all()
     begun = [each.reset(seed=10 + index) for index, each in enumerate(single)]
@@ -166,7 +166,7 @@ def test_vectorised_dreams_start_and_restart_as_single_ones(bundle):
 
 
 def test_a_memory_that_was_given_may_be_changed(bundle):
-    environment = CarRacingDream(bundle, recorded=1.0)
+    environment = Dream(bundle, recorded=1.0)
     first = environment.reset(seed=1)[1]["memory"]
     kept = first.copy()
     first[:] = 7

@@ -7,7 +7,7 @@ from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import NoDisplayError, UsageError
 from dreamfleet.worker.driving.drive_window import BACKGROUND, DriveStatus, DriveWindow, Pedals
 from dreamfleet.worker.driving.loop import DrivingConfig, drive
-from dreamfleet.worker.driving.scene import CarRacingScene, DreamScene
+from dreamfleet.worker.driving.scene import DreamScene, make_scene
 
 SEED = 20_003
 
@@ -72,7 +72,7 @@ def test_losing_the_focus_releases_all_keys():
 
 
 def test_holding_up_accelerates_and_q_quits():
-    scene = CarRacingScene(1000)
+    scene = make_scene("car-racing", 1000)
     hand = Hand({1: [down(pygame.K_UP)], 30: [down(pygame.K_q)]}, scene)
     (driven,) = drive(scene, DrivingConfig(SEED, scale=0.2), hand)
     assert (hand.frames, driven.steps) == (30, 30)

@@ -210,6 +210,16 @@ def test_the_world_is_passed_to_collect_alone():
     assert not any("--task" in words for name, words in stages.items() if name != "collect")
 
 
+def test_each_stage_has_its_flags():
+    flags = {f"{name}_flags": f"--of {name}" for name in ("collect", "vae", "mdnrnn", "bundle")}
+    stages = Pipeline(PRESETS["pixels"], Path("data"), **flags).stages(2, "cpu")
+    said = {name: " ".join(words) for name, words in stages.items()}
+    assert said["bundle"] == "bundle --data data --out data/pixels.zip --json --of bundle"
+    assert {name: text.partition("--of ")[2].split(" ")[0] for name, text in said.items()} == {
+        "collect": "collect", "train.vae": "vae", "encode": "", "train.mdnrnn": "mdnrnn", "bundle": "bundle",
+    }  # fmt: skip
+
+
 def test_a_share_of_every_amount_is_rounded_up():
     stages = Pipeline(PRESETS["notebook"], Path("data"), scale=0.02).stages(2, "cpu")
     assert "--episodes 20" in " ".join(stages["collect"])
@@ -227,6 +237,8 @@ def test_a_share_of_every_amount_is_rounded_up():
         (("--scale", "2"), "--scale must be above 0, to 1, not 2"),
         (("--vae-flags", "--dat other"), "--vae-flags: leave out --data, which pipeline sets itself"),
         (("--collect-flags", "'"), "--collect-flags"),
+        (("--bundle-flags", "--out b.zip"), "--bundle-flags: leave out --out, which pipeline sets itself"),
+        (("--bundle-flags", "--end 7"), "a dream ends at a probability from 0 to 1"),
         (("--preset", "dream"), "'dream' is a preset of run"),
     ],
 )

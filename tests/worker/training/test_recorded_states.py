@@ -7,7 +7,7 @@ import pytest
 
 from dreamfleet.common.artifacts.bundle import RECORDED_STATES, Bundle
 from dreamfleet.common.errors import DatasetError, UsageError
-from dreamfleet.worker.dream.environment import CarRacingDream
+from dreamfleet.worker.dream.environment import Dream
 from dreamfleet.worker.inspection.page_builder import manifest_facts
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble
@@ -106,7 +106,7 @@ def test_a_recorded_state_is_what_a_drive_up_to_there_remembers(trained, tmp_pat
 def test_a_dream_that_begins_there_goes_on_as_the_drive_would(trained, tmp_path):
     folder = trained(MODELS["attentive"])
     bundle = assemble(folder, tmp_path / "b.zip", "b", with_weights=False, recorded=40)
-    environment = CarRacingDream(bundle, recorded=1.0)
+    environment = Dream(bundle, recorded=1.0)
     latent, info = environment.reset(seed=3)
     place = [state for state in bundle.read_recorded() if np.array_equal(state[2 * LATENT :], info["memory"])]
     assert len(place) == 1

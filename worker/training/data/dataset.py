@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.archives import NPY, ArchiveLimits, Arrays, DamagedArchiveError, open_archive, parse_array
 from dreamfleet.common.files.regular_files import open_regular, read_text
-from dreamfleet.worker.scoring.rollout import FIRST_WORLD, OF_FIRST_WORLD, DataWorld
+from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld
 from dreamfleet.worker.tasks import registry
 from dreamfleet.worker.tasks.api import Preprocessing, RecordableTask
 
-WORLD = FIRST_WORLD  # what `baselines` calls it
 BEGUN = "preset.json"  # what a data set was begun with
 BEGUN_BYTES = 10_000
 REMEDY = "choose another --data"

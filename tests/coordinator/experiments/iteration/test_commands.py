@@ -58,6 +58,16 @@ def test_later_training_goes_on_from_the_model_that_counts(vae, decoder_only):
     assert "--decoder-only" not in later.train(3, "mdnrnn")
 
 
+def test_flags_of_bundle_are_of_every_round():
+    made = commands(*ROUND_2, bundle_flags="--reward value --end 0.3")
+    ends = [
+        said(made.bundle(number)).endswith(f"round-{number}.zip --json --reward value --end 0.3") for number in (1, 2)
+    ]
+    assert ends == [True, True]
+    with pytest.raises(UsageError, match="--bundle-flags: leave out --out, which iterate sets itself"):
+        IterateConfig(bundle_flags="--out b.zip")
+
+
 def test_updates_among_the_flags_of_every_round_count_in_later_rounds_too():
     made = commands(*ROUND_2, vae_flags="--updates 20", mdnrnn_flags="--updates 10", mdnrnn_updates=5)
     assert said(made.train(1, "vae")).endswith("--updates 20")

@@ -15,7 +15,7 @@ class FrameSkipPolicy(ABC):
     """Chooses by a picture, and repeats the choice for `frame_skip` steps."""
 
     def __init__(self, choices: Sequence[Sequence[float]], frame_skip: int) -> None:
-        """`choices`: steering, gas and brake of each choice."""
+        """`choices`: the action of each choice."""
         self._actions, self._frame_skip = np.array(choices, np.float32), frame_skip
         self._steps_held = 0
         self.choice = 0
@@ -31,7 +31,7 @@ class FrameSkipPolicy(ABC):
         self.reset_memory()
 
     def act(self, observation: NDArray[np.uint8]) -> Floats:
-        """Return steering, gas and brake `(3,)` for one picture `(side, side, 3)`."""
+        """Return the action `(actions,)` for one picture `(side, side, 3)`."""
         if self._steps_held in (0, self._frame_skip):
             self.choice, self._steps_held = self.choose(observation), 0
         self._steps_held += 1
