@@ -32,7 +32,7 @@ class TakeCoverOptions:
 
     tics: int = 4  # for which a decision holds
     actions: Literal["choices", "thirds"] = "choices"  # stay, left, right; or one number from -1 to 1, cut in thirds
-    crop: str = f"0:100,0:{WIDTH}"  # of the game's picture, what a world model sees; the article's, without the floor
+    crop: str = f"40:88,0:{WIDTH}"  # of the game's picture, what a world model sees: all fireballs, little else
 
     def __post_init__(self) -> None:
         valid = {
