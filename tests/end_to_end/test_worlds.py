@@ -1,11 +1,14 @@
-"""Evolving in the dream of a world that only the bundle describes."""
+"""World models of another world than the first: made, evolved in, judged, recorded, made anew in rounds."""
+
+import json
 
 import numpy as np
 import pytest
 
+from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support.dreams import write_bundle_of
-from tests.support.pixel_world import DODGE_TASK
+from tests.support.pixel_world import DODGE, DODGE_TASK, MODULE
 
 GENERATIONS, POPULATION, EPISODES = 3, 6, 2
 
@@ -40,7 +43,7 @@ def test_a_bundles_world_gives_the_same_bits_on_one_worker_and_on_two(processes,
     assert (settings.task.task, settings.controller.actions) == ("dream", 3)
     assert any(fitness for each in alone[0] for fitness in each), "somebody lived"
     runs = ("--runs-dir", processes.runs)
-    code, out, err = processes.call("replay", "alone", *runs, "--candidate", "1/2", "--trust", DODGE_TASK.split(":")[0])
+    code, out, err = processes.call("replay", "alone", *runs, "--candidate", "1/2", "--trust", MODULE)
     assert (code, out.count("same bits")) == (0, EPISODES), err
 
 
@@ -53,6 +56,62 @@ def test_an_end_of_the_runs_own_changes_its_dreams_and_its_controller_is_of_the_
     assert (own[-1].task.end, own[-1].task.version) == ("0.999", 11)
     code, _, err = processes.call(
         "evaluate", "--controller", "own", "--runs-dir", processes.runs, "--episodes", 1, "--trust",
-        DODGE_TASK.split(":")[0],
+        MODULE,
     )  # fmt: skip
     assert code == 0, err
+
+
+SMALL = {
+    "vae": "--updates 3 --batch 8 --latent 4 --channels 2 2 2 2 --validate-every 1",
+    "mdnrnn": "--updates 3 --batch 2 --latent 4 --hidden 4 --validate-every 1",
+    "bundle": "--end 0.9 --recorded 8",
+}
+LAYERS = tuple(word for name, text in SMALL.items() for word in (f"--{name}-flags", text))
+SHORT = "--generations 2 --population 4 --episodes 1 --horizon 20 --evaluate-every 1 --evaluation-episodes 1"
+TRUSTED = ("--trust", MODULE)
+
+
+@pytest.mark.slow
+def test_a_gymnasium_world_goes_from_drives_to_a_video(processes, tmp_path):
+    def call(*words):
+        code, out, err = processes.call(*words, *TRUSTED)
+        assert code == 0, err
+        return out
+
+    data, film = tmp_path / "data", tmp_path / "drive.mp4"
+    made = call("pipeline", "--data", data, "--task", DODGE, "--scale", "0.02", "--jobs", 1, *LAYERS, "--json")
+    bundle = Bundle.open(data / "pixels.zip")
+    assert json.loads(made)["stages"]["bundle"]["sha256"] == bundle.sha256
+    facts = bundle.manifest.world
+    assert (bundle.manifest.task, facts.reward.source, facts.end.at) == (DODGE, "survival", 0.9)
+    words = (*SHORT.split(), "--preset", "pixels", "--confirm-episodes", 0, "--bundle", bundle.path)
+    coordinator = processes.coordinator(*words, name="dodge")
+    processes.worker("--run", "dodge", "--task", DODGE)
+    assert coordinator.finish()[0] == 0, coordinator.lines
+    run = ("--controller", "dodge", "--runs-dir", processes.runs)
+    judged = json.loads(call("evaluate", *run, "--episodes", 2, "--jobs", 1, "--json"))
+    assert (judged["world"], len(judged["drives"])) == (DODGE, 2)
+    call("record", *run, "--steps", 20, "--out", film)
+    assert film.stat().st_size > 1000
+    lives = json.loads(call("inspect", bundle.path, "--survival", "--episodes", 4, "--json"))
+    assert "held" in json.dumps(lives)
+    call("inspect", bundle.path, "--out", tmp_path / "page", "--steps", 20)
+    assert (tmp_path / "page" / "index.html").exists()
+
+
+@pytest.mark.slow
+def test_rounds_of_a_gymnasium_world_learn_from_drives_of_its_own_controllers(processes):
+    data = processes.folder / "data"
+    code, out, err = processes.call(
+        "iterate", "--data", data, "--task", DODGE, "--rounds", 2, "--drives", 6, "--own-drives", 2, "--means", 1,
+        *LAYERS, "--vae-updates", 2, "--mdnrnn-updates", 2, "--gate-lives", 4, "--gate-drives", 0, "--gate-losses", 0,
+        "--run-flags", f"{SHORT} --confirm-episodes 0", "--jobs", 1, "--local", 1, *TRUSTED, "--json",
+    )  # fmt: skip
+    assert code == 0, err
+    rounds = json.loads(out)["rounds"]
+    assert [each["drives"] for each in rounds] == [6, 8]
+    for number in (1, 2):
+        bundle = Bundle.open(data / "rounds" / f"{number:02d}" / f"round-{number}.zip")
+        assert (bundle.manifest.task, bundle.manifest.world.end.at) == (DODGE, 0.9)
+        assert bundle.manifest.provenance["drivers"].get("controller", 0) == 2 * (number - 1)
+    assert json.loads((data / "rounds" / "02" / "gate.json").read_text())

@@ -68,30 +68,33 @@ def sample_steps(
     """Sample `count` steps of drives with rewards `(T,)`, up to half of them before losses.
 
     `lost_after` and each drive's `terminal`, empty for none, are those of `find_road_losses`. The others are uniform
-    over all steps from `FIRST_START` on. There are fewer than `count` if the drives are short.
+    over all steps from `FIRST_START` on, or from half a drive's median length where most drives are not longer than
+    that. There are fewer than `count` if the drives are short.
     """
+    median = int(np.median([len(rewards) for rewards in drives]))
+    first = FIRST_START if median > FIRST_START else median // 2
     deaths = terminal or [False] * len(drives)
     lost = [
         DriveStep(drive, step)
         for drive, (rewards, dead) in enumerate(zip(drives, deaths, strict=True))
         for step in find_road_losses(rewards, lost_after, bool(dead))
     ]
-    lost = [each for each in lost if each.step - LATEST >= FIRST_START]
+    lost = [each for each in lost if each.step - LATEST >= first]
     chosen = [lost[index] for index in random.permutation(len(lost))[: count // 2]]
-    before = {DriveStep(drive, _shortly_before(step, random)) for drive, step in chosen}
-    anywhere = [each for each in _anywhere(drives, count, random) if each not in before]
+    before = {DriveStep(drive, _shortly_before(step, first, random)) for drive, step in chosen}
+    anywhere = [each for each in _anywhere(drives, count, first, random) if each not in before]
     return SampledSteps(tuple(sorted(before)), tuple(anywhere[: count - len(before)]))
 
 
-def _shortly_before(step: int, random: np.random.Generator) -> int:
-    return int(random.integers(max(FIRST_START, step - EARLIEST), step - LATEST, endpoint=True))
+def _shortly_before(step: int, first: int, random: np.random.Generator) -> int:
+    return int(random.integers(max(first, step - EARLIEST), step - LATEST, endpoint=True))
 
 
-def _anywhere(drives: Sequence[Floats], count: int, random: np.random.Generator) -> list[DriveStep]:
+def _anywhere(drives: Sequence[Floats], count: int, first: int, random: np.random.Generator) -> list[DriveStep]:
     """Sample `count` different steps uniformly over all drives, or take all if there are fewer."""
-    lengths = np.array([max(len(rewards) - FIRST_START, 0) for rewards in drives])
+    lengths = np.array([max(len(rewards) - first, 0) for rewards in drives])
     ends = np.cumsum(lengths)
     places = random.choice(ends[-1], size=min(count, int(ends[-1])), replace=False)
     chosen = np.searchsorted(ends, places, side="right")
-    steps = FIRST_START + places - (ends - lengths)[chosen]
+    steps = first + places - (ends - lengths)[chosen]
     return [DriveStep(int(drive), int(step)) for drive, step in zip(chosen, steps, strict=True)]

@@ -70,7 +70,14 @@ def test_no_moment_is_drawn_twice_or_of_the_first_steps_and_all_may_be():
         DriveStep(3, FIRST_START + step) for step in range(42)
     ]
     assert list(drawn(drives, 1000).all) == every
-    assert drawn([drive(FIRST_START), drive(5)], 1000).all == ()
+
+
+def test_where_most_drives_are_short_dreams_begin_behind_half_the_usual_length():
+    found = drawn([drive(FIRST_START), drive(8), drive(6)], 1000)
+    assert list(found.all) == [DriveStep(0, step) for step in range(4, FIRST_START)] + [
+        *(DriveStep(1, step) for step in range(4, 8)), *(DriveStep(2, step) for step in (4, 5)),
+    ]  # fmt: skip
+    assert drawn([drive(1)], 1000).all == (DriveStep(0, 0),)
 
 
 def test_they_follow_from_the_seed():
