@@ -105,9 +105,7 @@ def assemble(
             provenance["recorded"] = {"states": states, "before_losses": found.before_losses}
     if with_weights:
         tensors = {f"vae.{key}": value for key, value in vae.items()} | {f"mdnrnn.{k}": v for k, v in rnn.items()}
-        parts[WEIGHTS] = save(
-            tensors, {"vae": json.dumps(to_dict(configs[0])), "mdnrnn": json.dumps(to_dict(configs[1]))}
-        )
+        parts[WEIGHTS] = save(tensors)  # without metadata, which it writes in any order: the manifest has the layers
     if measurements:
         with TemporaryDirectory() as aside:
             manifest = make_manifest(name, provenance, *configs, world, facts)
