@@ -47,7 +47,7 @@ from dreamfleet.worker.training.data.dataset import (
     split_held_out,
     world_of_folder,
 )
-from dreamfleet.worker.training.dream_facts import RecordedRewards, Source, describe_world
+from dreamfleet.worker.training.dream_facts import RecordedRewards, Source, describe_world, warn_of_unsure_ends
 from dreamfleet.worker.training.encode import ENCODED, latents_encoder_hash
 from dreamfleet.worker.training.recorded_states import compute_recorded_states
 from dreamfleet.worker.worldmodel.export import (
@@ -95,6 +95,7 @@ def assemble(
         rewards = RecordedRewards.load(episode_paths(folder))
         facts = describe_world(world, rewards, rnn_config, reward, end)
         provenance |= _describe_drives(folder, rewards, facts)
+        warn_of_unsure_ends(facts.end, provenance["quality"])
     elif reward or end:
         raise UsageError(f"{world} knows how its dreams pay and end: leave --reward and --end out")
     parts = export_graphs(vae, rnn, initial_latents(folder), *configs, facts)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -21,6 +21,7 @@ from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 log = logging.getLogger(__name__)
 Floats = NDArray[np.float32]
 Source = Literal["survival", "label", "value"]
+SURE = 0.9  # area under the curve below which a warning says that ends are uncertain
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,16 @@ def describe_world(
     _warn_of_gaps(source, recorded)
     found = find_world(*world).world
     return found.facts(_measure_reward(source, recorded, found), rule, world.options)
+
+
+def warn_of_unsure_ends(rule: EndRule, quality: Mapping[str, float]) -> None:
+    """Warn where dreams end above a bar that a model which can hardly foretell ends may never reach."""
+    if rule.kind != DRAWN and (area := quality.get("done_auc", 1.0)) < SURE:
+        log.warning(
+            "this model tells few ends from other steps (area under the curve %.2f, 0.5 is chance): dreams that end "
+            "above %g may go on for ever; `bundle --end drawn` ends them as often as they end in the world",
+            area, rule.at,
+        )  # fmt: skip
 
 
 def _warn_of_gaps(source: Source, recorded: RecordedRewards) -> None:

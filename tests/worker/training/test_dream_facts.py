@@ -9,7 +9,7 @@ from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.scoring.rollout import DataWorld
 from dreamfleet.worker.tasks.api import DreamReward
-from dreamfleet.worker.training.dream_facts import RecordedRewards, describe_world
+from dreamfleet.worker.training.dream_facts import RecordedRewards, describe_world, warn_of_unsure_ends
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from tests.support.pixel_world import DodgeTask
 
@@ -99,3 +99,11 @@ def test_what_the_data_lack_is_warned_of(caplog):
     assert "no recorded drive ends with a death" in caplog.text
     assert facts(NOTHING, LABEL).reward == RewardFacts("label"), "no figure of what it never saw"
     assert "random play never saw one" in caplog.text
+
+
+def test_a_bar_that_uncertain_ends_may_never_reach_is_warned_of(caplog):
+    for rule, quality in ((EndRule(), {"done_auc": 0.99}), (EndRule("drawn"), {"done_auc": 0.7}), (EndRule(), {})):
+        warn_of_unsure_ends(rule, quality)
+    assert not caplog.records
+    warn_of_unsure_ends(EndRule(), {"done_auc": 0.708})
+    assert "(area under the curve 0.71, 0.5 is chance): dreams that end above 0.5 may go on for ever" in caplog.text
