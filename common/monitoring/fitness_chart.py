@@ -11,6 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import begun_stages
+from dreamfleet.common.worlds.shipped import score_word_of_run
 
 
 class ScoreWithError(Protocol):
@@ -68,7 +69,8 @@ def error_bars(found: Iterable[ScoreWithError]) -> list[float]:
 def _draw_confirmed(axes: Any, run: RunFolder) -> None:
     """Draw the run's confirmed score; it is often below the best evaluation, which is partly luck."""
     if (confirmed := run.confirmation()) is not None:
+        word = score_word_of_run(run.spec, run.bundle_path)
         axes.errorbar(
             confirmed.generation, confirmed.mean, error_bars([confirmed]), fmt="*", color="tab:red", capsize=3,
-            markersize=10, label=f"reported: confirmed on {confirmed.episodes} fresh seeds (± standard error)",
+            markersize=10, label=f"reported: confirmed on {confirmed.episodes} fresh {word}s (± standard error)",
         )  # fmt: skip

@@ -59,19 +59,22 @@ class EvaluationReport:
 
     @property
     def description(self) -> str:
-        """A text for display: the score, figures on driving, the threshold and the controller."""
+        """A text for display that calls a seed a seed."""
+        return self.describe()
+
+    def describe(self, word: str = "seed") -> str:
+        """A text for display: the score, figures on driving, the threshold and the controller; `word`: one seed."""
         failures = self.results.failure_text
         lines = (
             failures and f"{failures}; all figures are over the episodes with a score",
-            self._describe_score,
+            self._describe_score(word),
             ", ".join([*self._describe_marks(), *_describe_driving(self.results)]),
-            self._describe_threshold,
+            self._describe_threshold(word),
             self._describe_origin,
         )
         return "\n".join(filter(None, lines))
 
-    @property
-    def _describe_threshold(self) -> str:
+    def _describe_threshold(self, word: str) -> str:
         """Whether the threshold is reached, or the distance to it; empty if there is none."""
         if self.threshold is None:
             return ""
@@ -81,22 +84,21 @@ class EvaluationReport:
             return f"{beyond:.1f} above {named} of {self.threshold:g} without the failed episodes"
         if beyond >= 0 and count >= MIN_EPISODES_TO_SOLVE:
             return f"solved: {named} is a mean of {self.threshold:g}"
-        few = "" if count >= MIN_EPISODES_TO_SOLVE else f", on fewer than {MIN_EPISODES_TO_SOLVE} seeds"
+        few = "" if count >= MIN_EPISODES_TO_SOLVE else f", on fewer than {MIN_EPISODES_TO_SOLVE} {word}s"
         return f"{abs(beyond):.1f} {'above' if beyond >= 0 else 'below'} {named} of {self.threshold:g}{few}"
 
-    @property
-    def _describe_score(self) -> str:
+    def _describe_score(self, word: str) -> str:
         found = self.results
         score = format_with_error(found.mean, found.error)
         judged = "by gymnasium's own environment" if self.judge == GYMNASIUM else f"in {self.judge}"
         if found.std is None:
-            return f"{score} on one seed; judged {judged}"
+            return f"{score} on one {word}; judged {judged}"
         digits = score_digits(found.mean, found.error)
         worst, best, median, std = (
             format_with_error(each, None, digits) for each in (found.worst, found.best, found.median, found.std)
         )
         return (
-            f"{score} (standard error) on {len(found.drives)} seeds, {worst} to {best}, median {median}, standard "
+            f"{score} (standard error) on {len(found.drives)} {word}s, {worst} to {best}, median {median}, standard "
             f"deviation {std}; judged {judged}"
         )
 

@@ -284,16 +284,16 @@ def with_error(found: StoredEvaluation | StoredConfirmation) -> dict[str, Any]:
     return {**asdict(found), "error": found.error}
 
 
-def describe_score(found: StoredEvaluation | StoredConfirmation | None) -> str:
-    """Describe the score of a mean, and whether it is confirmed or provisional."""
+def describe_score(found: StoredEvaluation | StoredConfirmation | None, word: str = "seed") -> str:
+    """Describe the score of a mean on seeds, each called `word`, and whether it is confirmed or provisional."""
     if found is None:
         return "the last mean; it was not evaluated"
     score = f"generation {found.generation}'s mean scored {format_mean(found)}"
     score += " (standard error)" if found.error is not None else ""
     if isinstance(found, StoredConfirmation):
-        seeds = count_episodes(found, "fresh validation seed")
+        seeds = count_episodes(found, f"fresh validation {word}")
         return f"{score} on {seeds}; confirmed: they took no part in its choice"
-    return f"{score} on {count_episodes(found, 'validation seed')}; provisional: it is the best of all looks so far"
+    return f"{score} on {count_episodes(found, f'validation {word}')}; provisional: it is the best of all looks so far"
 
 
 def count_episodes(found: StoredEvaluation | StoredConfirmation, noun: str = "episode") -> str:

@@ -13,6 +13,7 @@ from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.evaluation_report import EvaluationReport, read_evaluation_report
 from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.common.runs.standard_error import format_with_error
+from dreamfleet.common.worlds.shipped import score_word
 
 SUMMARY = "print the paired difference of each report of `evaluate --out` from the first"
 EXTRAS = ()
@@ -42,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
 def _line(path: Path, found: EvaluationReport) -> str:
     score = format_with_error(found.results.mean, found.results.error)
     failed = f", and {len(found.failed)} failed" if found.failed else ""
-    return f"{path}: {found.name}, {score} on {plural(len(found.drives), 'seed')}{failed}"
+    return f"{path}: {found.name}, {score} on {plural(len(found.drives), score_word(found.world))}{failed}"
 
 
 def _warn(first: Path, base: EvaluationReport, path: Path, other: EvaluationReport) -> None:

@@ -30,6 +30,7 @@ from dreamfleet.common.runs.seeds import TRAINING_FIRST
 from dreamfleet.common.runs.stages import begun_stages, describe_stages
 from dreamfleet.common.runs.times import parse_time
 from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.common.worlds.shipped import score_word_of_run
 from dreamfleet.coordinator.settings.start import total_effort
 
 
@@ -42,7 +43,7 @@ def citation_facts(run: RunFolder) -> dict[str, Any]:
         "run": run.name, "run_uid": run.uid, "created": run.created, "ended": run.ended,
         "ended_at": run.ended_at, "lasted_seconds": run.duration_seconds,
         "controller": controller.sha256, "bundle": settings.task.bundle or None,
-        "score": describe_score(score), "failed_episodes": score.failed if score else 0,
+        "score": _describe_score(run), "failed_episodes": score.failed if score else 0,
         "failed_candidates": count_failed(run.history()), "on_failure": settings.on_failure,
         "spent": {**asdict(spent), "core_hours": spent.core_hours},
         "settings": to_dict(settings), "receipt": to_dict(receipt), "commands": _commands(run),
@@ -77,7 +78,7 @@ def _rows(
     yield "run", f"`{run.uid}`, begun {since}, {state}"
     yield "controller", f"SHA-256 `{controller.sha256}` of its parameters"
     yield "world model", f"SHA-256 `{spec.bundle}`" if spec.bundle else "none"
-    yield "score", describe_score(_reported(run))
+    yield "score", _describe_score(run)
     warm = "" if spec.temperature is None else f", temperature {spec.temperature:g}"
     warm += f", end {spec.end}" if spec.end else ""
     generations = plural(receipt.generations, "generation")
@@ -111,6 +112,10 @@ def _rows(
 
 def _reported(run: RunFolder) -> StoredConfirmation | StoredEvaluation | None:
     return run.confirmation() or best_evaluation(run.evaluations())
+
+
+def _describe_score(run: RunFolder) -> str:
+    return describe_score(_reported(run), score_word_of_run(run.spec, run.bundle_path))
 
 
 def _commands(run: RunFolder) -> dict[str, str]:

@@ -22,6 +22,7 @@ from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import begun_stages, describe_steps, join_distinct
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.profile import PublishedScores
+from dreamfleet.common.worlds.shipped import score_word
 from dreamfleet.coordinator.analysis.learning import LearningCurve
 
 TITLE = 90  # characters in a line of the title
@@ -112,7 +113,7 @@ def _draw_curve(axes: Any, curve: LearningCurve, colour: str, spent: Callable[[E
     score = format_with_error(last.score, last.error)
     axes.errorbar(
         spent(last.effort), last.score, error_bars([last]), fmt="*", color=colour, markersize=13, capsize=3,
-        markeredgecolor="black", label=f"{curve.name}, confirmed on fresh seeds: {score}",
+        markeredgecolor="black", label=f"{curve.name}, confirmed on fresh {score_word(curve.world)}s: {score}",
     )  # fmt: skip
 
 

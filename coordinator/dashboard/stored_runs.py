@@ -25,6 +25,7 @@ from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import resume_command, run_paths
 from dreamfleet.common.runs.stages import stages_of
 from dreamfleet.common.runs.times import format_time
+from dreamfleet.common.worlds.shipped import score_word_of_run
 from dreamfleet.coordinator.dashboard.curves import Quartiles, RunData, cumulative_effort, curves, downsample
 from dreamfleet.coordinator.dashboard.page_state import NONE, Facts, describe_optimiser, format_score
 
@@ -53,12 +54,14 @@ def describe_run(runs_dir: Path, name: str) -> dict[str, Any]:
         spent = cumulative_effort(start, efforts, len(history))
         total = sum((each.effort for each in efforts), start)
         reported = data.confirmed or best_evaluation(data.evaluations)
+        word = score_word_of_run(run.spec, run.bundle_path)
+        judged = describe_score(reported, word) if reported else "no mean was evaluated"
         return {
             "run": run.name,
             "state": printable(run.state),
-            "sentence": printable(f"{run.state}; {describe_score(reported) if reported else 'no mean was evaluated'}"),
+            "sentence": printable(f"{run.state}; {judged}"),
             "again": _resume_command(run),
-            "facts": _facts(run, data, total),
+            "facts": _facts(run, data, total, word),
             "settings": flatten_settings(settings),
             "world": _world(run),
             "curves": curves(data, read_quartiles(run, settings, downsample(history)), spent),
@@ -131,7 +134,7 @@ def _world(run: RunFolder) -> str:
     return printable(task)
 
 
-def _facts(run: RunFolder, data: RunData, total: Effort) -> Facts:
+def _facts(run: RunFolder, data: RunData, total: Effort, word: str) -> Facts:
     settings, best = data.settings, best_evaluation(data.evaluations)
     failed = sum(each.failed for each in data.history)
     facts = [
@@ -146,9 +149,9 @@ def _facts(run: RunFolder, data: RunData, total: Effort) -> Facts:
         ("spent", total.description),
         ("hosts", run.classes.description),
         ("best evaluation", NONE if best is None else
-         f"{format_score(best)} on {count_episodes(best, 'seed')}, generation {best.generation}"),
+         f"{format_score(best)} on {count_episodes(best, word)}, generation {best.generation}"),
         ("confirmed", NONE if data.confirmed is None else
-         f"{format_score(data.confirmed)} on {count_episodes(data.confirmed, 'fresh seed')}"),
+         f"{format_score(data.confirmed)} on {count_episodes(data.confirmed, f'fresh {word}')}"),
     ]  # fmt: skip
     return [(name, printable(value)) for name, value in facts]
 

@@ -179,8 +179,9 @@ def _report(
     from dreamfleet.common.monitoring.eta import format_duration
     from dreamfleet.common.runs.records import describe_score, with_error
     from dreamfleet.common.runs.run_folder import open_run
-    from dreamfleet.common.runs.run_paths import CONTROLLER
+    from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER
     from dreamfleet.common.runs.times import elapsed_seconds
+    from dreamfleet.common.worlds.shipped import score_word_of_run
 
     again = request.resume_command()
     path = request.folder / CONTROLLER
@@ -194,7 +195,8 @@ def _report(
     facts["best"] = None if run.best is None else with_error(run.best)
     facts["confirmed"] = None if run.confirmed is None else with_error(run.confirmed)
     judged = run.confirmed or run.best
-    score = f"; {describe_score(judged)}" if judged else ""
+    word = score_word_of_run(run.settings.task, request.folder / BUNDLE)
+    score = f"; {describe_score(judged, word)}" if judged else ""
     if run.ended is None:
         with open_run(request.runs_dir, request.name) as stored:
             stored.history()  # `JournalError`: what cannot be read cannot be continued

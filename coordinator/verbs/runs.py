@@ -33,6 +33,7 @@ from dreamfleet.common.runs.run_paths import ARCHIVE as ARCHIVE_FOLDER
 from dreamfleet.common.runs.run_paths import check_movable, reporting_folder_errors, resume_command, run_paths
 from dreamfleet.common.runs.stages import begun_stages, describe_stages
 from dreamfleet.common.transport.network import SECURED_PREFIX
+from dreamfleet.common.worlds.shipped import score_word_of_run
 
 DROP_ORDER = ("created", "classes", "task", "mean", "evaluated")  # columns that a narrow terminal leaves out first
 LAST_GENERATIONS = 20
@@ -134,7 +135,7 @@ def show_run(args: argparse.Namespace) -> int:
             "fingerprint": stored.fingerprint,
             "failed_candidates": count_failed(history),
         }
-        classes = stored.classes
+        classes, word = stored.classes, score_word_of_run(stored.spec, stored.bundle_path)
     begun = begun_stages(settings, history, evaluations) if settings.stages else ()
     if args.json:
         rows: dict[str, Any] = {"history": [asdict(each) for each in history]}
@@ -150,7 +151,7 @@ def show_run(args: argparse.Namespace) -> int:
     facts["failed_candidates"] = describe_failed(settings, history)
     facts["hosts"] = classes.description
     facts |= {f"class {name}": hosts for name, hosts in classes.rows}
-    facts["reported"] = describe_score(confirmed or best_evaluation(evaluations))
+    facts["reported"] = describe_score(confirmed or best_evaluation(evaluations), word)
     facts |= {"stage": f"{len(begun)} of {len(settings.stages)}"} if begun else {}
     shown_settings = {**_flatten_settings(settings), **describe_stages(settings, begun)}
     print_rows([{"": name, "value": value} for name, value in {**facts, **shown_settings}.items()])

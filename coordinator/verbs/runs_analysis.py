@@ -19,6 +19,7 @@ from dreamfleet.common.printable import format_setting, printable_lines
 from dreamfleet.common.runs.records import count_episodes, format_mean, with_error
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.standard_error import format_with_error
+from dreamfleet.common.worlds.shipped import score_word
 
 if TYPE_CHECKING:
     from dreamfleet.coordinator.analysis.comparison import ComparedRun, EqualBudget, EvaluatedMean
@@ -74,13 +75,14 @@ def compare_runs(args: argparse.Namespace) -> int:
 
 
 def _run_row(side: ComparedRun) -> dict[str, object]:
+    word = score_word(side.world or "")
     confirmed, last = side.confirmed, side.evaluated_means[-1].point if side.evaluated_means else None
     return {
         "run": side.name,
         "task": side.settings.task.task,
         "spent": side.total.description,
         "last evaluation": None if last is None else format_with_error(last.score, last.error),
-        "confirmed": None if confirmed is None else f"{format_mean(confirmed)} on {count_episodes(confirmed, 'seed')}",
+        "confirmed": None if confirmed is None else f"{format_mean(confirmed)} on {count_episodes(confirmed, word)}",
     }  # fmt: skip
 
 

@@ -38,10 +38,10 @@ def video_paths(args: argparse.Namespace) -> dict[int, Path]:
     return videos
 
 
-def record_videos(args: argparse.Namespace, videos: dict[int, Path], film: partial[float]) -> int:
+def record_videos(args: argparse.Namespace, videos: dict[int, Path], film: partial[float], word: str) -> int:
     """Record one video after another and print each score; Ctrl-C ends the current video and the verb.
 
-    `film` is as in `record_in_process`.
+    `film` is as in `record_in_process`; `word` is what the world calls a seed.
     """
     from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.worker.tools.recording import record_in_process
@@ -52,8 +52,8 @@ def record_videos(args: argparse.Namespace, videos: dict[int, Path], film: parti
                 score, driven = record_in_process(film, seed, video, bar.update, stop)
             if stop():
                 raise StoppedError(
-                    f"stopped: {video} shows the first {driven} steps on seed {seed}, with a score of {score:.1f}; "
+                    f"stopped: {video} shows the first {driven} steps on {word} {seed}, with a score of {score:.1f}; "
                     "the same command records whole drives"
                 )
-            print_answer(args, f"{video}: score {score:.1f} on seed {seed}", video=video, score=score, seed=seed)
+            print_answer(args, f"{video}: score {score:.1f} on {word} {seed}", video=video, score=score, seed=seed)
     return 0

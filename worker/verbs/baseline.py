@@ -112,8 +112,9 @@ def evaluate_baseline(args: argparse.Namespace) -> int:
     from dreamfleet.worker.verbs.evaluate import judge
 
     name = args.agent if args.data is None else f"{args.agent} {args.data}"
-    judgement = judge(name, find_baseline(args.agent, args.data), seeds, args.jobs)
-    print(judgement.to_json() if args.json else judgement.description, flush=True)
+    agent = find_baseline(args.agent, args.data)
+    judgement = judge(name, agent, seeds, args.jobs)
+    print(judgement.to_json() if args.json else judgement.describe(agent.world.score_word), flush=True)
     if args.out:
         with open_output(args.out) as file:
             file.write(f"{judgement.to_json()}\n".encode())
@@ -133,7 +134,8 @@ def record_baseline(args: argparse.Namespace) -> int:
     from dreamfleet.worker.baselines.agents import find_baseline
     from dreamfleet.worker.tools.recording import record
 
-    return record_videos(args, videos, partial(record, find_baseline(args.agent, args.data), steps=args.steps))
+    agent = find_baseline(args.agent, args.data)
+    return record_videos(args, videos, partial(record, agent, steps=args.steps), agent.world.score_word)
 
 
 def configure_export(parser: argparse.ArgumentParser) -> None:

@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
         some = "some" if seeds[0] < TEST.stop and seeds[-1] >= TEST.start else "none"
         print(f"note: test seeds are {TEST.start} to {TEST.stop - 1}; {some} of these are among them", file=sys.stderr)
     judgement = judge(name, agent, seeds, args.jobs)
-    print(judgement.to_json() if args.json else judgement.description, flush=True)
+    print(judgement.to_json() if args.json else judgement.describe(agent.world.score_word), flush=True)
     if args.out:
         with open_output(args.out) as file:
             file.write(f"{judgement.to_json()}\n".encode())

@@ -246,6 +246,9 @@ def test_a_report_of_another_world_names_its_judge_and_its_marks(tmp_path):
     assert score.endswith("; judged in dodge")
     assert marks == "above 750: 50%"
     assert threshold == "0.0 above the world's threshold of 750, on fewer than 100 seeds"
+    score, _, threshold, _ = report.describe("game").splitlines()
+    assert " on 2 games, " in score
+    assert threshold.endswith(", on fewer than 100 games")
 
 
 def test_the_first_worlds_report_says_what_it_always_said():
