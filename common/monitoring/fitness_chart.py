@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import begun_stages
-from dreamfleet.common.worlds.shipped import score_word_of_run
+from dreamfleet.common.worlds.score_words import score_word_of_run
 
 
 class ScoreWithError(Protocol):

@@ -13,7 +13,7 @@ from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.evaluation_report import EvaluationReport, read_evaluation_report
 from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.common.runs.standard_error import format_with_error
-from dreamfleet.common.worlds.shipped import score_word
+from dreamfleet.common.worlds.score_words import score_word
 
 SUMMARY = "print the paired difference of each report of `evaluate --out` from the first"
 EXTRAS = ()

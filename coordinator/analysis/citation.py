@@ -30,7 +30,7 @@ from dreamfleet.common.runs.seeds import TRAINING_FIRST
 from dreamfleet.common.runs.stages import begun_stages, describe_stages
 from dreamfleet.common.runs.times import parse_time
 from dreamfleet.common.serialization.optional_fields import to_dict
-from dreamfleet.common.worlds.shipped import score_word_of_run
+from dreamfleet.common.worlds.score_words import score_word_of_run
 from dreamfleet.coordinator.settings.start import total_effort
 
 

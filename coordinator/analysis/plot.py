@@ -22,7 +22,7 @@ from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import begun_stages, describe_steps, join_distinct
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.profile import PublishedScores
-from dreamfleet.common.worlds.shipped import score_word
+from dreamfleet.common.worlds.score_words import score_word
 from dreamfleet.coordinator.analysis.learning import LearningCurve
 
 TITLE = 90  # characters in a line of the title

@@ -25,7 +25,7 @@ from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import resume_command, run_paths
 from dreamfleet.common.runs.stages import stages_of
 from dreamfleet.common.runs.times import format_time
-from dreamfleet.common.worlds.shipped import score_word_of_run
+from dreamfleet.common.worlds.score_words import score_word_of_run
 from dreamfleet.coordinator.dashboard.curves import Quartiles, RunData, cumulative_effort, curves, downsample
 from dreamfleet.coordinator.dashboard.page_state import NONE, Facts, describe_optimiser, format_score
 

@@ -33,7 +33,7 @@ from dreamfleet.common.runs.run_paths import ARCHIVE as ARCHIVE_FOLDER
 from dreamfleet.common.runs.run_paths import check_movable, reporting_folder_errors, resume_command, run_paths
 from dreamfleet.common.runs.stages import begun_stages, describe_stages
 from dreamfleet.common.transport.network import SECURED_PREFIX
-from dreamfleet.common.worlds.shipped import score_word_of_run
+from dreamfleet.common.worlds.score_words import score_word_of_run
 
 DROP_ORDER = ("created", "classes", "task", "mean", "evaluated")  # columns that a narrow terminal leaves out first
 LAST_GENERATIONS = 20

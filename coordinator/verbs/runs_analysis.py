@@ -19,7 +19,7 @@ from dreamfleet.common.printable import format_setting, printable_lines
 from dreamfleet.common.runs.records import count_episodes, format_mean, with_error
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.standard_error import format_with_error
-from dreamfleet.common.worlds.shipped import score_word
+from dreamfleet.common.worlds.score_words import score_word
 
 if TYPE_CHECKING:
     from dreamfleet.coordinator.analysis.comparison import ComparedRun, EqualBudget, EvaluatedMean

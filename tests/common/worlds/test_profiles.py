@@ -7,7 +7,8 @@ import pytest
 from dreamfleet.common.cli.presets import default_training_preset
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import DREAM, is_shipped
-from dreamfleet.common.worlds.shipped import WORLDS, score_word_of_run
+from dreamfleet.common.worlds.score_words import score_word_of_run
+from dreamfleet.common.worlds.shipped import WORLDS
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.worker.tasks.registry import find_world
 from dreamfleet.worker.training.presets import PRESETS

@@ -1,0 +1,33 @@
+"""What a scored seed is called in reports: a track, a game."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.world_facts import WorldFacts
+from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.worlds.shipped import WORLDS
+
+
+def score_word(task: str, facts: WorldFacts | None = None) -> str:
+    """What a scored seed is called in the world of `task`, of which its bundle says `facts`, if anything.
+
+    >>> score_word("car-racing"), score_word("gym:CartPole-v1")
+    ('track', 'seed')
+    """
+    if facts is not None:
+        return facts.score_word
+    demo = WORLDS[task].demo if task in WORLDS else None
+    return "seed" if demo is None else demo.word
+
+
+def score_word_of_run(spec: TaskSpec, bundle: Path) -> str:
+    """What a scored seed of a run's evaluations is called; `bundle` is the run's copy of its world model, if any."""
+    if spec.bundle:
+        with suppress(DreamfleetError, OSError):  # it may be gone
+            manifest = Bundle.open(bundle, spec.bundle).manifest
+            return score_word(manifest.task, manifest.world)
+    return score_word(spec.task)
