@@ -23,13 +23,13 @@ DREAM: dict[str, Any] = {
     "evaluation_episodes": 100,
     "confirm_episodes": 100,
 }
-# In the game itself, by what the world model sees and remembers.
+# In the game itself, by what the world model sees and remembers, from a controller of the dream (`--init`).
 REAL: dict[str, Any] = {
     "task": TASK,
     "bundle": "takecover",
     "population": 24,
     "episodes": 4,
-    "sigma0": 0.06,
+    "sigma0": 0.08,
     "covariance": "diagonal",
     "horizon": LIMIT,
     "evaluate_every": 10,
@@ -55,7 +55,6 @@ PROFILE = WorldProfile(
         "unknown)",
         (PublishedScore(None, 1092),),
     ),
-    # Not measured yet: no world model of it ships.
     demo=DemoPlan(
         bundle="takecover",
         preset="takecover",

@@ -21,7 +21,6 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from dreamfleet.common.artifacts.bundle_store import shipped_names
 from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli import model_commands
 from dreamfleet.common.cli.config import option
@@ -113,14 +112,6 @@ class DemoConfig:
         names = {each.name for each in fields(DemoPlan)}
         given = {name: value for name, value in vars(self).items() if name in names and value is not None}
         return replace(find_plan(self.world), **given)
-
-    def check_bundle(self) -> None:
-        """`UsageError` if the world's own world model is wanted and does not ship."""
-        if self.bundle is None and self.plan.bundle not in shipped_names():
-            raise UsageError(
-                f"the world model of {self.world} does not ship yet: make one with `dreamfleet pipeline --task "
-                f"{self.world} --data DIR`, and name it with --bundle DIR/{self.plan.preset}.zip"
-            )
 
 
 @dataclass(frozen=True)

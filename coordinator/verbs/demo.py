@@ -28,7 +28,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Play the demonstration."""
     config = load(DemoConfig, "demo", **args.sources)
-    config.check_bundle()
     for package in ("av", "gymnasium", "matplotlib", "onnxruntime", *config.plan.packages):
         if find_spec(package) is None:  # now rather than after minutes of evolution
             raise ModuleNotFoundError(name=package)

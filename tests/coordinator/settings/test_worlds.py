@@ -5,12 +5,14 @@ from dataclasses import replace
 import pytest
 
 from dreamfleet.common.artifacts.actions import one_hot
+from dreamfleet.common.artifacts.bundle_store import shipped_names
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts, WorldFacts
 from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.protocol.messages import OWN_END_VERSION, TaskSpec
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.common.worlds import shipped
 from dreamfleet.coordinator.experiments.demo import DemoConfig
 from dreamfleet.coordinator.service.main import RunRequest, _resolve_settings
 from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig, RunConfig, config_values
@@ -129,11 +131,8 @@ def test_presets_of_other_worlds_begin_on_their_bundles(tmp_path, name):
     assert RunConfig(**config_values(settings, bundle.path)).settings(bundle) == settings
 
 
-def test_a_demonstration_whose_world_model_does_not_ship_says_what_to_do():
-    DemoConfig().check_bundle()
-    DemoConfig(world="takecover", bundle="mine.zip").check_bundle()
-    with pytest.raises(UsageError, match=r"does not ship yet: make one with `dreamfleet pipeline --task takecover"):
-        DemoConfig(world="takecover").check_bundle()
+def test_each_demonstration_has_a_world_model_that_ships():
+    assert {DemoConfig(world=each).plan.bundle for each in shipped.WORLDS} <= set(shipped_names())
     with pytest.raises(UsageError, match="--world must be one of car-racing, takecover, not 'moon'"):
         DemoConfig(world="moon")
 
