@@ -62,6 +62,7 @@ from dreamfleet.coordinator.settings.task_options import (
 )
 
 DEFAULT_BUNDLE, NO_BUNDLE, NO_SUBSPACE = "tiny", "none", "none"
+DEFAULT_HORIZON = 1000  # steps
 LARGEST_STEP = 1e6  # of sigma0: parameters travel in single precision
 Interval = Annotated[int, Between(0, 10**6)]  # generations; 0: never
 
@@ -124,7 +125,11 @@ class RunConfig:
     racing: bool = frozen_option(
         RunSettings, False, "let only the better half of the candidates drive the second half of the episodes"
     )
-    horizon: Horizon = frozen_option(TaskSpec, 1000, "steps of a scored episode at most")
+    horizon: Horizon | None = frozen_option(
+        TaskSpec,
+        None,
+        f"steps of a scored episode at most (default {DEFAULT_HORIZON}, or the limit of the bundle's world if lower)",
+    )
     patience: Patience = frozen_option(TaskSpec, 0, "cut a scored episode after so many steps without reward; 0: never")
     temperature: Temperature | None = frozen_option(
         TaskSpec, None, "temperature of a dream's sampling; above 1 it is harder, and harder to exploit"
@@ -234,6 +239,10 @@ class RunConfig:
             return own.settings(bundle)
         if self.task is None and bundle is not None:
             return replace(self, task=bundle.manifest.task).settings(bundle)
+        if self.horizon is None:
+            world = None if bundle is None else bundle.manifest.world
+            limit = DEFAULT_HORIZON if world is None else world.horizon
+            return replace(self, horizon=min(limit, DEFAULT_HORIZON)).settings(bundle)
         spec, shape, packages = self._resolve_without_bundle() if bundle is None else self._resolve_with_bundle(bundle)
         if self.loaded_subspace is not None:
             _check_subspace(self.loaded_subspace, spec, shape)

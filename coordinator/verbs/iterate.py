@@ -16,7 +16,13 @@ from dreamfleet.common.files.regular_files import is_file
 from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_signals
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
-from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, NetworkConfig, RunConfig, default_world
+from dreamfleet.coordinator.settings.config import (
+    DEFAULT_BUNDLE,
+    DEFAULT_HORIZON,
+    NetworkConfig,
+    RunConfig,
+    default_world,
+)
 
 if TYPE_CHECKING:
     from dreamfleet.common.artifacts.bundle import Bundle
@@ -90,6 +96,7 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
     later, _ = parse_run_flags([*more, *config.flags_of_run(2)], args.sources, "iterate")  # wrong flags end it now
     task = first.task or config.task or default_world()
     settings = {**asdict(first), **asdict(limits), **dict.fromkeys(VARYING), "task": task}
+    settings["horizon"] = first.horizon or DEFAULT_HORIZON  # as it was when that was every world's default
     if new:
         for run in (first, later):
             _check_run(config, run, layout)
@@ -152,7 +159,7 @@ def _stand_in(config: IterateConfig) -> Bundle:
     shipped = find_bundle(DEFAULT_BUNDLE)
     if config.task in ("", shipped.manifest.task):
         return shipped
-    facts = WorldFacts.of(one_hot(shipped.manifest.actions), packages=(), horizon=1, frames_per_second=1)
+    facts = WorldFacts.of(one_hot(shipped.manifest.actions), packages=(), horizon=DEFAULT_HORIZON, frames_per_second=1)
     return Bundle(shipped.path, shipped.sha256, replace(shipped.manifest, task=config.task, world=facts))
 
 

@@ -79,11 +79,11 @@ def _check_arguments(task: str, arguments: Any) -> None:
 def describe_environment(environment: Environment, frames: int = 1) -> dict[str, Any]:
     """Fields of the environment's `World` that do not depend on its spaces; an action is held for `frames` steps."""
     spec = environment.spec
-    limited = spec is not None and bool(spec.max_episode_steps)
+    limit = (spec and spec.max_episode_steps) or DEFAULT_MAX_STEPS
     rate = environment.metadata.get("render_fps") or World.frames_per_second
     return {
         "packages": ("numpy", "gymnasium", *_engine_packages(environment)),
-        "horizon": ENVIRONMENT_LIMIT if limited else -(-DEFAULT_MAX_STEPS // frames),
+        "horizon": min(-(-limit // frames), ENVIRONMENT_LIMIT),
         "frames_per_second": max(1, round(rate / frames)),
         "threshold": spec.reward_threshold if spec else None,
         "judge": "gymnasium" if is_gymnasiums(environment) else "",

@@ -131,6 +131,20 @@ def test_presets_of_other_worlds_begin_on_their_bundles(tmp_path, name):
     assert RunConfig(**config_values(settings, bundle.path)).settings(bundle) == settings
 
 
+@pytest.mark.parametrize(("limit", "given", "horizon"), [(200, None, 200), (5000, None, 1000), (200, 400, 400)])
+def test_episodes_are_no_longer_than_the_bundles_world_unless_a_run_says_so(tmp_path, limit, given, horizon):
+    facts = replace(WORLDS["choices"], horizon=limit)
+    bundle = write_world_bundle(tmp_path / "b.zip", facts, ABSENT, vae=VAE, rnn=MODELS["choices"])
+    preset = find_preset("pixels") | ({"horizon": given} if given else {})
+    settings = settings_of(bundle, **preset)
+    assert settings.task.horizon == horizon
+    assert RunConfig(**config_values(settings, bundle.path)).settings(bundle) == settings
+
+
+def test_episodes_of_the_first_world_have_its_thousand_steps(random_bundle):
+    assert settings_of(random_bundle, task="dream").task.horizon == 1000
+
+
 def test_each_demonstration_has_a_world_model_that_ships():
     assert {DemoConfig(world=each).plan.bundle for each in shipped.WORLDS} <= set(shipped_names())
     with pytest.raises(UsageError, match="--world must be one of car-racing, takecover, not 'moon'"):

@@ -55,6 +55,7 @@ def test_an_environment_with_pictures_keeps_the_contract(kind, options):
     assert json.loads(task.options or "{}") == options
     assert task.world.packages[:2] == ("numpy", "gymnasium")
     assert task.world.frames_per_second == 10 // options.get("skip", 1)
+    assert task.world.horizon == 200 // options.get("skip", 1)
 
 
 def test_the_pixel_world_is_one_without_a_line_of_code():
