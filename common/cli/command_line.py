@@ -21,6 +21,7 @@ from typing import Any, NoReturn, Protocol
 
 from dreamfleet.common.errors import DreamfleetError, MissingExtraError, UsageError
 from dreamfleet.common.host.logs import configure_logging, report_failure
+from dreamfleet.common.host.packages import extra_of
 from dreamfleet.common.host.standard_streams import discard_stdout, prepare_streams
 from dreamfleet.common.host.stop_signals import interrupts
 from dreamfleet.common.printable import one_line
@@ -165,7 +166,8 @@ def run_verb(points: Mapping[str, EntryPoint], words: Sequence[str]) -> int:
     except ModuleNotFoundError as error:
         if not verb.EXTRAS:
             raise
-        wanted = ",".join(verb.EXTRAS)
+        own = extra_of(error.name)  # such as a world's, beside the verb's
+        wanted = ",".join((*verb.EXTRAS, own) if own and own not in verb.EXTRAS else verb.EXTRAS)
         raise MissingExtraError(
             f"the package {error.name!r} is not installed; this needs: pip install 'dreamfleet[{wanted}]'"
         ) from error

@@ -33,10 +33,16 @@ def install_command(extra: str) -> str:
     return f"pip install 'dreamfleet[{extra}]'" if extra else "pip install dreamfleet"
 
 
+def extra_of(module: str | None) -> str | None:
+    """The extra that contains a module; `None` if none does."""
+    top = (module or "").partition(".")[0]
+    return next((extra for each, extra in PACKAGES.values() if each == top), None)
+
+
 def install_command_for(module: str | None) -> str | None:
     """The command that installs a missing module; `None` if no extra contains it."""
-    top = (module or "").partition(".")[0]
-    return next((install_command(extra) for each, extra in PACKAGES.values() if each == top), None)
+    extra = extra_of(module)
+    return None if extra is None else install_command(extra)
 
 
 def package_version(name: str) -> str | None:

@@ -49,7 +49,7 @@ from dreamfleet.coordinator.experiments.local_run import LocalRun
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE
 
 REFRESH = 0.5
-START_SECONDS = 30.0
+START_SECONDS = 180.0  # a coordinator that ends earlier is seen at once; a busy host takes its time
 PAGE_PACKAGES = ("plotly", "starlette", "uvicorn")
 PLOT, VIDEO, SCHEDULE = "fitness.png", "drive.mp4", "stages.toml"
 DREAM_EVALUATIONS, REAL_EVALUATIONS = (

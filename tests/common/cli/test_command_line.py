@@ -220,6 +220,13 @@ def test_an_import_that_turns_ctrl_c_into_another_error_is_still_interrupted(mon
     assert signal.getsignal(signal.SIGINT) is before
 
 
+@pytest.mark.parametrize(("package", "extras"), [("av", "worker,views"), ("vizdoom", "worker,views,doom")])
+def test_a_missing_package_names_the_verbs_extras_and_its_own(package, extras, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("dreamfleet.coordinator.verbs.demo.find_spec", lambda name: None if name == package else 1)
+    assert command_line.main(["demo", "--world", "takecover", "--runs-dir", str(tmp_path)]) == 1
+    assert f"{package!r} is not installed; this needs: pip install 'dreamfleet[{extras}]'" in capsys.readouterr().err
+
+
 def test_ctrl_c_in_a_finaliser_is_not_lost(monkeypatch, capsys):
     class Finalised:
         def __del__(self):
