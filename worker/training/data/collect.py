@@ -20,7 +20,6 @@ from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.host.parent_death import exit_with_parent
 from dreamfleet.common.host.process_pool import count_step, map_in_processes
 from dreamfleet.common.host.resource_limits import pin_thread_pools
-from dreamfleet.common.host.stall_watch import STALL_SECONDS
 from dreamfleet.common.host.stop_signals import outlive_stop_signals
 from dreamfleet.worker.scoring.episode import EpisodeConfig, ResetHook, run_episode
 from dreamfleet.worker.scoring.failure_cause import describe_exception, describe_loss
@@ -47,6 +46,7 @@ from dreamfleet.worker.training.data.pilot import Pilot
 
 Environment = gymnasium.Env[Any, Any]
 EnvironmentFor = Callable[[RecordableTask, str], AbstractContextManager[Environment]]
+STALL = 300.0  # seconds without a step, after which a drive is given up; a long one is compressed in that time
 MOST_REWARD = float(np.finfo(np.float32).max)
 _kept: tuple[Environment, Finalize] | None = None  # in a process of the pool
 
@@ -58,7 +58,7 @@ def missing_numbers(folder: Path, config: CollectConfig) -> list[int]:
 
 def collect(
     folder: Path, config: CollectConfig, jobs: int, pilots: Sequence[Pilot] = (), world: DataWorld = OF_FIRST_WORLD,
-    stall: float = STALL_SECONDS,
+    stall: float = STALL,
 ) -> Generator[int, None, None]:  # fmt: skip
     """Drive the missing episodes in `jobs` processes; yield the frames of each once it is written.
 
