@@ -331,6 +331,9 @@ def _read_manifest(archive: Archive, path: Path) -> BundleManifest:
         manifest = from_plain(BundleManifest, plain)
         if not all(isinstance(each, dict) for each in manifest.models.values()):
             raise MalformedError("models are no configurations")
+        for name in ("reward_scale", "first_reward"):
+            if any(not _is_number(each.get(name, 0)) for each in manifest.models.values()):
+                raise MalformedError(f"{name} is no finite number")
         if manifest.world is not None and manifest.world.actions.actions != manifest.actions:
             raise MalformedError("its world has another number of actions")
     except DamagedArchiveError:
@@ -338,6 +341,10 @@ def _read_manifest(archive: Archive, path: Path) -> BundleManifest:
     except (ValueError, TypeError, KeyError, MalformedError, RecursionError) as error:
         raise BundleError(f"{path}: the manifest cannot be read ({error})") from error
     return manifest
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and bool(np.isfinite(value))
 
 
 def describe_bundle(sha256: str) -> str:

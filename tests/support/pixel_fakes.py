@@ -1,5 +1,8 @@
 """Environments of pictures, each with something that world models must get along with; all are dodged as `Dodge` is."""
 
+import sys
+from threading import Event
+
 import gymnasium
 import numpy as np
 from gymnasium import spaces
@@ -144,5 +147,30 @@ class Telling(Gauges):
     observation_space = spaces.Dict({"hand": spaces.Discrete(3), "mission": spaces.Text(9)})
 
 
-for each in (InDict, InTwo, Grey, Floats, Buttons, Switches, BothEnds, Unseen, Gauges, Telling):
+class Faulty(Dodge):
+    """Its third step has a fault."""
+
+    def __init__(self, render_mode=None, fault=""):
+        super().__init__(render_mode)
+        self.fault = fault
+
+    def reset(self, *, seed=None, options=None):
+        self.steps = 0
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        picture, reward, *rest = super().step(action)
+        self.steps += 1
+        if self.steps == 3:
+            if self.fault == "raises":
+                raise RuntimeError("a broken simulator\nwith details")
+            if self.fault == "exits":
+                sys.exit(0)
+            if self.fault == "hangs":
+                Event().wait()
+            reward = float(self.fault)
+        return (picture, reward, *rest)
+
+
+for each in (Faulty, InDict, InTwo, Grey, Floats, Buttons, Switches, BothEnds, Unseen, Gauges, Telling):
     gymnasium.register(f"{each.__name__}-v0", each, max_episode_steps=200)

@@ -62,6 +62,10 @@ class TakeCoverOptions:
         if unknown:
             named = ", ".join(unknown)
             raise UsageError(f"takecover knows no argument {named:.200}: known are {', '.join(OPTION_HELP)}")
+        for flag, name in FLAGS.items():
+            if flag in given and values.get(name, given[flag]) != given[flag]:
+                both = f"--{flag} {given[flag]!r:.50} and --environment {name}={values[name]!r:.50}"
+                raise UsageError(f"{both} say the same thing: give one of them")
         return cls(**{**{name: given[flag] for flag, name in FLAGS.items() if flag in given}, **values})
 
     @property

@@ -42,10 +42,19 @@ def is_picture(space: Any) -> bool:
 def to_pixels(picture: NDArray[Any]) -> Pixels:
     """The picture as uint8 `(H, W, 3)`; grey ones `(H, W)` or `(H, W, 1)` are repeated, floats are of 0 to 1.
 
+    `ValueError` for floats beyond that, or NaN.
+
     >>> to_pixels(np.full((1, 2), 0.5)).tolist()
     [[[128, 128, 128], [128, 128, 128]]]
     """
-    pixels = picture if picture.dtype == np.uint8 else np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
+    if picture.dtype != np.uint8:
+        levels = np.rint(picture * 255)
+        if not ((levels >= 0) & (levels <= 255)).all():  # also NaN
+            raise ValueError(
+                f"a picture of {picture.dtype} has values from 0 to 1, not {picture.min()} to {picture.max()}"
+            )
+        picture = levels.astype(np.uint8)
+    pixels = picture
     pixels = pixels[..., None] if pixels.ndim == 2 else pixels
     return pixels if pixels.shape[2] == 3 else np.repeat(pixels, 3, axis=2)
 
@@ -163,11 +172,15 @@ class CropAndResize(gymnasium.ObservationWrapper[Pixels, Any, NDArray[Any]]):
                 f"the crop {top}:{bottom},{left}:{right} is no part of a picture of {height} rows and {width} columns"
             )
         self._size, self._crop = size, (top, bottom, left, right)
+        self._shape, self._kind = space.shape, np.dtype(space.dtype).kind
         self.observation_space = spaces.Box(0, 255, (size, size, 3), np.uint8)
 
     def observation(self, observation: NDArray[Any]) -> Pixels:
-        """The picture."""
-        return cut_and_resize(np.asarray(observation), self._size, self._crop)
+        """The picture; `ValueError` for one of another shape or kind of number than the environment declares."""
+        seen = np.asarray(observation)
+        if seen.shape != self._shape or seen.dtype.kind != self._kind or (self._kind == "u" and seen.itemsize != 1):
+            raise ValueError(f"a picture is {seen.dtype} {seen.shape}, and its space is {self.env.observation_space}")
+        return cut_and_resize(seen, self._size, self._crop)
 
 
 class FrameDifference(gymnasium.Wrapper[Pixels, Any, Pixels, Any]):

@@ -97,6 +97,7 @@ def test_flags_that_any_world_takes_are_options_too():
         ('{"environment": 3}', "no argument 3"),
         ('{"environment": {"tics": 0}}', "tics must be a whole number from 1 to 10, not 0"),
         ('{"environment": {"tics": true}}', "tics must be"),
+        ('{"environment": {"tics": 3}, "skip": 4}', "--skip 4 and --environment tics=3 say the same thing"),
         ('{"environment": {"actions": "five"}}', "actions must be choices or thirds"),
         ('{"environment": {"crop": "0:121,0:160"}}', "crop must be TOP:BOTTOM,LEFT:RIGHT of a picture of 120 rows"),
         ('{"environment": {"crop": "9:9,0:160"}}', "crop must be"),

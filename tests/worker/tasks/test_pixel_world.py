@@ -114,6 +114,27 @@ class Scripted(gymnasium.Env):
         return np.full((8, 12, 3), 10 * self.steps, np.uint8)
 
 
+@pytest.mark.parametrize(
+    "later",
+    [np.zeros((4, 12, 3), np.uint8), np.zeros((8, 12, 3), np.int64), np.zeros((8, 12, 3), np.float32), None],
+)
+def test_a_picture_of_another_kind_than_declared_is_refused(later):
+    class Changing(Scripted):
+        def picture(self):
+            return later if self.steps else super().picture()
+
+    environment = CropAndResize(Changing(), 64)
+    environment.reset()
+    with pytest.raises(ValueError, match=r"a picture is .*, and its space is Box\(0, 255, \(8, 12, 3\), uint8\)"):
+        environment.step(0)
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.1, 255, np.nan])
+def test_a_picture_of_floats_beyond_0_to_1_is_refused(value):
+    with pytest.raises(ValueError, match="has values from 0 to 1, not"):
+        to_pixels(np.full((8, 12, 3), value, np.float32))
+
+
 def test_a_held_action_adds_rewards_and_stops_at_an_end():
     environment = SkipFrames(Scripted(), 3)
     environment.reset()

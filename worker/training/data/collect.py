@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
 from multiprocessing.util import Finalize
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import gymnasium
 import numpy as np
@@ -19,10 +18,11 @@ from dreamfleet.common.artifacts.bundle import hash_file
 from dreamfleet.common.errors import DatasetError, DreamfleetError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.host.parent_death import exit_with_parent
-from dreamfleet.common.host.process_pool import map_in_processes
+from dreamfleet.common.host.process_pool import count_step, map_in_processes
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.stop_signals import outlive_stop_signals
 from dreamfleet.worker.scoring.episode import EpisodeConfig, ResetHook, run_episode
+from dreamfleet.worker.scoring.failure_cause import describe_exception, describe_loss
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld, Rollout, write_episode
 from dreamfleet.worker.scoring.scorer import DRIVER_NAME
 from dreamfleet.worker.tasks.api import Policy, RecordableTask, TaskWithBeginnings
@@ -46,6 +46,8 @@ from dreamfleet.worker.training.data.pilot import Pilot
 
 Environment = gymnasium.Env[Any, Any]
 EnvironmentFor = Callable[[RecordableTask, str], AbstractContextManager[Environment]]
+STALL = 300.0  # seconds without a step, after which a drive is given up; a long one is compressed in that time
+MOST_REWARD = float(np.finfo(np.float32).max)
 _kept: tuple[Environment, Finalize] | None = None  # in a process of the pool
 
 
@@ -55,13 +57,15 @@ def missing_numbers(folder: Path, config: CollectConfig) -> list[int]:
 
 
 def collect(
-    folder: Path, config: CollectConfig, jobs: int, pilots: Sequence[Pilot] = (), world: DataWorld = OF_FIRST_WORLD
-) -> Generator[int, None, None]:
+    folder: Path, config: CollectConfig, jobs: int, pilots: Sequence[Pilot] = (), world: DataWorld = OF_FIRST_WORLD,
+    stall: float = STALL,
+) -> Generator[int, None, None]:  # fmt: skip
     """Drive the missing episodes in `jobs` processes; yield the frames of each once it is written.
 
     Random drivers drive, or `pilots` in turn. Before any drive it raises `DatasetError` if existing episodes are of
     another world or have other pictures, `ControllerError` if a pilot does, and `UsageError` if the world lacks what
-    `config` asks for. When closed early, it waits until running drives are written.
+    `config` asks for. When closed early, it waits until running drives are written. `DreamfleetError` for a drive that
+    fails, ends its process, or makes no step for `stall` seconds.
     """
     config.check_for(world)
     check_pictures(existing_episodes(folder), config.picture, world)
@@ -74,10 +78,14 @@ def collect(
         return
     pin_thread_pools()
     tasks = [(folder, config, number, tuple(pilots), world) for number in numbers]
-    try:
-        yield from map_in_processes(jobs, _start_process, (os.getpid(),), _collect_one, tasks)
-    except BrokenProcessPool as error:
-        raise DreamfleetError("a process that drove has crashed; `dreamfleet doctor` looks for the cause") from error
+    yield from map_in_processes(jobs, _start_process, (os.getpid(),), _collect_one, tasks, _lose, stall)
+
+
+def _lose(task: tuple[Path, CollectConfig, int, tuple[Pilot, ...], DataWorld], reason: int | str) -> NoReturn:
+    raise DreamfleetError(
+        f"drive {task[2]} failed: {describe_loss(reason)}; what was written before is whole, and `dreamfleet doctor` "
+        "looks for a cause in this host"
+    )
 
 
 def _start_process(parent: int) -> None:
@@ -88,7 +96,12 @@ def _start_process(parent: int) -> None:
 
 def _collect_one(task: tuple[Path, CollectConfig, int, tuple[Pilot, ...], DataWorld]) -> int:
     folder, config, number, pilots, world = task
-    arrays = drive_episode(config, number, pilots, world, kept_environment)
+    try:
+        arrays = drive_episode(config, number, pilots, world, kept_environment)
+    except (DreamfleetError, MemoryError):
+        raise
+    except BaseException as error:  # a simulator may raise anything, also `SystemExit`
+        raise DreamfleetError(f"drive {number} failed: {describe_exception(error)}") from error
     path = episode_path(folder, number)
     with explain_write_errors(path), atomic_write(path) as file:
         write_episode(file, arrays)
@@ -139,6 +152,9 @@ def drive_episode(
     rollout = Rollout(name, preprocessing.name, world)
     with environment_for(task, preprocessing.name) as environment:
         for moment in run_episode(environment, policy, episode_config, begin):
+            count_step()
+            if not abs(moment.reward) <= MOST_REWARD:  # also NaN
+                raise DatasetError(f"step {moment.step} of drive {number} gave the reward {moment.reward}")
             rollout.add(moment.seen, moment.action, moment.reward)
             rollout.ended, rollout.terminal = moment.ended, moment.terminal
     return rollout.arrays()

@@ -234,7 +234,10 @@ def load_steps(path: Path, *latents: str) -> Arrays:
         raise _damaged(path, DatasetError("its arrays are not of one drive"))
     if not all(arrays[name].dtype.kind == "f" for name in ranks):
         raise _damaged(path, DatasetError("its actions, rewards or latents are no floats"))
-    return {**arrays, **{name: arrays[name].astype(np.float32, copy=False) for name in ranks}}
+    steps_of = {name: arrays[name].astype(np.float32, copy=False) for name in ranks}
+    if not all(np.isfinite(each).all() for each in steps_of.values()):
+        raise _damaged(path, DatasetError("its actions, rewards or latents hold NaN or infinity"))
+    return {**arrays, **steps_of}
 
 
 def picture_batches(

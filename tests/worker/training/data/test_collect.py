@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.bundle_store import find_bundle
-from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
+from dreamfleet.common.errors import ControllerError, DatasetError, DreamfleetError, UsageError
 from dreamfleet.common.runs.lookup import find_controller
 from dreamfleet.worker.car_racing.drivers import DRIVERS, PushedDriver, UniformDriver
 from dreamfleet.worker.car_racing.random_network import RandomNetworkPolicy
+from dreamfleet.worker.scoring.rollout import DataWorld
 from dreamfleet.worker.training.data import collect as module
 from dreamfleet.worker.training.data.collect import collect, drive_episode, import_rollouts
 from dreamfleet.worker.training.data.collect_config import CollectConfig
-from dreamfleet.worker.training.data.dataset import episode_path, episode_paths, load_pictures
+from dreamfleet.worker.training.data.dataset import episode_path, episode_paths, load_pictures, load_steps
 from dreamfleet.worker.training.data.pilot import Pilot
+from tests.support import pixel_fakes
 from tests.support.drives import write_drive, write_drives
 
 # SWIG warns as Box2D is imported, and an error there kills the process.
@@ -184,6 +186,42 @@ def test_a_controller_of_another_model_or_other_pictures_drives_for_no_data_set(
     with pytest.raises(ControllerError, match=r"sees 'box-64' .* holds 'raw-96' .*: choose another --picture"):
         list(collect(tmp_path, replace(TINY, picture=96), 1, (pilot,)))
     assert not (tmp_path / "episodes").exists()
+
+
+def faulty(fault):
+    return DataWorld(f"gym:{pixel_fakes.MODULE}:Faulty-v0", f'{{"environment": {{"fault": "{fault}"}}}}')
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [
+        ("raises", "drive 0 failed: RuntimeError: a broken simulator$"),
+        ("exits", "drive 0 failed: SystemExit: 0"),
+        ("nan", "step 3 of drive 0 gave the reward nan"),
+        ("-inf", "step 3 of drive 0 gave the reward -inf"),
+        ("1e39", r"gave the reward 1e\+39"),
+    ],
+)
+def test_a_fault_of_the_environment_is_one_line_and_writes_no_drive(fault, says, tmp_path):
+    config = CollectConfig(episodes=1, steps=9, anywhere=0.0)
+    with pytest.raises(DreamfleetError, match=says):
+        module._collect_one((tmp_path, config, 0, (), faulty(fault)))
+    assert not list(tmp_path.rglob("*.npz"))
+
+
+@pytest.mark.slow
+def test_an_environment_that_hangs_is_given_up(tmp_path):
+    config = CollectConfig(episodes=1, steps=9, anywhere=0.0)
+    with pytest.raises(DreamfleetError, match=r"drive 0 failed: .*what was written before is whole"):
+        list(collect(tmp_path, config, 1, world=faulty("hangs"), stall=0.5))
+
+
+def test_a_drive_with_a_reward_that_is_no_number_is_damaged(tmp_path):
+    path = write_drive(tmp_path, 0, steps=3)
+    with np.load(path) as whole:
+        np.savez(path, **{**whole, "reward": np.array([0, np.nan, 0], np.float32)})
+    with pytest.raises(DatasetError, match="hold NaN or infinity"):
+        load_steps(path)
 
 
 def test_a_drive_that_a_full_disk_cannot_hold_is_named(monkeypatch, tmp_path):
