@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 
 # distribution -> (module, extra); the empty extra is required by every role
 PACKAGES = {
@@ -43,6 +45,13 @@ def install_command_for(module: str | None) -> str | None:
     """The command that installs a missing module; `None` if no extra contains it."""
     extra = extra_of(module)
     return None if extra is None else install_command(extra)
+
+
+def check_modules(names: Iterable[str]) -> None:
+    """`ModuleNotFoundError` for the first of these modules that is missing: now rather than after hours."""
+    for name in names:
+        if find_spec(name) is None:
+            raise ModuleNotFoundError(name=name)
 
 
 def package_version(name: str) -> str | None:

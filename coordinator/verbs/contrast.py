@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import asdict
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
+from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_signals
 from dreamfleet.coordinator.experiments.contrast.config import KINDS, RUN_FLAGS, SEEDS, Contrast, parse_kinds
 
@@ -53,9 +53,7 @@ def run(args: argparse.Namespace) -> int:
     contrast = Contrast(parse_kinds(args.kind), tuple(args.seeds), args.mdnrnn_flags, args.run_flags)
     parse_run_flags(contrast.common_run_flags, args.sources, "contrast")  # wrong flags end it now
     file = ("--config", str(args.config)) if args.config else ()
-    for package in PACKAGES:
-        if find_spec(package) is None:  # now rather than after hours
-            raise ModuleNotFoundError(name=package)
+    check_modules(PACKAGES)
     with folder_lock(args.out / LOCK, "contrast"), stop_on_signals() as stop:
         trials = Trials(contrast, args.data, args.out, lambda: LocalFleet.of((), args.local, file, ()), stop)
         outcomes = _run_trials(trials, contrast)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import os
 from datetime import datetime
-from importlib.util import find_spec
 
 from dreamfleet.common.cli.config import add_flags, load
 from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.stop_signals import interrupted_by_signals
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.coordinator.experiments.demo import Demo, DemoConfig
@@ -28,9 +28,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Play the demonstration."""
     config = load(DemoConfig, "demo", **args.sources)
-    for package in ("av", "gymnasium", "matplotlib", "onnxruntime", *config.plan.packages):
-        if find_spec(package) is None:  # now rather than after minutes of evolution
-            raise ModuleNotFoundError(name=package)
+    check_modules(("av", "gymnasium", "matplotlib", "onnxruntime", *config.plan.packages))
     os.environ["DREAMFLEET_JOIN"] = ""  # the demo stays on this host, even if its user is in a fleet
     name = check_run_name(args.run_name or f"demo-{datetime.now():%m%d-%H%M%S}")
     Demo(config, name, args.runs_dir).play()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import asdict, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +12,7 @@ from dreamfleet.common.cli.global_config import add_global_flags, load_credentia
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import is_file
+from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_signals
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
@@ -67,9 +67,7 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.common.files.locks import folder_lock
     from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
 
-    for package in PACKAGES:
-        if find_spec(package) is None:  # now rather than after hours
-            raise ModuleNotFoundError(name=package)
+    check_modules(PACKAGES)
     layout = IterationFolder(args.data)
     with folder_lock(layout.lock, "iteration"), stop_on_signals() as stop:
         iteration = _open_iteration(args, layout, stop)

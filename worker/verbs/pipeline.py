@@ -10,6 +10,7 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.cli.verb_runner import InProcessRunner
 from dreamfleet.common.cli.world_flags import add_world_flags, world_arguments
+from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import interrupted_by_signals
 
@@ -53,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
     check_seed(args.data, args.seed)
     flags = (world_flags(vars(args)), args.collect_flags, args.vae_flags, args.mdnrnn_flags, args.bundle_flags)
     source = Pipeline(preset, args.data, args.scale, args.seed, *flags)
+    check_modules(("gymnasium", "onnx", "onnxruntime", "safetensors", "torch"))
     runner = InProcessRunner(source.stages(max(1, args.jobs), args.device, args.out))  # wrong flags end it here
     check_output_path(args.out or source.bundle)
     if not args.json:

@@ -13,6 +13,7 @@ import pytest
 
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.host import packages
 from dreamfleet.common.host.standard_streams import LAST_STREAM
 from tests.fuzz.calls import flags_with_values
 from tests.support.processes import DEADLINE
@@ -220,11 +221,22 @@ def test_an_import_that_turns_ctrl_c_into_another_error_is_still_interrupted(mon
     assert signal.getsignal(signal.SIGINT) is before
 
 
-@pytest.mark.parametrize(("package", "extras"), [("av", "worker,views"), ("vizdoom", "worker,views,doom")])
-def test_a_missing_package_names_the_verbs_extras_and_its_own(package, extras, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("dreamfleet.coordinator.verbs.demo.find_spec", lambda name: None if name == package else 1)
-    assert command_line.main(["demo", "--world", "takecover", "--runs-dir", str(tmp_path)]) == 1
+@pytest.mark.parametrize(
+    ("words", "package", "extras"),
+    [
+        (["demo"], "av", "worker,views"),
+        (["demo", "--world", "takecover"], "vizdoom", "worker,views,doom"),
+        (["pipeline", "--data", "data"], "torch", "train"),
+    ],
+)
+def test_a_missing_package_is_said_first_with_the_verbs_extras_and_its_own(
+    words, package, extras, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(packages, "find_spec", lambda name: None if name == package else 1)
+    assert command_line.main(words) == 1
     assert f"{package!r} is not installed; this needs: pip install 'dreamfleet[{extras}]'" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_ctrl_c_in_a_finaliser_is_not_lost(monkeypatch, capsys):
