@@ -120,7 +120,8 @@ def test_through_a_tunnel_workers_serve_a_coordinator_on_loopback_and_end_with_t
 def test_a_log_is_followed_until_the_worker_ends_or_somebody_has_seen_enough(processes, hosts):
     a, coordinator = hosts.add("a"), processes.coordinator(*TOY, "--generations", 10**6)
     flags = ("--connect", processes.endpoint, "--no-tunnel", "--follow")
-    own = ("--worker-flags", f"--task {tasks.TOY} --exit-when-done --coordinator-timeout 1")
+    # The worker outlives its coordinator until the second command follows it: another one would wait for ever.
+    own = ("--worker-flags", f"--task {tasks.TOY} --exit-when-done --coordinator-timeout 15")
     command = processes.start("spawn", "a", *words(hosts, *flags, *own))
     coordinator.wait_for("generation 1: mean")
     command.popen.send_signal(signal.SIGINT)
