@@ -143,7 +143,9 @@ class Hand:
         self.put(encode(self.batch(number, *jobs, **content)))
 
     def put(self, payload):
-        self.session.put(keys.job(self.run, self.worker), payload)
+        """Put a payload for the worker. It arrives: without BLOCK, Zenoh drops what follows a large one on a busy machine."""
+        block = zenoh.CongestionControl.BLOCK
+        self.session.put(keys.job(self.run, self.worker), payload, congestion_control=block)
 
     def _hear(self, kind):
         return _direct(lambda sample: self._said.put(decode(kind, sample.payload.to_bytes())))
