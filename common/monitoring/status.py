@@ -256,6 +256,7 @@ class Status:
     ending: bool = field(default=False, metadata=OPTIONAL)  # a limit is reached: only evaluations are left
     # Episodes of evaluations and of the confirmation until the run's end.
     closing: Count = field(default=0, metadata=OPTIONAL)
+    score_word: Word = field(default="seed", metadata=OPTIONAL)  # what the world calls a scored seed: "track", "game"
 
     @property
     def is_over(self) -> bool:

@@ -122,7 +122,7 @@ class Evolution:
         """`UsageError` if the optimiser cannot draw single candidates anew."""
         if not callable(getattr(self._optimiser, "redraw", None)):
             raise UsageError(
-                f"optimiser {self._config.optimiser!r} cannot draw single candidates anew: say --on-failure worst"
+                f"optimiser {self._config.optimiser!r} cannot redraw single candidates: pass --on-failure worst"
             )
 
     def _check(self, drawn: object, count: int) -> NDArray[np.float64]:
@@ -137,7 +137,7 @@ class Evolution:
         if not travels:
             raise DreamfleetError(
                 f"optimiser {self._config.optimiser!r} asked for what no single-precision number can hold, at "
-                f"step size {self.sigma:g}: it cannot go on; fork the run with another --sigma0 or --optimiser"
+                f"step size {self.sigma:g}: it cannot continue; fork the run with another --sigma0 or --optimiser"
             )
         return asked
 

@@ -66,17 +66,19 @@ class Snapshot:
 
 
 def take_snapshot(
-    run: Run, name: str, dropped: Mapping[str, int], uptime: float, now: float, expires: float | None = None
-) -> Snapshot:
+    run: Run, name: str, dropped: Mapping[str, int], uptime: float, now: float, expires: float | None = None,
+    score_word: str = "seed",
+) -> Snapshot:  # fmt: skip
     """The run at `now`, seconds of the monotonic clock.
 
     `dropped` counts what the service dropped by reason, `uptime` is in seconds, `expires` in seconds since 1970.
+    `score_word` is what the world calls a scored seed.
     """
     background_jobs, candidate_scores = run.background_jobs, run.generation.candidate_scores()
     members = list(run.fleet.members.values())
     departed = [member for worker, member in run.fleet.departed.items() if worker not in run.fleet.members]
     return Snapshot(
-        status=_status(run, name, candidate_scores, members, departed, dropped, uptime, expires),
+        status=_status(run, name, candidate_scores, members, departed, dropped, uptime, expires, score_word),
         workers=tuple(_worker(member, now) for member in (*members, *departed)),
         history=run.history.view(),
         evaluations=background_jobs.evaluations.rows,
@@ -90,7 +92,7 @@ def take_snapshot(
 
 def _status(
     run: Run, name: str, candidate_scores: CandidateScores, members: Sequence[Member], departed: Sequence[Member],
-    dropped: Mapping[str, int], uptime: float, expires: float | None,
+    dropped: Mapping[str, int], uptime: float, expires: float | None, score_word: str,
 ) -> Status:  # fmt: skip
     present = [member for member in members if member.is_reachable]
     lost = sum(member.is_lost for member in departed)
@@ -136,6 +138,7 @@ def _status(
         strict=run.admission.strict,
         classes=run.classes,
         expires=expires,
+        score_word=score_word,
     )
 
 

@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.coordinator.settings.start import find_start
 
     if args.resume and args.init:
-        raise UsageError("--init is of a new run: a continued one has its parameters; `fork` begins another from it")
+        raise UsageError("--init starts a new run; a continued run has its parameters, and `fork` starts another")
     if args.resume:
         return _resume(args)
     return serve_new_run(args, {}, find_start(args.init, args.runs_dir) if args.init else None)
@@ -203,7 +203,7 @@ def _report(
         text = f"left run {request.name} open{score}; continue it with: {again}"
     else:
         where = f"; controller: {controller}" if controller else "; it has no controller yet"
-        more = f"; it goes on with wider limits, such as: {again} --generations 0 --minutes 30" if nothing_new else ""
+        more = f"; to continue it, widen its limits: {again} --generations 0 --minutes 30" if nothing_new else ""
         lasted = elapsed_seconds(run.created, datetime.now(UTC).isoformat())
         ago = "" if lasted is None else f" (begun {format_duration(lasted)} ago)"
         text = f"run {request.name} ended after {run.ended}{ago}{score}{where}{outcome.text or more}"

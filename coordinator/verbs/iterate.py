@@ -104,7 +104,7 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
         else begun.with_settings(config, settings, layout.root)
     )
     if config.local == 0 and not args.listen:
-        raise UsageError("nothing would score: give --local slots here, or --listen for workers of other hosts")
+        raise UsageError("no worker would score: give --local slots here, or --listen for workers of other hosts")
     Network(args.listen, credentials=load_credentials(args, ("coordinator",))).check_open(insecure=_insecure(args))
     iteration = Iteration(
         layout, config, ledger, lambda: _local_fleet(args, config, more, task), stop, _network_flags(args)

@@ -6,6 +6,7 @@ import argparse
 import json
 import shutil
 import sys
+from collections.abc import Collection
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,7 +18,7 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.files.regular_files import is_folder, path_exists
 from dreamfleet.common.monitoring.eta import format_duration
-from dreamfleet.common.printable import format_setting
+from dreamfleet.common.printable import format_number, format_setting
 from dreamfleet.common.runs.records import (
     RunSettings,
     StoredGeneration,
@@ -36,6 +37,7 @@ from dreamfleet.common.transport.network import SECURED_PREFIX
 from dreamfleet.common.worlds.score_words import score_word_of_run
 
 DROP_ORDER = ("created", "classes", "task", "mean", "evaluated")  # columns that a narrow terminal leaves out first
+SCORES = ("mean", "evaluated", "confirmed")  # columns of `runs list`
 LAST_GENERATIONS = 20
 
 
@@ -56,7 +58,7 @@ def configure_list(parser: argparse.ArgumentParser) -> None:
 def list_runs(args: argparse.Namespace) -> int:
     """Print one row per run; a run whose journal is damaged has the error as its state."""
     if not is_folder(args.runs_dir) and ("runs_dir" in args.given or path_exists(args.runs_dir)):
-        raise UsageError(f"--runs-dir {args.runs_dir} is no folder: name the one that holds runs")
+        raise UsageError(f"--runs-dir {args.runs_dir} is not a folder: name the one that holds runs")
     runs_dir = args.runs_dir / ARCHIVE_FOLDER if args.archived else args.runs_dir
     rows = [_run_row(path) for path in run_paths(runs_dir)]
     if args.json:
@@ -65,11 +67,13 @@ def list_runs(args: argparse.Namespace) -> int:
     if not rows:
         print(f"no runs in {runs_dir}; start one with: dreamfleet coordinator --run NAME", file=sys.stderr)
         return 0
-    print_rows(rows, right=("generations", "mean", "evaluated", "confirmed", "classes"), drop_order=DROP_ORDER)
+    for row in rows:
+        row |= {name: format_number(row[name]) for name in SCORES}
+    print_rows(rows, right=("generations", *SCORES, "classes"), drop_order=DROP_ORDER)
     return 0
 
 
-def _run_row(path: Path) -> dict[str, object]:
+def _run_row(path: Path) -> dict[str, Any]:
     try:
         with RunFolder(path) as run:
             history, evaluations, confirmed = run.history(), run.evaluations(), run.confirmation()
@@ -78,9 +82,9 @@ def _run_row(path: Path) -> dict[str, object]:
                 "created": run.created,
                 "task": run.spec.task,
                 "generations": len(history),
-                "mean": round(history[-1].mean, 1) if history else None,
-                "evaluated": round(evaluations[-1].mean, 1) if evaluations else None,
-                "confirmed": round(confirmed.mean, 1) if confirmed else None,
+                "mean": history[-1].mean if history and history[-1].number not in run.unscored_generations() else None,
+                "evaluated": evaluations[-1].mean if evaluations else None,
+                "confirmed": confirmed.mean if confirmed else None,
                 "classes": run.classes.total,
                 "state": run.state,
             }
@@ -135,10 +139,11 @@ def show_run(args: argparse.Namespace) -> int:
             "fingerprint": stored.fingerprint,
             "failed_candidates": count_failed(history),
         }
+        unscored = stored.unscored_generations()
         classes, word = stored.classes, score_word_of_run(stored.spec, stored.bundle_path)
     begun = begun_stages(settings, history, evaluations) if settings.stages else ()
     if args.json:
-        rows: dict[str, Any] = {"history": [asdict(each) for each in history]}
+        rows: dict[str, Any] = {"history": [_generation_facts(each, unscored) for each in history]}
         rows["evaluations"] = [with_error(each) for each in evaluations]
         rows["stages"] = [{"number": each.stage.number, "since": each.since, "after": each.why} for each in begun]
         reported = None if confirmed is None else with_error(confirmed)
@@ -158,7 +163,7 @@ def show_run(args: argparse.Namespace) -> int:
     print()
     shown = history[-LAST_GENERATIONS:] if sys.stdout.isatty() else history
     judged = {each.generation: each.mean for each in evaluations}
-    lines = [_generation_row(each, judged.get(each.number)) for each in shown]
+    lines = [_generation_row(each, judged.get(each.number), scored=each.number not in unscored) for each in shown]
     if len(shown) < len(history):
         print(f"the last {LAST_GENERATIONS} of {len(history)} generations; --json has all")
     least = ("seconds", "worst", "steps", "std", "sigma") + (
@@ -184,11 +189,18 @@ def _prefix_names(name: str, parts: dict[str, object]) -> dict[str, object]:
     return {part if part == name else f"{name}.{part}": value for part, value in parts.items() if value is not None}
 
 
-def _generation_row(each: StoredGeneration, evaluated: float | None) -> dict[str, object]:
+def _generation_facts(each: StoredGeneration, unscored: Collection[int]) -> dict[str, Any]:
+    missing = dict.fromkeys(("mean", "std", "best", "worst")) if each.number in unscored else {}
+    return {**asdict(each), **missing}
+
+
+def _generation_row(each: StoredGeneration, evaluated: float | None, *, scored: bool) -> dict[str, object]:
+    fitness = {"mean": each.mean, "std": each.std, "best": each.best, "worst": each.worst}
+    shown = {name: format_number(value if scored else None) for name, value in fitness.items()}
     return {
-        "generation": each.number, "mean": f"{each.mean:.1f}", "std": f"{each.std:.1f}", "best": f"{each.best:.1f}",
-        "worst": f"{each.worst:.1f}", "sigma": f"{each.sigma:.4f}", "failed": each.failed or "", "steps": each.steps,
-        "seconds": f"{each.seconds:.1f}", "evaluated": "" if evaluated is None else f"{evaluated:.1f}",
+        "generation": each.number, **shown,
+        "sigma": format_number(each.sigma), "failed": each.failed or "", "steps": each.steps,
+        "seconds": f"{each.seconds:.1f}", "evaluated": "" if evaluated is None else format_number(evaluated),
     }  # fmt: skip
 
 
@@ -227,7 +239,7 @@ def back_up_run(args: argparse.Namespace) -> int:
     join = args.global_config.join or ("FILE" if secured else None)
     text = (
         f"copied to {target}: {generations} closed generations, {results} results; should the run's own folder be "
-        f"lost, go on with: {resume_command(target, join)}"
+        f"lost, continue with: {resume_command(target, join)}"
     )
     print_answer(args, text, run=args.run_name, copy=target, generations=generations, results=results)
     return 0
@@ -245,7 +257,7 @@ def delete_run(args: argparse.Namespace) -> int:
         generations = len(stored.history())
     if not args.yes:
         if not sys.stdin.isatty():
-            raise UsageError("nobody is there to confirm: give --yes")
+            raise UsageError("cannot ask for confirmation: no terminal; give --yes")
         answer = input(f"delete run {args.run_name} with its {generations} generations? [y/N] ")
         if answer.strip().lower() not in ("y", "yes"):
             print_answer(args, "kept", run=args.run_name, deleted=None)
@@ -276,7 +288,7 @@ def export_run(args: argparse.Namespace) -> int:
     kinds = {"csv": export_csv, "parquet": export_parquet, "tensorboard": export_tensorboard}
     folder = args.out or Path(f"{args.run_name}-{args.kind}")
     if folder.exists() and not folder.is_dir():
-        raise UsageError(f"--out {folder} is no folder: name one")
+        raise UsageError(f"--out {folder} is not a folder: name one")
     with open_run(args.runs_dir, args.run_name) as stored, stored.read_transaction():
         written = kinds[args.kind](stored, folder)
     text = "\n".join(map(str, written)) if written else f"run {args.run_name} has no row yet: nothing was written"

@@ -28,7 +28,7 @@ SAME_SEEDS = (
     "all runs are judged on the same validation seeds, so their ± are not independent: differences are paired by seed"
 )
 NEAR_SHARE = 0.1  # of the steps of the first published score: a shorter run's curve would be squeezed beside it
-LEARNING, FITNESS = "learning.png", "fitness.png"
+MOST_IN_NAME = 3  # runs that name a picture
 
 
 def _add_place_flags(parser: argparse.ArgumentParser) -> None:
@@ -65,7 +65,7 @@ def compare_runs(args: argparse.Namespace) -> int:
     print()
     _print_settings(sides, settings)
     if len(worlds) > 1:
-        print(f"their evaluations are of the worlds {', '.join(sorted(worlds))}: scores are not compared")
+        print(f"their evaluations are in different worlds ({', '.join(sorted(worlds))}): scores are not compared")
     for each in equal:
         print(_format_budget(sides, each))
     if found:
@@ -80,7 +80,7 @@ def _run_row(side: ComparedRun) -> dict[str, object]:
     return {
         "run": side.name,
         "task": side.settings.task.task,
-        "spent": side.total.description,
+        "spent": side.spent,
         "last evaluation": None if last is None else format_with_error(last.score, last.error),
         "confirmed": None if confirmed is None else f"{format_mean(confirmed)} on {count_episodes(confirmed, word)}",
     }  # fmt: skip
@@ -112,7 +112,7 @@ def _format_budget(sides: Sequence[ComparedRun], equal: EqualBudget) -> str:
 
 def _format_evaluation(look: EvaluatedMean | None) -> str:
     if look is None:
-        return "had nothing evaluated"
+        return "without an evaluation"
     return f"{format_with_error(look.point.score, look.point.error)} (generation {look.generation})"
 
 
@@ -139,7 +139,9 @@ def _run_differences(sides: Sequence[ComparedRun], equal: Sequence[EqualBudget])
 def _run_facts(side: ComparedRun) -> dict[str, Any]:
     confirmed = side.confirmed and with_error(side.confirmed)
     effort = {**asdict(side.total), "core_hours": side.total.core_hours}
-    return {"run": side.name, "world": side.world, "effort": effort, "confirmed": confirmed}
+    inherited = {**asdict(side.inherited), "core_hours": side.inherited.core_hours}
+    facts = {"run": side.name, "world": side.world, "effort": effort, "inherited": inherited}
+    return {**facts, "confirmed": confirmed}
 
 
 def _budget_facts(sides: Sequence[ComparedRun], equal: EqualBudget) -> dict[str, Any]:
@@ -154,7 +156,11 @@ def configure_plot(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `runs plot`."""
     parser.add_argument("run_names", metavar="RUN", nargs="+", help="names of runs")
     parser.add_argument("--fitness", action="store_true", help="draw one run's fitness, even if it has evaluations")
-    parser.add_argument("--out", type=Path, help=f"a PNG or SVG to write (default {LEARNING}, or {FITNESS})")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        help="a PNG or SVG to write (default RUN-learning.png or RUN-fitness.png, with the names of the runs)",
+    )
     _add_place_flags(parser)
 
 
@@ -163,13 +169,20 @@ def plot_runs(args: argparse.Namespace) -> int:
     from dreamfleet.coordinator.analysis.plot import KINDS
 
     fitness = args.fitness or _has_no_evaluation(args)
-    out = args.out or Path(FITNESS if fitness else LEARNING)
+    out = args.out or _picture_name(args.run_names, "fitness" if fitness else "learning")
     if out.suffix not in KINDS:
         raise UsageError(f"--out {out}: give a name that ends in {' or '.join(KINDS)}")
     check_output_path(out)
     (_draw_fitness if fitness else _draw_learning)(args, out)
     print_answer(args, str(out), picture=out, runs=args.run_names)
     return 0
+
+
+def _picture_name(runs: Sequence[str], what: str) -> Path:
+    """A picture's name by its runs, so that one replaces no other's: a-learning.png, a-b-c-and-2-learning.png."""
+    names = list(dict.fromkeys(runs))
+    more = [f"and-{len(names) - MOST_IN_NAME}"] if len(names) > MOST_IN_NAME else []
+    return Path("-".join((*names[:MOST_IN_NAME], *more, f"{what}.png")))
 
 
 def _has_no_evaluation(args: argparse.Namespace) -> bool:
@@ -184,7 +197,7 @@ def _draw_fitness(args: argparse.Namespace, out: Path) -> None:
     from dreamfleet.coordinator.analysis.plot import plot_fitness
 
     if len(args.run_names) > 1:
-        raise UsageError("--fitness is of one run: name one")
+        raise UsageError("--fitness draws one run: name one")
     with open_run(args.runs_dir, args.run_names[0]) as stored:
         if not stored.history():
             raise UsageError(
@@ -205,7 +218,7 @@ def _draw_learning(args: argparse.Namespace, out: Path) -> None:
     worlds = sorted({each.world for each in curves})
     if len(worlds) > 1:
         names = ", ".join(worlds)
-        print(f"note: these runs are of the worlds {names}: their scores do not compare", file=sys.stderr)
+        print(f"note: these runs are in different worlds ({names}): their scores do not compare", file=sys.stderr)
     world = WORLDS.get(worlds[0]) if len(worlds) == 1 else None
     marks = world.published if world else None
     if marks is not None and max(each.total.steps for each in curves) < NEAR_SHARE * marks.first_steps:

@@ -10,6 +10,7 @@ import pytest
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.coordinator.experiments.demo import Demo, DemoConfig, median_drive, plan_runs
 
 
@@ -55,7 +56,7 @@ def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle):
         assert Controller.load(real.controller_path).bundle == random_bundle.sha256
         best = max((real, dream), key=lambda run: run.confirmation().mean).name
         found = [run.confirmation() for run in (real, dream)]
-        confirmed = [f"{each.mean:.0f} ± {each.error:.0f} ({each.episodes})" for each in found]
+        confirmed = [f"{format_with_error(each.mean, each.error)} ({each.episodes})" for each in found]
         provenance = Controller.load((real if best == "demo" else dream).controller_path).provenance
     assert provenance["confirmed"]
     assert f"run {best}'s" in out.replace("\n", " ")

@@ -341,7 +341,7 @@ def test_what_cannot_be_gone_on_from_is_refused_before_anything_is_driven(proces
             ("--vae-flags", "--error-factor 4", "--mdnrnn-flags", "--z-factor 0"),
             "--mdnrnn-flags: --z-factor must be from",
         ),
-        (("--local", 0), "nothing would score"),
+        (("--local", 0), "no worker would score"),
         (("--go-on", "--run-flags", "--generations 1 --variant feedback=last"), "--go-on fits a controller"),
         (("--subspace",), "give --go-on too"),
         (("--views", 8), "--views are beside the features of --subspace"),

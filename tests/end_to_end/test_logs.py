@@ -26,7 +26,9 @@ def test_a_json_log_is_json_and_says_how_to_start_a_worker(processes, random_bun
     closed = json.loads(coordinator.wait_for("generation 0: mean"))
     assert (closed["event"], closed["number"], closed["level"]) == ("generation", 0, "info")
     coordinator.popen.kill()
-    assert "this worker waits for that run alone" in worker.wait_for("the coordinator of run test is out of sight")
+    assert "this worker waits for this run only" in worker.wait_for(
+        "the coordinator of run test left or cannot be reached"
+    )
     worker.popen.terminate()
     assert worker.finish()[0] == 0
 
@@ -44,7 +46,7 @@ def test_an_orderly_end_is_not_logged_as_a_loss(processes, random_bundle):
     drained.wait_for("joined run test")
     coordinator.wait_for("generation 0: mean")
     drained.popen.terminate()
-    assert "left (drained after a signal): " in coordinator.wait_for("worker drained/")
+    assert "left (drained after a stop signal): " in coordinator.wait_for("worker drained/")
     code, out, err = processes.call("status", "test", "--connect", processes.endpoint)
     assert (code, "╭─ test · running" in out) == (0, True), err
     for verb, said in (("pause", "paused: by hand"), ("resume", "resumed"), ("stop", "")):
@@ -63,7 +65,7 @@ def test_the_events_of_a_killed_workers_jobs_are_printed_while_the_run_lives(pro
     worker = processes.worker("--task", tasks.SLOW_TOY, "--name", "host-a")
     coordinator.wait_for("generation 0: mean")
     worker.popen.kill()
-    assert "host-a" in coordinator.wait_for("is gone without a word: ")
+    assert "host-a" in coordinator.wait_for("is lost: it was killed, or its connection was cut: ")
 
     def story(*words):
         code, out, err = processes.call("story", "test", "--connect", processes.endpoint, *words, "--json")

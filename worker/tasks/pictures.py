@@ -169,7 +169,7 @@ class CropAndResize(gymnasium.ObservationWrapper[Pixels, Any, NDArray[Any]]):
         top, bottom, left, right = crop or (0, height, 0, width)
         if not (0 <= top < bottom <= height and 0 <= left < right <= width):
             raise UsageError(
-                f"the crop {top}:{bottom},{left}:{right} is no part of a picture of {height} rows and {width} columns"
+                f"the crop {top}:{bottom},{left}:{right} is not within a picture of {height} rows and {width} columns"
             )
         self._size, self._crop = size, (top, bottom, left, right)
         self._shape, self._kind = space.shape, np.dtype(space.dtype).kind

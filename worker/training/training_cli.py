@@ -51,7 +51,7 @@ def explain_interrupt(path: Path, new: bool) -> Iterator[None]:
             raise
         raise StoppedError(
             f"interrupted: {path} keeps what was made up to update {load_progress(path)['update']}; "
-            f"{resume_command(new)} goes on from there"
+            f"{resume_command(new)} continues from there"
         ) from error
 
 

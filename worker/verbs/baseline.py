@@ -135,7 +135,7 @@ def record_baseline(args: argparse.Namespace) -> int:
     from dreamfleet.worker.tools.recording import record
 
     agent = find_baseline(args.agent, args.data)
-    return record_videos(args, videos, partial(record, agent, steps=args.steps), agent.world.score_word)
+    return record_videos(args, videos, partial(record, agent, steps=args.steps), agent.world)
 
 
 def configure_export(parser: argparse.ArgumentParser) -> None:

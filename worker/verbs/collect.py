@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
     if there < total:
         raise StoppedError(
             f"stopped: {args.data} keeps {there - before} new episodes, {there} of {total} in all; the same command "
-            "goes on"
+            "continues"
         )
     text = f"{args.data}: {done} episodes, {frames} frames new; {there} episodes in all"
     print_answer(args, text, data=args.data, new_episodes=done, new_frames=frames, episodes=there)

@@ -34,4 +34,4 @@ def run(args: argparse.Namespace) -> int:
     controller, beside = find_agent(args.controller, args.runs_dir)
     agent = make_agent(controller, find_bundle_of(controller, args.bundle, beside))
     film = partial(record, agent, steps=args.steps, dreaming=ParallelDreamConfig(args.temperature))
-    return record_videos(args, videos, film, agent.world.score_word)
+    return record_videos(args, videos, film, agent.world)

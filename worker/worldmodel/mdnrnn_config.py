@@ -69,7 +69,7 @@ class MDNRNNConfig:
                 "--reward-factor is the weight of a reward head's loss: give --reward another kind than none"
             )
         if (self.done_factor, self.done_weight) != (1, 1) and not self.done:
-            raise UsageError("--done-factor and --done-weight are of a done head's loss: give --done")
+            raise UsageError("--done-factor and --done-weight weight a done head's loss: give --done")
         if self.reward_scale not in (0, 1):
             check_factors(self, "reward_scale")
             if self.reward != "value":

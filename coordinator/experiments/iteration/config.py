@@ -110,7 +110,7 @@ class IterateConfig:
         if self.gate_drives == 1 or 0 < self.gate_losses < 4:
             raise UsageError("--gate-drives must be 0 or at least 2, --gate-losses 0 or at least 4")
         if self.subspace and not self.go_on:
-            raise UsageError("--subspace changes a controller that is there: give --go-on too")
+            raise UsageError("--subspace changes an existing controller: give --go-on too")
         if self.views and not self.subspace:
             raise UsageError("--views are beside the features of --subspace: give that too")
         if self.seed > MOST_SEED:

@@ -96,7 +96,7 @@ def test_after_losing_workers_the_remaining_speed_counts():
 def test_a_target_score_has_no_estimate():
     eta = estimate_eta(status({"target": 900.0, "parted": 3}, best=BEST))
     assert eta.description == (
-        "until an evaluation reaches 900 (best 120), until 3 evaluations in a row fall behind, 4.6 s a generation"
+        "until an evaluation reaches 900 (best 120.5), until 3 evaluations in a row fall behind, 4.6 s a generation"
     )
     assert eta.seconds is None
 
@@ -134,7 +134,7 @@ def test_unknown_limits_are_ignored(strange):
             {"state": "evaluating", "confirming": EpisodeProgress(3, 1600)},
             "confirming its result: 3 of 1,600 episodes",
         ),
-        ({"state": "waiting for workers"}, "waiting for workers: none of 1 is present"),
+        ({"state": "waiting for workers"}, "waiting for workers: none is present"),
         (
             {"state": "waiting for workers", "workers": WorkerCount(0, 0), "steps": 0},
             "waiting for workers: none has joined yet",
@@ -145,7 +145,7 @@ def test_unknown_limits_are_ignored(strange):
                 "state": "waiting for workers",
                 "worker_list": (dataclasses.replace(WORKER, state="left", reason="no memory"),),
             },
-            f"waiting for workers: none of 1 is present; {WORKER.worker} left 0.3 s ago: no memory",
+            f"waiting for workers: none is present; {WORKER.worker} left 0.3 s ago: no memory",
         ),
         (
             {"state": "waiting for workers", "refused": {"old-host": "no AVX2"}},

@@ -63,8 +63,8 @@ def test_one_run_without_evaluations_is_drawn_by_its_fitness_and_the_file_is_nam
 ):
     monkeypatch.chdir(tmp_path)
     assert command_line.main(["runs", "plot", "hidden", "--runs-dir", str(runs)]) == 0
-    assert capsys.readouterr().out == "fitness.png\n"
-    assert (tmp_path / "fitness.png").read_bytes().startswith(b"\x89PNG")
+    assert capsys.readouterr().out == "hidden-fitness.png\n"
+    assert (tmp_path / "hidden-fitness.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_runs_of_several_worlds_are_drawn_with_a_note_and_short_ones_without_marks(runs, tmp_path, capsys):
@@ -75,7 +75,7 @@ def test_runs_of_several_worlds_are_drawn_with_a_note_and_short_ones_without_mar
     with closing(sqlite3.connect(runs / "reality" / "journal.sqlite")) as journal, journal:
         journal.execute("UPDATE run SET value = replace(value, 'car-racing', 'gym:Other-v0')")
     assert command_line.main(words) == 0
-    assert "note: these runs are of the worlds car-racing, gym:Other-v0" in capsys.readouterr().err
+    assert "note: these runs are in different worlds (car-racing, gym:Other-v0)" in capsys.readouterr().err
     assert "car-racing, gym:Other-v0: score of the mean" in html.unescape(out.read_text())
 
 
@@ -113,7 +113,7 @@ def test_the_verb_draws(runs, tmp_path, capsys, words):
     ("words", "says"),
     [
         (("reality", "--out", "a.gif"), "ends in .png or .svg"),
-        (("reality", "dream", "--fitness"), "--fitness is of one run"),
+        (("reality", "dream", "--fitness"), "--fitness draws one run"),
         (("nowhere",), "no run 'nowhere'"),
     ],
 )

@@ -155,7 +155,7 @@ def test_a_part_of_the_picture_is_resized():
     assert environment.observation_space == spaces.Box(0, 255, (64, 64, 3), np.uint8)
     assert (environment.reset()[0] == 200).all()
     assert (CropAndResize(Halves(), 96).reset()[0][:, :48] == 0).all()
-    with pytest.raises(UsageError, match="the crop 0:9,0:12 is no part of a picture of 8 rows and 12 columns"):
+    with pytest.raises(UsageError, match="the crop 0:9,0:12 is not within a picture of 8 rows and 12 columns"):
         CropAndResize(Halves(), 64, crop=(0, 9, 0, 12))
     with pytest.raises(UsageError, match=r"what is observed is Box.*a picture is uint8"):
         CropAndResize(gymnasium.make("CartPole-v1"), 64)

@@ -160,6 +160,6 @@ def test_models_that_are_there_stay(tmp_path, capsys):
     printed = json.loads(capsys.readouterr().out)
     assert printed["bundle"] == Bundle.open(tmp_path / "a.zip").sha256
     before = (tmp_path / "data" / "vae.safetensors").read_bytes()
-    with pytest.raises(UsageError, match="is there already"):
+    with pytest.raises(UsageError, match="exists: choose another"):
         unbundle(Bundle.open(tmp_path / "a.zip"), tmp_path / "data")
     assert (tmp_path / "data" / "vae.safetensors").read_bytes() == before
