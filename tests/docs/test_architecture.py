@@ -11,8 +11,9 @@ NO_ROOM = {"__pycache__", "pretrained"}  # `pretrained` holds files that ship, a
 
 
 def rooms_on_the_page() -> dict[str, set[str]]:
-    parts = re.split(r"^\*\*(\w+)/\*\*", PAGE.read_text(), flags=re.MULTILINE)[1:]
-    return {side: set(re.findall(r"^\| `(\w+)/` \|", text, re.MULTILINE)) for side, text in zip(*[iter(parts)] * 2)}
+    parts = re.split(r"^\*\*(\w+)/\*\*", PAGE.read_text(), flags=re.MULTILINE)
+    tables = zip(parts[1::2], parts[2::2], strict=True)
+    return {side: set(re.findall(r"^\| `(\w+)/` \|", text, re.MULTILINE)) for side, text in tables}
 
 
 def test_each_room_has_its_row():
