@@ -67,7 +67,7 @@ def check_clock(seconds: float) -> None:
     """`DreamfleetError` if Zenoh cannot write this time, in seconds since 1970, in its messages: it would panic."""
     if not 0 <= seconds < CLOCK_END:
         raise DreamfleetError(
-            fX
+            f"this host's clock is {seconds:.0f} s past 1970, and Zenoh works from 1970 to February 2106: set the clock"
         )
 
 
