@@ -149,7 +149,7 @@ class Client:
         if not isinstance(rows, list):
             raise MalformedError(
                 f"the coordinator of run {document.get('run')} sends no events: a worker's join file may not read "
-                "them, so use a viewer's; an older dreamfleet there has none, so install a newer one"
+                "them, so use a viewer's; an older dreamfleet sends none, so install a newer one"
             )
         return [from_plain_lenient(Event, row) for row in rows], int(document.get("total", len(rows)))
 

@@ -131,7 +131,8 @@ def _open_generation_seconds(status: Status, pace: float | None) -> float | None
     opened, rate = status.generation, status.throughput.episodes_per_second
     left = None if pace is None else max(pace - opened.seconds, 0.0)
     needed = max(opened.episodes - opened.episodes_done, 0) / rate if rate else None
-    return max((each for each in (left, needed) if each is not None), default=None)
+    retries = (each.retry_in for each in status.failures if each.kind == "score")  # it cannot close before these
+    return max((each for each in (left, needed, *retries) if each is not None), default=None)
 
 
 def _closing_episodes(status: Status) -> int:

@@ -200,6 +200,7 @@ class FailureStatus:
     seeds: tuple[Count, ...]
     errors: dict[str, str]  # the last error of each worker
     attempts: dict[str, int]  # failures of each worker
+    retry_in: float | None = field(default=None, metadata=OPTIONAL)  # seconds; `None`: as soon as a slot is free
 
     @property
     def subject(self) -> str:

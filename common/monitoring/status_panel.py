@@ -244,7 +244,8 @@ def _describe_reported(status: Status) -> str:
 
 def _describe_failure(failure: FailureStatus) -> str:
     worker, error = next(iter(failure.errors.items()), ("a worker", "no reason was given"))
-    return f"{failure.subject}, failed on {worker}: {error}; it is tried again"
+    when = "" if failure.retry_in is None else f" in {format_duration(failure.retry_in)}"
+    return f"{failure.subject}, failed on {worker}: {error}; it is tried again{when}"
 
 
 def _progress_lines(status: Status, width: int) -> Iterator[Text]:

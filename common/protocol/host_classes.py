@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
-from dreamfleet.common.printable import printable, truncate
+from dreamfleet.common.printable import plural, printable, truncate
 from dreamfleet.common.protocol.messages import HostClass
 from dreamfleet.common.serialization.validation import Count, Length, Text
 
@@ -116,4 +116,4 @@ def _fingerprints(counted: ResultCounts, host_class: str) -> tuple[str, ...]:
 
 def _describe_hosts(each: HostClassShare) -> str:
     hosts = [f"[{printable(fingerprint)}]" for fingerprint in each.fingerprints]
-    return f"{each.results:,} results of {', '.join(hosts)}"
+    return f"{plural(each.results, 'result')} of {', '.join(hosts)}"

@@ -77,7 +77,7 @@ class PendingJob:
     @property
     def failure(self) -> JobFailure:
         """Its failures so far."""
-        return JobFailure(self.work, tuple(self.attempts))
+        return JobFailure(self.work, tuple(self.attempts), self.retry_at)
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ def class_mismatch(run: str | None, host_class: str, fingerprint: str) -> tuple[
     own, other, host = (truncate(each or "", LONGEST) for each in (run, host_class, fingerprint))
     return f"classes differ: the run is --strict with class {own}, and this host has class {other} [{host}]", (
         "install the same dreamfleet and package versions on a host of the same CPU features; or continue the run with "
-        "--no-strict, which takes results of any host; the run is then not bit-identical when repeated"
+        "--no-strict, which takes results of any host, but makes the run not repeatable bit by bit"
     )
 
 

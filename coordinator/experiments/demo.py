@@ -300,7 +300,7 @@ def plan_runs(config: DemoConfig, name: str, runs_dir: Path) -> tuple[DemoRun, .
             **search, "preset": plan.preset, "temperature": plan.temperature, "sigma0": sigma0, "seed": config.seed,
             "minutes": plan.dream_minutes, **_evaluation_flags(*plan.dream_evaluations),
         }  # fmt: skip
-        found.append(DemoRun(dream, f"evolving in the dream for {plan.dream_minutes:g} minutes", flags))
+        found.append(DemoRun(dream, f"evolving in the dream for {plural(plan.dream_minutes, 'minute')}", flags))
         reality |= {
             "init": runs_dir / dream / CONTROLLER,
             "sigma0": SUBSPACE_SIGMA0_AFTER_DREAM if few else FULL_SIGMA0_AFTER_DREAM,
@@ -310,5 +310,5 @@ def plan_runs(config: DemoConfig, name: str, runs_dir: Path) -> tuple[DemoRun, .
             f"[[stage]]\nscore = {plan.able_score}\nsteps = {plan.quick_steps}\nepisodes = 1\n\n"
             f"[[stage]]\nepisodes = {plan.episodes}\n" + (f"sigma0 = {LATE_SIGMA0}\n" if few else "")
         )
-        found.append(DemoRun(name, f"evolving in reality for {plan.minutes:g} minutes", reality, schedule))
+        found.append(DemoRun(name, f"evolving in reality for {plural(plan.minutes, 'minute')}", reality, schedule))
     return tuple(found)

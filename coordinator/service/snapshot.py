@@ -78,7 +78,7 @@ def take_snapshot(
     members = list(run.fleet.members.values())
     departed = [member for worker, member in run.fleet.departed.items() if worker not in run.fleet.members]
     return Snapshot(
-        status=_status(run, name, candidate_scores, members, departed, dropped, uptime, expires, score_word),
+        status=_status(run, name, candidate_scores, members, departed, dropped, uptime, now, expires, score_word),
         workers=tuple(_worker(member, now) for member in (*members, *departed)),
         history=run.history.view(),
         evaluations=background_jobs.evaluations.rows,
@@ -92,7 +92,7 @@ def take_snapshot(
 
 def _status(
     run: Run, name: str, candidate_scores: CandidateScores, members: Sequence[Member], departed: Sequence[Member],
-    dropped: Mapping[str, int], uptime: float, expires: float | None, score_word: str,
+    dropped: Mapping[str, int], uptime: float, now: float, expires: float | None, score_word: str,
 ) -> Status:  # fmt: skip
     present = [member for member in members if member.is_reachable]
     lost = sum(member.is_lost for member in departed)
@@ -126,7 +126,7 @@ def _status(
         throughput=_throughput(run, present),
         waste=_waste(run.fleet.counts),
         failing=len(failures),
-        failures=tuple(_failure(each) for each in failures[:MOST_FAILURES]),
+        failures=tuple(_failure(each, now) for each in failures[:MOST_FAILURES]),
         dropped=dict(dropped),
         refused=_refused(run),
         confirmed=run.confirmed,
@@ -217,7 +217,7 @@ def _waste(counts: Mapping[str, int]) -> Waste:
     )
 
 
-def _failure(failure: JobFailure) -> FailureStatus:
+def _failure(failure: JobFailure, now: float) -> FailureStatus:
     job, names = failure.work.job, list(failure.errors)[:MOST_NAMED]
     return FailureStatus(
         candidate=f"{job.generation}/{job.candidate}",
@@ -225,6 +225,7 @@ def _failure(failure: JobFailure) -> FailureStatus:
         seeds=job.seeds,
         errors={name: shorten(failure.errors[name], LONGEST) for name in names},
         attempts={name: failure.attempts[name] for name in names},
+        retry_in=round(failure.retry_at - now, 1) if failure.retry_at > now else None,
     )
 
 

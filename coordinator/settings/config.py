@@ -407,7 +407,7 @@ def _check_subspace(subspace: Subspace, spec: TaskSpec, shape: ControllerShape) 
         )
     if (inputs := subspace.weights.shape[1]) != shape.features:
         raise UsageError(
-            f"--subspace is of controllers that see {inputs} numbers, latent and hidden state alone, and this run's "
+            f"--subspace fits controllers that see {inputs} numbers, latent and hidden state alone, and this run's "
             f"see {shape.features}: leave --features and feedback=last out, or pass --subspace {NO_SUBSPACE}"
         )
 

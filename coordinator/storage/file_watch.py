@@ -153,8 +153,8 @@ class FileWatch:
         if self._bundle is not None:
             self._bundle.restore_into(folder)
         return (
-            f"{self._folder} was removed while it was served: rescued to the last result as {folder / JOURNAL}; go on "
-            f"with: {self._resume_command(folder)}"
+            f"{self._folder} was removed while it was served: rescued to the last result as {folder / JOURNAL}; "
+            f"continue with: {self._resume_command(folder)}"
         )
 
     def _restore_bundle(self) -> None:

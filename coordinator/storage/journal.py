@@ -110,7 +110,7 @@ class Journal(JournalConnection):
         if found != self._incarnation:
             raise JournalError(
                 f"another coordinator serves {self.path} too (incarnation {found}, this one is {self._incarnation}): "
-                "this one leaves; what it committed is whole, and the other one goes on with it"
+                "this one leaves; what it committed is whole, and the other one continues it"
             )
 
     def fingerprint(self) -> str | None:

@@ -14,6 +14,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import is_file
 from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_signals
+from dreamfleet.common.printable import plural
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
 from dreamfleet.coordinator.settings.config import (
@@ -190,7 +191,7 @@ def _run_phases(iteration: Iteration, layout: IterationFolder) -> None:
 
     console = Console(stderr=True, highlight=False)
     if finished := iteration.ledger.finished:
-        console.print(f"{len(finished)} phases are finished, the last is {finished[-1]}", markup=False)
+        console.print(f"finished: {plural(len(finished), 'phase')}, the last is {finished[-1]}", markup=False)
     with console.status("") as shown:
         doing = ""
 

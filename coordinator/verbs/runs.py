@@ -18,7 +18,7 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.files.regular_files import is_folder, path_exists
 from dreamfleet.common.monitoring.eta import format_duration
-from dreamfleet.common.printable import format_number, format_setting
+from dreamfleet.common.printable import format_number, format_setting, plural
 from dreamfleet.common.runs.records import (
     RunSettings,
     StoredGeneration,
@@ -238,8 +238,8 @@ def back_up_run(args: argparse.Namespace) -> int:
     secured = any(each.startswith(SECURED_PREFIX) for each in (*network.get("listen", ()), *network.get("connect", ())))
     join = args.global_config.join or ("FILE" if secured else None)
     text = (
-        f"copied to {target}: {generations} closed generations, {results} results; should the run's own folder be "
-        f"lost, continue with: {resume_command(target, join)}"
+        f"copied to {target}: {plural(generations, 'closed generation')}, {plural(results, 'result')}; should its own "
+        f"folder be lost, continue with: {resume_command(target, join)}"
     )
     print_answer(args, text, run=args.run_name, copy=target, generations=generations, results=results)
     return 0
@@ -258,7 +258,7 @@ def delete_run(args: argparse.Namespace) -> int:
     if not args.yes:
         if not sys.stdin.isatty():
             raise UsageError("cannot ask for confirmation: no terminal; give --yes")
-        answer = input(f"delete run {args.run_name} with its {generations} generations? [y/N] ")
+        answer = input(f"delete run {args.run_name} with its {plural(generations, 'generation')}? [y/N] ")
         if answer.strip().lower() not in ("y", "yes"):
             print_answer(args, "kept", run=args.run_name, deleted=None)
             return 1

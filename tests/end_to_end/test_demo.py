@@ -67,6 +67,13 @@ def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle):
     assert "the dashboard is at http://127.0.0.1:" in out
 
 
+def test_each_world_is_judged_on_as_many_episodes_as_its_scores_vary():
+    cars, game = DemoConfig(), DemoConfig(world="takecover")
+    assert (cars.plan.tracks, game.plan.tracks, DemoConfig(tracks=3).plan.tracks) == (16, 100, 3)
+    looks = [each.flags["evaluation-episodes"] for each in plan_runs(game, "demo", Path("runs"))]
+    assert looks == [50, 50]
+
+
 def test_what_it_begins_is_of_no_other_fleet(monkeypatch):
     monkeypatch.setenv("DREAMFLEET_JOIN", "of-another-fleet.join")
     monkeypatch.setattr(Demo, "play", lambda _: joins.append(os.environ["DREAMFLEET_JOIN"]))
@@ -105,8 +112,10 @@ def test_without_the_page_none_is_begun(processes, random_bundle):
         assert demo.popen.poll() is None
     started = Path(f"/proc/{demo.popen.pid}/task/{demo.popen.pid}/children").read_text().split()
     words = [Path(f"/proc/{each}/cmdline").read_bytes().split(b"\0") for each in started]
-    demo.popen.send_signal(signal.SIGINT)
+    demo.popen.send_signal(signal.SIGTERM)
     assert demo.finish()[0] == 130
+    assert "stopped: all its processes have ended; run demo-dream is kept: continue it with" in demo.last_line()
+    assert not any(_runs(each) for each in started)
     assert not any(b"dashboard" in each for each in words)
 
 

@@ -220,7 +220,7 @@ def test_what_is_finished_is_not_done_again_and_other_settings_are_refused(undis
     before = layout.ledger.read_bytes()
     code, out, err = processes.call("iterate", "--data", layout.root)
     assert code == 0, err
-    assert "14 phases are finished" in err
+    assert "finished: 14 phases" in err
     assert out.splitlines()[0].split("\t")[:3] == ["round", "drives", "frames"]
     assert f"world model: {answer['model']}" in out
     assert layout.ledger.read_bytes() == before

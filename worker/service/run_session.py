@@ -134,8 +134,8 @@ class RunSession:
         self._send_heartbeat(monotonic(), capacity=0, reason=why)
         for each in self._declared:
             each.undeclare()
-        log.info("leaving run %s (%s): %d jobs, %d environment steps%s", self._admission.run, why, self._finished,
-                 self._steps_finished, self._lost_results())  # fmt: skip
+        log.info("leaving run %s (%s): %s, %s%s", self._admission.run, why, plural(self._finished, "job"),
+                 plural(self._steps_finished, "environment step"), self._lost_results())  # fmt: skip
 
     def _lost_results(self) -> str:
         """Which finished results go with this worker, in words."""

@@ -134,8 +134,8 @@ def check_config(path: Path, config: Any, extensible: frozenset[str] = frozenset
                  if stored[name] != value and not (name in extensible and value)]  # fmt: skip
     if differing:
         raise DatasetError(
-            f"checkpoint {path} is of another model: {'; '.join(differing)}; give it the same flags, or --new to begin "
-            "anew"
+            f"checkpoint {path} belongs to another model: {'; '.join(differing)}; give it the same flags, or --new to "
+            "start over"
         )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.command_line import SimpleVerb
 from dreamfleet.common.cli.output import print_answer
+from dreamfleet.common.printable import plural
 
 if TYPE_CHECKING:
     from torch import nn
@@ -85,7 +86,7 @@ def train_mdnrnn(args: argparse.Namespace) -> int:
         return training.train_mdnrnn(args.data, config, report, layers, device, other, stop, args.new, args.tensorboard)
 
     if waiting := count_unencoded(args.data):
-        note = f"note: {waiting} drives are not encoded, and not learnt from: `dreamfleet encode --data {args.data}`"
+        note = f"note: not encoded or learnt from: {plural(waiting, 'drive')}; `dreamfleet encode --data {args.data}`"
         print(note, file=sys.stderr)
     return run_training(args, "MDN-RNN", config.updates, args.data / training.CHECKPOINT, train)
 

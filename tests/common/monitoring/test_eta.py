@@ -5,7 +5,13 @@ import dataclasses
 import pytest
 
 from dreamfleet.common.monitoring.eta import describe_state, estimate_eta, format_duration
-from dreamfleet.common.monitoring.status import EpisodeProgress, GenerationStatus, Throughput, WorkerCount
+from dreamfleet.common.monitoring.status import (
+    EpisodeProgress,
+    FailureStatus,
+    GenerationStatus,
+    Throughput,
+    WorkerCount,
+)
 from tests.support.samples import BEST, CLOSED, STATUS
 
 WORKER = STATUS.worker_list[0]
@@ -34,6 +40,13 @@ def test_a_paused_generation_does_not_change_the_pace():
 def test_the_open_generations_elapsed_time_counts():
     assert estimate_eta(status({"generations": 9}, gone=1.6)).seconds == pytest.approx(3.0 + 4.6)
     assert estimate_eta(status({"generations": 8}, gone=99.0)).seconds == 0
+
+
+def test_a_failed_job_that_waits_for_its_next_attempt_counts():
+    failure = FailureStatus("7/1", "score", (1,), {"a": "no memory"}, {"a": 3}, retry_in=64.0)
+    evaluation = dataclasses.replace(failure, kind="evaluate")
+    assert estimate_eta(status({"generations": 8}, failures=(failure,))).seconds == pytest.approx(64.0)
+    assert estimate_eta(status({"generations": 8}, failures=(evaluation,))).seconds == pytest.approx(4.6)
 
 
 def test_steps_are_estimated_from_the_rate_of_closed_generations():

@@ -128,6 +128,16 @@ def test_candidates_are_cells_and_the_best_is_highlighted():
     assert [len(each) for each in candidate_grid(many, 76, 2)] == [76, 74]
 
 
+def test_a_failed_job_says_when_it_is_tried_again():
+    failure = FailureStatus("7/1", "score", (1,), {LONG: "no memory"}, {LONG: 3}, retry_in=64.0)
+    for failed, says in (
+        (failure, "tried again in 1 min"),
+        (dataclasses.replace(failure, retry_in=None), "tried again"),
+    ):
+        text = " ".join(drawn(dataclasses.replace(STATUS, failures=(failed,)), 200).split())
+        assert f"no memory; it is {says} " in text
+
+
 def test_a_failed_candidate_is_no_waiting_one():
     some = Population(7, 0, 4, (2, 0, 0, 1), (2, 0, 2, 2), (1.0, None, None, 2.0))
     (line,) = candidate_grid(some, 80, 1)

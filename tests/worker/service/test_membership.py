@@ -58,6 +58,13 @@ def test_silence_of_a_coordinator_that_owes_an_answer_makes_it_say_hello(hands, 
     assert member.must_rejoin(after + 0.1, hands)
 
 
+def test_a_run_that_its_coordinator_ended_is_over():
+    member = joined()
+    assert not member.run_is_over
+    member.end_run("the run has ended")
+    assert (member.run_is_over, member.find_end(0.0, busy=True)) == (True, "the run has ended")
+
+
 def test_silence_while_jobs_run_means_nothing():
     assert not joined().must_rejoin(1e6, BUSY)
 

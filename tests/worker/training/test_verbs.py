@@ -33,7 +33,7 @@ def test_a_flag_says_how_large_pictures_are(tmp_path, capsys):
     call(train.VAE, "--data", str(tmp_path), "--updates", "1", "--picture", "96", "--channels", "2", "2", "4", "4")
     assert load_config(tmp_path / "vae.safetensors", VAEConfig).picture == 96
     assert call(collect, "--data", str(tmp_path), "--episodes", "3", "--picture", "96") == 0
-    assert "0 episodes, 0 frames new; 3 episodes in all" in capsys.readouterr().out
+    assert "0 new episodes with 0 frames; 3 episodes in all" in capsys.readouterr().out
     with pytest.raises(DatasetError, match="or --picture"):
         call(collect, "--data", str(tmp_path), "--episodes", "4")
 

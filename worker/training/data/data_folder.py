@@ -55,7 +55,7 @@ def check_seed(folder: Path, seed: int) -> None:
     own = load_begun(folder).get("seed", seed)
     if own != seed:
         raise UsageError(
-            f"{folder} was begun with --seed {own}, and this is --seed {seed}: give --seed {own} to go on with it, or "
+            f"{folder} was begun with --seed {own}, and this is --seed {seed}: give --seed {own} to continue it, or "
             "another --data"
         )
 
