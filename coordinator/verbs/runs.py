@@ -177,7 +177,7 @@ def _flatten_settings(settings: RunSettings) -> dict[str, object]:
     """Settings by name, with those of task and controller, without stages; heat only of older runs that have it."""
     flat: dict[str, object] = {}
     plain = asdict(settings)
-    del plain["stages"]
+    del plain["stages"], plain["task"]["controller"]  # the same as the run's own
     if settings.heat == 1.0:
         del plain["heat"]
     for name, value in plain.items():
