@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constr
 SOURCES := pyproject.toml constraints.txt $(wildcard worker/car_racing/native/*)
 
 .PHONY: demo test test-doom test-newest slow setup check wheel long box2d-py simulate chaos weekend fuzz sanitize bundle worker-size \
-  stranger reproduce reproduce-evolution lock audit sbom structure clean
+  stranger reproduce reproduce-evolution lock audit sbom structure reference clean
 
 demo: $(VENV)/.demo $(if $(filter takecover,$(WORLD)),$(VENV)/.demo-doom)  ## evolve a controller here (WORLD=takecover: there), judge it, plot it, record it
 	$(BIN)/dreamfleet demo $(if $(WORLD),--world $(WORLD)) $(ARGS)
@@ -91,8 +91,8 @@ bundle: $(VENV)/.dev  ## a world model like the shipped one, from nothing: an ho
 	$(BIN)/dreamfleet iterate --data data/tiny --rounds $(or $(ROUNDS),2) --more-drives 580 --own-drives 0 \
 	  --run-flags "--generations 32 --collect-every 2 --collect-episodes 5" $(ARGS)
 
-reproduce: $(VENV)/.demo-doom  ## drive the shipped controllers again and compare with docs/results; REPRODUCE=NAME: one of them
-	$(BIN)/dreamfleet reproduce $(if $(REPRODUCE),docs/results/$(REPRODUCE).json,$(sort $(wildcard docs/results/*.json))) $(ARGS)
+reproduce: $(VENV)/.demo-doom  ## drive the shipped controllers again and compare with docs/lab/results; REPRODUCE=NAME: one of them
+	$(BIN)/dreamfleet reproduce $(if $(REPRODUCE),docs/lab/results/$(REPRODUCE).json,$(sort $(wildcard docs/lab/results/*.json))) $(ARGS)
 
 reproduce-evolution: $(VENV)/.demo  ## the run again that REPRODUCE=NAME came from (tiny), by its receipt; the same bits
 	$(BIN)/python deploy/reproduce_evolution.py $(or $(REPRODUCE),tiny) $(ARGS)
@@ -124,6 +124,9 @@ sbom: $(SUPPLY)/.done  ## build/worker.cdx.json: what a worker's environment is 
 
 structure:  ## figures of the structure: rooms, floors, imports between rooms, files a folder, class names, wording
 	$(PYTHON) deploy/structure.py $(ARGS)
+
+reference: $(VENV)/.dev  ## docs/reference/verbs.md and settings.md from the parsers
+	$(BIN)/python deploy/reference.py
 
 clean:
 	rm -rf $(VENV) $(SUPPLY) .venv-box2d-py .venv-newest build dist *.egg-info
