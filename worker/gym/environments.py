@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Mapping
 from importlib.metadata import packages_distributions
 from math import isfinite
-from numbers import Real
 from typing import Any
 
 import gymnasium
@@ -100,9 +99,9 @@ def describe_environment(environment: Environment, frames: int = 1) -> dict[str,
 
 def _frames_per_second(environment: Environment) -> float:
     """What the environment says of its pictures; the default where that is no positive number."""
-    said = environment.metadata.get("render_fps")
-    is_rate = isinstance(said, Real) and isfinite(said) and said > 0
-    return float(said) if is_rate else float(World.frames_per_second)
+    said: Any = environment.metadata.get("render_fps")
+    is_rate = isinstance(said, (int, float)) and isfinite(said) and said > 0
+    return float(said if is_rate else World.frames_per_second)
 
 
 def is_gymnasiums(environment: Environment) -> bool:
