@@ -19,6 +19,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, NoReturn, Protocol
 
+from dreamfleet.common.cli.removed import describe_removed
 from dreamfleet.common.errors import DreamfleetError, MissingExtraError, UsageError
 from dreamfleet.common.host.logs import configure_logging, report_failure
 from dreamfleet.common.host.packages import extra_of
@@ -211,12 +212,8 @@ def _show_overview(points: Mapping[str, EntryPoint], words: Sequence[str]) -> No
     group = [name for name in points if name.startswith(f"{first}.")] if first else []
     spoken = list(words[: 2 if group else 1])
     if spoken and not spoken[-1].startswith("-") and (not group or len(spoken) == 2):
-        raise UsageError(_unknown_verb_text(" ".join(spoken), points))
-    parser = (
-        _help_parser(f"dreamfleet {first}", group, points)
-        if group
-        else _help_parser("dreamfleet", _top_level_names(points), points)
-    )
+        raise UsageError(describe_removed(words) or _unknown_verb_text(" ".join(spoken), points))
+    parser = _help_parser(f"dreamfleet {first}", group, points) if group else _Overview(points)
     parser.add_argument("--version", action="version", version=f"dreamfleet {version('dreamfleet')}")
     parser.parse_args(words[1:] if group else words)
     parser.error("name a verb; --help lists them")
@@ -226,17 +223,25 @@ def _top_level_names(points: Iterable[str]) -> list[str]:
     return sorted({name.partition(".")[0] for name in points})
 
 
+class _Overview(argparse.ArgumentParser):
+    """The parser of no verb: its help lists all verbs by what people do."""
+
+    def __init__(self, points: Mapping[str, EntryPoint]) -> None:
+        super().__init__(prog="dreamfleet", usage="dreamfleet VERB ...")
+        self._points = points
+
+    def format_help(self) -> str:
+        from dreamfleet.common.cli.overview import overview
+
+        return overview(DESCRIPTION, EXIT_CODES, self._points, lambda name: _summary(self._points[name]))
+
+
 def _help_parser(prog: str, names: Iterable[str], points: Mapping[str, EntryPoint]) -> argparse.ArgumentParser:
-    """A parser whose help lists verbs and groups of verbs; one that cannot be loaded is marked as broken."""
+    """A parser whose help lists a group's verbs; one that cannot be loaded is marked as broken."""
     parser = argparse.ArgumentParser(prog=prog, description=DESCRIPTION, epilog=EXIT_CODES)
     verbs = parser.add_subparsers(metavar="VERB")
     for name in sorted(names):
-        spoken = name.rpartition(".")[2]
-        if name in points:
-            verbs.add_parser(spoken, help=_summary(points[name]).replace("%", "%%"))
-        else:
-            within = sorted(each.partition(".")[2] for each in points if each.startswith(f"{spoken}."))
-            verbs.add_parser(spoken, help=f"{', '.join(within)}: see `dreamfleet {spoken} --help`")
+        verbs.add_parser(name.rpartition(".")[2], help=_summary(points[name]).replace("%", "%%"))
     return parser
 
 

@@ -64,7 +64,7 @@ def _with_subspace(config: RunConfig) -> RunConfig:
     if config.subspace is None:
         return config
     if not config.subspace:
-        raise UsageError(f"--subspace is empty: name a file of `dreamfleet subspace`, or {NO_SUBSPACE}")
+        raise UsageError(f"--subspace is empty: name a file of `dreamfleet lab subspace`, or {NO_SUBSPACE}")
     return replace(config, loaded_subspace=None if config.subspace == NO_SUBSPACE else find_subspace(config.subspace))
 
 

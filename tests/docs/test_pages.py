@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from dreamfleet.common.cli.command_line import GROUP
+from dreamfleet.common.cli.removed import REMOVED_VERBS
 
 HERE = Path(__file__).parents[2]
 PAGES = sorted(path for folder in (".", "docs", "deploy") for path in (HERE / folder).glob("*.md"))
@@ -24,4 +25,5 @@ def test_each_verb_has_its_line():
         codes = [code.split() for code in re.findall(r"`([^`]+)`", row)]
         named |= {code[0] for code in codes} | {" ".join(code[:2]) for code in codes}
         named |= {f"{codes[0][0]} {code[0]}" for code in codes}  # `runs list`, `show`: the row's first word is of all
+    named |= {new for old, new in REMOVED_VERBS.items() if old in named}
     assert {point.name.replace(".", " ") for point in entry_points(group=GROUP)} <= named

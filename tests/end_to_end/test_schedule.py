@@ -86,7 +86,7 @@ def test_a_run_of_three_stages_gives_the_same_bits_however_often_it_is_killed(pr
     assert sorted(map(len, steps[-7:])) == [2] * 3 + [4] * 4
     for generation in (3, 4, 6):
         code, out, err = processes.call(
-            "replay", "night", "--runs-dir", processes.runs, "--candidate", f"{generation}/1"
+            "verify", "candidate", "night", "--runs-dir", processes.runs, "--candidate", f"{generation}/1"
         )
         assert (code, "DIFFERS" in out) == (0, False), err
     code, out, err = processes.call("runs", "show", "night", "--runs-dir", processes.runs)

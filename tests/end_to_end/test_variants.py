@@ -53,7 +53,7 @@ def test_a_run_evolves_to_the_same_bits_and_is_replayed(processes, evolve, kind)
         assert {each.steps for each in run.results(1, 2)} == {HORIZON}
         controller = Controller.load(run.controller_path)
         assert controller.options == run.spec.options != ""
-    code, out, err = processes.call("replay", "one", "--runs-dir", processes.runs, "--candidate", "1/2")
+    code, out, err = processes.call("verify", "candidate", "one", "--runs-dir", processes.runs, "--candidate", "1/2")
     assert (code, out.count("same bits")) == (0, 1), err
 
 

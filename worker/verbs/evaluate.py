@@ -38,7 +38,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one per core)")
     add_global_flags(parser, "runs_dir")
     parser.add_argument("--json", action="store_true", help="print every figure and drive as JSON")
-    parser.add_argument("--out", type=Path, help="also write that JSON to this file, for `compare` and `reproduce`")
+    parser.add_argument("--out", type=Path, help="also write that JSON to this file, for `compare` and `verify report`")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 
 from dreamfleet.common.cli import command_line
+from dreamfleet.common.cli.overview import GROUPS, WIDTH
+from dreamfleet.common.cli.removed import REMOVED_VERBS
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host import packages
 from dreamfleet.common.host.standard_streams import LAST_STREAM
@@ -93,7 +95,7 @@ def test_a_broken_verb_does_not_affect_others(capsys, tmp_path):
     with pytest.raises(SystemExit):
         command_line.run_verb(points(BROKEN), ["--help"])
     output = " ".join(capsys.readouterr().out.split())
-    assert re.search(r"broken BROKEN: the verb 'broken' cannot be loaded from tests\.no_such_module", output)
+    assert re.search(r"broken +BROKEN: the verb 'broken' cannot be loaded from tests\.no_such_module", output)
     assert "score candidates for a run" in output
     with pytest.raises(DreamfleetError, match=r"'broken' cannot be loaded .*ModuleNotFoundError"):
         command_line.run_verb(points(BROKEN), ["broken"])
@@ -264,3 +266,28 @@ def test_a_lack_of_memory_is_one_line(monkeypatch, capsys):
     assert capsys.readouterr().err.startswith(
         "dreamfleet: not enough memory on this host (Unable to allocate 81.7 GiB): "
     )
+
+
+def test_each_verb_stands_once_in_the_overview():
+    named = [name for entries in GROUPS.values() for names in entries for name in names]
+    assert sorted(named) == sorted(points())
+
+
+def test_the_overview_fits_a_terminal_and_loads_no_verb(capsys, monkeypatch):
+    monkeypatch.setattr(command_line, "load_verb", lambda point: pytest.fail(f"{point.name} was loaded"))
+    with pytest.raises(SystemExit) as left:
+        command_line.main(["--help"])
+    lines = capsys.readouterr().out.splitlines()
+    assert left.value.code == 0
+    assert max(map(len, lines)) <= WIDTH
+    assert len(lines) <= 75
+
+
+@pytest.mark.parametrize("old", sorted(REMOVED_VERBS))
+def test_a_removed_verb_is_answered_with_the_new_one(old, capsys):
+    new = REMOVED_VERBS[old]
+    assert {old, old.replace(" ", ".")}.isdisjoint(points())
+    assert any(name == new.replace(" ", ".") for name in points())
+    assert command_line.main([*old.split(), "night", "--seed", "3"]) == UsageError.exit_code
+    error = capsys.readouterr().err
+    assert error == f"dreamfleet: `{old}` is now `{new}`: dreamfleet {new} night --seed 3\n"

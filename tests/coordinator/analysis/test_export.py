@@ -98,8 +98,9 @@ def test_the_receipt_says_what_a_paper_cites(runs, capsys):
     assert command_line.main(["runs", "receipt", "reality", "--runs-dir", str(runs)]) == 0
     text = capsys.readouterr().out
     with open_run(runs, "reality") as run:
-        for part in (run.uid, run.spec.bundle, f"seed: {run.settings.seed};", "dreamfleet replay reality --candidate",
-                     "dreamfleet repeat reality ", "@misc{dreamfleet-reality,"):  # fmt: skip
+        for part in (run.uid, run.spec.bundle, f"seed: {run.settings.seed};",
+                     "dreamfleet verify candidate reality --candidate", "dreamfleet verify run reality ",
+                     "@misc{dreamfleet-reality,"):  # fmt: skip
             assert part in text
     assert command_line.main(["runs", "receipt", "reality", "--runs-dir", str(runs), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)

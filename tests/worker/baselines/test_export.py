@@ -135,7 +135,7 @@ def test_evaluate_and_baseline_evaluate_give_the_same_report_and_compare_takes_b
     capsys.readouterr()
     assert main(["compare", one, other, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["differences"][0]["mean"] == 0
-    assert main(["reproduce", one, "--jobs", "1"]) == 0
+    assert main(["verify", "report", one, "--jobs", "1"]) == 0
 
 
 def test_it_goes_to_other_processes(file):
@@ -169,7 +169,9 @@ print(observation.shape)
 
 
 def test_where_parameters_are_needed_an_agent_is_refused(file, tmp_path):
-    with pytest.raises(ControllerError, match="is a trained agent, which `evaluate`, `record` and `reproduce` take"):
+    with pytest.raises(
+        ControllerError, match="is a trained agent, which `evaluate`, `record` and `verify report` take"
+    ):
         find_controller(str(file), tmp_path)
 
 

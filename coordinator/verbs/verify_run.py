@@ -1,4 +1,4 @@
-"""`dreamfleet repeat`: re-run a run from its controller's provenance."""
+"""`dreamfleet verify run`: re-run a run from its controller's provenance."""
 
 from __future__ import annotations
 

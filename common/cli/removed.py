@@ -1,0 +1,30 @@
+"""Names that verbs and flags once had, and what stands for them now: an old command is answered with the new one."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+
+REMOVED_VERBS = {
+    "bench": "lab bench",
+    "contrast": "lab contrast",
+    "refit": "lab refit",
+    "repeat": "verify run",
+    "replay": "verify candidate",
+    "reproduce": "verify report",
+    "subspace": "lab subspace",
+}
+
+
+def describe_removed(words: Sequence[str]) -> str | None:
+    """The answer to a command that begins with a removed verb, with the command to give instead; else None.
+
+    >>> describe_removed(["replay", "night", "--candidate", "3/0"])
+    '`replay` is now `verify candidate`: dreamfleet verify candidate night --candidate 3/0'
+    """
+    for length in (2, 1):
+        old = " ".join(words[:length])
+        if new := REMOVED_VERBS.get(old):
+            command = shlex.join(("dreamfleet", *new.split(), *words[length:]))
+            return f"`{old}` is now `{new}`: {command}"
+    return None
