@@ -34,12 +34,10 @@ def add_flags(
     *sections: type[Any],
     only: Iterable[str] | None = None,
     texts: Mapping[str, str] | None = None,
-    default: str | None = None,
 ) -> None:
     """Add a flag for each field of the sections that has a help text, or for those named in `only`.
 
-    A flag that is not given sets nothing. `texts` replaces help texts by field name; `default` is shown in place of the
-    fields' defaults.
+    A flag that is not given sets nothing. `texts` replaces help texts by field name.
     """
     wanted = None if only is None else frozenset(only)
     for section in sections:
@@ -47,7 +45,7 @@ def add_flags(
         hints = get_type_hints(section)
         for each in _configurable_fields(section):
             if wanted is None or each.name in wanted:
-                text = (texts or {}).get(each.name) or each.metadata["help"] + _default_text(each, default)
+                text = (texts or {}).get(each.name) or each.metadata["help"] + _default_text(each)
                 group.add_argument(_flag(each), **_flag_options(each, hints[each.name], text))
 
 
@@ -213,10 +211,9 @@ def _flag(each: Field[Any]) -> str:
     return "--" + each.name.replace("_", "-")
 
 
-def _default_text(each: Field[Any], replacement: str | None) -> str:
+def _default_text(each: Field[Any]) -> str:
     default = each.default if each.default is not MISSING else None
-    shown = "" if default in (None, (), False, "") else str(default)
-    return f" (default {replacement or shown})" if replacement or shown else ""
+    return "" if default in (None, (), False, "") else f" (default {default})"
 
 
 def _flag_options(each: Field[Any], hint: Any, text: str) -> dict[str, Any]:

@@ -6,13 +6,20 @@ import shlex
 from collections.abc import Sequence
 
 REMOVED_VERBS = {
+    "baseline evaluate": "evaluate --controller",
+    "baseline record": "record --controller",
     "bench": "lab bench",
     "contrast": "lab contrast",
+    "fork": "coordinator --from",
     "refit": "lab refit",
     "repeat": "verify run",
     "replay": "verify candidate",
     "reproduce": "verify report",
+    "runs compare": "compare",
+    "runs story": "story --journal",
     "subspace": "lab subspace",
+    "unbundle": "bundle --extract",
+    "up": "spawn --hosts",
 }
 
 

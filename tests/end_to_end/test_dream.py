@@ -71,7 +71,7 @@ def test_dreams_from_recorded_states_are_the_same_on_every_worker(processes, tmp
     assert json.loads(out)["settings"]["task"]["recorded"] == 0.5, err
     code, out, err = processes.call("evaluate", "--controller", "alone", *runs, "--episodes", 1)
     assert code == 0, err
-    code, out, err = processes.call("fork", "alone", *runs, "--task", "car-racing")
+    code, out, err = processes.call("coordinator", "--from", "alone", *runs, "--task", "car-racing")
     assert (code, err.count("\n")) == (2, 1)
     assert "--recorded is of task dream, not of car-racing: leave it out, or say 0" in err
 

@@ -30,10 +30,10 @@ FIXTURES = ROOT / "tests" / "fixtures"
 OWN, GYM = f"{MARK}:World", f"gym:{MARK}:X-v0"
 # Verbs that read no file, journal, message or report of somebody else in which a task or an optimiser has a name.
 NAMELESS = {
-    "access.init", "access.issue", "access.list", "access.revoke", "baseline.evaluate", "baseline.export",
-    "baseline.record", "baseline.train", "dashboard", "demo", "doctor", "down", "drain", "encode",
-    "iterate", "lab.contrast", "pause", "pipeline", "resume", "router", "spawn", "status", "stop", "story",
-    "tasks", "train.mdnrnn", "train.vae", "up", "worker",
+    "access.init", "access.issue", "access.list", "access.revoke", "baseline.export",
+    "baseline.train", "dashboard", "demo", "doctor", "down", "drain", "encode",
+    "iterate", "lab.contrast", "pause", "pipeline", "resume", "router", "spawn", "status", "stop",
+    "tasks", "train.mdnrnn", "train.vae", "worker",
 }  # fmt: skip
 
 
@@ -149,11 +149,11 @@ def commands(port=0):
         yield "coordinator", "--run", "x", "--bundle", file, *serve
         yield "inspect", file, "--out", "page.html"
         yield "lab", "subspace", file, "--data", "data", "--out", "s.npz"
-        yield "unbundle", file, "--data", "unbundled"
+        yield "bundle", "--extract", file, "--data", "unbundled"
         yield "drive", "--dream", "--bundle", file, "--steps", "1"
     yield "verify", "run", "optimiser", "--run", "again", *serve
     for run in RUNS:
-        yield "fork", run, "--run", f"{run}-more", *serve
+        yield "coordinator", "--from", run, "--run", f"{run}-more", *serve
         own = ("--listen", "tcp/127.0.0.1:0") if run == "optimiser" else serve  # it is refused after it listens
         yield "coordinator", "--resume", run, *own
         yield "verify", "candidate", run, "--candidate", "1/0"
@@ -161,11 +161,11 @@ def commands(port=0):
         yield "live", "--controller", run, "--generation", "3", "--out", "pictures", "--seconds", "0.1"
         yield "collect", "--data", "new", "--from-run", run
         yield "runs", "show", run
-        yield "runs", "story", run
+        yield "story", run, "--journal"
         yield "runs", "receipt", run
         yield "runs", "plot", run, "--out", "a.png"
         yield "runs", "export", run, "--csv", "--out", f"csv-{run}"
-        yield "runs", "compare", run, run
+        yield "compare", run, "own"
         yield "runs", "backup", run, "--to", f"backup-{run}"
     yield "runs", "archive", "gym"
     yield "runs", "list"
@@ -184,7 +184,7 @@ def test_every_verb_is_tried_or_reads_no_names():
 
 def call(words, capfd):
     """The exit code and stderr of a verb; one that serves a run changes the process, so it gets its own."""
-    if words[0] in ("coordinator", "fork") or words[:2] == ("verify", "run"):
+    if words[0] == "coordinator" or words[:2] == ("verify", "run"):
         done = subprocess.run(command(*words), capture_output=True, text=True, timeout=DEADLINE, check=False)
         return done.returncode, done.stderr
     try:
@@ -206,7 +206,7 @@ def test_no_verb_imports_what_a_file_names(folder, mark, capfd):
                 assert code == 2, words
                 refused.add(" ".join(words[: 2 if words[0] in ("lab", "verify") else 1]))
     assert refused >= {
-        "coordinator", "drive", "evaluate", "fork", "inspect", "lab bench", "lab subspace", "live", "record",
+        "coordinator", "drive", "evaluate", "inspect", "lab bench", "lab subspace", "live", "record",
         "verify candidate", "verify report", "verify run",
     }  # fmt: skip
 

@@ -62,7 +62,7 @@ def test_a_run_without_a_bundle_evolves_and_any_fleet_gives_its_bits(processes):
     code, out, err = processes.call("inspect", "one", "--runs-dir", processes.runs, "--out", processes.folder / "page")
     assert code == 0, err
     forked = processes.start(
-        "fork", "one", "--run", "fork", "--runs-dir", processes.runs, "--listen", processes.endpoint,
+        "coordinator", "--from", "one", "--run", "fork", "--runs-dir", processes.runs, "--listen", processes.endpoint,
         "--generations", 1,
     )  # fmt: skip
     processes.worker("--run", "fork", "--exit-when-done")

@@ -100,7 +100,17 @@ def test_a_fork_goes_on_in_it_or_leaves_it_with_a_step_of_its_own(processes, beg
     processes.worker("--task", tasks.TOY, "--run", "night")
     coordinator.wait_for("generation 1: mean")
     coordinator.end()
-    fork = ("fork", "night", "--runs-dir", processes.runs, "--listen", processes.endpoint, "--beat", 0.2)
+    fork = (
+        "coordinator",
+        "--from",
+        "night",
+        "--runs-dir",
+        processes.runs,
+        "--listen",
+        processes.endpoint,
+        "--beat",
+        0.2,
+    )
     code, _, err = processes.call(*fork, "--subspace", "none")
     assert (code, "give --sigma0 too" in err) == (2, True), err
     (processes.folder / "fleet.toml").write_text('[run]\nsubspace = "none"\n')

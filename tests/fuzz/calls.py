@@ -19,23 +19,23 @@ RUN = "--task dream --bundle tiny --population 4 --episodes 1"
 # Words that a verb accepts, in a folder that `write_stage` made; a verb of a plug-in has none.
 VALID = {
     "access.init": "--access-dir new", "access.issue": "worker x --out x.join", "access.list": "",
-    "access.revoke": "w", "baseline.evaluate": "able --episodes 1", "baseline.export": "tiny --data data --out b.lean",
-    "baseline.record": "able --steps 2 --out new", "baseline.train": "tiny --data new --episodes 1 --steps 4",
+    "access.revoke": "w", "baseline.export": "tiny --data data --out b.lean",
+    "baseline.train": "tiny --data new --episodes 1 --steps 4",
     "bundle": "--data data --out new.zip", "collect": "--data new --episodes 1 --steps 2 --jobs 1",
     "compare": "report.json report.json", "lab.contrast": "--data data --out new --kind lr 1e-3",
     "coordinator": f"--run new {RUN} {NETWORK}", "dashboard": "--port 0", "demo": "--no-page --workers 1",
     "doctor": "", "down": "nowhere.invalid", "drain": "", "drive": "--steps 2", "encode": "--data data",
-    "evaluate": "--controller tiny --episodes 1 --jobs 1", "fork": f"dream --run new {NETWORK}", "inspect": "tiny",
+    "evaluate": "--controller tiny --episodes 1 --jobs 1", "inspect": "tiny",
     "iterate": f"--data data --rounds 1 {LISTEN}", "live": "--controller tiny --seconds 0.1",
     "lab.bench": "policy", "pause": "", "pipeline": "--data new --scale 0.001", "record": "--controller tiny --steps 2",
     "lab.refit": "tiny --to tiny --data data --out new.npz", "verify.run": f"tiny --run new {LISTEN}",
     "verify.candidate": "reality --candidate best", "verify.report": "report.json --episodes 1 --jobs 1", "resume": "",
     "router": LISTEN, "runs.archive": "dream", "runs.backup": "dream --to new",
-    "runs.compare": "dream reality", "runs.delete": "dream --yes", "runs.export": "dream --csv --out new",
+    "runs.delete": "dream --yes", "runs.export": "dream --csv --out new",
     "runs.list": "", "runs.plot": "dream", "runs.receipt": "reality", "runs.show": "dream",
     "spawn": "nowhere.invalid", "status": "", "stop": "", "story": "", "lab.subspace": "tiny --data data --out new.npz",
     "tasks": "", "train.mdnrnn": "--data data --updates 1", "train.vae": "--data data --updates 1 --batch 2",
-    "unbundle": "tiny --data new", "up": "settings.toml", "worker": "--connect tcp/127.0.0.1:7400 --lifetime 0.01",
+    "worker": "--connect tcp/127.0.0.1:7400 --lifetime 0.01",
 }  # fmt: skip
 # No path of these leads out of the scratch folder, except to devices.
 VALUES = (

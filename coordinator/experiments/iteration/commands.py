@@ -34,7 +34,7 @@ class Commands:
 
     def unbundle(self) -> Words:
         """Write the models of the initial world model as checkpoints."""
-        return command("unbundle", self.layout.bundle(0), "--data", self.layout.round(0), "--json")
+        return command("bundle", "--extract", self.layout.bundle(0), "--data", self.layout.round(0), "--json")
 
     def collect(self, number: int) -> Words:
         """Random drives: the first round's, or those that a later round adds."""

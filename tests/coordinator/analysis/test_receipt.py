@@ -33,7 +33,8 @@ def change(tmp_path):
 @pytest.fixture
 def printed(tmp_path, capsys):
     def call(*words):
-        assert command_line.main(["runs", *words, "--runs-dir", str(tmp_path / "runs")]) == 0
+        group = [] if words[0] == "compare" else ["runs"]
+        assert command_line.main([*group, *words, "--runs-dir", str(tmp_path / "runs")]) == 0
         return capsys.readouterr().out
 
     return call

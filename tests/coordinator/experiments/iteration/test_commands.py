@@ -78,7 +78,7 @@ def test_updates_among_the_flags_of_every_round_count_in_later_rounds_too():
 
 def test_with_init_the_first_round_goes_on_as_later_ones_do():
     made = commands(entry(0, "init", sha256="ab", controller="tiny"), init="tiny", vae="keep", mdnrnn_flags="--done")
-    assert said(made.unbundle()) == "unbundle data/rounds/00/bundle.zip --data data/rounds/00 --json"
+    assert said(made.unbundle()) == "bundle --extract data/rounds/00/bundle.zip --data data/rounds/00 --json"
     train = said(made.train(1, "mdnrnn"))
     assert "--seed 0 --json --updates 600 --done --continue-from data/rounds/00/mdnrnn.safetensors" in train
     vae, mdnrnn = (said(words) for words in made.check_trainings())
