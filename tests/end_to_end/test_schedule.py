@@ -112,8 +112,8 @@ def test_a_live_run_shows_its_stage_and_a_fork_begins_with_it(processes, begin):
     with open_run(processes.runs, "night") as run:
         stage = scoring_params_of(run, len(run.history())).stage
     forked = processes.start(
-        "coordinator", "--from", "night", "--runs-dir", processes.runs, "--run", "other", "--listen", processes.endpoint, "--beat", 0.2,
-        "--generations", 1,
+        "coordinator", "--from", "night", "--runs-dir", processes.runs, "--run", "other", "--listen",
+        processes.endpoint, "--beat", 0.2, "--generations", 1,
     )  # fmt: skip
     forked.wait_for(f"generation 0 is in stage 1 of {4 - stage.number} ({stage.horizon} steps")
     status = processes.statuses()[0]

@@ -159,7 +159,7 @@ class Part:
 PARTS = {
     "policy": Part("a policy step, against this core's matrix rate and against torch", measure_policy),
     "dream": Part("dreamed steps a second, against their matrix products alone and against torch", measure_dream),
-    "env": Part("CarRacing's environment against gymnasium's own", measure_env, ("bundle", "episodes", "exact")),
+    "env": Part("the environment against gymnasium's own", measure_env, ("bundle", "episodes", "exact")),
     "live": Part("what the live view costs a slot, unwatched and watched", measure_live),
     "dispatch": Part("jobs a second through real Zenoh, beside Dask and Ray where installed", measure_dispatch,
                      ("workers",)),

@@ -23,7 +23,7 @@ SUMMARY = "judge a controller on unseen seeds, in whole episodes of the world it
 EXTRAS = ("worker",)
 CONTROLLER = (
     "who drives: a controller's file, a run, one that ships, a trained agent's file or its training's folder, or "
-    "random or random-discrete, which drive CarRacing at random"
+    "random or random-discrete, which act by chance"
 )
 
 
