@@ -22,6 +22,13 @@ REMOVED_VERBS = {
     "up": "spawn --hosts",
 }
 
+# By the verb's entry point and the flag: what to do instead.
+REMOVED_FLAGS = {
+    ("evaluate", "--data"): "name the training's folder as --controller FOLDER",
+    ("record", "--data"): "name the training's folder as --controller FOLDER",
+    ("coordinator", "--popsize"): "the number of candidates is --population",
+}
+
 
 def describe_removed(words: Sequence[str]) -> str | None:
     """The answer to a command that begins with a removed verb, with the command to give instead; else None.

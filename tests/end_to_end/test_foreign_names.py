@@ -33,7 +33,7 @@ NAMELESS = {
     "access.init", "access.issue", "access.list", "access.revoke", "baseline.export",
     "baseline.train", "dashboard", "demo", "doctor", "down", "drain", "encode",
     "iterate", "lab.contrast", "pause", "pipeline", "resume", "router", "spawn", "status", "stop",
-    "tasks", "train.mdnrnn", "train.vae", "worker",
+    "tasks", "train", "worker",
 }  # fmt: skip
 
 

@@ -34,7 +34,7 @@ VALID = {
     "runs.delete": "dream --yes", "runs.export": "dream --csv --out new",
     "runs.list": "", "runs.plot": "dream", "runs.receipt": "reality", "runs.show": "dream",
     "spawn": "nowhere.invalid", "status": "", "stop": "", "story": "", "lab.subspace": "tiny --data data --out new.npz",
-    "tasks": "", "train.mdnrnn": "--data data --updates 1", "train.vae": "--data data --updates 1 --batch 2",
+    "tasks": "", "train": "vae --data data --updates 1 --batch 2",
     "worker": "--connect tcp/127.0.0.1:7400 --lifetime 0.01",
 }  # fmt: skip
 # No path of these leads out of the scratch folder, except to devices.

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from dreamfleet.worker.baselines.progress import TrainingReport
 
 
+LEARNING_FLAGS = ("episodes", "steps", "seed")  # other settings are keys of --set
+TABLE = "baseline"
+
+
 def _check_learns(agent: str, hint: str) -> None:
     from dreamfleet.worker.baselines.presets import DRQN
 
@@ -28,30 +32,32 @@ def _check_learns(agent: str, hint: str) -> None:
 def configure_train(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `baseline train`."""
     from dreamfleet.worker.baselines.presets import NAMES, PRESETS
-    from dreamfleet.worker.training.config_flags import add_config_flags
+    from dreamfleet.worker.training.config_flags import add_config_flags, add_settings_flag
 
     parser.add_argument("agent", choices=NAMES, help="drqn; random drivers learn nothing")
     parser.add_argument("--data", type=Path, required=True, help="folder of the training and of the trained network")
     parser.add_argument("--preset", default="learning", help=f"{preset_help_text('baseline')} (default learning)")
     parser.add_argument("--device", default="cpu", help="cpu, cuda, or auto (default cpu)")
     parser.add_argument("--new", action="store_true", help="start over, replacing the checkpoint that is there")
-    add_config_flags(parser, "learning", {name: each.learning for name, each in PRESETS.items()})
-    add_config_flags(parser, "layers and driving", {name: each.agent for name, each in PRESETS.items()})
+    learning = {name: each.learning for name, each in PRESETS.items()}
+    add_config_flags(parser, "learning", learning, LEARNING_FLAGS)
+    add_settings_flag(parser, {TABLE: (learning, {name: each.agent for name, each in PRESETS.items()})}, LEARNING_FLAGS)
     add_json_flag(parser)
 
 
 def train_baseline(args: argparse.Namespace) -> int:
     """Train, with a report every few episodes on stderr, and print the figures."""
     from dreamfleet.worker.baselines.presets import DRQN, find_preset
-    from dreamfleet.worker.training.config_flags import apply_flags
+    from dreamfleet.worker.training.config_flags import apply_settings
 
     _check_learns(args.agent, f"`dreamfleet evaluate --controller {args.agent}` judges it")
     preset = find_preset(args.preset)
-    config, layers = apply_flags(preset.learning, args), apply_flags(preset.agent, args)
+    config, layers = apply_settings((preset.learning, preset.agent), TABLE, args)
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.common.host.stop_signals import stop_on_signals
-    from dreamfleet.worker.baselines.train import CHECKPOINT, train_drqn
+    from dreamfleet.worker.baselines.presets import CHECKPOINT
+    from dreamfleet.worker.baselines.train import train_drqn
     from dreamfleet.worker.training.training_cli import explain_interrupt
     from dreamfleet.worker.training.training_state import select_device
 

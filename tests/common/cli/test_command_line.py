@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from dreamfleet.common.cli import command_line
+from dreamfleet.common.cli.first_flags import FIRST_FLAGS
 from dreamfleet.common.cli.overview import GROUPS, WIDTH
-from dreamfleet.common.cli.removed import REMOVED_VERBS
+from dreamfleet.common.cli.removed import REMOVED_FLAGS, REMOVED_VERBS
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host import packages
 from dreamfleet.common.host.standard_streams import LAST_STREAM
@@ -77,7 +78,7 @@ def test_help_lists_the_exit_codes(words, capsys):
 
 def test_every_verb_has_the_flags_for_config_and_logs():
     for name, point in points().items():
-        text = command_line.build_parser(name, point.load()).format_help()
+        text = command_line.build_parser(name, point.load()).format_all_help()
         assert "--config" in text, name
         assert "--log-level" in text, name
 
@@ -86,7 +87,7 @@ SILENT = {"dashboard", "demo", "router", "worker"}  # these work for a person wh
 
 
 def test_every_verb_with_output_has_json():
-    verbs = {name: command_line.build_parser(name, point.load()).format_help() for name, point in points().items()}
+    verbs = {name: command_line.build_parser(name, point.load()).format_all_help() for name, point in points().items()}
     assert {name for name, text in verbs.items() if "--json" not in text} <= SILENT
 
 
@@ -258,6 +259,23 @@ def test_a_lack_of_memory_is_one_line(monkeypatch, capsys):
     assert capsys.readouterr().err.startswith(
         "dreamfleet: not enough memory on this host (Unable to allocate 81.7 GiB): "
     )
+
+
+@pytest.mark.parametrize("name", sorted(points()))
+def test_help_shows_the_first_flags_and_help_all_the_rest(name):
+    parser = command_line.build_parser(name, points()[name].load())
+    short, whole = parser.format_help(), parser.format_all_help()
+    known = {flag for flag in parser._option_string_actions if flag.startswith("--")}
+    assert {*FIRST_FLAGS.get(name, ())} <= known
+    assert len(short.splitlines()) <= 75
+    assert f"`{parser.prog} --help-all` shows " in short
+    assert all(flag in whole for flag in known if not flag.startswith("--no-"))
+
+
+def test_the_tables_of_flags_name_what_is_there():
+    assert FIRST_FLAGS.keys() <= points().keys()
+    for verb, flag in REMOVED_FLAGS:
+        assert flag not in command_line.build_parser(verb, points()[verb].load())._option_string_actions
 
 
 def test_each_verb_stands_once_in_the_overview():
