@@ -247,7 +247,8 @@ def _flag(each: Field[Any]) -> str:
 
 def _default_text(each: Field[Any]) -> str:
     default = each.default if each.default is not MISSING else None
-    return "" if default in (None, (), False, "") else f" (default {default})"
+    shown = _flag(each) if default is True else default
+    return "" if default in (None, (), False, "") else f" (default {shown})"
 
 
 def _flag_options(each: Field[Any], hint: Any, text: str) -> dict[str, Any]:

@@ -43,7 +43,7 @@ class Parser(argparse.ArgumentParser):
         """Parse `words`; exits with an error on an unknown one."""
         args, unknown = self.parse_known_args(words)
         if unknown:
-            self._refuse(unknown)
+            self._refuse(unknown, words)
         return args
 
     def format_help(self) -> str:
@@ -91,7 +91,11 @@ class Parser(argparse.ArgumentParser):
             if action.option_strings and action.required:
                 yield f"{action.option_strings[0]} {formatter._format_args(action, action.dest.upper())}"
 
-    def _refuse(self, unknown: Sequence[str]) -> NoReturn:
+    def _refuse(self, unknown: Sequence[str], words: Sequence[str]) -> NoReturn:
+        before = words[words.index(unknown[0]) - 1] if unknown[0] in words[1:] else ""
+        action = self._option_string_actions.get(before)
+        if action is not None and action.nargs == 0 and _is_value(unknown[0]):
+            raise UsageError(f"{before} takes no value, and {unknown[0]!r} stands behind it; `{self.prog} --help`")
         said = f"unrecognized arguments: {' '.join(unknown)}"
         for at, word in enumerate(unknown):
             if word.startswith("--") and (answer := self._describe_moved(word, unknown[at + 1 :])):

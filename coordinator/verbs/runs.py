@@ -242,6 +242,9 @@ def export_run(args: argparse.Namespace) -> int:
     from dreamfleet.coordinator.analysis.export import export_csv, export_parquet, export_tensorboard
 
     kinds = {"csv": export_csv, "parquet": export_parquet, "tensorboard": export_tensorboard}
+    if args.run_name.endswith(f".{args.kind}"):
+        command = f"dreamfleet runs export RUN --{args.kind} --out FOLDER"
+        raise UsageError(f"{args.run_name} is a file's name: --{args.kind} takes none, so write {command}")
     folder = args.out or Path(f"{args.run_name}-{args.kind}")
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"--out {folder} is no folder: name one")

@@ -31,7 +31,7 @@ OWN, GYM = f"{MARK}:World", f"gym:{MARK}:X-v0"
 # Verbs that read no file, journal, message or report of somebody else in which a task or an optimiser has a name.
 NAMELESS = {
     "access.init", "access.issue", "access.list", "access.revoke", "baseline.export",
-    "baseline.train", "dashboard", "demo", "doctor", "down", "drain", "encode",
+    "baseline.train", "completion", "dashboard", "demo", "doctor", "down", "drain", "encode",
     "iterate", "lab.contrast", "pause", "pipeline", "resume", "router", "spawn", "status", "stop",
     "tasks", "train", "worker",
 }  # fmt: skip

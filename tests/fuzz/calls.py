@@ -22,7 +22,7 @@ VALID = {
     "access.revoke": "w", "baseline.export": "tiny --data data --out b.lean",
     "baseline.train": "tiny --data new --episodes 1 --steps 4",
     "bundle": "--data data --out new.zip", "collect": "--data new --episodes 1 --steps 2 --jobs 1",
-    "compare": "report.json report.json", "lab.contrast": "--data data --out new --kind lr 1e-3",
+    "completion": "bash", "compare": "report.json report.json", "lab.contrast": "--data data --out new --kind lr 1e-3",
     "coordinator": f"--run new {RUN} {NETWORK}", "dashboard": "--port 0", "demo": "--no-page --workers 1",
     "doctor": "", "down": "nowhere.invalid", "drain": "", "drive": "--steps 2", "encode": "--data data",
     "evaluate": "--controller tiny --episodes 1 --jobs 1", "inspect": "tiny",

@@ -23,7 +23,7 @@ BUNDLE, EPISODES = "tiny", 3
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     texts = "; ".join(f"{name}: {part.text}" for name, part in PARTS.items())
-    parser.add_argument("part", metavar="PART", choices=PARTS, help=texts)
+    parser.add_argument("part", metavar="PART", choices=tuple(PARTS), help=texts)
     parser.add_argument("--bundle", help=f"the world model of policy, dream, env and live (default {BUNDLE})")
     parser.add_argument(
         "--workers", type=int, metavar="N", help="of dispatch: let N simulated workers join and work too"

@@ -83,7 +83,7 @@ def test_every_verb_has_the_flags_for_config_and_logs():
         assert "--log-level" in text, name
 
 
-SILENT = {"dashboard", "demo", "router", "worker"}  # these work for a person who watches, or for nobody
+SILENT = {"completion", "dashboard", "demo", "router", "worker"}  # these work for a person who watches, or for nobody
 
 
 def test_every_verb_with_output_has_json():
