@@ -95,7 +95,9 @@ class Parser(argparse.ArgumentParser):
         before = words[words.index(unknown[0]) - 1] if unknown[0] in words[1:] else ""
         action = self._option_string_actions.get(before)
         if action is not None and action.nargs == 0 and _is_value(unknown[0]):
-            raise UsageError(f"{before} takes no value, and {unknown[0]!r} stands behind it; `{self.prog} --help`")
+            raise UsageError(
+                f"{before} takes no value, and {unknown[0]!r} stands behind it; `{self.prog} --help` lists the flags"
+            )
         said = f"unrecognized arguments: {' '.join(unknown)}"
         for at, word in enumerate(unknown):
             if word.startswith("--") and (answer := self._describe_moved(word, unknown[at + 1 :])):

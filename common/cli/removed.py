@@ -26,7 +26,6 @@ REMOVED_VERBS = {
 REMOVED_FLAGS = {
     ("evaluate", "--data"): "name the training's folder as --controller FOLDER",
     ("record", "--data"): "name the training's folder as --controller FOLDER",
-    ("coordinator", "--popsize"): "the number of candidates is --population",
 }
 
 

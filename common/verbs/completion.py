@@ -20,7 +20,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     texts = "; ".join(f"{shell}: {path}" for shell, path in PLACES.items())
     parser.add_argument(
-        "shell", metavar="SHELL", choices=PLACES, help=f"whose script; the file to write it to: {texts}"
+        "shell", metavar="SHELL", choices=tuple(PLACES), help=f"whose script; the file to write it to: {texts}"
     )
 
 

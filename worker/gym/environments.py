@@ -84,7 +84,7 @@ def _unregistered_class(name: str) -> EnvSpec | None:
     found = getattr(import_module(module), attribute, None)
     if not (isinstance(found, type) and issubclass(found, gymnasium.Env)):
         return None
-    if any(attribute in (each.id, each.name) for each in gymnasium.registry.values()):
+    if any(attribute in (name, name.rpartition("-v")[0]) for name in gymnasium.registry):
         return None
     return EnvSpec(attribute, entry_point=name)
 
