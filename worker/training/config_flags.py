@@ -64,9 +64,9 @@ class _Set(argparse.Action):
         self._tables = tables
 
     def __call__(self, _parser: Any, namespace: argparse.Namespace, values: Any, _flag: str | None = None) -> None:
-        model = getattr(namespace, "model", None)
+        model = str(getattr(namespace, "model", ""))
         refusals = []
-        for table in [model] if model in self._tables else self._tables:
+        for table in (model,) if model in self._tables else self._tables:
             try:
                 read_settings(self._tables[table], table, {}, values)
                 break

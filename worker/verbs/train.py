@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.cli.model_commands import MODELS
 from dreamfleet.common.cli.output import add_json_flag, print_answer
@@ -52,7 +52,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_json_flag(parser)
     training = {name: each.vae for name, each in PRESETS.items()}
     add_config_flags(parser, "training", training, TRAINING_FLAGS, shows_default=False)
-    tables = {
+    tables: dict[str, list[dict[str, Any]]] = {
         model: [{name: getattr(each, part) for name, each in PRESETS.items()} for part in (model, f"{model}_layers")]
         for model in MODELS
     }
@@ -101,14 +101,14 @@ def _train_mdnrnn(args: argparse.Namespace) -> int:
     from dreamfleet.worker.training.presets import find_preset
     from dreamfleet.worker.training.training_cli import run_training
     from dreamfleet.worker.training.training_state import select_device
-    from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
+    from dreamfleet.worker.worldmodel import mdnrnn
     from dreamfleet.worker.worldmodel.mdnrnn_config import ADDABLE_HEADS
 
     preset = find_preset(resolve_preset(args.data, args.preset))
     config, layers = apply_settings((preset.mdnrnn, preset.mdnrnn_layers), MDNRNN, args)
     if args.summary:
         layers = training.fit_layers(layers, args.data, args.continue_from, args.new)
-        return _print_summary(args, MDNRNN(layers), ADDABLE_HEADS)
+        return _print_summary(args, mdnrnn.MDNRNN(layers), ADDABLE_HEADS)
 
     def train(report: ReportProgress, stop: Stop) -> dict[str, float]:
         device, other = select_device(args.device), args.continue_from
