@@ -25,7 +25,7 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, *, verb: str, **more: Any) -> None:
         """`verb` is the name of its entry point; `more` is as of `ArgumentParser`."""
-        super().__init__(add_help=False, **more)
+        super().__init__(add_help=False, formatter_class=_Formatter, **more)
         self._verb = verb
         self.keys: dict[str, Mapping[str, str]] = {}  # texts of settings that are no flags, by the group's title
         self.add_argument("-h", "--help", action="help", help="show the first flags")
@@ -89,7 +89,10 @@ class Parser(argparse.ArgumentParser):
                 yield formatter._format_args(action, action.dest).replace("%", "%%")
         for action in self._actions:
             if action.option_strings and action.required:
-                yield f"{action.option_strings[0]} {formatter._format_args(action, action.dest.upper())}"
+                yield _with_value(action, formatter)
+        for group in self._mutually_exclusive_groups:
+            if group.required:
+                yield f"({' | '.join(_with_value(each, formatter) for each in group._group_actions)})"
 
     def _refuse(self, unknown: Sequence[str], words: Sequence[str]) -> NoReturn:
         before = words[words.index(unknown[0]) - 1] if unknown[0] in words[1:] else ""
@@ -125,6 +128,15 @@ class Parser(argparse.ArgumentParser):
         return super()._get_values(action, arg_strings)
 
 
+class _Formatter(argparse.HelpFormatter):
+    """Calls values that have no name of their own by their kind."""
+
+    def _get_default_metavar_for_optional(self, action: argparse.Action) -> str:
+        if action.type in (int, float):
+            return "N"
+        return "PATH" if action.type is Path else super()._get_default_metavar_for_optional(action)
+
+
 class _HelpAll(argparse.Action):
     """Prints all flags and ends the program."""
 
@@ -135,6 +147,15 @@ class _HelpAll(argparse.Action):
         assert isinstance(parser, Parser)
         parser._print_message(parser.format_all_help())
         parser.exit()
+
+
+def _with_value(action: argparse.Action, formatter: argparse.HelpFormatter) -> str:
+    value = (
+        ""
+        if action.nargs == 0
+        else f" {formatter._format_args(action, formatter._get_default_metavar_for_optional(action))}"
+    )
+    return f"{action.option_strings[0]}{value}".replace("%", "%%")
 
 
 def _is_value(word: str) -> bool:
