@@ -65,12 +65,8 @@ def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
     if arguments.get("render_mode") == "human":
         raise UsageError(f"render_mode=human opens a window in every process that plays {name}: leave it out")
     try:
-<<<<<<< HEAD
-        return gymnasium.make(_unregistered_class(name) or name, disable_env_checker=True, **arguments)
-=======
         with contained(f"making {name}"):
-            return gymnasium.make(name, disable_env_checker=True, **arguments)
->>>>>>> main
+            return gymnasium.make(_unregistered_class(name) or name, disable_env_checker=True, **arguments)
     except gymnasium.error.DependencyNotInstalled as error:
         raise UsageError(f"{name} lacks a package on this host: {error}") from error
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
