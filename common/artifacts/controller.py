@@ -20,6 +20,7 @@ from dreamfleet.common.artifacts.driving import Variant
 from dreamfleet.common.errors import ControllerError
 from dreamfleet.common.files.archives import ArchiveLimits, read_arrays
 from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.serialization.display import Displayed
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
 
 FORMAT = 1
@@ -81,8 +82,8 @@ def act(
     return actions.to_action(weights @ value + biases)
 
 
-@dataclass(frozen=True)
-class Controller:
+@dataclass(frozen=True, repr=False)
+class Controller(Displayed):
     """Parameters `(size,)` float32, with the task and world model that they were evolved for.
 
     >>> from pathlib import Path
@@ -91,13 +92,15 @@ class Controller:
     >>> controller.save(Path("copy.npz"))
     >>> Controller.load(Path("copy.npz")).sha256 == controller.sha256
     True
+    >>> controller
+    <Controller of dream: 867 parameters, 288 inputs to 3 outputs, SHA-256 e987f25edac2>
     """
 
     shape: ControllerShape
-    parameters: NDArray[np.float32] = field(repr=False)
+    parameters: NDArray[np.float32]
     task: str
     bundle: str  # SHA-256 of the bundle's file, hexadecimal; empty if the task needs none
-    provenance: dict[str, Any] = field(default_factory=dict, repr=False)
+    provenance: dict[str, Any] = field(default_factory=dict)
     options: str = ""  # the task's options as in its specification
     version: int = 1  # of the task
 
@@ -109,6 +112,21 @@ class Controller:
             )
         if not np.isfinite(self.parameters).all():
             raise ControllerError("a controller's parameters must be finite; this one holds NaN or infinity")
+
+    def _display(self) -> tuple[str, dict[str, object]]:
+        shape, digest = self.shape, self.sha256[:12]
+        layers = f"{shape.features} inputs to {shape.actions} outputs"
+        layers += f" through {shape.hidden} tanh units" if shape.hidden else ""
+        facts = {
+            "task": self.task,
+            "parameters": shape.size,
+            "layers": layers,
+            "world model": self.bundle[:12] or "none",
+            "options": self.options or None,
+            "from generation": self.provenance.get("generation"),
+            "SHA-256": digest,
+        }
+        return f"Controller of {self.task}: {shape.size} parameters, {layers}, SHA-256 {digest}", facts
 
     @property
     def sha256(self) -> str:
