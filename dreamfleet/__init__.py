@@ -1,7 +1,7 @@
 """Evolve World-Models controllers on whatever machines you have.
 
-What a program of one's own needs, few names: docs/notebook.ipynb shows most of them at work. Everything is imported
-when it is first asked for, so that a coordinator needs no simulator and a reader of journals no world model.
+The few names that a program needs; docs/tutorials/notebook.ipynb shows most of them at work. Each is imported when it
+is first used, so that a coordinator needs no simulator and a reader of journals no world model.
 
 >>> import dreamfleet
 >>> controller = dreamfleet.find_controller("tiny")

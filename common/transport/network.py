@@ -44,7 +44,7 @@ class Network:
             if self.credentials is None and not insecure and not is_loopback(endpoint):
                 raise UsageError(
                     f"{endpoint} can be reached from other hosts, and anyone who reaches it owns the run: give --join "
-                    "FILE (`dreamfleet access`, docs/security.md), or --insecure inside a network that you trust"
+                    "FILE (`dreamfleet access`, docs/how-to/security.md), or --insecure inside a network that you trust"
                 )
 
 

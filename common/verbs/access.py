@@ -46,7 +46,7 @@ def init_authority(args: argparse.Namespace) -> int:
 
 def configure_issue(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `access issue`."""
-    parser.add_argument("role", choices=ROLES, help="what its holder may do: docs/security.md")
+    parser.add_argument("role", choices=ROLES, help="what its holder may do: docs/how-to/security.md")
     parser.add_argument(
         "name", metavar="NAME", help="of a host or person; a name that was issued before keeps its seat"
     )

@@ -8,7 +8,7 @@ from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING
 from dreamfleet.common.runs.records import StageSettings
 from dreamfleet.common.worlds.profile import DemoPlan, PublishedScore, PublishedScores, WorldProfile
 
-# A few generations in the dream, then reality, in the features that ship; docs/results.md says what each is for.
+# A few generations in the dream, then reality, in the features that ship; docs/lab/results.md says what each is for.
 REAL: dict[str, Any] = {
     "task": "dream",
     "bundle": "tiny",
@@ -29,7 +29,7 @@ REAL: dict[str, Any] = {
         StageSettings(episodes=16),
     ),
 }
-# Each candidate drives one track and dreams another: docs/dreams.md, "Some of reality in it".
+# Each candidate drives one track and dreams another: docs/explanation/dreams.md, "Some of reality in it".
 MIXED: dict[str, Any] = {
     **REAL,
     "stages": (

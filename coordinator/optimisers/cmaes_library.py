@@ -140,7 +140,7 @@ class RateAdapted(CmaesOptimiser):
     Mean and covariance are updated as by Hansen 2016 (arXiv:1604.00772, equations 38 to 47), then each step is
     shortened by a learning rate of its own, at most 1, so that noise or many optima slow it down instead of leading it
     astray at the default population. It holds the full matrix: cost and state grow with the square of the parameters
-    and more, see `docs/optimisers.md`.
+    and more, see `docs/reference/optimisers.md`.
 
     >>> optimiser = RateAdapted(Search(mean=np.zeros(3), population=4, sigma0=0.1, seed=1))
     >>> candidates = optimiser.ask()

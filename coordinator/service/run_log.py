@@ -53,7 +53,7 @@ class RunLog:
             log.info("listening on %s", ", ".join(listen))
             if self._network.credentials is None and not all(is_loopback(each) for each in listen):
                 log.warning("this is neither encrypted nor authenticated: anyone who reaches the port owns the run "
-                            "(docs/security.md)", extra={"facts": {"event": "insecure"}})  # fmt: skip
+                            "(docs/how-to/security.md)", extra={"facts": {"event": "insecure"}})  # fmt: skip
 
     def report_closed(self, generations: Iterable[StoredGeneration]) -> None:
         """Log these closed generations, and the evaluations that have finished since the last call."""

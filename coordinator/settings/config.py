@@ -96,7 +96,7 @@ class RunConfig:
         (),
         f"NAME=VALUE of how controllers of a world model drive: decide_every=, feedback=last; and in {FIRST_WORLD} "
         "actions=discrete, pedals=half or one, pedal_shift=, in its dream too, time_cost=, offroad_cost= "
-        "(docs/tasks.md)",
+        "(docs/reference/tasks.md)",
     )
     controller: Literal["linear", "hidden"] = option("linear", "a linear map, or one with a layer of tanh units")
     hidden_units: Annotated[int, Between(1, 10**5)] = option(8, "units of a hidden controller's layer")
@@ -179,7 +179,7 @@ class RunConfig:
     schedule: str | None = option(
         None,
         "a TOML file of stages, each a [[stage]] with its end (generations, steps, score) and its own horizon, "
-        "patience, episodes, population, sigma0 and racing (docs/operations.md); none: no stages",
+        "patience, episodes, population, sigma0 and racing (docs/how-to/operations.md); none: no stages",
     )
     preset_variant: tuple[str, ...] = ()  # the preset's variant, which `variant` overrides name by name
     stages: tuple[StageSettings, ...] = field(default=(), metadata={"record": RunSettings})  # read from the schedule

@@ -40,7 +40,7 @@ def start_workers(args: argparse.Namespace) -> int:
 def configure_up(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `up`."""
     parser.add_argument(  # read as --config is: its top level and [spawn] hold for all hosts
-        "config", type=Path, metavar="FILE", help="TOML file with a [[host]] table for each (docs/hosts.md)"
+        "config", type=Path, metavar="FILE", help="TOML file with a [[host]] table for each (docs/how-to/hosts.md)"
     )
     _add_start_flags(parser)
 

@@ -1,7 +1,7 @@
 #!/bin/bash
 # Workers as an array job, each on the cores that it was given:
 #   sbatch --array 1-20 --cpus-per-task 8 --time 4:00:00 deploy/slurm/workers.sh --run night
-# A join file that the nodes can read is named by DREAMFLEET_JOIN (docs/security.md), as in every shell.
+# A join file that the nodes can read is named by DREAMFLEET_JOIN (docs/how-to/security.md), as in every shell.
 #SBATCH --job-name=dreamfleet
 #SBATCH --output=dreamfleet-%A-%a.log
 #SBATCH --requeue

@@ -15,7 +15,7 @@ from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
 from tests.support.processes import DEADLINE, ROOT
 
-SCRIPT = ROOT / "docs" / "own_agent.py"
+SCRIPT = ROOT / "docs" / "tutorials" / "own_agent.py"
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import pytest
 from dreamfleet.common.cli.command_line import GROUP
 
 HERE = Path(__file__).parents[2]
-PAGES = sorted(path for folder in (".", "docs", "deploy") for path in (HERE / folder).glob("*.md"))
+PAGES = sorted(path for pages in ("*.md", "docs/**/*.md", "deploy/*.md") for path in HERE.glob(pages))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(HERE)))
@@ -20,7 +20,7 @@ def test_a_page_leads_to_what_is_there(page):
 
 def test_each_verb_has_its_line():
     named = set()
-    for row in re.findall(r"^\| (`.*?) \|", (HERE / "docs" / "verbs.md").read_text(), re.MULTILINE):
+    for row in re.findall(r"^\| (`.*?) \|", (HERE / "docs" / "reference" / "verbs.md").read_text(), re.MULTILINE):
         codes = [code.split() for code in re.findall(r"`([^`]+)`", row)]
         named |= {code[0] for code in codes} | {" ".join(code[:2]) for code in codes}
         named |= {f"{codes[0][0]} {code[0]}" for code in codes}  # `runs list`, `show`: the row's first word is of all

@@ -1,4 +1,4 @@
-"""The numbered rules of docs/protocol.md: code cites no other, and each one is served somewhere."""
+"""The numbered rules of docs/reference/protocol.md: code cites no other, and each one is served somewhere."""
 
 import re
 
@@ -17,12 +17,12 @@ def cited_rules() -> dict[int, list[str]]:
 
 
 def test_the_rules_are_numbered_without_a_gap():
-    rules = [int(number) for number in RULE.findall((ROOT / "docs/protocol.md").read_text())]
+    rules = [int(number) for number in RULE.findall((ROOT / "docs/reference/protocol.md").read_text())]
     assert rules == list(range(1, len(rules) + 1))
 
 
 def test_code_cites_rules_that_exist_and_serves_each_one():
-    rules = {int(number) for number in RULE.findall((ROOT / "docs/protocol.md").read_text())}
+    rules = {int(number) for number in RULE.findall((ROOT / "docs/reference/protocol.md").read_text())}
     cited = cited_rules()
     assert {number: paths for number, paths in cited.items() if number not in rules} == {}
     assert rules - cited.keys() == set()

@@ -10,7 +10,7 @@ from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
 from dreamfleet.common.runs.seeds import TEST
 from tests.support.processes import DEADLINE, ROOT
 
-RECORDS = sorted((ROOT / "docs" / "results").glob("*.json"))
+RECORDS = sorted((ROOT / "docs" / "lab" / "results").glob("*.json"))
 
 
 @pytest.mark.parametrize("path", RECORDS, ids=lambda path: path.stem)
@@ -20,7 +20,7 @@ def test_a_record_is_of_a_shipped_controller_and_the_page_has_its_figures(path, 
     assert (found.name, found.controller) == (path.stem, controller.sha256)
     assert found.bundle == find_bundle_of(controller, None).sha256
     assert set(found.results.seeds) <= set(TEST)
-    assert f"{found.results.mean:.1f} ± {found.results.error:.1f}" in (ROOT / "docs" / "results.md").read_text()
+    assert f"{found.results.mean:.1f} ± {found.results.error:.1f}" in (ROOT / "docs" / "lab" / "results.md").read_text()
     plain = json.loads(path.read_text())
     assert {name: plain[name] for name in ("std", "error")} == pytest.approx(
         {"std": found.results.std, "error": found.results.error}
@@ -30,8 +30,8 @@ def test_a_record_is_of_a_shipped_controller_and_the_page_has_its_figures(path, 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("reproduce",), " reproduce " + " ".join(f"docs/results/{path.name}" for path in RECORDS)),
-        (("reproduce", "REPRODUCE=tiny"), " reproduce docs/results/tiny.json"),
+        (("reproduce",), " reproduce " + " ".join(f"docs/lab/results/{path.name}" for path in RECORDS)),
+        (("reproduce", "REPRODUCE=tiny"), " reproduce docs/lab/results/tiny.json"),
         (("reproduce-evolution",), "reproduce_evolution.py tiny"),
         (("reproduce-evolution", "REPRODUCE=real"), "reproduce_evolution.py real"),
     ],

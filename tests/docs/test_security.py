@@ -1,4 +1,4 @@
-"""The first commands of docs/security.md work as written."""
+"""The first commands of docs/how-to/security.md work as written."""
 
 import shlex
 import sys
@@ -15,7 +15,7 @@ def test_five_commands_make_a_fleet(processes, tmp_path, monkeypatch):
     port = free_port()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("DREAMFLEET_LISTEN", f"tls/{HOST}:{port}")  # others may use 7447
-    block = (ROOT / "docs" / "security.md").read_text().split("## In five commands")[1].split("```")[1]
+    block = (ROOT / "docs" / "how-to" / "security.md").read_text().split("## In five commands")[1].split("```")[1]
     here = block.replace("coordinator.example", HOST).replace("7447", str(port))
     install, *commands = (shlex.split(line, comments=True) for line in here.splitlines()[1:])
     assert install[:2] == ["pip", "install"]

@@ -10,7 +10,7 @@ import pytest
 
 from tests.support.processes import DEADLINE, ROOT, free_port
 
-PAGE = (ROOT / "docs" / "tutorial-world.md").read_text()
+PAGE = (ROOT / "docs" / "tutorials" / "own-world-model.md").read_text()
 SHARES = {
     "--scale 0.5": "--scale 0.005 --jobs 1",
     "--episodes 1000": "--episodes 8",

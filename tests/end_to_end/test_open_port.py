@@ -1,7 +1,7 @@
 """Who does what at an open port, without certificates: it is refused or bounded, and the run ends with the same bits.
 
 The attacker has a session of Zenoh and nothing else: it overhears names, lives, nonces, batches and fingerprints. What
-rules cannot hold off is not here: docs/threats.md names it.
+rules cannot hold off is not here: docs/explanation/threats.md names it.
 """
 
 import socket

@@ -12,7 +12,7 @@ from dreamfleet.common.security.authority import Authority
 from tests.support.drives import write_drives
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
-REPORT = Path(__file__).parents[2] / "docs" / "results" / "tiny.json"
+REPORT = Path(__file__).parents[2] / "docs" / "lab" / "results" / "tiny.json"
 LISTEN = "--listen tcp/127.0.0.1:7400"
 NETWORK = f"{LISTEN} --minutes 0.003"
 RUN = "--task dream --bundle tiny --population 4 --episodes 1"

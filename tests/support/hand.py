@@ -143,7 +143,7 @@ class Hand:
         self.put(encode(self.batch(number, *jobs, **content)))
 
     def put(self, payload):
-        """Put a payload for the worker. It arrives: without BLOCK, Zenoh drops what follows a large one on a busy machine."""
+        """Put a payload, which arrives: without BLOCK, Zenoh drops what follows a large one on a busy machine."""
         block = zenoh.CongestionControl.BLOCK
         self.session.put(keys.job(self.run, self.worker), payload, congestion_control=block)
 

@@ -20,9 +20,9 @@ class BaselinePreset:
     learning: LearningConfig
 
 
-# A notebook's settings (docs/sources.md). It does not give learning rate, layer sizes, replay size, and how often it
-# learns and copies the target: these are ours. Its LSTM sees single transitions, its advantages lie between 0 and 1,
-# and full gas spins the car, so that its score stays at about -20 to -60.
+# A notebook's settings (docs/explanation/sources.md). It does not give learning rate, layer sizes, replay size, and how
+# often it learns and copies the target: these are ours. Its LSTM sees single transitions, its advantages lie between 0
+# and 1, and full gas spins the car, so that its score stays at about -20 to -60.
 NOTEBOOK = BaselinePreset(
     name="notebook",
     agent=AgentConfig(picture=96, choices="notebook", heads="softmax", channels=(16, 32, 32), hidden=128),

@@ -117,7 +117,9 @@ def record_disturbed_drives(
     assignment = Assignment.of(bundle.manifest.task, bundle)
     task = task_of(bundle)
     if not isinstance(task, TaskWithTrueState):
-        raise UsageError(f"task {task.name} gives no true state to compare with: give it a `truth` (docs/tasks.md)")
+        raise UsageError(
+            f"task {task.name} gives no true state to compare with: give it a `truth` (docs/reference/tasks.md)"
+        )
     if not isinstance(actions := task.world_of(assignment).actions, Continuous):
         raise UsageError(f"task {task.name} has no continuous actions: its drives cannot be disturbed")
     begin_at = _random_begin(task) if config.anywhere else lambda _seed: None

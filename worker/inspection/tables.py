@@ -36,7 +36,7 @@ def knowledge_text(knowledge: Knowledge) -> str:
     """Describe the rows of `knowledge_rows`."""
     return (
         f"R² ± standard error on held-out drives; {knowledge.drives} drives, {knowledge.steps} steps, none off a road; "
-        "deviations in the units of the world's true state (docs/tasks.md)"
+        "deviations in the units of the world's true state (docs/reference/tasks.md)"
     )
 
 

@@ -1,7 +1,7 @@
 """The contract of a task: an environment, the policy that acts in it, and what the rest of the system knows of it.
 
-A package with a task imports only this module; docs/tasks.md has an example. The dream, the real track and any
-gymnasium environment satisfy the same contract.
+A package with a task imports only this module; docs/reference/tasks.md has an example. The dream, the real track and
+any gymnasium environment satisfy the same contract.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ class DreamReward:
 class World(DisplayedFields, metaclass=FormerFields):
     """What the rest of the system must know of a world; `UsageError` for a mirror of another number of actions.
 
-    The last six fields are of worlds in which world models are trained; docs/worlds.md lists all that these must give.
+    The last six fields are of worlds in which world models are trained (docs/reference/worlds.md).
     `off_course` and `off_course_cost` may also be given and read by their former names `stray` and `stray_cost`.
 
     >>> from dreamfleet import Continuous, Discrete, World

@@ -44,7 +44,9 @@ def find_task(name: str) -> Task:
     task = load_task(name)
     accept_former_names(task)
     if missing := list(_find_problems(task)):
-        raise UsageError(f"task {name!r} is incomplete: {'; '.join(missing)}; docs/tasks.md shows a whole one")
+        raise UsageError(
+            f"task {name!r} is incomplete: {'; '.join(missing)}; docs/reference/tasks.md shows a whole one"
+        )
     found: Task = task
     return found
 
@@ -57,7 +59,9 @@ def find_world(name: str, options: str = "") -> RecordableTask:
     """
     task = _bind(find_task(name), options)
     if not isinstance(task, RecordableTask):
-        raise UsageError(f"task {name!r} has no drivers and pictures to collect: docs/worlds.md says what it needs")
+        raise UsageError(
+            f"task {name!r} has no drivers and pictures to collect: docs/reference/worlds.md says what it needs"
+        )
     return task
 
 

@@ -69,7 +69,7 @@ class TrainingPreset:
 
 
 # About 12 minutes on two cores. More data or updates made a VAE distinguish pictures better but dream worse, while an
-# MDN-RNN gained from them (docs/dreams.md): `iterate` continues training the MDN-RNN and the decoder alone.
+# MDN-RNN gained from them (docs/explanation/dreams.md): `iterate` continues training the MDN-RNN and the decoder alone.
 TINY = TrainingPreset(
     name="tiny",
     collect=CollectConfig(episodes=620, steps=300),

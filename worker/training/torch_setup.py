@@ -17,7 +17,7 @@ def configure_process() -> None:
     Threads that spin while they wait take time from other processes: beside one busy process an update of the article's
     VAE on two threads took 0.61 s, and 0.38 s with sleeping threads; alone the times are equal. Returning each update's
     memory to the system and requesting it again cost an eighth of a VAE's update and a quarter of an MDN-RNN's
-    (docs/measurements.md). Environment variables that the user has set take precedence.
+    (docs/lab/measurements.md). Environment variables that the user has set take precedence.
     """
     os.environ["OMP_WAIT_POLICY"] = os.environ.get("OMP_WAIT_POLICY") or "PASSIVE"
     if not any(name.startswith("MALLOC_") for name in os.environ):

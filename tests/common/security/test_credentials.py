@@ -148,7 +148,7 @@ def test_the_verbs_create_list_and_revoke(tmp_path, capsys):
 
 
 def test_a_listener_is_issued_a_file_for_its_host_names(tmp_path, capsys):
-    """The first of the five commands in docs/security.md."""
+    """The first of the five commands in docs/how-to/security.md."""
     folder, out = ("--access-dir", str(tmp_path / "access")), tmp_path / "home.join"
     assert main(["access", "init", *folder]) == 0
     assert main(["access", "issue", "coordinator", "home", *folder, "--host", "h.example", "--out", str(out)]) == 0

@@ -34,7 +34,7 @@ def test_a_hosts_table_overrides_the_file_and_flags_override_it(tmp_path):
 
 def test_the_documented_file_is_valid(tmp_path):
     (tmp_path / "a.whl").touch()
-    text = re.search(r"```toml\n(.*?)```", (Path(ROOT) / "docs" / "hosts.md").read_text(), re.DOTALL)[1]
+    text = re.search(r"```toml\n(.*?)```", (Path(ROOT) / "docs" / "how-to" / "hosts.md").read_text(), re.DOTALL)[1]
     path = tmp_path / "hosts.toml"
     path.write_text(text.replace("/data/wheels", str(tmp_path)))
     file = read_config_file(path)

@@ -125,5 +125,5 @@ def test_a_world_without_true_state_is_reported(tmp_path):
     ours = write_random_bundle(tmp_path / "ours.zip", vae=small, rnn=MDNRNNConfig(latent=5, hidden=8))
     parts = {name: ours.read(name) for name in ours.manifest.parts}
     poles = write_bundle(tmp_path / "poles.zip", replace(ours.manifest, task="gym:CartPole-v1"), parts)
-    with pytest.raises(UsageError, match=r"gym:CartPole-v1 gives no true state .*docs/tasks.md"):
+    with pytest.raises(UsageError, match=r"gym:CartPole-v1 gives no true state .*docs/reference/tasks.md"):
         next(record_disturbed_drives(poles, RecurrentState(poles), lambda _seed: None, DisturbedDriveConfig()))

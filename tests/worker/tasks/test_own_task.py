@@ -1,4 +1,4 @@
-"""The example package of docs/tasks.md, installed with pip."""
+"""The example package of docs/reference/tasks.md, installed with pip."""
 
 import os
 import re
@@ -28,7 +28,7 @@ py-modules = ["field"]
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory):
     """The folder that the package was installed in."""
-    page = (ROOT / "docs" / "tasks.md").read_text()
+    page = (ROOT / "docs" / "reference" / "tasks.md").read_text()
     (module,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     (points,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     assert len(module.splitlines()) - module.count("\n\n") <= 30, "thirty lines, blank ones aside"

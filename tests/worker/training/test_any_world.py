@@ -1,4 +1,4 @@
-"""A world that says what docs/worlds.md asks for, from its drives to a world model that candidates evolve in."""
+"""A world with what docs/reference/worlds.md requires, from drives to a world model in which candidates evolve."""
 
 import json
 import shutil

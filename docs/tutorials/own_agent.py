@@ -1,6 +1,6 @@
 """Train your own agent: a double DQN that learns only in the dream and is evaluated on real tracks.
 
-    python docs/own_agent.py --steps 3000000 --episodes 32
+    python docs/tutorials/own_agent.py --steps 3000000 --episodes 32
 
 It chooses one of gymnasium's five CarRacing actions and holds it for four steps. It observes [z, h], since the latent z
 alone does not show the car's speed. Needs `pip install '.[train]'`.
