@@ -14,6 +14,7 @@ from dreamfleet.common.errors import ControllerError
 from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive, write_archive
 from dreamfleet.common.files.atomic_write import open_output
 from dreamfleet.common.files.regular_files import open_regular, read_regular
+from dreamfleet.common.printable import plural
 from dreamfleet.common.serialization.display import Displayed
 from dreamfleet.common.serialization.validation import Between, Length, MalformedError, Word, from_plain
 
@@ -58,7 +59,8 @@ class TrainedAgent(Displayed):
             "recurrent state": about.state,
             "SHA-256": self.sha256[:12],
         }
-        return f"TrainedAgent {about.name} of {about.task}: {len(about.choices)} actions to choose from", facts
+        choices = plural(len(about.choices), "action")
+        return f"TrainedAgent {about.name} of {about.task}: {choices} to choose from", facts
 
     @property
     def task(self) -> str:

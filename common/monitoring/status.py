@@ -150,12 +150,12 @@ class WorkerStatus(Displayed):
 
     @property
     def name(self) -> str:
-        """The worker's name."""
-        return self.worker
+        """The worker's name, which later processes of the same worker share; `worker` is of one process alone."""
+        return self.worker.partition("/")[0]
 
     def _display(self) -> tuple[str, dict[str, object]]:
         speed = f"{self.steps_per_second:,.0f} steps/s"
-        facts = {
+        facts: dict[str, object] = {
             "state": self.state,
             "reason": self.reason or None,
             "slots": self.slots,
@@ -302,7 +302,7 @@ class Status(Displayed):
         now, best = self.generation, self.confirmed or self.best
         progress = f"generation {now.number}, {now.episodes_done} of {now.episodes} episodes"
         workers = plural(self.workers.present, "worker")
-        facts = {
+        facts: dict[str, object] = {
             "task": self.settings.task.task,
             "state": f"{self.state}: {self.why}" if self.why else self.state,
             "progress": progress,

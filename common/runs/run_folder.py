@@ -67,14 +67,7 @@ def open_run(runs_dir: Path, name: str) -> RunFolder:
 
 
 class RunFolder(Displayed):
-    """A run's folder, read-only; close it, or use it in a `with`.
-
-    >>> from dreamfleet import open_run
-    >>> with open_run("cartpole") as run:  # begun by `dreamfleet coordinator --run cartpole --task gym:CartPole-v1`
-    ...     generation = run.history()[0]
-    ...     print(run.spec.task, generation.number, generation.worst <= generation.mean <= generation.best)
-    gym:CartPole-v1 0 True
-    """
+    """A run's folder, read-only; close it, or use it in a `with`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -237,14 +230,15 @@ class RunFolder(Displayed):
         """Accepted results of every kind."""
         return int(self._journal.row("SELECT count(*) FROM result")[0])
 
-    def history(self) -> list[StoredGeneration]:
-        """Every closed generation, oldest first."""
+    def history(self, since: int = 0) -> list[StoredGeneration]:
+        """Every closed generation from number `since` on, oldest first."""
         query = (
             f"SELECT number, mean, std, best, worst, sigma, steps, seconds, {self._failed_column} FROM generation "  # noqa: S608
-            "WHERE closed IS NOT NULL ORDER BY number"
+            "WHERE closed IS NOT NULL AND number >= ? ORDER BY number"
         )
         found = []
-        for number, mean, std, best, worst, sigma, steps, seconds, failed in self._journal.rows("iFFFFfiFi", query):
+        rows = self._journal.rows("iFFFFfiFi", query, since)
+        for number, mean, std, best, worst, sigma, steps, seconds, failed in rows:
             fitness = to_finite(mean), to_finite(std), to_finite(best), to_finite(worst)  # not finite in old journals
             effort = clamp_count(steps), to_finite(seconds)
             found.append(StoredGeneration(number, *fitness, to_finite(sigma), *effort, clamp_count(failed)))
