@@ -40,7 +40,7 @@ class EvolvedPredictor:
             return action, deepcopy(getattr(self._policy, "state", None))
 
     def _restore(self, state: Any) -> None:
-        own = getattr(self._policy, "state", None)
+        own: Any = getattr(self._policy, "state", None)
         if np.shape(own) != np.shape(state):
             raise ControllerError(
                 f"a state of shape {np.shape(state)} does not fit this controller's {np.shape(own)}: pass what its own "
