@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,7 +44,12 @@ def configure_compare(parser: argparse.ArgumentParser) -> None:
 
 def compare_runs(args: argparse.Namespace) -> int:
     """Print settings that differ, scores at equal budgets, and differences from the first run."""
-    from dreamfleet.coordinator.analysis.comparison import ComparedRun, at_equal_budget, differing_settings
+    from dreamfleet.coordinator.analysis.comparison import (
+        ComparedRun,
+        at_equal_budget,
+        differing_settings,
+        paired_differences,
+    )
 
     names = list(dict.fromkeys(args.run_names))
     if len(names) < 2:
@@ -55,7 +60,7 @@ def compare_runs(args: argparse.Namespace) -> int:
             sides.append(ComparedRun.of(stored))
     settings, worlds = differing_settings(sides), {each.world for each in sides if each.world is not None}
     equal = at_equal_budget(sides) if len(worlds) == 1 else []
-    found = list(_run_differences(sides, equal)) if len(worlds) == 1 else []
+    found = list(paired_differences(sides, equal)) if len(worlds) == 1 else []
     if args.json:
         runs = [_run_facts(each) for each in sides]
         budgets = [_budget_facts(sides, each) for each in equal]
@@ -114,26 +119,6 @@ def _format_evaluation(look: EvaluatedMean | None) -> str:
     if look is None:
         return "had nothing evaluated"
     return f"{format_with_error(look.point.score, look.point.error)} (generation {look.generation})"
-
-
-def _run_differences(sides: Sequence[ComparedRun], equal: Sequence[EqualBudget]) -> Iterator[dict[str, Any]]:
-    """Each run less the first: at equal budgets, then of confirmed scores."""
-    from dreamfleet.common.runs.paired_difference import PairedDifference
-    from dreamfleet.coordinator.analysis.comparison import difference
-
-    def paired(of: str, side: ComparedRun, one: dict[int, float], other: dict[int, float]) -> dict[str, Any]:
-        found = difference(one, other)
-        figures = {**asdict(found), "clear": found.is_significant} if isinstance(found, PairedDifference) else {}
-        text = found.description if isinstance(found, PairedDifference) else found
-        return {"of": of, "run": side.name, "against": sides[0].name, **figures, "text": text}
-
-    for number, side in enumerate(sides[1:], 1):
-        for each in equal:
-            base, look = each.evaluated_means[0], each.evaluated_means[number]
-            if base is not None and look is not None:
-                yield paired(f"at equal {each.what}", side, base.scores, look.scores)
-        if sides[0].confirmed is not None and side.confirmed is not None:
-            yield paired("confirmed", side, sides[0].confirmed_scores, side.confirmed_scores)
 
 
 def _run_facts(side: ComparedRun) -> dict[str, Any]:
