@@ -51,6 +51,7 @@ def _difference(found: dict[str, Any], word: str) -> dict[str, Any]:
         "half": paired.critical_value * paired.error,
         "size": format_with_error(paired.mean, paired.error, sign="+,"),
         "on": plural(paired.seeds, f"common {word}"),
+        "clear": paired.is_significant,
         "verdict": _verdict(found, paired),
     }
 

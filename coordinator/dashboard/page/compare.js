@@ -35,9 +35,9 @@ const fillDifferences = (page, runs, { worlds, differences, error }) => {
   page["paired-table"].hidden = !differences.length;
   page["paired-why"].hidden = differences.length > 0;
   say(page["paired-why"], why);
-  page.paired.replaceChildren(...differences.map(({ of, size, on, verdict }) => {
+  page.paired.replaceChildren(...differences.map(({ of, size, on, verdict, clear }) => {
     const row = make("tr");
-    row.append(make("th", of, { scope: "row" }), make("td", size ?? "-", { class: "n" }), make("td", on ?? ""), make("td", verdict));
+    row.append(make("th", of, { scope: "row" }), make("td", size ?? "-", { class: "n" }), make("td", on ?? ""), make("td", verdict, { class: clear ? "clear" : "" }));
     return row;
   }));
   say(page["paired-size"], `${second} − ${first}`);

@@ -57,12 +57,9 @@ export const number = (value, digits = 1) =>
     ? "-"
     : value.toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits });
 
-// A score in four significant digits, whole thousands in full.
-export const score = (value) => {
-  if (value === null || value === undefined) return "-";
-  if (Math.abs(value) >= 999.95) return number(value, 0);
-  return value.toLocaleString("en", { minimumSignificantDigits: 4, maximumSignificantDigits: 4, useGrouping: false });
-};
+// A score: with one decimal, so that a column of them is aligned, or in three significant digits if it is small.
+export const score = (value) =>
+  !value || Math.abs(value) >= 0.95 ? number(value) : value.toLocaleString("en", { minimumSignificantDigits: 3, maximumSignificantDigits: 3 });
 
 export const short = (seconds) => (seconds < 10 ? seconds.toPrecision(2) : number(seconds, 0));
 

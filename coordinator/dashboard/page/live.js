@@ -217,7 +217,9 @@ const split = (worker) => {
 };
 
 const cell = (key, value) =>
-  value === null ? "-" : key === "heard" ? `${value.toFixed(1)} s ago` : key === "load" ? value.toFixed(2) : typeof value === "number" ? value.toLocaleString("en") : value;
+  value === null ? "-" : key === "heard" ? ago(value) : key === "load" ? value.toFixed(2) : typeof value === "number" ? value.toLocaleString("en") : value;
+
+const ago = (seconds) => (seconds < 99.95 ? `${seconds.toFixed(1)} s ago` : `${Math.round(seconds / 60)} min ago`);
 
 const workerRow = () => {
   const row = make("tr", "", { role: "row" }); // the roles that a grid would take from a table
