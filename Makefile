@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constr
 SOURCES := pyproject.toml constraints.txt $(wildcard worker/car_racing/native/*)
 
 .PHONY: demo test test-doom test-newest slow setup check wheel long box2d-py simulate chaos weekend fuzz sanitize bundle worker-size \
-  stranger reproduce reproduce-evolution lock audit sbom structure clean
+  stranger reproduce reproduce-evolution lock audit sbom structure reference clean
 
 demo: $(VENV)/.demo $(if $(filter takecover,$(WORLD)),$(VENV)/.demo-doom)  ## evolve a controller here (WORLD=takecover: there), judge it, plot it, record it
 	$(BIN)/dreamfleet demo $(if $(WORLD),--world $(WORLD)) $(ARGS)
@@ -124,6 +124,9 @@ sbom: $(SUPPLY)/.done  ## build/worker.cdx.json: what a worker's environment is 
 
 structure:  ## figures of the structure: rooms, floors, imports between rooms, files a folder, class names, wording
 	$(PYTHON) deploy/structure.py $(ARGS)
+
+reference: $(VENV)/.dev  ## docs/reference/verbs.md and settings.md from the parsers
+	$(BIN)/python deploy/reference.py
 
 clean:
 	rm -rf $(VENV) $(SUPPLY) .venv-box2d-py .venv-newest build dist *.egg-info

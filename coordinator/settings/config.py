@@ -179,7 +179,7 @@ class RunConfig:
     schedule: str | None = option(
         None,
         "a TOML file of stages, each a [[stage]] with its end (generations, steps, score) and its own horizon, "
-        "patience, episodes, population, sigma0 and racing (docs/how-to/operations.md); none: no stages",
+        "patience, episodes, population, sigma0 and racing (docs/how-to/stages.md); none: no stages",
     )
     preset_variant: tuple[str, ...] = ()  # the preset's variant, which `variant` overrides name by name
     stages: tuple[StageSettings, ...] = field(default=(), metadata={"record": RunSettings})  # read from the schedule
