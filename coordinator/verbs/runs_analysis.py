@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,7 @@ from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.score_words import score_word
 
 if TYPE_CHECKING:
-    from dreamfleet.coordinator.analysis.comparison import ComparedRun, EqualBudget, EvaluatedMean
+    from dreamfleet.common.runs.comparison import ComparedRun, EqualBudget, EvaluatedMean
 
 SAME_SEEDS = (
     "all runs are judged on the same validation seeds, so their ± are not independent: differences are paired by seed"
@@ -44,12 +44,7 @@ def configure_compare(parser: argparse.ArgumentParser) -> None:
 
 def compare_runs(args: argparse.Namespace) -> int:
     """Print settings that differ, scores at equal budgets, and differences from the first run."""
-    from dreamfleet.coordinator.analysis.comparison import (
-        ComparedRun,
-        at_equal_budget,
-        differing_settings,
-        paired_differences,
-    )
+    from dreamfleet.common.runs.comparison import ComparedRun, at_equal_budget, differing_settings
 
     names = list(dict.fromkeys(args.run_names))
     if len(names) < 2:
@@ -60,7 +55,7 @@ def compare_runs(args: argparse.Namespace) -> int:
             sides.append(ComparedRun.of(stored))
     settings, worlds = differing_settings(sides), {each.world for each in sides if each.world is not None}
     equal = at_equal_budget(sides) if len(worlds) == 1 else []
-    found = list(paired_differences(sides, equal)) if len(worlds) == 1 else []
+    found = list(_run_differences(sides, equal)) if len(worlds) == 1 else []
     if args.json:
         runs = [_run_facts(each) for each in sides]
         budgets = [_budget_facts(sides, each) for each in equal]
@@ -121,6 +116,26 @@ def _format_evaluation(look: EvaluatedMean | None) -> str:
     return f"{format_with_error(look.point.score, look.point.error)} (generation {look.generation})"
 
 
+def _run_differences(sides: Sequence[ComparedRun], equal: Sequence[EqualBudget]) -> Iterator[dict[str, Any]]:
+    """Each run less the first: at equal budgets, then of confirmed scores."""
+    from dreamfleet.common.runs.comparison import difference
+    from dreamfleet.common.runs.paired_difference import PairedDifference
+
+    def paired(of: str, side: ComparedRun, one: dict[int, float], other: dict[int, float]) -> dict[str, Any]:
+        found = difference(one, other)
+        figures = {**asdict(found), "clear": found.is_significant} if isinstance(found, PairedDifference) else {}
+        text = found.description if isinstance(found, PairedDifference) else found
+        return {"of": of, "run": side.name, "against": sides[0].name, **figures, "text": text}
+
+    for number, side in enumerate(sides[1:], 1):
+        for each in equal:
+            base, look = each.evaluated_means[0], each.evaluated_means[number]
+            if base is not None and look is not None:
+                yield paired(f"at equal {each.what}", side, base.scores, look.scores)
+        if sides[0].confirmed is not None and side.confirmed is not None:
+            yield paired("confirmed", side, sides[0].confirmed_scores, side.confirmed_scores)
+
+
 def _run_facts(side: ComparedRun) -> dict[str, Any]:
     confirmed = side.confirmed and with_error(side.confirmed)
     effort = {**asdict(side.total), "core_hours": side.total.core_hours}
@@ -179,8 +194,8 @@ def _draw_fitness(args: argparse.Namespace, out: Path) -> None:
 
 
 def _draw_learning(args: argparse.Namespace, out: Path) -> None:
+    from dreamfleet.common.runs.learning import LearningCurve
     from dreamfleet.common.worlds.shipped import WORLDS
-    from dreamfleet.coordinator.analysis.learning import LearningCurve
     from dreamfleet.coordinator.analysis.plot import plot_learning
 
     curves = []

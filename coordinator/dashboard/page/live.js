@@ -194,6 +194,7 @@ const fillWorkers = (frame) => {
   const fleet = page.workers;
   while (fleet.children.length > count) fleet.lastElementChild.remove();
   let before = "";
+  const inks = laneInks(); // read once: between changes of the page each reading would cost a layout of it
   for (let index = 0; index < count; index += 1) {
     if (!fleet.children[index]) fleet.append(workerRow());
     const row = fleet.children[index];
@@ -205,7 +206,7 @@ const fillWorkers = (frame) => {
     say(row.name.lastChild, workers.reason[index] ? `${life} ${workers.reason[index]}` : life);
     if (row.lane !== workers.lane[index]) {
       row.lane = workers.lane[index];
-      paintLane(row);
+      paintLane(row, inks);
     }
     COLUMNS.forEach(([key], at) => say(row.cells[at + 2], cell(key, workers[key][index])));
   }
@@ -234,27 +235,36 @@ const workerRow = () => {
   return row;
 };
 
-const paintLane = ({ canvas, lane }) => {
-  if (!lane) return;
+const laneInks = () => ({
+  x: colour("red"), "?": colour("amber"), ".": colour("line-strong"), " ": colour("soft"), speed: colour("blue"),
+});
+
+// Only what changed since it was painted last: of a lane mostly its newest slice.
+const paintLane = (row, inks) => {
+  const { canvas, lane, painted = "" } = row;
   const paper = canvas.getContext("2d");
   const wide = canvas.width / lane.length;
-  const inks = { x: colour("red"), "?": colour("amber"), ".": colour("line-strong"), " ": colour("soft") };
-  const blue = colour("blue");
-  paper.fillStyle = inks[" "];
-  paper.fillRect(0, 0, canvas.width, canvas.height);
   for (let at = 0; at < lane.length; at += 1) {
     const sign = lane[at];
-    if (sign === " ") continue;
-    const speed = Number(sign);
-    paper.globalAlpha = inks[sign] ? 1 : 0.25 + 0.75 * (speed / 9);
-    paper.fillStyle = inks[sign] ?? blue;
-    paper.fillRect(at * wide, 0, wide - 1, canvas.height);
+    if (sign === painted[at]) continue;
+    const last = sign === " " ? wide : wide - 1; // a gap between slices
+    paper.globalAlpha = 1;
+    paper.fillStyle = inks[" "];
+    paper.fillRect(at * wide, 0, wide, canvas.height);
+    if (!inks[sign]) paper.globalAlpha = 0.25 + 0.75 * (Number(sign) / 9);
+    paper.fillStyle = inks[sign] ?? inks.speed;
+    paper.fillRect(at * wide, 0, last, canvas.height);
   }
-  paper.globalAlpha = 1;
+  row.painted = lane;
 };
 
 export const redraw = () => {
-  if (page) for (const row of page.workers.children) paintLane(row);
+  if (!page) return;
+  const inks = laneInks();
+  for (const row of page.workers.children) {
+    row.painted = "";
+    paintLane(row, inks);
+  }
 };
 
 export const leave = () => {

@@ -6,18 +6,17 @@ is therefore common to both scores and cancels in a difference per track (`commo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.effort import Effort
+from dreamfleet.common.runs.learning import LearningCurve, Point, total_effort
 from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, expand_task_options
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.serialization.optional_fields import to_dict
-from dreamfleet.coordinator.analysis.learning import LearningCurve, Point
-from dreamfleet.coordinator.settings.start import total_effort
 
 Scores = dict[int, float]  # by validation seed
 
@@ -105,24 +104,6 @@ def difference(one: Scores, other: Scores) -> PairedDifference | str:
         return PairedDifference.of(one, other)
     except UsageError:
         return "no difference: fewer than 2 seeds are in both"
-
-
-def paired_differences(sides: Sequence[ComparedRun], equal: Sequence[EqualBudget]) -> Iterator[dict[str, Any]]:
-    """Each run less the first, as plain values: at equal budgets, then of confirmed scores."""
-
-    def paired(of: str, side: ComparedRun, one: Scores, other: Scores) -> dict[str, Any]:
-        found = difference(one, other)
-        figures = {**asdict(found), "clear": found.is_significant} if isinstance(found, PairedDifference) else {}
-        text = found.description if isinstance(found, PairedDifference) else found
-        return {"of": of, "run": side.name, "against": sides[0].name, **figures, "text": text}
-
-    for number, side in enumerate(sides[1:], 1):
-        for each in equal:
-            base, look = each.evaluated_means[0], each.evaluated_means[number]
-            if base is not None and look is not None:
-                yield paired(f"at equal {each.what}", side, base.scores, look.scores)
-        if sides[0].confirmed is not None and side.confirmed is not None:
-            yield paired("confirmed", side, sides[0].confirmed_scores, side.confirmed_scores)
 
 
 def _flatten(plain: dict[str, Any], prefix: str = "") -> dict[str, Any]:
