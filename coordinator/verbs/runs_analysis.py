@@ -63,7 +63,7 @@ def _draw_fitness(args: argparse.Namespace, out: Path) -> None:
 
 
 def _draw_learning(args: argparse.Namespace, out: Path) -> None:
-    from dreamfleet.coordinator.analysis.learning import LearningCurve
+    from dreamfleet.common.runs.learning import LearningCurve
     from dreamfleet.coordinator.analysis.plot import plot_learning, published_scores
 
     curves = []
