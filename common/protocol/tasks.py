@@ -19,6 +19,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.host.packages import install_command_for
 from dreamfleet.common.host.trusted_modules import check_trusted, import_trusted
+from dreamfleet.common.serialization.display import DisplayedFields
 
 GROUP = "dreamfleet.tasks"
 _NAME = re.compile(r"[\w-][\w.-]*(:\S+)?", re.ASCII)
@@ -27,13 +28,14 @@ GYM = "gym"  # the family of gymnasium's environments; they need no bundle
 DREAM = "dream"  # the task whose candidates are scored in the world model
 
 
-@dataclass(frozen=True)
-class Description:
+@dataclass(frozen=True, repr=False)
+class Description(DisplayedFields):
     """The properties of a task without bundle that a run freezes.
 
     >>> from dreamfleet import Description
-    >>> Description(observations=4, outputs=2, packages=("numpy", "gymnasium")).version
-    1
+    >>> description = Description(observations=4, outputs=2)
+    >>> description, description.version
+    (Description(observations=4, outputs=2), 1)
     """
 
     observations: int  # inputs of a controller
@@ -99,6 +101,9 @@ def _task_class(module: Any, name: str) -> Any:
     found = getattr(module, name)
     if not isinstance(found, type):
         raise TypeError(f"{name} of {module.__name__} is not a task: it is not a class")
+    if issubclass(found, getattr(sys.modules.get("gymnasium"), "Env", ())):
+        written = f"{GYM}:{module.__name__}:{name}"
+        raise TypeError(f"{name} of {module.__name__} is an environment of gymnasium and no task: write {written}")
     return found
 
 
@@ -133,9 +138,22 @@ def check_task(name: str) -> None:
     head, colon, _ = name.partition(":")
     if head in points or "." in head:
         return
+    if same := [each for each in points if _plain(each) == _plain(head)]:
+        raise UsageError(f"unknown task {name!r}: it is written {same[0]} here")
+    if not colon and _ENVIRONMENT.search(name):
+        raise UsageError(f"unknown task {name!r}: gymnasium's environments are written {GYM}:{name}")
     near = difflib.get_close_matches(head, points, n=1, cutoff=0.75)
     if near:
         raise UsageError(f"unknown task {name!r}: did you mean {near[0]}{':...' if colon else ''}?")
+
+
+def _plain(name: str) -> str:
+    """A name without what people write differently.
+
+    >>> _plain("CarRacing-v3") == _plain("car-racing")
+    True
+    """
+    return re.sub(r"[-_]", "", _ENVIRONMENT.sub("", name)).lower()
 
 
 def describe_task(name: str, options: Mapping[str, Any]) -> Description:

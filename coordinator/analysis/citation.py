@@ -14,6 +14,7 @@ from dreamfleet.common.errors import BundleError
 from dreamfleet.common.monitoring.eta import format_duration
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.tasks import module_of
+from dreamfleet.common.runs.learning import total_effort
 from dreamfleet.common.runs.records import (
     RunSettings,
     StoredConfirmation,
@@ -31,7 +32,6 @@ from dreamfleet.common.runs.stages import begun_stages, describe_stages
 from dreamfleet.common.runs.times import parse_time
 from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.common.worlds.score_words import score_word_of_run
-from dreamfleet.coordinator.settings.start import total_effort
 
 
 def citation_facts(run: RunFolder) -> dict[str, Any]:
@@ -131,8 +131,16 @@ def _commands(run: RunFolder) -> dict[str, str]:
     modules = _task_modules(run)
     trust, trust_all = trust_flag(modules), trust_flag([*modules, module_of(run.settings.optimiser)])
     words = {
-        f"one candidate's fitness again, {one}": ("replay", run.name, "--candidate", f"{last}/0", *beside, *trust),
-        f"the whole run again, {whole}": ("repeat", run.name, *beside, *trust_all),
+        f"one candidate's fitness again, {one}": (
+            "verify",
+            "candidate",
+            run.name,
+            "--candidate",
+            f"{last}/0",
+            *beside,
+            *trust,
+        ),
+        f"the whole run again, {whole}": ("verify", "run", run.name, *beside, *trust_all),
         "its score on unseen seeds": ("evaluate", "--controller", controller, "--episodes", "100", *trust),
     }
     return {why: shlex.join(("dreamfleet", *each)) for why, each in words.items()}
