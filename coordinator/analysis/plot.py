@@ -55,7 +55,7 @@ def fitness_figure(run: RunFolder) -> Any:
     )
     dreamt = settings.task.task == DREAM
     steps = join_distinct(describe_steps(each.stage.horizon, each.stage.driven, dreamt=dreamt) for each in stages)
-    axes.set_ylabel(f"fitness: sum of rewards over {steps}")
+    axes.set_ylabel(f"fitness over {steps} (sum of rewards)")
     title = f"{run.name}: {settings.task.task}, {size}, seed {settings.seed}"
     axes.set_title("\n".join(textwrap.wrap(title, TITLE)), fontsize=11)
     figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)

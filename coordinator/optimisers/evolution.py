@@ -137,7 +137,7 @@ class Evolution:
         if not travels:
             raise DreamfleetError(
                 f"optimiser {self._config.optimiser!r} asked for what no single-precision number can hold, at "
-                f"step size {self.sigma:g}: it cannot continue; fork the run with another --sigma0 or --optimiser"
+                f"step size {self.sigma:g}: it cannot continue; start one --from it with other --sigma0 or --optimiser"
             )
         return asked
 

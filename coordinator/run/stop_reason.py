@@ -15,7 +15,7 @@ def find_stop_reason(
     """Why the run ends before `generation` is scored, in words; `None` if it continues."""
     if generation.is_one_point:
         collapsed = f"the population of generation {generation.number} collapsed to one point"
-        return f"{collapsed}; fork the run with a larger --sigma0"
+        return f"{collapsed}; start another --from it with a larger --sigma0"
     return _find_reached_limit(limits, history, jobs)
 
 
