@@ -29,7 +29,7 @@ REAL: dict[str, Any] = {
         StageSettings(episodes=16),
     ),
 }
-# Each candidate drives one track and dreams another: docs/explanation/dreams.md, "Some of reality in it".
+# Each candidate drives one track and dreams another: docs/lab/dreams-notes.md, "Some of reality in it".
 MIXED: dict[str, Any] = {
     **REAL,
     "stages": (

@@ -15,7 +15,7 @@ from dreamfleet.coordinator.experiments.iteration.ledger import IterationLedger
 from dreamfleet.coordinator.experiments.iteration.plan import EVOLVE, GATE, MDNRNN, VAE, Phase
 
 GATE_SEED = VALIDATION.start + 30_000  # the first track of a gate: no evaluation and no confirmation has it
-GATE_NOISE = 0.3  # as in docs/explanation/dreams.md
+GATE_NOISE = 0.3  # as in docs/lab/dreams-notes.md
 LATER_UPDATES = {VAE: 1800, MDNRNN: 600}  # default of a round that continues a model's training
 
 

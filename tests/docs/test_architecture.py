@@ -1,0 +1,41 @@
+"""architecture.md names the rooms that exist, and the files, classes and methods that it names are there."""
+
+import ast
+import re
+
+from deploy.structure import ROOT, SIDES, sources
+
+PAGE = ROOT / "docs" / "explanation" / "architecture.md"
+MOST_WORDS = 1200
+NO_ROOM = {"__pycache__", "pretrained"}  # `pretrained` holds files that ship, and no code
+
+
+def rooms_on_the_page() -> dict[str, set[str]]:
+    parts = re.split(r"^\*\*(\w+)/\*\*", PAGE.read_text(), flags=re.MULTILINE)
+    tables = zip(parts[1::2], parts[2::2], strict=True)
+    return {side: set(re.findall(r"^\| `(\w+)/` \|", text, re.MULTILINE)) for side, text in tables}
+
+
+def test_each_room_has_its_row():
+    rooms = {side: {path.name for path in (ROOT / side).iterdir() if path.is_dir()} - NO_ROOM for side in SIDES}
+    assert rooms_on_the_page() == rooms
+
+
+def test_what_it_names_exists():
+    defined = {
+        node.name
+        for path in sources(*SIDES)
+        for node in ast.walk(ast.parse((ROOT / path).read_text()))
+        if isinstance(node, (ast.ClassDef, ast.FunctionDef))
+    }
+    words = re.findall(r"`([^`]+)`", PAGE.read_text())
+    paths = [word for word in words if re.fullmatch(r"(common|coordinator|worker|deploy|tests)/[\w/.]*", word)]
+    names = [word for word in words if re.fullmatch(r"[A-Z]\w+(\.\w+)?", word)]
+    assert [path for path in paths if not (ROOT / path).exists()] == []
+    assert [name for name in names if not set(name.split(".")) <= defined] == []
+    assert paths
+    assert names
+
+
+def test_it_stays_short():
+    assert len(PAGE.read_text().split()) <= MOST_WORDS
