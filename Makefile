@@ -139,8 +139,8 @@ site: $(VENV)/.docs  ## build/site: README and all documents as a site that need
 	rm -rf build/pages && mkdir -p build/pages/deploy
 	cp -r README.md CONTRIBUTING.md CHANGELOG.md docs build/pages
 	cp deploy/*.md build/pages/deploy
-	$(BIN)/mkdocs build --strict --quiet
-	@echo "build/site/index.html"
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "build/site/index.html; with search: $(PYTHON) -m http.server --directory build/site"
 
 clean:
 	rm -rf $(VENV) $(SUPPLY) .venv-box2d-py .venv-newest build dist *.egg-info

@@ -27,13 +27,15 @@ CODE = re.compile(r"(`+).+?\1", re.DOTALL)
 LINK = re.compile(r"!?\[([^\]]*)\]\([^)]*\)(?:\{[^}]*\})?")
 # What begins a block of its own: a heading, an item of a list, a quotation, an admonition.
 BEGINNING = re.compile(r"^\s*(?:#+|[-*+]|\d+[.)]|>|!!!|\?\?\?|===)\s+")
-END = re.compile(r"(?<=[.!?])[\"')*_]*\s+(?=[A-Z0-9\"'(*_`\[±])")
+END = re.compile(r"(?:(?<=[.!?])|(?<=[.!?][\"')*_]))\s+(?=[A-Z0-9\"'(*_`\[±])")
 ABBREVIATION = re.compile(r"\b(?:e\.g|i\.e|etc|vs|cf|s\.e)\.$")
 
 
 def pages() -> list[Path]:
     """The documents of the project, relative to its folder."""
-    found = (path for part in ("README.md", "CONTRIBUTING.md", "docs/**/*.md", "deploy/*.md") for path in ROOT.glob(part))
+    found = (
+        path for part in ("README.md", "CONTRIBUTING.md", "docs/**/*.md", "deploy/*.md") for path in ROOT.glob(part)
+    )
     return sorted(path.relative_to(ROOT) for path in found)
 
 
@@ -131,10 +133,10 @@ def measure() -> dict[str, dict[str, int]]:
 def check_spelling() -> int:
     """Look for American spelling in the documents with codespell's own list of British words, turned round.
 
-    Code within a line is left out. Returns how many words were found; codespell prints them. Words that are right as they
-    are stand in `pyproject.toml`.
+    Code within a line is left out. Returns how many words were found; codespell prints them. `pyproject.toml` lists
+    words that are right as they are.
     """
-    import codespell_lib  # noqa: PLC0415  (of the extra `dev`, which the other figures do not need)
+    import codespell_lib
 
     british = Path(codespell_lib.__file__).parent / "data" / "dictionary_en-GB_to_en-US.txt"
     pairs = (line.split("->") for line in british.read_text().splitlines())

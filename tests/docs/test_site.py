@@ -16,7 +16,9 @@ NAMED = re.compile(r"<link\b[^>]*\brel=\"?canonical")
 
 def test_every_document_stands_in_the_navigation():
     listed = set(re.findall(r": (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
-    there = {str(path.relative_to(ROOT)) for part in ("*.md", "docs/**/*.md", "deploy/*.md") for path in ROOT.glob(part)}
+    there = {
+        str(path.relative_to(ROOT)) for part in ("*.md", "docs/**/*.md", "deploy/*.md") for path in ROOT.glob(part)
+    }
     assert there - listed == set(), "name it under `nav` in mkdocs.yml"
     assert listed - there == set(), "`nav` in mkdocs.yml names what is not there"
 

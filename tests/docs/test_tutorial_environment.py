@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from tests.docs.tutorial import run_tutorial
+from tests.docs.tutorial import WHOLE, run_tutorial
 
 SHARES = {
     "--generations 30 --evaluate-every 10": "--generations 2 --population 4 --evaluate-every 1 --evaluation-episodes 2"
@@ -14,6 +14,7 @@ SHARES = {
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(WHOLE + 60)
 def test_its_commands_work_as_they_stand(tmp_path):
     printed = run_tutorial("own-environment.md", "my_drone.py", SHARES, tmp_path)
     for made in ("runs/drone/controller.npz", "runs/hidden/controller.npz", "learning.png", "drive.mp4"):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.docs.tutorial import run_tutorial
+from tests.docs.tutorial import WHOLE, run_tutorial
 
 SHARES = {
     "--scale 0.5": "--scale 0.005 --jobs 1",
@@ -15,6 +15,7 @@ SHARES = {
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(WHOLE + 60)
 def test_its_commands_work_as_they_stand(tmp_path):
     printed = run_tutorial("own-world-model.md", "my_world.py", SHARES, tmp_path)
     for made in ("data/pixels.zip", "inspection/index.html", "runs/canyon/controller.npz", "drive.mp4"):

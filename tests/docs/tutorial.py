@@ -8,6 +8,8 @@ from pathlib import Path
 
 from tests.support.processes import DEADLINE, ROOT, free_port
 
+WHOLE = 3 * DEADLINE  # seconds that a page's commands may take together
+
 
 def run_tutorial(page, module, shares, folder):
     """What its commands print, but for its first block, which installs; `module` is the file of its Python block."""
@@ -26,7 +28,7 @@ def run_tutorial(page, module, shares, folder):
     }  # fmt: skip
     done = subprocess.run(
         ("bash", "-ec", script), cwd=folder, env={**os.environ, **own}, capture_output=True, text=True,
-        timeout=DEADLINE, check=False,
+        timeout=WHOLE, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return done.stdout
