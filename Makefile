@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constr
 SOURCES := pyproject.toml constraints.txt $(wildcard worker/car_racing/native/*)
 
 .PHONY: demo test test-doom test-newest slow setup check wheel long box2d-py simulate chaos weekend fuzz sanitize bundle worker-size \
-  stranger reproduce reproduce-evolution lock audit sbom structure words site clean
+  stranger reproduce reproduce-evolution lock audit sbom structure words site reference clean
 
 demo: $(VENV)/.demo $(if $(filter takecover,$(WORLD)),$(VENV)/.demo-doom)  ## evolve a controller here (WORLD=takecover: there), judge it, plot it, record it
 	$(BIN)/dreamfleet demo $(if $(WORLD),--world $(WORLD)) $(ARGS)
@@ -141,6 +141,9 @@ site: $(VENV)/.docs  ## build/site: README and all documents as a site that need
 	cp deploy/*.md build/pages/deploy
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "build/site/index.html; with search: $(PYTHON) -m http.server --directory build/site"
+
+reference: $(VENV)/.dev  ## docs/reference/verbs.md and settings.md from the parsers
+	$(BIN)/python deploy/reference.py
 
 clean:
 	rm -rf $(VENV) $(SUPPLY) .venv-box2d-py .venv-newest build dist *.egg-info

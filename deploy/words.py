@@ -27,7 +27,7 @@ CODE = re.compile(r"(`+).+?\1", re.DOTALL)
 LINK = re.compile(r"!?\[([^\]]*)\]\([^)]*\)(?:\{[^}]*\})?")
 # What begins a block of its own: a heading, an item of a list, a quotation, an admonition.
 BEGINNING = re.compile(r"^\s*(?:#+|[-*+]|\d+[.)]|>|!!!|\?\?\?|===)\s+")
-END = re.compile(r"(?:(?<=[.!?])|(?<=[.!?][\"')*_]))\s+(?=[A-Z0-9\"'(*_`\[±])")
+END = re.compile(r"(?:(?<=[.!?])|(?<=[.!?][\"')*_])|(?<=[.!?][\"')*_]{2}))\s+(?=[A-Z0-9\"'(*_`\[±])")
 ABBREVIATION = re.compile(r"\b(?:e\.g|i\.e|etc|vs|cf|s\.e)\.$")
 
 

@@ -334,6 +334,8 @@ def _read_manifest(archive: Archive, path: Path) -> BundleManifest:
         for name in ("reward_scale", "first_reward"):
             if any(not _is_number(each.get(name, 0)) for each in manifest.models.values()):
                 raise MalformedError(f"{name} is no finite number")
+        if not all(map(str.isprintable, (manifest.name, manifest.task, manifest.preprocessing))):
+            raise MalformedError("a name holds control characters")
         if manifest.world is not None and manifest.world.actions.actions != manifest.actions:
             raise MalformedError("its world has another number of actions")
     except DamagedArchiveError:

@@ -98,7 +98,9 @@ class EndRule:
 
 @dataclass(frozen=True, kw_only=True)
 class WorldFacts:
-    """A world as a bundle's manifest describes it; `MalformedError` if its actions do not fit together.
+    """A world as a bundle's manifest describes it.
+
+    `MalformedError` if its actions do not fit together, or a name would control a terminal.
 
     >>> from dreamfleet.common.artifacts.actions import one_hot
     >>> facts = WorldFacts.of(one_hot(3), packages=("numpy", "onnxruntime"), horizon=525, frames_per_second=9)
@@ -133,6 +135,10 @@ class WorldFacts:
             raise MalformedError("output_indices do not name one output for each component of an action")
         if any(len(choice) != size for choice in self.choices):
             raise MalformedError("a choice has another length than the action")
+        if len(self.action_names) not in (0, size):
+            raise MalformedError(f"it names {len(self.action_names)} actions of {size}")
+        if not all(map(str.isprintable, (*self.packages, *self.action_names, self.score_word))):
+            raise MalformedError("a name holds control characters")
 
     @classmethod
     def of(cls, actions: Continuous, **facts: Any) -> WorldFacts:

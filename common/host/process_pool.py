@@ -15,6 +15,7 @@ from time import monotonic, sleep
 from typing import Any, Generic, NoReturn, TypeVar
 
 from dreamfleet.common.host.descendants import Descendants
+from dreamfleet.common.host.foreign_code import send_stdout_to_stderr
 from dreamfleet.common.host.parent_death import signals_blocked
 from dreamfleet.common.host.stall_watch import START_LIMIT, StallWatch, describe_slow_start, describe_stall
 
@@ -181,7 +182,8 @@ class _Pool(Generic[Item, Answer]):
 
 
 def _begin(steps: Any, start: Callable[..., None], arguments: tuple[Any, ...]) -> None:
-    """Initialise a process of the pool."""
+    """Initialise a process of the pool. What it prints goes to stderr: its parent answers on stdout."""
     global _steps  # noqa: PLW0603 - one a process
+    send_stdout_to_stderr()
     _steps = steps
     start(*arguments)

@@ -212,7 +212,12 @@ class Demo:
             for name in (f"core-{number}" for number in range(workers)):
                 run.start_worker(name, model_commands.worker(demo_run.run, self._endpoint, 1, "--name", name))
             with Live(console=self._console, refresh_per_second=4) as live:
-                run.wait(never_stop, lambda: self._show(live, client, demo_run.run), REFRESH)
+
+                def look() -> None:
+                    run.check_some_worker()
+                    self._show(live, client, demo_run.run)
+
+                run.wait(never_stop, look, REFRESH)
 
     def _connect(self, coordinator: VerbProcess) -> Client:
         deadline = time.monotonic() + START_SECONDS

@@ -88,6 +88,11 @@ class LocalRun:
             if each.popen.poll() not in (None, 0):
                 raise DreamfleetError(f"this host's worker failed: {each.last_line()}")
 
+    def check_some_worker(self) -> None:
+        """`DreamfleetError` if every worker failed: the coordinator would wait for ever."""
+        if self._workers and all(each.popen.poll() not in (None, 0) for each in self._workers):
+            raise DreamfleetError(f"this host's workers failed: {self._workers[-1].last_line()}")
+
     def wait(self, stop: Stop, on_poll: Callable[[], None], interval: float = POLL_INTERVAL) -> None:
         """Wait until the coordinator ends, calling `on_poll` meanwhile.
 

@@ -55,6 +55,7 @@ from dreamfleet.common.runs.records import (
 from dreamfleet.common.runs.stages import Stage, stages_of
 from dreamfleet.common.serialization.validation import Between, Count
 from dreamfleet.common.transport.network import parse_metrics_address
+from dreamfleet.coordinator.settings.presets import check_preset_fits
 from dreamfleet.coordinator.settings.schedule import check_schedule, split_first_stage
 from dreamfleet.coordinator.settings.task_options import (
     check_normalisation,
@@ -179,7 +180,7 @@ class RunConfig:
     schedule: str | None = option(
         None,
         "a TOML file of stages, each a [[stage]] with its end (generations, steps, score) and its own horizon, "
-        "patience, episodes, population, sigma0 and racing (docs/how-to/operations.md); none: no stages",
+        "patience, episodes, population, sigma0 and racing (docs/how-to/stages.md); none: no stages",
     )
     preset_variant: tuple[str, ...] = ()  # the preset's variant, which `variant` overrides name by name
     stages: tuple[StageSettings, ...] = field(default=(), metadata={"record": RunSettings})  # read from the schedule
@@ -294,6 +295,7 @@ class RunConfig:
     def _check_world(self, bundle: Bundle) -> None:
         """`UsageError` for a world model that the task surely cannot use; others may be of several tasks."""
         task, world = str(self.task), bundle.manifest.task
+        check_preset_fits(self.preset, world, bundle.path.name)
         if task in (DREAM, world):
             return
         if bundle.manifest.world is not None or is_shipped(task):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from dreamfleet.common.cli.presets import check_preset
+from dreamfleet.common.errors import UsageError
 from dreamfleet.common.worlds.shipped import WORLDS
 
 # The dream of any world that a bundle describes.
@@ -20,6 +21,18 @@ PIXELS: dict[str, Any] = {
     "confirm_episodes": 32,
 }
 PRESETS = {"pixels": PIXELS, **{name: each for world in WORLDS.values() for name, each in world.run_presets.items()}}
+
+
+def check_preset_fits(name: str | None, world: str, bundle: str) -> None:
+    """`UsageError` if a preset was made for a named world model, and the run's `bundle` is of another world.
+
+    Presets that name no world model, such as dream, are of any.
+    """
+    own = next((each.task for each in WORLDS.values() if "bundle" in each.run_presets.get(name or "", {})), world)
+    if own != world:
+        raise UsageError(
+            f"the preset {name} is of {own}, and {bundle} is a world model of {world}: give --preset pixels"
+        )
 
 
 def find_preset(name: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Every verb accepts the configuration file of docs/how-to/operations.md; a run ends with its workers."""
+"""Every verb accepts the configuration file of docs/how-to/configure.md; a run ends with its workers."""
 
 import json
 import re
@@ -9,7 +9,7 @@ from tests.support.processes import ROOT
 
 
 def test_the_documented_file_is_accepted_by_every_kind_of_verb(processes):
-    text = Path(ROOT / "docs" / "how-to" / "operations.md").read_text()
+    text = Path(ROOT / "docs" / "how-to" / "configure.md").read_text()
     path = processes.folder / "fleet.toml"
     path.write_text(re.search(r"```toml\n(.*?)```", text, re.DOTALL)[1].replace("/data/runs", str(processes.runs)))
     assert processes.call("runs", "list", "--config", path)[0] == 0

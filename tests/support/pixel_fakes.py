@@ -1,7 +1,11 @@
 """Environments of pictures, each with something that world models must get along with; all are dodged as `Dodge` is."""
 
+import os
+import signal
+import subprocess
 import sys
 from threading import Event
+from typing import ClassVar
 
 import gymnasium
 import numpy as np
@@ -172,5 +176,41 @@ class Faulty(Dodge):
         return (picture, reward, *rest)
 
 
-for each in (Faulty, InDict, InTwo, Grey, Floats, Buttons, Switches, BothEnds, Unseen, Gauges, Telling):
+class Rude(Dodge):
+    """As it is made it does to its process what it should not; `close` and what it says of itself fail too."""
+
+    metadata: ClassVar = {**Dodge.metadata, "render_fps": "fast"}
+
+    def __init__(self, render_mode=None, close="raises", child=""):
+        super().__init__(render_mode)
+        self.at_close = close
+        self.misbehave()
+        if child:
+            script = "import pathlib, signal, sys, os, time\n"
+            script += "for each in (signal.SIGINT, signal.SIGTERM): signal.signal(each, signal.SIG_IGN)\n"
+            script += "open(sys.argv[1], 'a').write(f'{os.getpid()}\\n')\nwhile True: time.sleep(60)"
+            subprocess.Popen([sys.executable, "-c", script, child], start_new_session=True)
+
+    def misbehave(self):
+        os.chdir("/")
+        print("made")  # noqa: T201
+        os.write(1, b"made\n")
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
+
+    def reset(self, *, seed=None, options=None):
+        self.misbehave()
+        return super().reset(seed=seed, options=options)
+
+    def get_action_meanings(self):
+        return ["stay", "\x1b[2J", 5]
+
+    def close(self):
+        self.misbehave()
+        if self.at_close == "exits":
+            sys.exit(0)
+        raise RuntimeError("closing is broken\nwith details")
+
+
+for each in (Faulty, Rude, InDict, InTwo, Grey, Floats, Buttons, Switches, BothEnds, Unseen, Gauges, Telling):
     gymnasium.register(f"{each.__name__}-v0", each, max_episode_steps=200)

@@ -10,6 +10,7 @@ import numpy as np
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.driving.drive_window import DriveStatus, DriveWindow
 from dreamfleet.worker.driving.scene import Scene
+from dreamfleet.worker.tasks.closing import close_environment
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ def drive(
                 if not over:
                     yield DriveResult(score, step)
                 if command == "quit":
-                    environment.close()
+                    close_environment(environment)
                     return
                 environment.reset(seed=config.seed)
                 score, step, over = 0.0, 0, False

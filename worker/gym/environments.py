@@ -6,17 +6,21 @@ import re
 import warnings
 from collections.abc import Mapping
 from importlib.metadata import packages_distributions
+from math import isfinite
 from typing import Any
 
 import gymnasium
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.foreign_code import contained
 from dreamfleet.common.host.trusted_modules import check_trusted
 from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, World
+from dreamfleet.worker.tasks.closing import close_environment
 
 RGB = "rgb_array"  # gymnasium's render mode that returns pictures
 _MODULE_PREFIX = re.compile(r"([\w.]+):")  # of an environment's name
+FASTEST = 1000  # pictures a second, as a manifest holds them
 DEFAULT_MAX_STEPS = 10_000  # steps of an episode, if the environment was registered without a limit
 # Packages that gymnasium's own environments compute with. Other environments: the distribution of their module.
 ENGINES = {
@@ -40,7 +44,7 @@ def make_environment(name: str, arguments: Mapping[str, Any], render_mode: str |
     except UsageError as error:
         if not isinstance(error.__cause__, TypeError):
             raise
-        _make(name, arguments).close()  # without pictures it is sound
+        close_environment(_make(name, arguments))  # without pictures it is sound
         raise UsageError(
             f"this environment ({name}) draws no pictures: it must take `render_mode`, and its `render` must "
             f"return an array (height, width, 3) in the render mode {render_mode}"
@@ -49,8 +53,11 @@ def make_environment(name: str, arguments: Mapping[str, Any], render_mode: str |
 
 def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
     _check_arguments(f"{GYM}:{name}", arguments)
+    if arguments.get("render_mode") == "human":
+        raise UsageError(f"render_mode=human opens a window in every process that plays {name}: leave it out")
     try:
-        return gymnasium.make(name, disable_env_checker=True, **arguments)
+        with contained(f"making {name}"):
+            return gymnasium.make(name, disable_env_checker=True, **arguments)
     except gymnasium.error.DependencyNotInstalled as error:
         raise UsageError(f"{name} lacks a package on this host: {error}") from error
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
@@ -80,14 +87,21 @@ def describe_environment(environment: Environment, frames: int = 1) -> dict[str,
     """Fields of the environment's `World` that do not depend on its spaces; an action is held for `frames` steps."""
     spec = environment.spec
     limit = (spec and spec.max_episode_steps) or DEFAULT_MAX_STEPS
-    rate = environment.metadata.get("render_fps") or World.frames_per_second
+    rate = _frames_per_second(environment)
     return {
         "packages": ("numpy", "gymnasium", *_engine_packages(environment)),
         "horizon": min(-(-limit // frames), ENVIRONMENT_LIMIT),
-        "frames_per_second": max(1, round(rate / frames)),
+        "frames_per_second": min(max(1, round(rate / frames)), FASTEST),
         "threshold": spec.reward_threshold if spec else None,
         "judge": "gymnasium" if is_gymnasiums(environment) else "",
     }
+
+
+def _frames_per_second(environment: Environment) -> float:
+    """What the environment says of its pictures; the default where that is no positive number."""
+    said: Any = environment.metadata.get("render_fps")
+    is_rate = isinstance(said, (int, float)) and isfinite(said) and said > 0
+    return float(said if is_rate else World.frames_per_second)
 
 
 def is_gymnasiums(environment: Environment) -> bool:

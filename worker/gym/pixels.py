@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
 from typing import Annotated, Any
@@ -24,6 +25,7 @@ from dreamfleet.common.serialization.validation import Between, Length, Malforme
 from dreamfleet.worker.gym.environments import RGB, describe_environment, distributions_of, make_environment
 from dreamfleet.worker.gym.spaces import make_converter, vector_actions
 from dreamfleet.worker.tasks.api import Assignment, Driver, Policy, Preprocessing, Task, World
+from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tasks.drivers import HeldActions, UniformActions
 from dreamfleet.worker.tasks.pictures import (
     Crop,
@@ -41,6 +43,7 @@ from dreamfleet.worker.worldmodel.policy import ModelPolicy
 
 RENDERED = "render"  # as an observation: what the environment draws
 SIZES = (64, 96)
+LONGEST_NAME = 128  # characters of an action's name, as a manifest holds it
 _CROP = re.compile(r"(\d{1,5}):(\d{1,5}),(\d{1,5}):(\d{1,5})", re.ASCII)
 
 
@@ -104,6 +107,15 @@ class PixelOptions:
         return f"box-{self.size}{crop}{'-difference' if self.difference else ''}"
 
 
+def _action_meanings(environment: gymnasium.Env[Any, Any]) -> tuple[str, ...]:
+    """The names of an environment's numbered actions, as the Arcade Learning Environment gives them; empty for none."""
+    found: Any = ()
+    with suppress(Exception):  # environments may raise anything
+        found = tuple(getattr(environment.unwrapped, "get_action_meanings", tuple)())
+    are_names = all(type(each) is str and each.isprintable() and 0 < len(each) <= LONGEST_NAME for each in found)
+    return found if are_names else ()
+
+
 class GymPixelTask(Task):
     """The task `gym:ENVIRONMENT` under options: its pictures, its actions as vectors, and drivers that draw these.
 
@@ -131,13 +143,12 @@ class GymPixelTask(Task):
         try:
             actions = self._wrap(made).actions
             facts = describe_environment(made, self._options.skip)
-            # The Arcade Learning Environment has it.
-            meanings: list[str] = getattr(made.unwrapped, "get_action_meanings", list)()
+            meanings = _action_meanings(made)
         finally:
-            made.close()
+            close_environment(made)
         drawing = distributions_of("pygame") if self._options.observation == RENDERED else ()
         packages = tuple(dict.fromkeys((*facts.pop("packages"), "onnxruntime", *drawing)))
-        names = tuple(meanings) if len(meanings) == actions.actions else ()
+        names = meanings if len(meanings) == actions.actions else ()
         return World(actions, packages, action_names=names, **facts)
 
     @cached_property
@@ -185,7 +196,7 @@ class GymPixelTask(Task):
         try:
             return self._wrap(made)
         except BaseException:
-            made.close()
+            close_environment(made)
             raise
 
     def _make(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:

@@ -100,7 +100,10 @@ def _check_box(space: spaces.Box, name: str) -> None:
         raise UsageError(f"{name} takes actions {space}: a controller gives at least one number")
     if not np.issubdtype(space.dtype, np.floating):
         raise UsageError(f"{name} takes whole numbers as actions: wrap it so that they are Discrete, or of a float Box")
-    if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+    low, high = (np.asarray(each, np.float64) for each in (space.low, space.high))
+    with np.errstate(over="ignore"):  # actions are float32, and so are drawn ones of their whole range
+        reach = np.stack([low, high, high - low]).astype(np.float32)
+    if not np.isfinite(reach).all():
         raise UsageError(f"{name} takes actions without bounds: wrap it so that its actions have a range")
 
 

@@ -26,6 +26,7 @@ from dreamfleet.worker.gym.environments import (
 from dreamfleet.worker.gym.pixels import GymPixelTask, PixelOptions
 from dreamfleet.worker.gym.spaces import flatten_environment
 from dreamfleet.worker.tasks.api import Assignment, Description, Policy, Task, World
+from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tasks.policy import FlatPolicy
 from dreamfleet.worker.tasks.reset import reset_folded
 
@@ -63,7 +64,7 @@ class GymTask(Task):
     def world_of(self, assignment: Assignment) -> World:
         """The world of the environment's spaces and registration; `UsageError` if they cannot be used."""
         environment, world = self._open(assignment.spec.option("environment", {}))
-        environment.close()
+        close_environment(environment)
         return world
 
     def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
@@ -79,7 +80,7 @@ class GymTask(Task):
     def make_watched_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any] | None:
         """The environment with pictures; `None` outside of gymnasium, where `render` might change scores."""
         plain = self.make_environment(assignment)
-        plain.close()
+        close_environment(plain)
         drawn = is_gymnasiums(plain) and RGB in plain.metadata.get("render_modes", ())
         return _RenderOnDemand(self.make_evaluation_environment(assignment, RGB)) if drawn else None
 
@@ -105,7 +106,7 @@ class GymTask(Task):
                 frozen["normal"] = {"mean": mean.tolist(), "deviation": deviation.tolist()}
             observations = int(np.prod(environment.observation_space.shape or (1,)))
         finally:
-            environment.close()
+            close_environment(environment)
         text = json.dumps(frozen, sort_keys=True) if frozen else ""
         return Description(observations, world.actions.outputs, world.packages, world.version, text)
 
@@ -117,7 +118,7 @@ class GymTask(Task):
         try:
             environment, actions = flatten_environment(made, self._id)
         except UsageError:
-            made.close()
+            close_environment(made)
             raise
         return environment, World(actions, **describe_environment(made))
 

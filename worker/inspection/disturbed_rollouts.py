@@ -19,6 +19,7 @@ from dreamfleet.worker.scoring.actors import Actor
 from dreamfleet.worker.scoring.disturbance import Disturbance, DisturbedPolicy
 from dreamfleet.worker.scoring.episode import EpisodeConfig, ResetHook, run_episode
 from dreamfleet.worker.tasks.api import Assignment, Task, TaskWithBeginnings, TaskWithTrueState
+from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.worldmodel.observation import join_features
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
@@ -130,7 +131,7 @@ def record_disturbed_drives(
             recorder = DisturbedDriveRecorder(recurrent, actor_of(seed), disturbance, lambda: task.truth(environment))
             yield _drive(environment, recorder, EpisodeConfig(seed, config.steps), config, begin_at(seed))
     finally:
-        environment.close()
+        close_environment(environment)
 
 
 def _random_begin(task: Task) -> Callable[[int], ResetHook]:

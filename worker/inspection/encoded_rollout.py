@@ -17,6 +17,7 @@ from dreamfleet.worker.scoring.actors import check_same_pictures
 from dreamfleet.worker.scoring.disturbance import numbered_choices
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.api import Assignment, Continuous, Policy, RecordableTask, World
+from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tasks.policy import DriverPolicy
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.worldmodel.inference import Encoder
@@ -144,7 +145,7 @@ def record_drive(
     try:
         moments = list(run_episode(environment, policy, EpisodeConfig(config.seed, config.steps)))
     finally:
-        environment.close()
+        close_environment(environment)
     seen = np.stack([moment.seen for moment in moments])
     mu, logvar = Encoder(bundle).encode(seen)
     actions, rewards = np.stack([moment.action for moment in moments]), np.array([each.reward for each in moments])

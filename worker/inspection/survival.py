@@ -26,6 +26,7 @@ from dreamfleet.worker.inspection.probe import Estimate
 from dreamfleet.worker.scoring.disturbance import numbered_choices
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.api import Assignment, Driver, Task, World
+from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tasks.policy import NO_PARAMETERS, DriverPolicy
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.tools.canvas import choice_name
@@ -190,7 +191,7 @@ class _Reality:
 
     def close(self) -> None:
         """Release the environment."""
-        self._environment.close()
+        close_environment(self._environment)
 
 
 def _dream_lengths(

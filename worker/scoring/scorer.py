@@ -31,6 +31,7 @@ from dreamfleet.worker.tasks.api import (
     WatchableBatch,
     World,
 )
+from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tasks.former_names import FORMER_OBSERVER_NAMES, accept_former_names
 from dreamfleet.worker.tasks.registry import find_scored_task
 
@@ -178,9 +179,9 @@ class Scorer:
 
     def close(self) -> None:
         """Release the environments."""
-        self._environment.close()
+        close_environment(self._environment)
         if (watched := self.__dict__.get("_watched_environment")) is not None:  # made on first use
-            watched.close()
+            close_environment(watched)
 
     def _run_episode(
         self,

@@ -10,12 +10,12 @@ from typing import Any, Literal
 from dreamfleet.common.artifacts.task_options import check_options, read_options, write_options
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.takecover.game import HEIGHT, LIMIT, TICS_PER_SECOND, WIDTH
-from dreamfleet.worker.tasks.pictures import Crop
+from dreamfleet.worker.tasks.pictures import SHORTEST, Crop, is_crop
 
 OPTION_HELP = {
     "tics": "a whole number from 1 to 10",
     "actions": "choices or thirds",
-    "crop": f"TOP:BOTTOM,LEFT:RIGHT of a picture of {HEIGHT} rows and {WIDTH} columns",
+    "crop": f"TOP:BOTTOM,LEFT:RIGHT of a picture of {HEIGHT} rows and {WIDTH} columns, with {SHORTEST} of each or more",
 }
 FLAGS = {"skip": "tics", "crop": "crop"}  # of any world, and what they are here
 KNOWN = ("environment", *FLAGS)
@@ -100,5 +100,4 @@ def _read_crop(text: str) -> Crop:
 def _is_crop(text: Any) -> bool:
     if not isinstance(text, str) or not _CROP.fullmatch(text):
         return False
-    top, bottom, left, right = _read_crop(text)
-    return top < bottom <= HEIGHT and left < right <= WIDTH
+    return is_crop(_read_crop(text), HEIGHT, WIDTH)

@@ -156,7 +156,7 @@ class DreamReward:
 
 @dataclass(frozen=True)
 class World(metaclass=FormerFields):
-    """What the rest of the system must know of a world; `UsageError` for a mirror of another number of actions.
+    """What the rest of the system must know of a world; `UsageError` for a mirror or names of other actions.
 
     The last six fields are of worlds in which world models are trained (docs/reference/worlds.md).
     `off_course` and `off_course_cost` may also be given and read by their former names `stray` and `stray_cost`.
@@ -174,7 +174,7 @@ class World(metaclass=FormerFields):
     time_cost: float = 0.0  # charged to a candidate for each step until `finish` or its horizon; never in evaluations
     off_course_cost: float = 0.0  # charged to a candidate for each step off the course, of 100 an episode at most
     frames_per_second: int = 30  # of videos
-    action_names: tuple[str, ...] = ()  # labels of continuous actions
+    action_names: tuple[str, ...] = ()  # labels of continuous actions, one for each
     dream_reward: DreamReward | None = None  # for world models that predict no reward
     off_course: str = ""  # key of the environment's `info`: whether this step left the course; empty: there is none
     threshold: float | None = None  # mean score at which gymnasium considers the world solved; `None`: unknown
@@ -194,6 +194,8 @@ class World(metaclass=FormerFields):
         own = self.actions.actions if isinstance(self.actions, Continuous) else 0
         if self.mirror is not None and len(self.mirror.order) != own:
             raise UsageError(f"a mirror of {len(self.mirror.order)} columns does not fit {own} actions")
+        if own and len(self.action_names) not in (0, own):
+            raise UsageError(f"{len(self.action_names)} action_names do not fit {own} actions: give one for each")
 
     def facts(self, reward: RewardFacts, end: EndRule, options: str = "") -> WorldFacts:
         """What a bundle's manifest says of this world, under a task's `options`; `UsageError` for numbered actions.

@@ -25,6 +25,16 @@ SHORTEST = 8  # pixels of a side; smaller boxes hold codes, such as MiniGrid's o
 MIDDLE = 128  # the difference of equal pictures
 
 
+def is_crop(crop: Crop, height: int, width: int) -> bool:
+    """Whether a crop is a part of a picture of this size that is large enough to be seen: of 8 pixels a side.
+
+    >>> is_crop((0, 8, 0, 8), 8, 8), is_crop((0, 7, 0, 8), 8, 8), is_crop((4, 12, 0, 8), 8, 8)
+    (True, False, False)
+    """
+    top, bottom, left, right = crop
+    return 0 <= top <= bottom - SHORTEST <= height - SHORTEST and 0 <= left <= right - SHORTEST <= width - SHORTEST
+
+
 def is_picture(space: Any) -> bool:
     """Whether a space holds pictures that `to_pixels` takes, of at least 8 pixels a side.
 
@@ -70,21 +80,21 @@ def box_resize(picture: Pixels, size: int) -> Pixels:
     height, width, channels = picture.shape
     area = height * width
     exact = np.int32 if 255 * area + area // 2 < 2**31 else np.int64
-    rows = _area_sums(picture.reshape(height, width * channels).astype(exact), size)
+    rows = _area_sums(picture.reshape(height, width * channels), size, np.int32)
     columns = rows.reshape(size, width, channels).transpose(1, 0, 2).reshape(width, size * channels)
-    means = (_area_sums(columns, size) + area // 2) // area
+    means = (_area_sums(columns, size, exact) + area // 2) // area
     return np.ascontiguousarray(means.astype(np.uint8).reshape(size, size, channels).transpose(1, 0, 2))
 
 
-def _area_sums(values: NDArray[Any], size: int) -> NDArray[Any]:
-    """Rows `(n, m)` as `(size, m)`: each the sum of the rows that it covers, times how much of each.
+def _area_sums(values: NDArray[Any], size: int, exact: type[np.signedinteger[Any]]) -> NDArray[Any]:
+    """Rows `(n, m)` as `(size, m)`: each the sum of the rows that it covers, times how much of each, in type `exact`.
 
     A matrix product would be the same, but its threads wait for each other on a busy host, 40 ms for one picture.
     """
     old, overlap = _overlaps(len(values), size)
-    sums = np.zeros((size, values.shape[1]), values.dtype)
+    sums = np.zeros((size, values.shape[1]), exact)
     for covered, weights in zip(old, overlap, strict=True):
-        sums += weights[:, None].astype(values.dtype) * values[covered]
+        sums += weights[:, None].astype(exact) * values[covered]
     return sums
 
 
@@ -167,9 +177,10 @@ class CropAndResize(gymnasium.ObservationWrapper[Pixels, Any, NDArray[Any]]):
             )
         height, width = (space.shape or (0, 0))[:2]
         top, bottom, left, right = crop or (0, height, 0, width)
-        if not (0 <= top < bottom <= height and 0 <= left < right <= width):
+        if not is_crop((top, bottom, left, right), height, width):
             raise UsageError(
-                f"the crop {top}:{bottom},{left}:{right} is no part of a picture of {height} rows and {width} columns"
+                f"the crop {top}:{bottom},{left}:{right} is no part of a picture of {height} rows and {width} columns "
+                f"with at least {SHORTEST} of each"
             )
         self._size, self._crop = size, (top, bottom, left, right)
         self._shape, self._kind = space.shape, np.dtype(space.dtype).kind

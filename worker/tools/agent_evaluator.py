@@ -9,6 +9,7 @@ from dreamfleet.common.runs.episode_results import EpisodeResult
 from dreamfleet.worker.scoring.agents import Agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig, Transition, score
 from dreamfleet.worker.tasks.api import Score, World
+from dreamfleet.worker.tasks.closing import close_environment
 
 SPEED, BRAKE = "speed", "brake"  # names in a task's true state, and among a world's actions
 
@@ -33,7 +34,7 @@ class AgentEvaluator:
 
     def close(self) -> None:
         """Release the environment."""
-        self._environment.close()
+        close_environment(self._environment)
 
 
 class DriveStatistics:

@@ -12,6 +12,7 @@ from dreamfleet.common.monitoring.live import LiveView
 from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
 from dreamfleet.worker.scoring.agents import Agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
+from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tools.canvas import Frame
 from dreamfleet.worker.tools.drive_frames import FilmedPolicy, FramePainter, WorldModelView, episode_errors
 from dreamfleet.worker.tools.live_view import CaptionedFrame, LiveCanvas
@@ -48,7 +49,7 @@ def driven_frames(
             with episode_errors(track):
                 yield from _episode(agent, facts, environment, replace(dreaming, seed=track), rate)
         finally:
-            environment.close()
+            close_environment(environment)
 
 
 def _episode(

@@ -21,6 +21,7 @@ from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
 from dreamfleet.worker.scoring.agents import Agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.scoring.failure_cause import describe_exception, describe_loss
+from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tools.drive_frames import FilmedPolicy, FramePainter, WorldModelView, episode_errors
 from dreamfleet.worker.tools.video import Video
 
@@ -49,7 +50,7 @@ def record(
                 if stop():
                     break
     finally:
-        environment.close()
+        close_environment(environment)
     return score
 
 
@@ -73,7 +74,7 @@ def record_in_process(
 
     arguments = os.getpid(), is_stopped
     with reporting_write_errors(out), TemporaryDirectory(prefix=f".{out.stem}-", dir=out.parent) as folder:
-        video = Path(folder) / out.name
+        video = Path(folder).absolute() / out.name  # a simulator may change the current folder of its process
         items = [(film, seed, video)]
         (made,) = map_in_processes(1, _Recorder.start, arguments, _Recorder.record, items, lose, stall, look)
         video.replace(out)

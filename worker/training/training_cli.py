@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from dreamfleet.common.cli.output import print_answer
 from dreamfleet.common.cli.progress import progress_bar
 from dreamfleet.common.errors import StoppedError
+from dreamfleet.common.files.locks import folder_lock
 from dreamfleet.common.host.stop_signals import Stop, stop_on_signals
 from dreamfleet.worker.training.assemble import record_quality
 from dreamfleet.worker.training.checkpoint import load_progress
@@ -59,8 +60,13 @@ TrainModel = Callable[[ReportProgress, Stop], dict[str, float]]
 
 
 def run_training(args: argparse.Namespace, name: str, updates: int, checkpoint: Path, train: TrainModel) -> int:
-    """Train, store the figures beside the data, and print them; the exit code."""
+    """Train, store the figures beside the data, and print them; the exit code.
+
+    `UsageError` while another process trains the same model in the folder: each would overwrite the other's.
+    """
+    is_there = checkpoint.parent.is_dir()  # a folder without data is none to make
     with (
+        folder_lock(checkpoint.with_suffix(".lock"), f"training of the {name}") if is_there else nullcontext(),
         progress_bar(name, updates, "updates") as bar,
         explain_interrupt(checkpoint, args.new),
         stop_on_signals() as stop,

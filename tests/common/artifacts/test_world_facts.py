@@ -23,7 +23,8 @@ ACTIONS = {
 def test_facts_are_the_same_after_json(actions):
     facts = WorldFacts.of(
         actions, **ABOUT, reward=RewardFacts("survival", gain=4.0), end=EndRule("drawn"), options='{"skip": 4}',
-        version=2, score_word="game", marks=(750.0,), action_names=("move",),
+        version=2, score_word="game", marks=(750.0,),
+        action_names=tuple(f"move {number}" for number in range(actions.actions)),
     )  # fmt: skip
     found = from_plain(WorldFacts, json.loads(json.dumps(to_dict(facts))))
     assert found == facts
@@ -54,6 +55,10 @@ def test_what_is_as_usual_is_not_written():
         {"end": {"kind": "drawn", "at": 0.5, "odds_weight": 0.0}},
         {"reward": {"source": "score", "gain": 1.0, "cost": 0.0}},
         {"gravity": 9.81},
+        {"action_names": ["left", "right"]},
+        {"action_names": ["left", "right", "\x1b[2Jstay"]},
+        {"score_word": "game\n"},
+        {"packages": ["numpy\x07"]},
     ],
     ids=str,
 )

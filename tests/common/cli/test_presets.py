@@ -46,7 +46,7 @@ def test_help_lists_each_presets_values():
 
 
 def test_docs_list_each_run_presets_values():
-    page = (ROOT / "docs" / "how-to" / "operations.md").read_text()
+    page = (ROOT / "docs" / "reference" / "presets.md").read_text()
     described = dict(re.findall(r"^\| `([\w-]+)` \| `(--[^`]+)`", page, re.MULTILINE))
     assert described.keys() == runs.PRESETS.keys()
     for name, flags in described.items():

@@ -1,10 +1,13 @@
-"""Who scores a round's run, and which of its means drive for the next."""
+"""Who scores a round's run, which of its means drive for the next, and a run that nobody scores any longer."""
 
 import pytest
 
+from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.host.stop_signals import never_stop
 from dreamfleet.common.runs.records import StoredEvaluation
 from dreamfleet.coordinator.experiments.iteration.phases import other_means
-from dreamfleet.coordinator.experiments.local_run import LocalFleet
+from dreamfleet.coordinator.experiments.local_run import LocalFleet, LocalRun
+from tests.support.processes import DEADLINE, free_port
 
 
 def test_without_an_address_this_host_scores_alone_with_a_slot_a_core():
@@ -32,3 +35,18 @@ def test_the_last_mean_and_the_best_evaluated_ones_drive_beside_the_reported_one
     assert other_means(seen, 19, 2) == [9, 4]
     assert other_means(seen, None, 9) == [19, 9, 4, 14]
     assert other_means(seen, 4, 0) == other_means([], None, 3) == []
+
+
+def test_a_run_whose_workers_all_failed_is_not_waited_for(tmp_path):
+    words = ("coordinator", "--run", "alone", "--runs-dir", tmp_path, "--task", "gym:CartPole-v1", "--generations", 1)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with LocalRun("alone", (*words, "--listen", endpoint), tmp_path) as run:
+        run.check_some_worker()
+        run.start_worker("fails", ("worker", "--connect", endpoint, "--slots", "none"))
+        run.start_worker("lives", ("worker", "--connect", endpoint, "--run", "another"))
+        first, second = (each.popen for each in run._workers)
+        assert first.wait(DEADLINE)
+        run.check_some_worker()  # the other one may go on
+        second.kill()
+        with pytest.raises(DreamfleetError, match="this host's workers failed: killed by signal 9"):
+            run.wait(never_stop, run.check_some_worker)

@@ -74,6 +74,25 @@ def test_a_world_model_of_another_world_is_refused(bundle, random_bundle, task):
             settings_of(each, task=task)
 
 
+@pytest.mark.parametrize("preset", ["takecover", "real"])
+def test_a_preset_that_was_made_for_another_worlds_model_is_refused(bundle, preset):
+    with pytest.raises(UsageError, match=f"the preset {preset} is of .*b.zip is a world model of {ABSENT}: give"):
+        RunConfig(**{**find_preset(preset), "bundle": str(bundle.path), "subspace": None}, preset=preset).settings(
+            bundle
+        )
+
+
+@pytest.mark.parametrize("preset", ["pixels", "dream"])
+def test_a_preset_without_a_world_model_is_of_any_world(bundle, preset):
+    assert settings_of(bundle, **find_preset(preset), preset=preset).task.task == "dream"
+
+
+def test_a_preset_fits_a_world_model_of_its_world_that_does_not_ship(tmp_path):
+    own = write_bundle_of("choices", tmp_path / "b.zip", task="takecover")
+    named = {**find_preset("takecover"), "bundle": str(own.path)}
+    assert RunConfig(**named, preset="takecover").settings(own).task.horizon == 525
+
+
 def test_a_gymnasium_environment_is_scored_with_a_world_model_of_its_own(tmp_path):
     bundle = write_bundle_of("choices", tmp_path / "b.zip", task="gym:Some-v0")
     assert settings_of(bundle, task="gym:Some-v0") == settings_of(bundle)

@@ -146,17 +146,20 @@ def test_a_held_action_adds_rewards_and_stops_at_an_end():
 
 def test_a_part_of_the_picture_is_resized():
     class Halves(Scripted):
+        observation_space = spaces.Box(0, 255, (8, 16, 3), np.uint8)
+
         def picture(self):
-            picture = np.zeros((8, 12, 3), np.uint8)
-            picture[:, 6:] = 200
+            picture = np.zeros((8, 16, 3), np.uint8)
+            picture[:, 8:] = 200
             return picture
 
-    environment = CropAndResize(Halves(), 64, crop=(0, 8, 6, 12))
+    environment = CropAndResize(Halves(), 64, crop=(0, 8, 8, 16))
     assert environment.observation_space == spaces.Box(0, 255, (64, 64, 3), np.uint8)
     assert (environment.reset()[0] == 200).all()
     assert (CropAndResize(Halves(), 96).reset()[0][:, :48] == 0).all()
-    with pytest.raises(UsageError, match="the crop 0:9,0:12 is no part of a picture of 8 rows and 12 columns"):
-        CropAndResize(Halves(), 64, crop=(0, 9, 0, 12))
+    for crop, name in {(0, 9, 0, 16): "0:9,0:16", (0, 8, 9, 16): "0:8,9:16", (0, 1, 0, 1): "0:1,0:1"}.items():
+        with pytest.raises(UsageError, match=f"{name} is no part of a picture of 8 rows and 16 columns with at least"):
+            CropAndResize(Halves(), 64, crop=crop)
     with pytest.raises(UsageError, match=r"what is observed is Box.*a picture is uint8"):
         CropAndResize(gymnasium.make("CartPole-v1"), 64)
 

@@ -58,11 +58,11 @@ def test_a_target_is_the_mean_of_the_steps_to_come():
 
 
 def test_all_windows_are_asked_of_what_goes_both_ways_alone():
-    world = World(Continuous.between([-1, 0], [1, 1]), action_names=("steer",))
-    names = [each.name for each in make_targets(world, 2)]
+    actions = Continuous.between([-1, 0], [1, 1])
+    assert make_targets(World(actions), 2)[0].name == "action 1 0-3"
+    names = [each.name for each in make_targets(World(actions, action_names=("steer", "gas")), 2)]
     assert names[:2] == ["steer 0-3", "steer 3-8"]
-    assert names.count("action 2 0-5") == 1
-    assert [each for each in names if each.startswith("action 2")] == ["action 2 0-5"]
+    assert [each for each in names if each.startswith("gas")] == ["gas 0-5"]
     assert names[-3:] == ["reward 0-6", "reward 6-20", "reward 20-40"]
     assert len(names) == 16
     assert len(make_targets(World(Discrete(3)), 3)) == 6

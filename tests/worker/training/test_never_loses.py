@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.errors import DatasetError, StoppedError, UsageError
+from dreamfleet.common.files.locks import folder_lock
 from dreamfleet.common.host.stop_signals import stop_on_signals
 from dreamfleet.worker.training import checkpoint, train_mdnrnn, train_vae, training_state
 from dreamfleet.worker.training.checkpoint import load_progress, load_weights
@@ -182,6 +183,19 @@ def test_a_second_signal_says_what_is_kept(data, new, command):
     args = argparse.Namespace(data=data, new=new, json=False)
     with pytest.raises(StoppedError, match=rf"vae\.safetensors keeps what was made up to update 2; .*{command}"):
         run_training(args, "VAE", 6, data / train_vae.CHECKPOINT, lambda _, stop: train(data, SHORT, twice, stop=stop))
+
+
+def test_a_second_training_of_a_model_in_a_folder_is_refused(data):
+    with folder_lock(data / "vae.lock", "other"), pytest.raises(UsageError, match="another training of the VAE works"):
+        call("--data", data, "--updates", 1)
+    with folder_lock(data / "mdnrnn.lock", "other"):
+        assert call("--data", data, "--updates", 1) == 0
+
+
+def test_a_training_without_data_makes_no_folder(tmp_path):
+    with pytest.raises(DatasetError, match="at least 2 are needed"):
+        call("--data", tmp_path / "missing", "--updates", 1)
+    assert not (tmp_path / "missing").exists()
 
 
 def test_checkpoints_are_kept_beside_the_last_one(drives, data):

@@ -26,6 +26,7 @@ from dreamfleet.worker.scoring.failure_cause import describe_exception, describe
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld, Rollout, write_episode
 from dreamfleet.worker.scoring.scorer import DRIVER_NAME
 from dreamfleet.worker.tasks.api import Policy, RecordableTask, TaskWithBeginnings
+from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tasks.policy import ALL_DRIVERS, DriverPolicy
 from dreamfleet.worker.training.data.collect_config import CollectConfig, source_policies
 from dreamfleet.worker.training.data.data_folder import explain_folder_errors, explain_write_errors
@@ -77,7 +78,8 @@ def collect(
     if not numbers:
         return
     pin_thread_pools()
-    tasks = [(folder, config, number, tuple(pilots), world) for number in numbers]
+    absolute = folder.absolute()  # a simulator may change the current folder of its process
+    tasks = [(absolute, config, number, tuple(pilots), world) for number in numbers]
     yield from map_in_processes(jobs, _start_process, (os.getpid(),), _collect_one, tasks, _lose, stall)
 
 
@@ -115,7 +117,7 @@ def fresh_environment(task: RecordableTask, preprocessing: str) -> Iterator[Envi
     try:
         yield environment
     finally:
-        environment.close()  # a game of its own process would go on
+        close_environment(environment)  # a game of its own process would go on
 
 
 @contextmanager
@@ -127,7 +129,7 @@ def kept_environment(task: RecordableTask, preprocessing: str) -> Iterator[Envir
     global _kept  # noqa: PLW0603 - a process of the pool has no other memory
     if _kept is None:
         environment = task.make_recorded(preprocessing)
-        _kept = environment, Finalize(None, environment.close, exitpriority=1)
+        _kept = environment, Finalize(None, close_environment, (environment,), exitpriority=1)
     environment, close = _kept
     try:
         yield environment

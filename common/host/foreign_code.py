@@ -1,0 +1,97 @@
+"""Code of other packages in this process, such as a simulator that is made: what it changes here is undone."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
+from pathlib import Path
+
+from dreamfleet.common.host.descendants import VARIABLE, Descendants
+from dreamfleet.common.host.stop_signals import SIGNALS
+
+log = logging.getLogger(__name__)
+STDOUT, STDERR = 1, 2
+SLOW = 30.0  # seconds
+
+
+@contextmanager
+def contained(what: str) -> Iterator[None]:
+    """Run foreign code inside: it leaves the current folder, stdout, and handlers of Ctrl-C and SIGTERM as they were.
+
+    What it prints goes to stderr: stdout is for a verb's answer. Processes that it starts end with this one, at the
+    latest. After `SLOW` seconds a warning says `what` takes so long.
+    """
+    with ExitStack() as stack:
+        stack.enter_context(_warning_if_slow(what))
+        if not os.environ.get(VARIABLE):  # else another process ends them
+            stack.enter_context(Descendants().starting())
+        stack.enter_context(_folder_kept())
+        stack.enter_context(_handlers_kept())
+        stack.enter_context(_stdout_kept())
+        yield
+
+
+def send_stdout_to_stderr() -> None:
+    """Let all that this process prints go to stderr, also what native code prints."""
+    with suppress(OSError):
+        os.dup2(STDERR, STDOUT)
+
+
+@contextmanager
+def _warning_if_slow(what: str) -> Iterator[None]:
+    timer = threading.Timer(SLOW, log.warning, ("%s takes longer than %g s: wait, or press Ctrl-C", what, SLOW))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+@contextmanager
+def _folder_kept() -> Iterator[None]:
+    before = None
+    with suppress(OSError):  # it may have been deleted
+        before = Path.cwd()
+    try:
+        yield
+    finally:
+        if before is not None:
+            os.chdir(before)
+
+
+@contextmanager
+def _handlers_kept() -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():  # others set no handlers
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            if handler is not None:  # of native code
+                signal.signal(number, handler)
+
+
+@contextmanager
+def _stdout_kept() -> Iterator[None]:
+    with suppress(OSError, ValueError, AttributeError):  # it may be closed, or none
+        sys.stdout.flush()
+    kept = None
+    with suppress(OSError):
+        kept = os.dup(STDOUT)
+    try:
+        with redirect_stdout(sys.stderr):
+            send_stdout_to_stderr()
+            yield
+    finally:
+        with suppress(OSError):  # foreign code may have closed it
+            if kept is not None:
+                os.dup2(kept, STDOUT)
+                os.close(kept)

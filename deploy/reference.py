@@ -1,0 +1,278 @@
+"""Write docs/reference/verbs.md and settings.md from the parsers and the settings' dataclasses.
+
+`make reference` writes them; `tests/docs/test_reference.py` compares them with what this would write. Help texts are
+the source: to change a row, change the verb.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import MISSING, Field, fields
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from dreamfleet.common.cli.command_line import GROUP, build_parser, load_verb
+from dreamfleet.common.cli.global_config import GlobalConfig
+from dreamfleet.common.verbs.router import RouterConfig
+from dreamfleet.coordinator.dashboard.config import DashboardConfig
+from dreamfleet.coordinator.experiments.demo import DemoConfig
+from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
+from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig, RunConfig
+from dreamfleet.coordinator.spawn.config import SpawnConfig
+from dreamfleet.worker.service.config import WorkerConfig
+
+FOLDER = Path(__file__).parents[1] / "docs" / "reference"
+NOTE = "<!-- Written by `make reference`: change the help text in the code, not this page. -->"
+# Table of the configuration file: its dataclass, and what it is of. The empty name is the top of the file.
+SECTIONS: Mapping[str, tuple[type, str]] = {
+    "": (
+        GlobalConfig,
+        "What every program of a fleet shares. These keys stand at the top of the file, before any table.",
+    ),
+    "run": (RunConfig, "What is frozen with a new run. `dreamfleet fork` begins another run with other values."),
+    "limits": (LimitsConfig, "When a run ends: at the first limit that it reaches. 0 means no such limit."),
+    "network": (NetworkConfig, "Where the coordinator is reached, and how it treats its workers. Kept with the run."),
+    "worker": (WorkerConfig, "A worker process."),
+    "dashboard": (DashboardConfig, "The web page."),
+    "router": (RouterConfig, "A router of its own."),
+    "spawn": (SpawnConfig, "Workers on other hosts. A `[[host]]` table overrides these."),
+    "demo": (DemoConfig, "`dreamfleet demo`."),
+    "iterate": (IterateConfig, "`dreamfleet iterate`."),
+}
+ALL_VERBS = ("config", "log_level", "log_format", "trust", "help", "help_all")  # names of flags that each verb has
+LARGE = 1e9  # a bound from here on only guards the wire
+JSON = "print the answer as JSON"
+UNITS = {
+    "run.horizon": "steps", "run.patience": "steps", "run.evaluate_every": "generations",
+    "run.collect_every": "generations", "run.temperature": "factor", "run.sigma0": "parameter units",
+    "limits.generations": "generations", "limits.steps": "environment steps", "limits.minutes": "minutes of work",
+    "limits.parted": "evaluations", "limits.target": "score", "network.beat": "seconds",
+    "worker.drain_timeout": "seconds", "worker.lifetime": "seconds", "worker.slot_memory": "MiB",
+    "worker.coordinator_timeout": "seconds",
+}  # fmt: skip
+SETTINGS_HEAD = f"""{NOTE}
+# Settings
+
+Each setting is a key of the configuration file, an environment variable and, for the verbs that use it, a flag. A flag
+overrides the variable, and the variable overrides the file. [How to configure a fleet](../how-to/configure.md) has an
+example.
+
+- The flag of `evaluate_every` is `--evaluate-every`. A setting that is true or false has `--no-NAME` too.
+- A variable holds a list as texts between commas. An empty variable counts as unset, but it empties a text or a list.
+- `DREAMFLEET_CONFIG` names the configuration file, and `DREAMFLEET_CACHE` the folder of downloaded world models.
+- `[[stage]]` tables are described in [stages of one run](../how-to/stages.md), `[[host]]` tables in
+  [workers on other hosts](../how-to/hosts.md).
+"""
+VERBS_HEAD = f"""{NOTE}
+# Verbs
+
+`dreamfleet VERB --help` shows a verb's flags. [Exit codes](exit-codes.md) says how a verb ends.
+
+A flag in capitals takes a value: `--run RUN`. *Settings* names the tables of [settings](settings.md) whose keys are
+flags of that verb too; they are described there. Each verb also has these:
+
+"""
+
+
+def write() -> None:
+    """Write both pages."""
+    for name, text in pages().items():
+        (FOLDER / name).write_text(text)
+
+
+def pages() -> dict[str, str]:
+    """The text of each page, by its file name."""
+    return {"verbs.md": verbs_page(), "settings.md": settings_page()}
+
+
+def settings_page() -> str:
+    """Every setting by table: key, variable, default, values and meaning."""
+    parts = [SETTINGS_HEAD]
+    for table, (section, about) in SECTIONS.items():
+        parts += [f"\n## {_title(table)}\n", f"{about}\n", *_settings_table(table, section)]
+    return "\n".join(parts) + "\n"
+
+
+def _settings_table(table: str, section: type) -> Iterator[str]:
+    hints = get_type_hints(section, include_extras=True)
+    prefix = f"DREAMFLEET_{table.upper()}_" if table else "DREAMFLEET_"
+    yield f"Variables begin with `{prefix}`: `{prefix}{next(_settings(section)).name.upper()}`.\n"
+    yield "| key | default | values | meaning |\n|---|---|---|---|"
+    for each in _settings(section):
+        values = ", ".join(filter(None, (_values(hints[each.name]), UNITS.get(f"{table}.{each.name}"))))
+        yield f"| `{each.name}` | {_default(each)} | {values} | {_cell(_plain_help(each.metadata['help']))} |"
+
+
+def verbs_page() -> str:
+    """Every verb of this distribution by group: its summary, the tables that it reads, and its own flags."""
+    points = {each.name: each for each in entry_points(group=GROUP) if each.value.startswith("dreamfleet.")}
+    parsers = {name: build_parser(name, load_verb(point)) for name, point in points.items()}
+    common = [each for each in parsers["status"]._actions if each.dest in ALL_VERBS]
+    parts = [VERBS_HEAD + "\n".join(_flags_table(common))]
+    for heading, names in _groups(points).items():
+        parts.append(f"\n## {heading}")
+        for name in names:
+            parts += ["", *_verb(name, load_verb(points[name]).SUMMARY, parsers[name])]
+    return "\n".join(parts) + "\n"
+
+
+def _verb(name: str, summary: str, parser: argparse.ArgumentParser) -> Iterator[str]:
+    yield f"### {name.replace('.', ' ')}\n"
+    yield f"{_sentence(summary)}\n"
+    of_tables: list[str] = []
+    own: list[argparse.Action] = []
+    titles = {id(each): group.title or "" for group in parser._action_groups for each in group._group_actions}
+    for each in parser._actions:
+        if each.dest in ALL_VERBS or _help(each) == JSON:
+            continue
+        table = _table_of(each, titles.get(id(each), ""))
+        if table is None:
+            own.append(each)
+        elif table not in of_tables:
+            of_tables.append(table)
+    if of_tables:
+        links = ", ".join(f"[{_title(each)}](settings.md#{_anchor(_title(each))})" for each in of_tables)
+        yield f"*Settings:* {links}{_part_of(parser, of_tables)}.\n"
+    if any(_help(each) == JSON for each in parser._actions):
+        yield "`--json` prints the answer as JSON.\n"
+    if own:
+        yield from _flags_table(own)
+
+
+def _part_of(parser: argparse.ArgumentParser, tables: Sequence[str]) -> str:
+    """Of which keys, where a verb takes a part of these tables: the flags by name."""
+    taken = {each.dest for each in parser._actions}
+    partial = [each for each in tables if {one.name for one in _settings(SECTIONS[each][0])} - taken]
+    names = [one.name for each in partial for one in _settings(SECTIONS[each][0]) if one.name in taken - {*ALL_VERBS}]
+    flags = ", ".join(f"`--{name.replace('_', '-')}`" for name in dict.fromkeys(names))
+    return (
+        f" ({'of the ' + ' and '.join(map(_title, partial)) + ': ' if len(tables) > len(partial) else ''}{flags})"
+        if flags
+        else ""
+    )
+
+
+def _flags_table(actions: Sequence[argparse.Action]) -> Iterator[str]:
+    yield "| flag | default | meaning |\n|---|---|---|"
+    for each in actions:
+        yield f"| {_flag(each)} | {_own_default(each)} | {_cell(_plain_help(_help(each)))} |"
+
+
+def _flag(action: argparse.Action) -> str:
+    if not action.option_strings:
+        shown = action.metavar or action.dest.upper()
+        return f"`{' '.join(shown) if isinstance(shown, tuple) else shown}`" + (
+            " ..." if action.nargs in ("+", "*") else ""
+        )
+    names = [each for each in action.option_strings if not each.startswith("--no-") or len(action.option_strings) == 1]
+    value = ""
+    if action.nargs != 0 and not isinstance(action, argparse.BooleanOptionalAction):
+        shown = action.metavar or ("" if action.choices else action.dest.upper())
+        value = " " + (" ".join(shown) if isinstance(shown, tuple) else shown) if shown else ""
+    more = " ..." if action.nargs in ("+", "*") else ""
+    chosen = " " + ", ".join(f"`{each}`" for each in action.choices) if action.choices else ""
+    return ", ".join(f"`{each}{value}`" for each in names) + more + chosen
+
+
+def _help(action: argparse.Action) -> str:
+    """The help text; of a flag that the short help hides, the text that it keeps for the long one."""
+    shown = action.help if action.help not in (None, argparse.SUPPRESS) else getattr(action, "full_help", "")
+    return (shown or "") % {**vars(action), "prog": "dreamfleet"} if "%(" in (shown or "") else (shown or "")
+
+
+def _own_default(action: argparse.Action) -> str:
+    found = re.search(r"\(default:? ([^()]*)\)$", _help(action))
+    if found:
+        return _cell(found[1])
+    shown = action.default
+    return "" if shown in (None, False, argparse.SUPPRESS, (), [], "") or not action.option_strings else f"`{shown}`"
+
+
+def _plain_help(text: str) -> str:
+    """A help text as a cell: without the default at its end, which has a column."""
+    return re.sub(r" \(default:? [^()]*\)$", "", " ".join(text.split())).replace("%%", "%")
+
+
+def _table_of(action: argparse.Action, title: str) -> str | None:
+    """The table of the configuration file that a flag sets, or None: the flag's name and text are the field's."""
+    for table, (section, _) in SECTIONS.items():
+        for each in _settings(section):
+            if each.name == action.dest and f"--{each.name.replace('_', '-')}" in action.option_strings:
+                text = _help(action)
+                if text.startswith(each.metadata["help"]) or (not text and title == _group_title(section)):
+                    return table
+    return None
+
+
+def _group_title(section: type) -> str:
+    return section.__name__.removesuffix("Config").lower()
+
+
+def _groups(points: Mapping[str, EntryPoint]) -> dict[str, list[str]]:
+    """Names of verbs by heading, as the overview of `dreamfleet --help` has them."""
+    try:
+        known = import_module("dreamfleet.common.cli.overview").GROUPS
+    except ModuleNotFoundError:
+        known = {}
+    groups = {
+        heading: [name for names in entries for name in names if name in points] for heading, entries in known.items()
+    }
+    rest = sorted(points.keys() - {name for names in groups.values() for name in names})
+    return {**groups, **({"Other verbs" if groups else "All verbs": rest} if rest else {})}
+
+
+def _settings(section: type) -> Iterator[Field[Any]]:
+    """The fields that a user may set."""
+    return (each for each in fields(section) if "help" in each.metadata)
+
+
+def _default(each: Field[Any]) -> str:
+    if found := re.search(r"\(default:? ([^()]*)\)$", each.metadata["help"]):
+        return _cell(found[1])
+    if each.default in (MISSING, None, (), ""):
+        return "none"
+    return f"`{str(each.default).lower() if isinstance(each.default, bool) else each.default}`"
+
+
+def _values(hint: Any) -> str:
+    """What a setting may be, in words: its type, its bounds, its choices."""
+    if get_origin(hint) is Annotated:
+        base, *bounds = get_args(hint)
+        limits = [_bounds(each.low, each.high) for each in bounds if hasattr(each, "low")]
+        return " ".join((_values(base), *limits))
+    if get_origin(hint) is Union or type(hint).__name__ == "UnionType":
+        return next(_values(each) for each in get_args(hint) if each is not type(None))
+    if get_origin(hint) is Literal:
+        return ", ".join(f"`{each}`" for each in get_args(hint))
+    if get_origin(hint) is tuple:
+        return "texts"
+    return {int: "whole number", float: "number", bool: "true, false", str: "text", Path: "path"}[hint]
+
+
+def _bounds(low: float, high: float) -> str:
+    return f"from {low:g}" if high >= LARGE else f"{low:g} to {high:.7g}"
+
+
+def _title(table: str) -> str:
+    return f"[{table}]" if table else "Shared settings"
+
+
+def _anchor(title: str) -> str:
+    return re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
+
+
+def _sentence(text: str) -> str:
+    return _cell(text[:1].upper() + text[1:]) + ("" if text.endswith(".") else ".")
+
+
+def _cell(text: str) -> str:
+    """Text for a table's cell: bars and angle brackets are escaped."""
+    return text.replace("|", r"\|").replace("<", "&lt;")
+
+
+if __name__ == "__main__":
+    write()

@@ -1,0 +1,35 @@
+"""What code of other packages does to a process while it runs there is undone."""
+
+import os
+import threading
+
+from dreamfleet.common.host import foreign_code
+from dreamfleet.common.host.descendants import VARIABLE
+from dreamfleet.common.host.foreign_code import contained
+
+
+def test_code_that_takes_long_is_named(monkeypatch):
+    monkeypatch.setattr(foreign_code, "SLOW", 0.0)
+    said = threading.Event()
+    lines = []
+    monkeypatch.setattr(foreign_code.log, "warning", lambda text, *values: (lines.append(text % values), said.set()))
+    with contained("making it"):
+        assert said.wait(60)
+    assert lines == ["making it takes longer than 0 s: wait, or press Ctrl-C"]
+
+
+def test_inside_another_it_starts_no_second_guard():
+    with contained("outer"):
+        mark = os.environ[VARIABLE]
+        with contained("inner"):
+            assert os.environ[VARIABLE] == mark
+    assert VARIABLE not in os.environ
+
+
+def test_a_current_folder_that_is_gone_is_no_error(tmp_path, monkeypatch):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    with contained("it"):
+        os.chdir(tmp_path)
