@@ -21,7 +21,8 @@ class Video:
     """
 
     def __init__(self, out: Path, frames_per_second: int, *, keep_partial: bool = False) -> None:
-        self._out, self._rate, self._keep_partial = out, frames_per_second, keep_partial
+        self._out = out.absolute()  # a simulator may change the current folder of its process
+        self._rate, self._keep_partial = frames_per_second, keep_partial
         self._output = ExitStack()
         self._container: Any = None
         self._stream: Any = None
