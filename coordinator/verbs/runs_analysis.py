@@ -22,12 +22,11 @@ from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.score_words import score_word
 
 if TYPE_CHECKING:
-    from dreamfleet.coordinator.analysis.comparison import ComparedRun, EqualBudget, EvaluatedMean
+    from dreamfleet.common.runs.comparison import ComparedRun, EqualBudget, EvaluatedMean
 
 SAME_SEEDS = (
     "all runs are judged on the same validation seeds, so their ± are not independent: differences are paired by seed"
 )
-NEAR_SHARE = 0.1  # of the steps of the first published score: a shorter run's curve would be squeezed beside it
 LEARNING, FITNESS = "learning.png", "fitness.png"
 
 
@@ -44,7 +43,7 @@ def configure_compare(parser: argparse.ArgumentParser) -> None:
 
 def compare_runs(args: argparse.Namespace) -> int:
     """Print settings that differ, scores at equal budgets, and differences from the first run."""
-    from dreamfleet.coordinator.analysis.comparison import ComparedRun, at_equal_budget, differing_settings
+    from dreamfleet.common.runs.comparison import ComparedRun, at_equal_budget, differing_settings
 
     names = list(dict.fromkeys(args.run_names))
     if len(names) < 2:
@@ -118,8 +117,8 @@ def _format_evaluation(look: EvaluatedMean | None) -> str:
 
 def _run_differences(sides: Sequence[ComparedRun], equal: Sequence[EqualBudget]) -> Iterator[dict[str, Any]]:
     """Each run less the first: at equal budgets, then of confirmed scores."""
+    from dreamfleet.common.runs.comparison import difference
     from dreamfleet.common.runs.paired_difference import PairedDifference
-    from dreamfleet.coordinator.analysis.comparison import difference
 
     def paired(of: str, side: ComparedRun, one: dict[int, float], other: dict[int, float]) -> dict[str, Any]:
         found = difference(one, other)
@@ -186,17 +185,12 @@ def _draw_fitness(args: argparse.Namespace, out: Path) -> None:
     if len(args.run_names) > 1:
         raise UsageError("--fitness is of one run: name one")
     with open_run(args.runs_dir, args.run_names[0]) as stored:
-        if not stored.history():
-            raise UsageError(
-                f"run {stored.name} has no closed generation, so there is nothing to draw: wait for the first"
-            )
         plot_fitness(stored, out)
 
 
 def _draw_learning(args: argparse.Namespace, out: Path) -> None:
-    from dreamfleet.common.worlds.shipped import WORLDS
-    from dreamfleet.coordinator.analysis.learning import LearningCurve
-    from dreamfleet.coordinator.analysis.plot import plot_learning
+    from dreamfleet.common.runs.learning import LearningCurve
+    from dreamfleet.coordinator.analysis.plot import plot_learning, published_scores
 
     curves = []
     for name in dict.fromkeys(args.run_names):
@@ -206,11 +200,7 @@ def _draw_learning(args: argparse.Namespace, out: Path) -> None:
     if len(worlds) > 1:
         names = ", ".join(worlds)
         print(f"note: these runs are of the worlds {names}: their scores do not compare", file=sys.stderr)
-    world = WORLDS.get(worlds[0]) if len(worlds) == 1 else None
-    marks = world.published if world else None
-    if marks is not None and max(each.total.steps for each in curves) < NEAR_SHARE * marks.first_steps:
-        marks = None
-    plot_learning(curves, marks, out)
+    plot_learning(curves, published_scores(curves), out)
 
 
 def configure_receipt(parser: argparse.ArgumentParser) -> None:
