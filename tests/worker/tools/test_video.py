@@ -10,10 +10,12 @@ from tests.support.disks import small_disk
 NOISE = np.random.default_rng(1).integers(0, 255, (128, 128, 3)).astype(np.uint8)
 
 
-def film(path, pictures, **more):
+def film(path, pictures, error=None, **more):
     with Video(path, 10, **more) as video:
         for _ in range(pictures):
             video.add(NOISE)
+        if error is not None:
+            raise error
 
 
 @pytest.mark.parametrize("keep_partial", [False, True])
@@ -33,12 +35,6 @@ def test_a_full_disk_is_named_and_keeps_no_part(tmp_path, keep_partial, pictures
 
 @pytest.mark.parametrize(("keep_partial", "kept"), [(False, []), (True, ["drive.mp4"])])
 def test_an_error_of_the_drive_is_the_drives_own(tmp_path, keep_partial, kept):
-    with (
-        pytest.raises(FileNotFoundError, match="of the simulator"),
-        Video(  # noqa: PT012
-            tmp_path / "drive.mp4", 10, keep_partial=keep_partial
-        ) as video,
-    ):
-        video.add(NOISE)
-        raise FileNotFoundError(2, "of the simulator")
+    with pytest.raises(FileNotFoundError, match="of the simulator"):
+        film(tmp_path / "drive.mp4", 1, keep_partial=keep_partial, error=FileNotFoundError(2, "of the simulator"))
     assert [each.name for each in tmp_path.iterdir()] == kept
