@@ -10,6 +10,7 @@ import pytest
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.coordinator.experiments.demo import Demo, DemoConfig, median_drive, plan_runs
 
@@ -72,6 +73,16 @@ def test_each_world_is_judged_on_as_many_episodes_as_its_scores_vary():
     assert (cars.plan.tracks, game.plan.tracks, DemoConfig(tracks=3).plan.tracks) == (16, 100, 3)
     looks = [each.flags["evaluation-episodes"] for each in plan_runs(game, "demo", Path("runs"))]
     assert looks == [50, 50]
+
+
+@pytest.mark.parametrize("name", ["shown-dream", "shown"])
+def test_a_run_of_its_name_is_refused_before_anything_begins(name, tmp_path, capsys):
+    (tmp_path / name).mkdir()
+    (tmp_path / name / JOURNAL).touch()
+    assert main(["demo", "--run", "shown", "--runs-dir", str(tmp_path), "--no-page"]) == 2
+    said = capsys.readouterr().err
+    assert f"run {name} exists: give another --run; `dreamfleet runs delete {name}` removes it" in said
+    assert [each.name for each in tmp_path.iterdir()] == [name]
 
 
 def test_what_it_begins_is_of_no_other_fleet(monkeypatch):
