@@ -206,7 +206,7 @@ def _connection_error(network: Network, error: zenoh.ZError) -> ConnectionFailed
     if found := diagnose_connection(network.connect, network.credentials):
         return HandshakeRejectedError(found)
     return ConnectionFailedError(
-        f"nobody answers at {', '.join(network.connect)}: start `dreamfleet coordinator` or `dreamfleet router` "
+        f"no one answers at {', '.join(network.connect)}: start `dreamfleet coordinator` or `dreamfleet router` "
         f"there, or name another address with --connect {protocol}HOST:PORT"
     )
 

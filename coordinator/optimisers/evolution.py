@@ -144,7 +144,7 @@ class Evolution:
     def tell(self, fitness: NDArray[np.float64]) -> None:
         """Update the distribution; `fitness` `(population,)`, larger is better, in the order of `ask`."""
         if fitness.shape != (self._config.population,) or not np.isfinite(fitness).all():
-            raise ValueError(f"tell needs {self._config.population} finite numbers")  # pycma accepts NaN silently
+            raise ValueError(f"an update needs {self._config.population} finite numbers")  # pycma accepts NaN silently
         self._optimiser.tell(fitness)
         self._is_open = False
 
@@ -154,7 +154,7 @@ class Evolution:
 
     def state(self) -> Checkpoint:
         """Everything that the next `ask` depends on."""
-        assert not self._is_open, "a state is taken between tell and ask"
+        assert not self._is_open, "a state is taken after an update and before ask"
         state = self._optimiser.state()
         unfit = [name for name, array in state.items() if name.startswith(PREFIX) or array.dtype.hasobject]
         if unfit:

@@ -167,9 +167,8 @@ class RunConfig:
     confirm_episodes: ConfirmationEpisodes | None = frozen_option(
         RunSettings,
         None,
-        "confirm what is reported as the run ends, after its limits: the best evaluated means drive about twice as "
-        "many seeds in rounds, then the remaining one drives so many fresh ones, which give its score (default as many "
-        "as of an evaluation, 2 at least); 0: never",
+        "fresh seeds that confirm what is reported, once a limit is reached (default as many as of an evaluation, 2 "
+        "at least); 0: never. Before, the best evaluated means drive about twice as many seeds in rounds",
     )
     collect_every: Interval = frozen_option(
         RunSettings, 0, "keep rollouts of the mean for training, every so many generations; 0: never"

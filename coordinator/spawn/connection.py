@@ -42,7 +42,7 @@ _SSH_ERRORS = (
     (r"Could not resolve hostname", "no such host: look at its address, or at HostName in ~/.ssh/config"),
     (r"REMOTE HOST IDENTIFICATION HAS CHANGED|Host key for .* has changed",
      "its host key is not the one that is known: if it was reinstalled, remove the old one with `ssh-keygen -R HOST`, "
-     "and connect once by hand. Otherwise somebody may intercept the connection"),
+     "and connect once by hand. Otherwise the connection may be intercepted"),
     (r"Host key verification failed|host key is known",
      "its host key is not known here: connect once by hand, compare what is shown, and accept it"),
     (r"Permission denied \(", "it refuses this user and key: try `ssh {address}` by hand; no password is asked for "

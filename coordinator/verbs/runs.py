@@ -269,14 +269,14 @@ def export_run(args: argparse.Namespace) -> int:
 
 LIST = SimpleVerb("list the runs on this disk", configure_list, list_runs)
 SHOW = SimpleVerb("show one run from its journal: settings, history, evaluations", add_run_arguments, show_run)
-ARCHIVE = SimpleVerb("move a run that nobody serves into the archive", add_run_arguments, archive_run)
+ARCHIVE = SimpleVerb("move a run that is not served into the archive", add_run_arguments, archive_run)
 BACKUP = SimpleVerb(
     "copy a run, served or not, into another folder of runs, from which it can be resumed",
     configure_backup,
     back_up_run,
 )
 DELETE = SimpleVerb(
-    "delete a run that nobody serves, with its journal, controller and videos", configure_delete, delete_run
+    "delete a run that is not served, with its journal, controller and videos", configure_delete, delete_run
 )
 EXPORT = SimpleVerb(
     "write a run's generations, candidates, evaluations and confirmed score as CSV, Parquet or TensorBoard events",

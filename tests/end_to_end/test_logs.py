@@ -95,4 +95,4 @@ def test_a_coordinator_from_before_stories_is_said_to_be_old_and_not_absent(proc
             code, _, err = processes.call("story", *run, "--connect", processes.endpoint)
             assert (code, "run night sends no events: a worker's join file may not read" in err) == (1, True), err
     code, _, err = processes.call("story", "night", "--connect", processes.endpoint)
-    assert (code, "nobody answers" in err) == (1, True), err
+    assert (code, "no one answers" in err) == (1, True), err

@@ -26,7 +26,7 @@ def test_a_port_in_use_is_an_error():
 
 
 def test_no_listener_is_an_error():
-    with pytest.raises(ConnectionFailedError, match="nobody answers at"):
+    with pytest.raises(ConnectionFailedError, match="no one answers at"):
         open_session(Network(connect=(f"tcp/127.0.0.1:{free_port()}",)), timeout=0.2)
 
 
