@@ -45,7 +45,7 @@ def test_a_set_that_has_more_than_is_asked_for_is_counted_whole(tmp_path, capsys
     flags = ("--episodes", "4", "--jobs", "1", "--preset", "tiny")
     assert call(collect, "--data", str(tmp_path), *flags) == 0
     printed = capsys.readouterr()
-    assert ": 1 episodes, " in printed.out
+    assert ": 1 new episode with " in printed.out
     assert "5 episodes in all" in printed.out
     assert "5/5" in printed.err
 
