@@ -18,13 +18,15 @@ if TYPE_CHECKING:
     from dreamfleet.common.artifacts.actions import Continuous, Discrete
     from dreamfleet.common.artifacts.bundle import Bundle
     from dreamfleet.common.artifacts.bundle_store import find_bundle
-    from dreamfleet.common.artifacts.controller import Controller
+    from dreamfleet.common.artifacts.controller import Controller, ControllerShape
     from dreamfleet.common.errors import DreamfleetError
     from dreamfleet.common.monitoring.client import Client
     from dreamfleet.common.protocol.messages import TaskSpec
     from dreamfleet.common.protocol.tasks import Description
     from dreamfleet.common.runs.episode_results import EpisodeResults
-    from dreamfleet.common.runs.run_folder import RunFolder as Run
+    from dreamfleet.coordinator.analysis.stored_run import StoredRun as Run
+    from dreamfleet.coordinator.analysis.stored_run import open_run
+    from dreamfleet.coordinator.experiments.started_run import evolve, start_run
     from dreamfleet.worker.scoring.scorer import Scorer
     from dreamfleet.worker.tasks.api import Task, World
     from dreamfleet.worker.tools.public_api import (
@@ -33,7 +35,6 @@ if TYPE_CHECKING:
         find_controller,
         make_environment,
         make_policy,
-        open_run,
     )
 
 _HOMES = {
@@ -41,28 +42,32 @@ _HOMES = {
     "Client": "common.monitoring.client",
     "Continuous": "common.artifacts.actions",
     "Controller": "common.artifacts.controller",
+    "ControllerShape": "common.artifacts.controller",
     "Description": "common.protocol.tasks",
     "Discrete": "common.artifacts.actions",
     "DreamfleetError": "common.errors",
     "EpisodeResults": "common.runs.episode_results",
-    "Run": "common.runs.run_folder:RunFolder",
+    "Run": "coordinator.analysis.stored_run:StoredRun",
     "Scorer": "worker.scoring.scorer",
     "Task": "worker.tasks.api",
     "TaskSpec": "common.protocol.messages",
     "World": "worker.tasks.api",
     "evaluate": "worker.tools.public_api",
+    "evolve": "coordinator.experiments.started_run",
     "find_agent": "worker.tools.public_api",
     "find_bundle": "common.artifacts.bundle_store",
     "find_controller": "worker.tools.public_api",
     "make_environment": "worker.tools.public_api",
     "make_policy": "worker.tools.public_api",
-    "open_run": "worker.tools.public_api",
+    "open_run": "coordinator.analysis.stored_run",
+    "start_run": "coordinator.experiments.started_run",
 }
 __all__ = [
     "Bundle",
     "Client",
     "Continuous",
     "Controller",
+    "ControllerShape",
     "Description",
     "Discrete",
     "DreamfleetError",
@@ -73,12 +78,14 @@ __all__ = [
     "TaskSpec",
     "World",
     "evaluate",
+    "evolve",
     "find_agent",
     "find_bundle",
     "find_controller",
     "make_environment",
     "make_policy",
     "open_run",
+    "start_run",
 ]
 
 

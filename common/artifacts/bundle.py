@@ -30,6 +30,7 @@ from dreamfleet.common.errors import BundleError, ControllerError, UsageError
 from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive, write_archive
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import open_regular, read_regular
+from dreamfleet.common.serialization.display import Displayed
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
 from dreamfleet.common.serialization.validation import Between, MalformedError, Word, from_plain
 
@@ -74,13 +75,15 @@ class BundleManifest:
         return REQUIRED if self.world is None else REQUIRED_WITH_WORLD
 
 
-class Bundle:
+class Bundle(Displayed):
     """A verified bundle, the shape of the controllers that drive by it, and how they drive.
 
     >>> from dreamfleet import find_bundle
     >>> bundle = find_bundle("tiny")
     >>> bundle.manifest.latent, bundle.manifest.hidden, bundle.controller_shape.size
     (32, 256, 867)
+    >>> bundle
+    <Bundle tiny of car-racing: latent 32, hidden 256, SHA-256 c593fb1347bd>
     """
 
     def __init__(
@@ -92,6 +95,21 @@ class Bundle:
         self.manifest = manifest
         self.driving: Driving = driving or self.driving_of("")
         self._shape = shape
+
+    def _display(self) -> tuple[str, dict[str, object]]:
+        manifest, digest = self.manifest, self.sha256[:12]
+        sizes = f"latent {manifest.latent}, hidden {manifest.hidden}"
+        facts = {
+            "task": manifest.task,
+            "pictures": " x ".join(map(str, manifest.picture)) + f", {manifest.preprocessing}",
+            "latent": manifest.latent,
+            "hidden": manifest.hidden,
+            "actions": manifest.actions,
+            "controllers": f"{self.controller_shape.size} parameters",
+            "file": str(self.path),
+            "SHA-256": digest,
+        }
+        return f"Bundle {manifest.name} of {manifest.task}: {sizes}, SHA-256 {digest}", facts
 
     @classmethod
     def open(cls, path: Path | str, sha256: str | None = None) -> Bundle:

@@ -9,20 +9,27 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass, field
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import Actions
 from dreamfleet.common.artifacts.driving import Variant
-from dreamfleet.common.errors import ControllerError
+from dreamfleet.common.errors import ControllerError, MissingExtraError
 from dreamfleet.common.files.archives import ArchiveLimits, read_arrays
 from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.host.packages import install_command_for
+from dreamfleet.common.serialization.display import Displayed
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
 
+if TYPE_CHECKING:
+    from dreamfleet.common.artifacts.bundle import Bundle
+
 FORMAT = 1
+PREDICTORS = "dreamfleet.predictors"  # entry points: what makes a `Predictor` of a controller, on hosts that score
 _LIMITS = ArchiveLimits(64 << 20, members=8)  # 16 million parameters, more than any search has
 _TASK_DEFAULTS: dict[str, Any] = {"options": "", "version": 1}  # written only where a task's values differ
 
@@ -32,6 +39,10 @@ class ControllerShape:
     """The layout of a flat parameter vector: `features` inputs to `actions` outputs, with biases.
 
     Linear, or with one layer of `hidden` tanh units (Ha & Schmidhuber 2018, table 2).
+
+    >>> from dreamfleet import ControllerShape
+    >>> ControllerShape(features=4, actions=2).size, ControllerShape(4, 2, hidden=8).size
+    (10, 58)
     """
 
     features: int
@@ -81,9 +92,18 @@ def act(
     return actions.to_action(weights @ value + biases)
 
 
-@dataclass(frozen=True)
-class Controller:
+class Predictor(Protocol):
+    """A controller with all that it needs to act."""
+
+    def predict(self, observation: Any, state: Any, reward: float | None) -> tuple[Any, Any]:
+        """As `Controller.predict`."""
+
+
+@dataclass(frozen=True, repr=False)
+class Controller(Displayed):
     """Parameters `(size,)` float32, with the task and world model that they were evolved for.
+
+    `predict` acts; `save` and `load` are for files.
 
     >>> from pathlib import Path
     >>> from dreamfleet import Controller, find_controller
@@ -91,13 +111,15 @@ class Controller:
     >>> controller.save(Path("copy.npz"))
     >>> Controller.load(Path("copy.npz")).sha256 == controller.sha256
     True
+    >>> controller
+    <Controller of dream: 867 parameters, 288 inputs to 3 outputs, SHA-256 e987f25edac2>
     """
 
     shape: ControllerShape
-    parameters: NDArray[np.float32] = field(repr=False)
+    parameters: NDArray[np.float32]
     task: str
     bundle: str  # SHA-256 of the bundle's file, hexadecimal; empty if the task needs none
-    provenance: dict[str, Any] = field(default_factory=dict, repr=False)
+    provenance: dict[str, Any] = field(default_factory=dict)
     options: str = ""  # the task's options as in its specification
     version: int = 1  # of the task
 
@@ -110,10 +132,61 @@ class Controller:
         if not np.isfinite(self.parameters).all():
             raise ControllerError("a controller's parameters must be finite; this one holds NaN or infinity")
 
+    def _display(self) -> tuple[str, dict[str, object]]:
+        shape, digest = self.shape, self.sha256[:12]
+        layers = f"{shape.features} inputs to {shape.actions} outputs"
+        layers += f" through {shape.hidden} tanh units" if shape.hidden else ""
+        facts = {
+            "task": self.task,
+            "parameters": shape.size,
+            "layers": layers,
+            "world model": self.bundle[:12] or "none",
+            "options": self.options or None,
+            "from generation": self.provenance.get("generation"),
+            "SHA-256": digest,
+        }
+        return f"Controller of {self.task}: {shape.size} parameters, {layers}, SHA-256 {digest}", facts
+
     @property
     def sha256(self) -> str:
         """Hash of the parameters' little-endian bytes."""
         return hashlib.sha256(self.parameters.astype("<f4").tobytes()).hexdigest()
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: bool = False,
+        deterministic: bool = True,  # noqa: ARG002 - the order of Stable-Baselines; a controller has no randomness
+        *,
+        reward: float | None = None,
+        bundle: Bundle | None = None,
+    ) -> tuple[Any, Any]:
+        """The action for one observation, and the recurrent state to pass to the next call.
+
+        Arguments are in the order of Stable-Baselines. Without `state`, or with `episode_start`, an episode begins. A
+        controller with a world model encodes the picture and remembers; the state of one without is `None`. `reward` is
+        that of the last action, which some world models look at. `bundle` is the world model, where it neither ships
+        nor is cached; the first call loads it. `MissingExtraError` on a host without the packages of a worker;
+        `ControllerError` for the state of another controller.
+
+        >>> from dreamfleet import find_controller, make_environment
+        >>> controller = find_controller("tiny")
+        >>> environment = make_environment(controller)
+        >>> observation, info = environment.reset(seed=1)
+        >>> state, reward = None, None
+        >>> for _ in range(3):
+        ...     action, state = controller.predict(observation, state, reward=reward)
+        ...     observation, reward, terminated, truncated, info = environment.step(action)
+        >>> environment.close()
+        """
+        if "_predictor" not in self.__dict__:
+            object.__setattr__(self, "_predictor", _load_predictor(self, bundle))
+        predictor: Predictor = self.__dict__["_predictor"]
+        return predictor.predict(observation, None if episode_start else state, reward)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_predictor"}
 
     @property
     def variant(self) -> Variant:
@@ -162,3 +235,14 @@ class Controller:
         if details["options"] and not isinstance(json.loads(details["options"]), dict):
             raise ValueError("its task's options are not a JSON object")
         return cls(shape, parameters, about["task"], about["bundle"], dict(about["provenance"]), **details)
+
+
+def _load_predictor(controller: Controller, bundle: Bundle | None) -> Predictor:
+    """What acts for the controller, which only the worker's side can make: this side knows no simulator."""
+    try:
+        (point,) = entry_points(group=PREDICTORS, name="worker")
+        found: Predictor = point.load()(controller, bundle)
+    except ModuleNotFoundError as error:
+        remedy = install_command_for(error.name) or "install the package that has it"
+        raise MissingExtraError(f"predict needs the package {error.name!r}: {remedy}") from error
+    return found

@@ -14,6 +14,8 @@ from dreamfleet.common.errors import ControllerError
 from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive, write_archive
 from dreamfleet.common.files.atomic_write import open_output
 from dreamfleet.common.files.regular_files import open_regular, read_regular
+from dreamfleet.common.printable import plural
+from dreamfleet.common.serialization.display import Displayed
 from dreamfleet.common.serialization.validation import Between, Length, MalformedError, Word, from_plain
 
 FORMAT = 1
@@ -39,12 +41,26 @@ class AgentManifest:
     provenance: dict[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class TrainedAgent:
+@dataclass(frozen=True, repr=False)
+class TrainedAgent(Displayed):
     """A network and its manifest: inputs `picture` and `state`, outputs `worth` of each choice and `next_state`."""
 
     manifest: AgentManifest
-    network: bytes = field(repr=False)  # ONNX
+    network: bytes  # ONNX
+
+    def _display(self) -> tuple[str, dict[str, object]]:
+        about = self.manifest
+        facts = {
+            "baseline": about.name,
+            "task": about.task,
+            "pictures": about.preprocessing,
+            "choices": len(about.choices),
+            "steps an action": about.frame_skip,
+            "recurrent state": about.state,
+            "SHA-256": self.sha256[:12],
+        }
+        choices = plural(len(about.choices), "action")
+        return f"TrainedAgent {about.name} of {about.task}: {choices} to choose from", facts
 
     @property
     def task(self) -> str:

@@ -86,12 +86,12 @@ def bundle(data: Path, out: Path, *more: object) -> Words:
 
 
 def begin_run(
-    name: str, runs_dir: Path, listen: Sequence[str], *flags: object, world_model: Path | str,
+    name: str, runs_dir: Path, listen: Sequence[str], *flags: object, world_model: Path | str | None = None,
     as_json: bool = True, **more: object,
 ) -> Words:  # fmt: skip
     """The coordinator of a new run; `flags` come first, so that `more`, such as `seed`, counts."""
     return command(
-        "coordinator", *flags, "--run", name, "--bundle", world_model, *options(**more),
+        "coordinator", *flags, "--run", name, *options(bundle=world_model, **more),
         *_run_place(runs_dir, listen, as_json=as_json),
     )  # fmt: skip
 

@@ -17,7 +17,7 @@ GROUPS: Mapping[str, Mapping[tuple[str, ...], str]] = {
         ("record",): "record a controller's drives as mp4",
         ("compare",): "compare runs or evaluation reports with each other",
         ("doctor",): "check this installation and name what is missing",
-        ("completion",): "print a script that completes verbs and flags in a shell",
+        ("completion",): "print a script that completes verbs and flags",
     },
     "A run": {
         ("coordinator",): "start, continue or fork a run: CMA-ES asks",

@@ -27,6 +27,7 @@ from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import decode_json
 from dreamfleet.common.protocol.messages import ControlReply
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
+from dreamfleet.common.serialization.display import Displayed
 from dreamfleet.common.serialization.validation import MalformedError, from_plain_lenient
 from dreamfleet.common.transport.query import query_all
 from dreamfleet.common.transport.session import Network, enqueue_into, open_session
@@ -37,7 +38,7 @@ MAX_PARAMETERS = 16 << 20  # of a controller; the same as in a controller file
 MAX_RESTARTS = 5  # of fetching a controller in parts while new controllers replace it
 
 
-class Client:
+class Client(Displayed):
     """A connection to the router of one or more runs; use it in a `with`.
 
     >>> from dreamfleet import Client
@@ -57,6 +58,10 @@ class Client:
         #: the flags with which a worker joins a run here; in a secured fleet each worker has its own join file
         self.worker_flags = "--join FILE" if network.credentials else f"--connect {' '.join(network.connect)}"
         self.session = open_session(network)  # public: for other queries, such as for a bundle
+
+    def _display(self) -> tuple[str, dict[str, object]]:
+        with_join_file = "with a join file" if self._secured else "without a join file"
+        return f"Client of {self._where}, {with_join_file}", {"router": self._where, "access": with_join_file}
 
     def __enter__(self) -> Client:
         return self

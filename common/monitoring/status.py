@@ -10,10 +10,18 @@ import json
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
+from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.failures import describe_job
 from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, HostClass
-from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs.records import (
+    RunSettings,
+    StoredConfirmation,
+    StoredEvaluation,
+    StoredGeneration,
+    format_mean,
+)
+from dreamfleet.common.serialization.display import Displayed
 from dreamfleet.common.serialization.optional_fields import OPTIONAL
 from dreamfleet.common.serialization.validation import (
     Count,
@@ -110,9 +118,16 @@ class Population:
         return tuple(Candidate(self.generation, index, *row) for index, row in enumerate(columns, self.offset))
 
 
-@dataclass(frozen=True)
-class WorkerStatus:
-    """A worker as the coordinator knows it."""
+@dataclass(frozen=True, repr=False)
+class WorkerStatus(Displayed):
+    """A worker as the coordinator knows it.
+
+    >>> from dreamfleet import Client
+    >>> with Client(address) as client:  # where the coordinator listens
+    ...     [worker] = client.workers("cartpole")
+    >>> worker.name, worker.state, worker.slots
+    ('alpha', 'present', 1)
+    """
 
     worker: Word
     state: Word  # present, silent, lost or left
@@ -132,6 +147,25 @@ class WorkerStatus:
     resent: Count = field(default=0, metadata=OPTIONAL)  # batches
     host_class: HostClass = field(default="", metadata=OPTIONAL)  # empty: not known yet
     reason: Text = field(default="", metadata=OPTIONAL)  # why it left
+
+    @property
+    def name(self) -> str:
+        """The worker's name, which later processes of the same worker share; `worker` is of one process alone."""
+        return self.worker.partition("/")[0]
+
+    def _display(self) -> tuple[str, dict[str, object]]:
+        speed = f"{self.steps_per_second:,.0f} steps/s"
+        facts: dict[str, object] = {
+            "state": self.state,
+            "reason": self.reason or None,
+            "slots": self.slots,
+            "jobs held": self.leases,
+            "jobs finished": self.finished,
+            "speed": speed,
+            "last heard": f"{self.heard:.1f} s ago",
+        }
+        slots = plural(self.slots, "slot")
+        return f"WorkerStatus of {self.worker}: {self.state}, {slots}, {self.finished} jobs finished, {speed}", facts
 
 
 EventKind = Literal[
@@ -208,9 +242,16 @@ class FailureStatus:
         return describe_job(self.kind, generation, index, self.seeds)
 
 
-@dataclass(frozen=True)
-class Status:
-    """A run at one moment."""
+@dataclass(frozen=True, repr=False)
+class Status(Displayed):
+    """A run at one moment.
+
+    >>> from dreamfleet import Client
+    >>> with Client(address) as client:  # where the coordinator listens
+    ...     status = client.status("cartpole")
+    >>> status.settings.population, status.workers.present, status.generations > 0
+    (4, 1, True)
+    """
 
     schema: Count
     run: Word
@@ -256,6 +297,22 @@ class Status:
     ending: bool = field(default=False, metadata=OPTIONAL)  # a limit is reached: only evaluations are left
     # Episodes of evaluations and of the confirmation until the run's end.
     closing: Count = field(default=0, metadata=OPTIONAL)
+
+    def _display(self) -> tuple[str, dict[str, object]]:
+        now, best = self.generation, self.confirmed or self.best
+        progress = f"generation {now.number}, {now.episodes_done} of {now.episodes} episodes"
+        workers = plural(self.workers.present, "worker")
+        facts: dict[str, object] = {
+            "task": self.settings.task.task,
+            "state": f"{self.state}: {self.why}" if self.why else self.state,
+            "progress": progress,
+            "last generation's mean": None if self.last is None else f"{self.last.mean:.6g}",
+            "confirmed" if self.confirmed else "best evaluation": None if best is None else format_mean(best),
+            "workers": f"{workers}, {plural(self.slots, 'slot')}",
+            "speed": f"{self.throughput.steps_per_second:,.0f} steps/s",
+            "failing jobs": self.failing or None,
+        }
+        return f"Status of {self.run}: {self.state}, {progress}, {workers}", facts
 
     @property
     def is_over(self) -> bool:

@@ -14,6 +14,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
+from dreamfleet.common.serialization.display import DisplayedFields
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
 from dreamfleet.common.serialization.validation import Between, Count, Digest, Length, Seconds, Text, Word
 
@@ -44,8 +45,8 @@ Kind = Literal["score", "evaluate", "collect"]
 VerdictWord = Literal["accepted", "duplicate", "obsolete", "refused"]
 
 
-@dataclass(frozen=True)
-class TaskSpec:
+@dataclass(frozen=True, repr=False)
+class TaskSpec(DisplayedFields):
     """The task that candidates are scored in, frozen with a run.
 
     A fitness is a function of this specification, the parameters and the seeds alone.
@@ -54,6 +55,8 @@ class TaskSpec:
     >>> spec = TaskSpec("car-racing", find_bundle("tiny").sha256, horizon=1000, patience=100)
     >>> spec.with_overrides(horizon=200).horizon
     200
+    >>> TaskSpec("gym:CartPole-v1", "", horizon=500, patience=0)
+    TaskSpec(task='gym:CartPole-v1', bundle='', horizon=500, patience=0)
     """
 
     task: Word

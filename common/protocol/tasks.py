@@ -19,6 +19,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.host.packages import install_command_for
 from dreamfleet.common.host.trusted_modules import check_trusted, import_trusted
+from dreamfleet.common.serialization.display import DisplayedFields
 
 GROUP = "dreamfleet.tasks"
 _NAME = re.compile(r"[\w-][\w.-]*(:\S+)?", re.ASCII)
@@ -27,13 +28,14 @@ GYM = "gym"  # the family of gymnasium's environments; they need no bundle
 DREAM = "dream"  # the task whose candidates are scored in the world model
 
 
-@dataclass(frozen=True)
-class Description:
+@dataclass(frozen=True, repr=False)
+class Description(DisplayedFields):
     """The properties of a task without bundle that a run freezes.
 
     >>> from dreamfleet import Description
-    >>> Description(observations=4, outputs=2, packages=("numpy", "gymnasium")).version
-    1
+    >>> description = Description(observations=4, outputs=2)
+    >>> description, description.version
+    (Description(observations=4, outputs=2), 1)
     """
 
     observations: int  # inputs of a controller

@@ -8,7 +8,8 @@ from statistics import fmean, median
 
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.printable import join_some, plural
-from dreamfleet.common.runs.standard_error import sample_std, standard_error
+from dreamfleet.common.runs.standard_error import format_with_error, sample_std, standard_error
+from dreamfleet.common.serialization.display import Displayed
 from dreamfleet.common.serialization.validation import Count
 
 MAX_NAMED = 3  # failed episodes in a text
@@ -37,8 +38,8 @@ class FailedEpisode:
         return f"seed {self.seed}, {self.error}"
 
 
-@dataclass(frozen=True)
-class EpisodeResults:
+@dataclass(frozen=True, repr=False)
+class EpisodeResults(Displayed):
     """The episodes of one controller, in the order of their seeds; at least one has a score.
 
     All statistics are over the episodes with a score.
@@ -53,6 +54,22 @@ class EpisodeResults:
 
     drives: tuple[EpisodeResult, ...]
     failed: tuple[FailedEpisode, ...] = ()
+
+    def _display(self) -> tuple[str, dict[str, object]]:
+        score = format_with_error(self.mean, self.error)
+        extremes = f"{self.worst:g} to {self.best:g}"
+        failed = f", {len(self.failed)} failed" if self.failed else ""
+        facts = {
+            "mean ± standard error": score,
+            "median": self.median,
+            "worst to best": extremes,
+            "episodes": len(self.drives),
+            "failed": self.failure_text or None,
+            "seeds": f"{self.seeds[0]} to {self.seeds[-1]}",
+            "steps": self.steps,
+            "finished": self.finished,
+        }
+        return f"EpisodeResults of {plural(len(self.drives), 'episode')}: {score}, {extremes}{failed}", facts
 
     @classmethod
     def of(cls, episodes: Iterable[EpisodeResult | FailedEpisode]) -> EpisodeResults:

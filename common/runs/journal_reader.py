@@ -32,17 +32,18 @@ class JournalReader:
     """A read-only connection to the journal at `path`; every failure is a `JournalError`."""
 
     def __init__(self, path: Path) -> None:
-        self._run, self._path = path.parent.name, path
+        self._run, self._path, self._closed = path.parent.name, path, False
         self._connection, self.version = _connect_read_only(path)
 
     def close(self) -> None:
         """Release the journal."""
+        self._closed = True
         self._connection.close()
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
         """Queries inside see one state of the journal, whatever a coordinator writes meanwhile; may be nested."""
-        if self._connection.in_transaction:
+        if not self._closed and self._connection.in_transaction:
             yield
             return
         self._fetch("BEGIN")  # deferred: the first query fixes the state
@@ -78,6 +79,8 @@ class JournalReader:
         return JournalError(f"the journal of run {self._run} is damaged: {what}; restore it from a copy")
 
     def _fetch(self, query: str, *values: Any) -> list[Any]:
+        if self._closed:
+            raise JournalError(f"run {self._run} was closed here: open it again")
         try:
             return self._connection.execute(query, values).fetchall()
         except (sqlite3.Error, OverflowError, UnicodeError) as error:
@@ -112,6 +115,12 @@ def efforts_query(begun: Sequence[BegunStage]) -> str:
         f"kind = 'score' AND episode < CASE {whens} ELSE 0 END, total(steps), "
         "total(CAST(seconds * 1e6 AS INTEGER)) FROM result GROUP BY 1, 2, 3, 4 ORDER BY 2, 3, 1, 4"
     )
+
+
+WORK_QUERY = (
+    f"SELECT worker, generation, kind, kind = 'evaluate' AND episode >= {CHOOSING_OFFSET}, count(*), total(steps), "  # noqa: S608
+    "total(seconds) FROM result GROUP BY 1, 2, 3, 4"
+)
 
 
 def _connect_read_only(path: Path, *, rolled_back: bool = False) -> tuple[sqlite3.Connection, int]:

@@ -7,14 +7,14 @@ from collections.abc import Iterable
 from contextlib import AbstractContextManager, suppress
 from difflib import SequenceMatcher
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.files.regular_files import path_exists
-from dreamfleet.common.printable import join_some
+from dreamfleet.common.printable import join_some, plural
 from dreamfleet.common.protocol.host_classes import HostClasses, class_from_fingerprint, count_results
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.protocol.messages import TaskSpec
@@ -23,6 +23,7 @@ from dreamfleet.common.runs import schema
 from dreamfleet.common.runs.effort import Effort, GenerationEffort
 from dreamfleet.common.runs.journal_reader import (
     CANDIDATES_QUERY,
+    WORK_QUERY,
     JournalReader,
     class_counts_query,
     efforts_query,
@@ -37,13 +38,16 @@ from dreamfleet.common.runs.records import (
     StoredFailure,
     StoredGeneration,
     StoredResult,
+    StoredWork,
     best_evaluation,
+    format_mean,
 )
 from dreamfleet.common.runs.run_lock import is_run_locked
 from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, rollout_path, run_paths
 from dreamfleet.common.runs.seeds import CHOOSING_OFFSET, CONFIRMING_OFFSET, VALIDATION
 from dreamfleet.common.runs.stages import begun_stages
 from dreamfleet.common.runs.times import elapsed_seconds
+from dreamfleet.common.serialization.display import Displayed
 
 MAX_LISTED_RUNS = 8  # in the error for an unknown run name
 # Names of facts in the journal.
@@ -64,15 +68,8 @@ def open_run(runs_dir: Path, name: str) -> RunFolder:
     return RunFolder(path)
 
 
-class RunFolder:
-    """A run's folder, read-only; close it, or use it in a `with`.
-
-    >>> from dreamfleet import open_run
-    >>> with open_run("cartpole") as run:  # begun by `dreamfleet coordinator --run cartpole --task gym:CartPole-v1`
-    ...     generation = run.history()[0]
-    ...     print(run.spec.task, generation.number, generation.worst <= generation.mean <= generation.best)
-    gym:CartPole-v1 0 True
-    """
+class RunFolder(Displayed):
+    """A run's folder, read-only; close it, or use it in a `with`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -82,7 +79,26 @@ class RunFolder:
         self._has_failures = self._journal.version >= schema.FAILURE_VERSION
         self._failed_column = "failed" if self._has_failures else "0"
 
-    def __enter__(self) -> RunFolder:
+    def _display(self) -> tuple[str, dict[str, object]]:
+        facts: dict[str, object] = {"folder": str(self.path)}
+        try:
+            with self.read_transaction():
+                count, confirmed, best = len(self.history()), self.confirmation(), best_evaluation(self.evaluations())
+                task, state = self.spec.task, self.state
+        except JournalError as error:  # closed, or damaged
+            return f"Run {self.name}: {error}", facts
+        generations = plural(count, "generation")
+        facts |= {
+            "task": task,
+            "state": state,
+            "generations": count,
+            "best evaluation": best and format_mean(best),
+            "confirmed": confirmed and format_mean(confirmed),
+            "begun": self.created,
+        }
+        return f"Run {self.name} of {task}: {generations}, {state}", facts
+
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_error: object) -> None:
@@ -216,14 +232,15 @@ class RunFolder:
         """Accepted results of every kind."""
         return int(self._journal.row("SELECT count(*) FROM result")[0])
 
-    def history(self) -> list[StoredGeneration]:
-        """Every closed generation, oldest first."""
+    def history(self, since: int = 0) -> list[StoredGeneration]:
+        """Every closed generation from number `since` on, oldest first."""
         query = (
             f"SELECT number, mean, std, best, worst, sigma, steps, seconds, {self._failed_column} FROM generation "  # noqa: S608
-            "WHERE closed IS NOT NULL ORDER BY number"
+            "WHERE closed IS NOT NULL AND number >= ? ORDER BY number"
         )
         found = []
-        for number, mean, std, best, worst, sigma, steps, seconds, failed in self._journal.rows("iFFFFfiFi", query):
+        rows = self._journal.rows("iFFFFfiFi", query, since)
+        for number, mean, std, best, worst, sigma, steps, seconds, failed in rows:
             fitness = to_finite(mean), to_finite(std), to_finite(best), to_finite(worst)  # not finite in old journals
             effort = clamp_count(steps), to_finite(seconds)
             found.append(StoredGeneration(number, *fitness, to_finite(sigma), *effort, clamp_count(failed)))
@@ -285,6 +302,20 @@ class RunFolder:
         return [GenerationEffort(generation, bool(confirming), Effort.of(settings.task.task, kind, *made,
                                                                          driven=bool(driven)))
                 for kind, generation, confirming, driven, *made in rows]  # fmt: skip
+
+    def work_by_worker(self) -> list[StoredWork]:
+        """What each worker did for each generation."""
+        return [
+            StoredWork(worker, generation, kind, bool(confirming), results, to_finite(steps), to_finite(seconds))
+            for worker, generation, kind, confirming, results, steps, seconds in self._journal.rows(
+                "sisiiff", WORK_QUERY
+            )
+        ]
+
+    def generation_times(self) -> dict[int, tuple[float, float | None]]:
+        """When each generation was opened and closed, in seconds since 1970; `None` while it is open."""
+        rows = self._journal.rows("ifF", "SELECT number, opened, closed FROM generation ORDER BY number")
+        return {number: (opened, closed) for number, opened, closed in rows}
 
     def rollouts(self) -> list[Path]:
         """The files of all accepted rollouts, oldest first."""

@@ -98,13 +98,23 @@ def _remove_on_failure(folder: Path) -> Iterator[None]:
         raise
 
 
+def columns_of(table: str) -> list[str]:
+    """The names of a table's columns."""
+    kind, _ = TABLES[table]
+    return [each.name for each in fields(kind)] + ["error"] * (table in JUDGED)
+
+
+def rows_of(run: RunFolder, table: str) -> list[Row]:
+    """A run's rows of a table."""
+    _, read = TABLES[table]
+    return [with_error(each) if table in JUDGED else asdict(each) for each in read(run)]
+
+
 def _tables(run: RunFolder) -> Iterator[tuple[str, list[str], list[Row]]]:
     """Name, columns and rows of each table with rows."""
-    for name, (kind, read) in TABLES.items():
-        judged = name in JUDGED
-        columns = [each.name for each in fields(kind)] + ["error"] * judged
-        if rows := [with_error(each) if judged else asdict(each) for each in read(run)]:
-            yield name, columns, rows
+    for name in TABLES:
+        if rows := rows_of(run, name):
+            yield name, columns_of(name), rows
 
 
 def _export_tables(

@@ -8,33 +8,45 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-
-mpl.use("Agg")
-import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import open_output
 from dreamfleet.common.monitoring.fitness_chart import PLOT_COLOURS, draw_fitness, error_bars
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.effort import Effort, format_steps
+from dreamfleet.common.runs.learning import LearningCurve
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import begun_stages, describe_steps, join_distinct
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.profile import PublishedScores
 from dreamfleet.common.worlds.score_words import score_word
-from dreamfleet.coordinator.analysis.learning import LearningCurve
+from dreamfleet.common.worlds.shipped import WORLDS
 
 TITLE = 90  # characters in a line of the title
 KINDS = (".png", ".svg")
+NEAR_SHARE = 0.1  # of the steps of the first published score: a shorter run's curve would be squeezed beside it
 REPEATABLE: dict[Any, str] = {"svg.hashsalt": "dreamfleet"}  # fixed identifiers in SVG files, instead of random ones
 
 
 def plot_fitness(run: RunFolder, path: Path) -> None:
-    """Plot one run's fitness over its generations, with its evaluated and confirmed means."""
+    """Write the picture of `fitness_figure`."""
+    _save(fitness_figure(run), path)
+
+
+def fitness_figure(run: RunFolder) -> Any:
+    """One run's fitness over its generations, with its evaluated and confirmed means, as a matplotlib `Figure`.
+
+    `UsageError` before the first generation is closed. It is made without pyplot, so that a notebook keeps its backend.
+    """
+    if not run.history():
+        raise UsageError(f"run {run.name} has no closed generation, so there is nothing to draw: wait for the first")
     settings = run.settings
     stages = begun_stages(settings, run.history(), run.evaluations())
-    figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    axes = figure.subplots()
     handles = draw_fitness(axes, run)
     size = join_distinct(
         f"{each.stage.population} candidates x {plural(each.stage.episodes, 'episode')}" for each in stages
@@ -45,18 +57,24 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
     title = f"{run.name}: {settings.task.task}, {size}, seed {settings.seed}"
     axes.set_title("\n".join(textwrap.wrap(title, TITLE)), fontsize=11)
     figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
-    _save(figure, path)
+    return figure
 
 
 def plot_learning(curves: Sequence[LearningCurve], marks: PublishedScores | None, path: Path) -> None:
-    """Plot evaluated scores over environment steps and over core-hours, with published scores as `marks`.
+    """Write the picture of `learning_figure`."""
+    _save(learning_figure(curves, marks), path)
+
+
+def learning_figure(curves: Sequence[LearningCurve], marks: PublishedScores | None) -> Any:
+    """Evaluated scores over environment steps and core-hours, with published scores as `marks`: a matplotlib `Figure`.
 
     A published score of unknown steps is a horizontal line.
 
     Environment steps are all steps in reality: of candidates, kept rollouts, evaluations, and of the run that this one
     began from. The legend shows dreamt steps.
     """
-    figure, (over_steps, over_hours) = plt.subplots(1, 2, figsize=(11, 5.6), sharey=True, layout="constrained")
+    figure = Figure(figsize=(11, 5.6), layout="constrained")
+    over_steps, over_hours = figure.subplots(1, 2, sharey=True)
     for curve, colour in zip(curves, PLOT_COLOURS * len(curves), strict=False):
         _draw_curve(over_steps, curve, colour, lambda effort: effort.steps)
         _draw_curve(over_hours, curve, colour, lambda effort: effort.core_hours)
@@ -74,7 +92,17 @@ def plot_learning(curves: Sequence[LearningCurve], marks: PublishedScores | None
         axes.margins(y=0.1)
         axes.grid(alpha=0.3, which="major")
     figure.legend(*over_steps.get_legend_handles_labels(), loc="outside lower center", fontsize=9, frameon=False)
-    _save(figure, path)
+    return figure
+
+
+def published_scores(curves: Sequence[LearningCurve]) -> PublishedScores | None:
+    """The published scores of the world that all curves are of; `None` if the curves are much shorter."""
+    worlds = {each.world for each in curves}
+    world = WORLDS.get(worlds.pop()) if len(worlds) == 1 else None
+    found = world.published if world else None
+    if found is not None and max(each.total.steps for each in curves) < NEAR_SHARE * found.first_steps:
+        return None
+    return found
 
 
 def _scale(axes: Any) -> None:
@@ -136,4 +164,3 @@ def _save(figure: Any, path: Path) -> None:
     metadata = {"Date": None} if path.suffix == ".svg" else None
     with open_output(path) as file, mpl.rc_context(REPEATABLE):
         figure.savefig(file, format=path.suffix.removeprefix("."), dpi=120, metadata=metadata)
-    plt.close(figure)

@@ -7,7 +7,6 @@ over Zenoh; it imports neither the service nor the worker.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, fields, replace
@@ -45,11 +44,10 @@ from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.common.runs.standard_error import format_with_error, standard_error
 from dreamfleet.common.worlds.profile import DemoPlan
 from dreamfleet.coordinator.experiments.demo_plans import PLANS, find_plan, plan_defaults
-from dreamfleet.coordinator.experiments.local_run import LocalRun
+from dreamfleet.coordinator.experiments.local_run import START_SECONDS, LocalRun, has_begun
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE
 
 REFRESH = 0.5
-START_SECONDS = 180.0  # a coordinator that ends earlier is seen at once; a busy host takes its time
 PAGE_PACKAGES = ("plotly", "starlette", "uvicorn")
 PLOT, VIDEO, SCHEDULE = "fitness.png", "drive.mp4", "stages.toml"
 DREAM_EVALUATIONS, REAL_EVALUATIONS = (
@@ -135,7 +133,10 @@ class Demo:
         self._console = Console()
 
     def play(self) -> None:
-        """Evolve, judge, plot, record, and print what to try next."""
+        """Evolve, judge, plot, record, and print what to try next; `UsageError` if a run of that name exists."""
+        for name in (each.run for each in self._demo_runs):
+            if has_begun(self._runs_dir, name):
+                raise UsageError(f"run {name} exists: give another --run; `dreamfleet runs delete {name}` removes it")
         with ExitStack() as stack:
             self._show_page(stack)
             for demo_run in self._demo_runs:
@@ -208,7 +209,7 @@ class Demo:
             demo_run.run, self._runs_dir, (self._endpoint,), *options(**flags), world_model=self._plan.bundle,
             as_json=False,
         )  # fmt: skip
-        with LocalRun(demo_run.run, words, logs) as run, self._connect(run.coordinator) as client:
+        with LocalRun(demo_run.run, words, logs) as run, run.connect(self._endpoint) as client:
             for name in (f"core-{number}" for number in range(workers)):
                 run.start_worker(name, model_commands.worker(demo_run.run, self._endpoint, 1, "--name", name))
             with Live(console=self._console, refresh_per_second=4) as live:
@@ -218,17 +219,6 @@ class Demo:
                     self._show(live, client, demo_run.run)
 
                 run.wait(never_stop, look, REFRESH)
-
-    def _connect(self, coordinator: VerbProcess) -> Client:
-        deadline = time.monotonic() + START_SECONDS
-        while True:
-            if coordinator.popen.poll() is not None:
-                raise DreamfleetError(coordinator.last_line())
-            try:
-                return Client((self._endpoint,))
-            except ConnectionFailedError:
-                if time.monotonic() > deadline:
-                    raise
 
     def _show(self, live: Live, client: Client, run: str) -> None:
         with suppress(ConnectionFailedError):  # the coordinator is starting, or has just ended

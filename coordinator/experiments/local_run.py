@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 import socket
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -13,15 +14,17 @@ from typing import Any
 
 from dreamfleet.common.cli import model_commands
 from dreamfleet.common.cli.verb_runner import POLL_INTERVAL, wait_for_end
-from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
+from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, StoppedError, UsageError
 from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.host.processes import VerbProcess, parent_death_command
 from dreamfleet.common.host.resource_limits import usable_cores
-from dreamfleet.common.host.stop_signals import Stop
+from dreamfleet.common.host.stop_signals import Stop, signals_deferred
+from dreamfleet.common.monitoring.client import Client
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.coordinator.settings.config import LimitsConfig, RunConfig
 
+START_SECONDS = 180.0  # a coordinator that ends earlier is seen at once; a busy host takes its time
 ANY_ADDRESS = re.compile(r"/(0\.0\.0\.0|\[::\]):")  # an endpoint that listens on all of this host's addresses
 # Flags of `coordinator` that each run of an experiment has its own of, by the names of their values.
 RESERVED = {"run_name": "--run", "source": "--from"} | {
@@ -61,26 +64,53 @@ class LocalFleet:
 class LocalRun:
     """A run's coordinator, and workers of this host, as child processes; leaving the context ends them."""
 
-    def __init__(self, name: str, words: Sequence[str], logs: Path) -> None:
+    def __init__(
+        self, name: str, words: Sequence[str], logs: Path, environment: Mapping[str, str] | None = None
+    ) -> None:
         """`words` are the coordinator's command line; each process logs into a file in `logs`."""
-        self._name, self._words, self._logs = name, words, logs
+        self._name, self._words, self._logs, self._environment = name, words, logs, environment
         self._log = logs / "coordinator.log"
         self._workers: list[VerbProcess] = []
 
     def __enter__(self) -> LocalRun:
         self._stack = ExitStack()
-        self.coordinator = self._stack.enter_context(
-            VerbProcess(*self._words, inside=parent_death_command(), log=self._log)
-        )
+        self.coordinator = self._start(self._words, self._log)
         return self
 
     def __exit__(self, *_error: object) -> None:
-        self._stack.close()
+        with signals_deferred():  # a second Ctrl-C would leave processes behind
+            for each in self._workers:  # together: each may be in an episode
+                each.popen.terminate()
+            self._stack.close()
+
+    def connect(self, endpoint: str) -> Client:
+        """A client of the coordinator, once that answers at `endpoint`.
+
+        `DreamfleetError` if it ends before, `UsageError` if its command line was wrong.
+        """
+        deadline = time.monotonic() + START_SECONDS
+        while True:
+            if (code := self.coordinator.popen.poll()) is not None:
+                raise (UsageError if code == UsageError.exit_code else DreamfleetError)(self.coordinator.last_line())
+            try:
+                with ExitStack() as stack:
+                    client = stack.enter_context(Client((endpoint,)))
+                    client.document(self._name)
+                    stack.pop_all()
+                    return client
+            except ConnectionFailedError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(POLL_INTERVAL)
 
     def start_worker(self, name: str, words: Sequence[str]) -> None:
         """Start a worker by its command line; it logs into `name`.log."""
-        log = self._logs / f"{name}.log"
-        self._workers.append(self._stack.enter_context(VerbProcess(*words, inside=parent_death_command(), log=log)))
+        self._workers.append(self._start(words, self._logs / f"{name}.log"))
+
+    def _start(self, words: Sequence[str], log: Path) -> VerbProcess:
+        with signals_deferred():  # what is started is also ended
+            process = VerbProcess(*words, inside=parent_death_command(), log=log, environment=self._environment)
+            return self._stack.enter_context(process)
 
     def check_workers(self) -> None:
         """`DreamfleetError` if a worker failed."""
@@ -99,6 +129,10 @@ class LocalRun:
         `StoppedError` if `stop` is true or the run was left open, `DreamfleetError` if the coordinator failed.
         """
         wait_for_end(self.coordinator, stop, on_poll, interval)
+        self.check_end()
+
+    def check_end(self) -> None:
+        """Errors as in `wait`, of a coordinator that has ended."""
         code, _ = self.coordinator.finish()
         if code == StoppedError.exit_code:
             raise StoppedError(f"run {self._name} was left open")

@@ -23,7 +23,7 @@ from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.score_words import score_word
 
 if TYPE_CHECKING:
-    from dreamfleet.coordinator.analysis.comparison import ComparedRun, EqualBudget, EvaluatedMean
+    from dreamfleet.common.runs.comparison import ComparedRun, EqualBudget, EvaluatedMean
 
 SUMMARY = (
     "compare runs (settings that differ, scores at equal steps and core-hours, confirmed scores), or reports of "
@@ -91,7 +91,7 @@ def _warn(first: Path, base: EvaluationReport, path: Path, other: EvaluationRepo
 
 def _compare_runs(args: argparse.Namespace, names: Sequence[str]) -> int:
     """Print settings that differ, scores at equal budgets, and differences from the first run."""
-    from dreamfleet.coordinator.analysis.comparison import ComparedRun, at_equal_budget, differing_settings
+    from dreamfleet.common.runs.comparison import ComparedRun, at_equal_budget, differing_settings
 
     if len(names) < 2:
         raise UsageError(f"{names[0]} is one run: give another to compare it with")
@@ -164,7 +164,7 @@ def _format_evaluation(look: EvaluatedMean | None) -> str:
 
 def _run_differences(sides: Sequence[ComparedRun], equal: Sequence[EqualBudget]) -> Iterator[dict[str, Any]]:
     """Each run less the first: at equal budgets, then of confirmed scores."""
-    from dreamfleet.coordinator.analysis.comparison import difference
+    from dreamfleet.common.runs.comparison import difference
 
     def paired(of: str, side: ComparedRun, one: dict[int, float], other: dict[int, float]) -> dict[str, Any]:
         found = difference(one, other)

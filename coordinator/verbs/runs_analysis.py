@@ -15,7 +15,6 @@ from dreamfleet.common.files.atomic_write import check_output_path, open_output
 from dreamfleet.common.printable import printable_lines
 from dreamfleet.common.runs.run_folder import open_run
 
-NEAR_SHARE = 0.1  # of the steps of the first published score: a shorter run's curve would be squeezed beside it
 LEARNING, FITNESS = "learning.png", "fitness.png"
 
 
@@ -60,17 +59,12 @@ def _draw_fitness(args: argparse.Namespace, out: Path) -> None:
     if len(args.run_names) > 1:
         raise UsageError("--fitness is of one run: name one")
     with open_run(args.runs_dir, args.run_names[0]) as stored:
-        if not stored.history():
-            raise UsageError(
-                f"run {stored.name} has no closed generation, so there is nothing to draw: wait for the first"
-            )
         plot_fitness(stored, out)
 
 
 def _draw_learning(args: argparse.Namespace, out: Path) -> None:
-    from dreamfleet.common.worlds.shipped import WORLDS
-    from dreamfleet.coordinator.analysis.learning import LearningCurve
-    from dreamfleet.coordinator.analysis.plot import plot_learning
+    from dreamfleet.common.runs.learning import LearningCurve
+    from dreamfleet.coordinator.analysis.plot import plot_learning, published_scores
 
     curves = []
     for name in dict.fromkeys(args.run_names):
@@ -80,11 +74,7 @@ def _draw_learning(args: argparse.Namespace, out: Path) -> None:
     if len(worlds) > 1:
         names = ", ".join(worlds)
         print(f"note: these runs are of the worlds {names}: their scores do not compare", file=sys.stderr)
-    world = WORLDS.get(worlds[0]) if len(worlds) == 1 else None
-    marks = world.published if world else None
-    if marks is not None and max(each.total.steps for each in curves) < NEAR_SHARE * marks.first_steps:
-        marks = None
-    plot_learning(curves, marks, out)
+    plot_learning(curves, published_scores(curves), out)
 
 
 def configure_receipt(parser: argparse.ArgumentParser) -> None:

@@ -56,7 +56,7 @@ def test_what_cannot_be_contrasted_is_said_at_once(processes, tmp_path):
     assert (code, "has no episodes: collect, train the VAE and encode there first" in err) == (1, True), err
     for flags, why in (
         ("--sigma0 0.1", "a run would never end"),
-        ("--generations 2 --seed 4", "--seed in --run-flags: contrast sets them for each run"),
+        ("--generations 2 --seed 4", "--seed in --run-flags: lab contrast sets them for each run"),
         ("--generations 2 --population 1", "--population must be from 2 to"),
     ):
         code, _, err = processes.call(

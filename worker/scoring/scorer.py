@@ -17,6 +17,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, class_from_fingerprint
 from dreamfleet.common.protocol.messages import Kind, TaskSpec
+from dreamfleet.common.serialization.display import Displayed
 from dreamfleet.worker.scoring.episode import EpisodeConfig, score
 from dreamfleet.worker.scoring.host_class_probe import REPEAT_LIMIT, HostClassProbe
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld, Rollout
@@ -38,7 +39,7 @@ from dreamfleet.worker.tasks.registry import find_scored_task
 DRIVER_NAME = "controller"  # the driver's name in collected rollouts
 
 
-class Scorer:
+class Scorer(Displayed):
     """Scores jobs of one specification, and of variants of it.
 
     `UsageError` or `BundleError` if the task, its version or the world model does not fit this host.
@@ -49,6 +50,8 @@ class Scorer:
     >>> score = scorer.score("score", find_controller("tiny").parameters, seed=2**20)
     >>> score.steps
     20
+    >>> scorer
+    <Scorer of car-racing: 867 parameters, episodes of 20 steps at most>
     >>> scorer.close()
     """
 
@@ -70,6 +73,19 @@ class Scorer:
         self._policy = task.make_policy(assignment)
         self._preprocessing = "" if bundle is None else bundle.manifest.preprocessing
         self._data_world = OF_FIRST_WORLD if bundle is None else DataWorld.of(bundle)
+
+    def _display(self) -> tuple[str, dict[str, object]]:
+        spec, size = self.spec, self._assignment.controller.size
+        facts = {
+            "task": spec.task,
+            "parameters": size,
+            "horizon": spec.horizon,
+            "patience": spec.patience,
+            "temperature": spec.temperature,
+            "world model": spec.bundle[:12] or "none",
+            "options": spec.options or None,
+        }
+        return f"Scorer of {spec.task}: {size} parameters, episodes of {spec.horizon} steps at most", facts
 
     @property
     def observer(self) -> StepObserver | None:

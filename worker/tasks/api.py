@@ -21,6 +21,7 @@ from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts, WorldF
 from dreamfleet.common.errors import BundleError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import Description
+from dreamfleet.common.serialization.display import DisplayedFields
 from dreamfleet.worker.tasks.former_names import FormerFields, accept_former_names, add_former_names
 from dreamfleet.worker.tasks.policy import Driver, FlatPolicy
 
@@ -154,16 +155,18 @@ class DreamReward:
     source: Literal["label", "survival"] = "label"
 
 
-@dataclass(frozen=True)
-class World(metaclass=FormerFields):
+@dataclass(frozen=True, repr=False)
+class World(DisplayedFields, metaclass=FormerFields):
     """What the rest of the system must know of a world; `UsageError` for a mirror or names of other actions.
 
     The last six fields are of worlds in which world models are trained (docs/reference/worlds.md).
     `off_course` and `off_course_cost` may also be given and read by their former names `stray` and `stray_cost`.
 
-    >>> from dreamfleet import Continuous, World
+    >>> from dreamfleet import Continuous, Discrete, World
     >>> World(Continuous.between(low=[-2], high=[2]), horizon=200).actions.outputs
     1
+    >>> World(Discrete(2), horizon=200)  # what differs from the defaults
+    World(actions=Discrete(outputs=2, first=0), horizon=200)
     """
 
     actions: Actions

@@ -12,7 +12,7 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.trained_agent import TrainedAgent
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.resource_limits import usable_cores
-from dreamfleet.common.runs import lookup, run_folder, run_paths
+from dreamfleet.common.runs import lookup, run_paths
 from dreamfleet.common.runs.episode_results import EpisodeResults
 from dreamfleet.common.runs.seeds import TEST
 from dreamfleet.worker.scoring.agents import Agent, make_agent
@@ -40,17 +40,6 @@ def find_agent(path: Path | str) -> TrainedAgent:
     ('car-racing', 5)
     """
     return TrainedAgent.load(Path(path))
-
-
-def open_run(name: str, runs_dir: Path | str | None = None) -> run_folder.RunFolder:
-    """A run's journal, read-only; close it or use it in a `with`. `JournalError` lists the existing runs.
-
-    >>> from dreamfleet import open_run
-    >>> with open_run("cartpole") as run:  # the name of a run of yours
-    ...     print(run.spec.task, len(run.history()) > 0)
-    gym:CartPole-v1 True
-    """
-    return run_folder.open_run(_folder(runs_dir), name)
 
 
 def make_environment(

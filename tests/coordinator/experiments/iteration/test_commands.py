@@ -130,7 +130,9 @@ def test_an_evolution_in_a_subspace_names_its_file():
     made = commands(*ROUND_2, entry(2, "bundle"), entry(2, "gate", kept=False), run_flags="--generations 3")
     few = Path("few.npz")
     words = said(made.subspace(2, few))
-    assert words == "subspace data/rounds/01/round-1.zip --data data --out few.npz --json", "of the model that counts"
+    assert words == "lab subspace data/rounds/01/round-1.zip --data data --out few.npz --json", (
+        "of the model that counts"
+    )
     assert "--init start.npz --subspace few.npz" in said(made.begin_run(2, (), (), Path("start.npz"), few))
     seeing = commands(*ROUND_2, views=8, subspace=True, go_on=True)
     assert "--data data --views 8 --out" in said(seeing.subspace(2, few))
