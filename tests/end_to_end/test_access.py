@@ -247,9 +247,9 @@ def test_nobody_listens_beyond_this_host_without_security_unless_that_is_said(pr
     anywhere = f"tcp/0.0.0.0:{processes.port}"
     words = ("coordinator", "--run", "open", "--runs-dir", processes.runs, "--listen", anywhere)
     code, _, err = processes.call(*words)
-    assert (code, "owns the run" in err, "--insecure" in err) == (2, True, True)
+    assert (code, "controls the run" in err, "--insecure" in err) == (2, True, True)
     process = processes.start(*words, "--insecure")
-    process.wait_for("anyone who reaches the port owns the run")
+    process.wait_for("anyone who reaches the port controls the run")
     process.end()
     code, _, err = processes.call(*words, "--join", access.path("coordinator"))
     assert (code, f"it is tls/0.0.0.0:{processes.port}" in err) == (2, True)
