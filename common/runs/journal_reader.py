@@ -117,6 +117,12 @@ def efforts_query(begun: Sequence[BegunStage]) -> str:
     )
 
 
+WORK_QUERY = (
+    f"SELECT worker, generation, kind, kind = 'evaluate' AND episode >= {CHOOSING_OFFSET}, count(*), total(steps), "  # noqa: S608
+    "total(seconds) FROM result GROUP BY 1, 2, 3, 4"
+)
+
+
 def _connect_read_only(path: Path, *, rolled_back: bool = False) -> tuple[sqlite3.Connection, int]:
     """An open journal and its schema version."""
     # In a read-only folder SQLite cannot create the shared-memory file. It needs none where no write-ahead log is left.

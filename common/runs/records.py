@@ -163,6 +163,19 @@ class StoredFailure:
 
 
 @dataclass(frozen=True)
+class StoredWork:
+    """The accepted results of one worker in one generation, of one kind."""
+
+    worker: str
+    generation: int
+    kind: str  # score, evaluate, collect
+    confirming: bool  # of choosing and confirming the reported mean, after the last generation
+    results: int
+    steps: float
+    seconds: float  # of slots
+
+
+@dataclass(frozen=True)
 class StoredCandidate:
     """One candidate: its fitness, and the effort of its accepted results, also of those before a redraw."""
 

@@ -23,6 +23,7 @@ from dreamfleet.common.runs import schema
 from dreamfleet.common.runs.effort import Effort, GenerationEffort
 from dreamfleet.common.runs.journal_reader import (
     CANDIDATES_QUERY,
+    WORK_QUERY,
     JournalReader,
     class_counts_query,
     efforts_query,
@@ -37,6 +38,7 @@ from dreamfleet.common.runs.records import (
     StoredFailure,
     StoredGeneration,
     StoredResult,
+    StoredWork,
     best_evaluation,
     format_mean,
 )
@@ -300,6 +302,20 @@ class RunFolder(Displayed):
         return [GenerationEffort(generation, bool(confirming), Effort.of(settings.task.task, kind, *made,
                                                                          driven=bool(driven)))
                 for kind, generation, confirming, driven, *made in rows]  # fmt: skip
+
+    def work_by_worker(self) -> list[StoredWork]:
+        """What each worker did for each generation."""
+        return [
+            StoredWork(worker, generation, kind, bool(confirming), results, to_finite(steps), to_finite(seconds))
+            for worker, generation, kind, confirming, results, steps, seconds in self._journal.rows(
+                "sisiiff", WORK_QUERY
+            )
+        ]
+
+    def generation_times(self) -> dict[int, tuple[float, float | None]]:
+        """When each generation was opened and closed, in seconds since 1970; `None` while it is open."""
+        rows = self._journal.rows("ifF", "SELECT number, opened, closed FROM generation ORDER BY number")
+        return {number: (opened, closed) for number, opened, closed in rows}
 
     def rollouts(self) -> list[Path]:
         """The files of all accepted rollouts, oldest first."""

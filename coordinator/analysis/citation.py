@@ -15,6 +15,7 @@ from dreamfleet.common.errors import BundleError
 from dreamfleet.common.monitoring.eta import format_duration
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.tasks import module_of
+from dreamfleet.common.runs.learning import total_effort
 from dreamfleet.common.runs.records import (
     RunSettings,
     StoredConfirmation,
@@ -32,7 +33,6 @@ from dreamfleet.common.runs.stages import begun_stages, describe_stages
 from dreamfleet.common.runs.times import parse_time
 from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.common.worlds.score_words import score_word_of_run
-from dreamfleet.coordinator.settings.start import total_effort
 
 AUTHORS = "The dreamfleet authors"
 

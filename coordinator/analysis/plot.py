@@ -17,13 +17,13 @@ from dreamfleet.common.monitoring.fitness_chart import PLOT_COLOURS, draw_fitnes
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.effort import Effort, format_steps
+from dreamfleet.common.runs.learning import LearningCurve
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import begun_stages, describe_steps, join_distinct
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.profile import PublishedScores
 from dreamfleet.common.worlds.score_words import score_word
 from dreamfleet.common.worlds.shipped import WORLDS
-from dreamfleet.coordinator.analysis.learning import LearningCurve
 
 TITLE = 90  # characters in a line of the title
 KINDS = (".png", ".svg")

@@ -73,7 +73,7 @@ class StoredRun(RunFolder):
         ...     figure = run.plot()
         >>> figure.savefig("learning.png")
         """
-        from dreamfleet.coordinator.analysis.learning import LearningCurve
+        from dreamfleet.common.runs.learning import LearningCurve
 
         if kind not in (None, *PLOTS):
             raise UsageError(f"kind must be {' or '.join(PLOTS)}, not {kind!r}")

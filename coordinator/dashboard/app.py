@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import aclosing
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from dreamfleet.common.monitoring.prometheus import CONTENT_TYPE, exposition
 from dreamfleet.common.printable import printable
 from dreamfleet.coordinator.dashboard import stored_runs
 from dreamfleet.coordinator.dashboard.assets import Assets
+from dreamfleet.coordinator.dashboard.compared_runs import compare_runs
 from dreamfleet.coordinator.dashboard.config import DashboardConfig
 from dreamfleet.coordinator.dashboard.feed import Feed
 from dreamfleet.coordinator.dashboard.guard import Guard
@@ -37,6 +38,7 @@ def make_app(feed: Feed, views: ViewProcesses, runs_dir: Path, config: Dashboard
         Route("/", handlers.index), Route("/files/{digest}/{name}", handlers.file), Route("/live", handlers.live),
         Route("/view", handlers.view), Route("/metrics", handlers.metrics),
         Route("/runs", handlers.runs), Route("/runs/{name}", handlers.run),
+        Route("/hosts/{name}", handlers.hosts), Route("/compare/{one}/{other}", handlers.compare),
     ]  # fmt: skip
     return Guard(Starlette(routes=routes), config.token, is_loopback=config.is_loopback)
 
@@ -92,10 +94,14 @@ class _Handlers:
         return _json({"runs": rows, "folder": printable(str(self._runs_dir))})
 
     def run(self, request: Request) -> Response:
-        try:
-            return _json(stored_runs.describe_run(self._runs_dir, request.path_params["name"]))
-        except DreamfleetError as error:
-            return _json({"error": printable(str(error))}, 404)
+        return _found(stored_runs.describe_run, self._runs_dir, request.path_params["name"])
+
+    def hosts(self, request: Request) -> Response:
+        return _found(stored_runs.describe_hosts, self._runs_dir, request.path_params["name"])
+
+    def compare(self, request: Request) -> Response:
+        names = request.path_params["one"], request.path_params["other"]
+        return _found(compare_runs, self._runs_dir, *names)
 
     async def _events(self, run: str | None) -> AsyncIterator[bytes]:
         """A frame for each snapshot, and the curves whenever they changed."""
@@ -115,6 +121,14 @@ class _Handlers:
 def _stream(request: Request, events: AsyncIterator[bytes]) -> Response:
     """An endless stream of events; for HEAD only its headers."""
     return Response(media_type=EVENTS) if request.method == "HEAD" else StreamingResponse(events, media_type=EVENTS)
+
+
+def _found(read: Callable[..., dict[str, Any]], *given: Any) -> Response:
+    """What `read` finds in journals, or 404 with the reason."""
+    try:
+        return _json(read(*given))
+    except DreamfleetError as error:
+        return _json({"error": printable(str(error))}, 404)
 
 
 def _json(document: Mapping[str, Any], status: int = 200) -> Response:

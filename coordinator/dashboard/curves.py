@@ -41,10 +41,13 @@ def sampling_step(rows: int) -> int:
     return max(math.ceil(rows / (MOST_POINTS - 1)), 1) if rows > MOST_POINTS else 1
 
 
-def curves(data: RunData, quartiles: Quartiles | None, spent: Sequence[Effort] | None = None) -> dict[str, Any]:
+def curves(
+    data: RunData, quartiles: Quartiles | None, spent: Sequence[Effort] | None = None, word: str = "seed"
+) -> dict[str, Any]:
     """The columns as a JSON document; `spent` is the effort up to each generation, including the run's start.
 
-    Without quartiles the band is one standard deviation around the mean; `band` names which one it is.
+    Without quartiles the band is one standard deviation around the mean; `band` names which one it is. `word` names a
+    seed of an evaluation.
     """
     settings, rows = data.settings, downsample(data.history)
     dreamt = settings.task.task == DREAM
@@ -66,11 +69,19 @@ def curves(data: RunData, quartiles: Quartiles | None, spent: Sequence[Effort] |
         "stages": [each.since for each in stages[1:]],
         "dreamt": dreamt,
         "fitness_axis": f"fitness over {steps}",
-        "score_axis": f"score{' in reality' * dreamt}, {plural(settings.evaluation_episodes, 'whole episode')}",
+        "score_axis": f"score{' in reality' * dreamt}, mean of {plural(settings.evaluation_episodes, word)}",
+        "coming": _coming(settings),
     }
     if spent is not None:
         drawn |= _effort_columns([spent[each.number] for each in rows if each.number < len(spent)])
     return drawn
+
+
+def _coming(settings: RunSettings) -> str:
+    """What an empty chart will show."""
+    every = settings.evaluate_every
+    mean = f", and the evaluated mean {'of each generation' if every == 1 else f'every {every} generations'}"
+    return f"Once the first generation closes: the mean, the best and the spread of its candidates{mean * bool(every)}."
 
 
 def cumulative_effort(start: Effort, efforts: Iterable[GenerationEffort], generations: int) -> list[Effort]:

@@ -21,6 +21,7 @@ from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.serialization.validation import MalformedError, from_plain_lenient
 from dreamfleet.common.transport.network import Network
 from dreamfleet.common.transport.session import enqueue_into
+from dreamfleet.common.worlds.score_words import score_word, score_word_of_run
 from dreamfleet.coordinator.dashboard.curves import RunData, curves, downsample
 from dreamfleet.coordinator.dashboard.lanes import Lanes
 from dreamfleet.coordinator.dashboard.page_state import RunSnapshot, page_state
@@ -175,15 +176,18 @@ class _FollowedRun:
     history: list[StoredGeneration] = field(default_factory=list)
     evaluations: list[StoredEvaluation] = field(default_factory=list)
     lanes: Lanes = field(default_factory=Lanes)
+    _word: str = "seed"
     _workers: Sequence[WorkerStatus] = ()
     _population: Sequence[Population] = ()
     _quartiles: dict[int, tuple[float, float]] | None = None  # `None`: no journal of it here
     _rendered_curves: tuple[Any, bytes, int] = (None, b"", 0)  # cache key, event, counter
 
     def __post_init__(self) -> None:
+        self._word = score_word(self.status.settings.task.task)
         with suppress(DreamfleetError), open_run(self.runs_dir, self.name) as stored:
             if stored.uid == self.uid:
                 self._quartiles = {}
+                self._word = score_word_of_run(stored.spec, stored.bundle_path)
 
     @property
     def name(self) -> str:
@@ -235,7 +239,7 @@ class _FollowedRun:
         """The events for viewers."""
         snapshot = RunSnapshot(
             self.status, self._workers, self.lanes.render(self._workers), self._population, self.heard, self.lost,
-            folder=None if self._quartiles is None else self.runs_dir / self.name,
+            folder=None if self._quartiles is None else self.runs_dir / self.name, word=self._word,
         )  # fmt: skip
         self._render_curves()
         _, drawing, times = self._rendered_curves
@@ -281,7 +285,11 @@ class _FollowedRun:
             return
         data = RunData(self.status.settings, self.history, self.evaluations, self.status.confirmed)
         self._read_quartiles()
-        self._rendered_curves = of, event("curves", curves(data, self._quartiles)), self._rendered_curves[2] + 1
+        self._rendered_curves = (
+            of,
+            event("curves", curves(data, self._quartiles, word=self._word)),
+            self._rendered_curves[2] + 1,
+        )
 
     def _read_quartiles(self) -> None:
         """Read the missing quartiles of drawn generations from the journal, if it is on this disk."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from dreamfleet.common.runs.records import (
     RunSettings,
     StoredConfirmation,
     StoredEvaluation,
-    StoredGeneration,
     count_episodes,
 )
 from dreamfleet.common.runs.run_paths import resume_command
@@ -39,6 +38,7 @@ class RunSnapshot:
     heard: float  # seconds since 1970
     lost: float | None = None  # seconds since 1970 at which answers stopped
     folder: Path | None = None  # of its journal, if on this disk
+    word: str = "seed"  # what a scored seed of its evaluations is called
 
 
 def page_state(look: RunSnapshot) -> dict[str, Any]:
@@ -52,16 +52,17 @@ def page_state(look: RunSnapshot) -> dict[str, Any]:
         "link": link,
         "stored": look.folder is not None,
         "state": {LOST: "coordinator lost", LIVE: status.state}.get(link, _ended_state(status)),
-        "sentence": _lost_sentence(look) if link == LOST else printable(describe_state(status)),
+        "sentence": _lost_sentence(look) if link == LOST else _sentence(status),
         "lost": look.lost if link == LOST else None,
         "heard": look.heard,
         "eta": _eta(eta) if link == LIVE else None,
         "task": printable(_task(status)),
-        "tiles": _tiles(status, eta, link),
+        "word": look.word,
+        "tiles": _tiles(look, eta, link),
         "candidates": _candidates(look.population, status),
-        "evaluation": _progress(status),
+        "evaluation": _progress(status, look.word),
         "search": _search(status),
-        "waste": _waste(status),
+        "redundant": _redundant_work(status),
         "troubles": _problems(status),
         "fleet": _fleet(status, link),
         "workers": _workers(look, link),
@@ -72,20 +73,28 @@ def _ended_state(status: Status) -> str:
     return "ended" if status.state == "ended" else "left open"
 
 
+def _sentence(status: Status) -> str:
+    """What the run does or waits for, without its state; empty while the open generation's card says it."""
+    if status.state == "running":
+        return ""
+    text = printable(describe_state(status)).removeprefix(f"{status.state}: ")
+    return text[:1].upper() + text[1:]
+
+
 def _lost_sentence(look: RunSnapshot) -> str:
     rest = "--join where it had one" if look.folder else "--runs-dir and --join where it had them"
     words = (
         ("dreamfleet coordinator --resume", look.status.run) if look.folder is None else (resume_command(look.folder),)
     )
     return (
-        "nobody answers for it: its coordinator was killed, or the network is cut. The page goes on once it is back. "
+        "Its coordinator was killed, or the network is cut. The page goes on once it answers again. "
         f"After a kill, continue it: {printable(' '.join(words))}, with {rest}"
     )
 
 
 def _eta(eta: Eta) -> dict[str, Any]:
     bounds = [{"text": each.description, "share": round(each.share, 4)} for each in eta.bounds]
-    return {"text": eta.description, "bounds": bounds}
+    return {"text": replace(eta, pace=None).description, "bounds": bounds}  # a tile has the pace
 
 
 def _task(status: Status) -> str:
@@ -93,31 +102,32 @@ def _task(status: Status) -> str:
     size = settings if stage is None else stage
     horizon = settings.task.horizon if stage is None else stage.horizon
     steps = describe_steps(horizon, size.driven, dreamt=settings.task.task == DREAM)
-    candidates = f"{size.population} candidates x {plural(size.episodes, 'episode')}"
+    candidates = f"{plural(size.population, 'candidate')}, {plural(size.episodes, 'episode')} each"
     parts = [settings.task.task, candidates, steps]
     if stage is not None:
         parts.append(f"stage {stage.number} of {stage.total}")
     return ", ".join(parts)
 
 
-def _tiles(status: Status, eta: Eta, link: str) -> list[dict[str, str]]:
+def _tiles(look: RunSnapshot, eta: Eta, link: str) -> list[dict[str, str]]:
     """The headline figures: name, value and caption."""
-    reported = status.confirmed or status.best
-    spent = status.throughput
-    pace = "" if eta.pace is None else f"{format_duration(eta.pace)} each"
-    last = status.last
+    status, last = look.status, look.status.last
+    reported, spent = status.confirmed or status.best, status.throughput
     workers, slots = plural(status.workers.present, "worker"), plural(status.slots, "slot")
+    spread = "" if last is None else f"mean; std {last.std:,.1f}; {last.worst:,.1f} to {last.best:,.1f}"
     return [
-        _tile("generation", f"{status.generation.number:,}", pace),
-        _tile("last generation", NONE if last is None else f"{last.mean:,.1f}", _last_generation_caption(last)),
-        _tile("reported", NONE if reported is None else format_score(reported), _reported_caption(reported)),
-        _tile("throughput", f"{format_steps(round(spent.steps_per_second))} steps/s" if link == LIVE else NONE,
+        tile("score", NONE if reported is None else format_score(reported),
+              _awaited_score(status) if reported is None else reported_caption(reported, look.word)),
+        tile("last generation", NONE if last is None else f"{last.mean:,.1f}", spread or "once a generation closes"),
+        tile("time per generation", NONE if eta.pace is None else format_duration(eta.pace), _worked(status)),
+        tile("throughput", f"{format_steps(round(spent.steps_per_second))} steps/s" if link == LIVE else NONE,
               f"{format_steps(spent.environment_steps)} steps in all"),
-        _tile("fleet", workers, slots) if link == LIVE else _tile("fleet", NONE, f"{workers}, {slots} at the last"),
+        tile("fleet", workers, slots) if link == LIVE else tile("fleet", NONE, f"{workers}, {slots} at the last"),
     ]  # fmt: skip
 
 
-def _tile(name: str, value: str, caption: str) -> dict[str, str]:
+def tile(name: str, value: str, caption: str) -> dict[str, str]:
+    """One headline figure for the page."""
     return {"name": name, "value": value, "beneath": caption}
 
 
@@ -126,15 +136,26 @@ def format_score(found: StoredEvaluation | StoredConfirmation) -> str:
     return format_with_error(found.mean, found.error, sign=",")
 
 
-def _last_generation_caption(last: StoredGeneration | None) -> str:
-    return "none is closed yet" if last is None else f"mean; {last.worst:,.1f} to {last.best:,.1f}"
+def _awaited_score(status: Status) -> str:
+    """When the first score comes."""
+    every = status.settings.evaluate_every
+    if not every:
+        return "means are not evaluated"
+    return f"first evaluation after generation {every - 1}" if every > 1 else "after the first generation"
 
 
-def _reported_caption(reported: StoredEvaluation | StoredConfirmation | None) -> str:
-    if reported is None:
-        return "no evaluation yet"
+def reported_caption(reported: StoredEvaluation | StoredConfirmation, word: str) -> str:
+    """What the caption of a reported score says."""
     kind = "confirmed" if isinstance(reported, StoredConfirmation) else "provisional"
-    return f"{kind}, generation {reported.generation}, {count_episodes(reported)}"
+    return f"{kind}, generation {reported.generation}, {count_episodes(reported, word)}"
+
+
+def _worked(status: Status) -> str:
+    """The time that was worked, and the time that passed; empty if unknown."""
+    if status.throughput.seconds is None or status.elapsed is None:
+        return ""
+    worked = format_duration(status.throughput.seconds + status.generation.seconds)
+    return f"{worked} of work in {format_duration(status.elapsed)}"
 
 
 def _candidates(parts: Sequence[Population], status: Status) -> dict[str, Any]:
@@ -150,15 +171,15 @@ def _candidates(parts: Sequence[Population], status: Status) -> dict[str, Any]:
     }
 
 
-def _progress(status: Status) -> list[dict[str, Any]]:
+def _progress(status: Status, word: str) -> list[dict[str, Any]]:
     """Progress of evaluation, confirmation and kept rollouts."""
     parts = {
-        "evaluation of the mean": status.evaluating, "confirmation": status.confirming,
-        "kept rollouts": status.collecting,
+        "evaluation of the mean": (status.evaluating, word), "confirmation": (status.confirming, word),
+        "kept rollouts": (status.collecting, "episode"),
     }  # fmt: skip
     return [
-        {"name": name, "done": each.episodes_done, "wanted": each.episodes}
-        for name, each in parts.items()
+        {"name": name, "done": each.episodes_done, "wanted": each.episodes, "of": plural(each.episodes, noun)}
+        for name, (each, noun) in parts.items()
         if each.episodes > each.episodes_done
     ]
 
@@ -170,13 +191,8 @@ def _search(status: Status) -> Facts:
         facts.append(("axis ratio", f"{open_one.axis_ratio:,.4g}"))
     if open_one.temperature is not None:
         facts.append(("temperature", f"{open_one.temperature:g}"))
-    if status.throughput.seconds is not None and status.elapsed is not None:
-        worked = status.throughput.seconds + open_one.seconds
-        facts.append(("time", f"{format_duration(worked)} of work in {format_duration(status.elapsed)}"))
     if failed := status.failed + open_one.failed:
         facts.append(("failed candidates", f"{failed:,}, {open_one.failed} of this generation"))
-    if status.last is not None:
-        facts.append(("spread of the last generation", f"{status.last.std:,.1f} (standard deviation)"))
     return facts
 
 
@@ -185,17 +201,18 @@ def describe_optimiser(settings: RunSettings) -> str:
     return printable(f"CMA-ES, {settings.covariance}" if settings.optimiser == "cma" else settings.optimiser)
 
 
-def _waste(status: Status) -> Facts:
-    """Work that was repeated or discarded."""
+def _redundant_work(status: Status) -> dict[str, Any]:
+    """Work that was repeated or discarded: a line, and what is not zero."""
     waste = status.waste
-    return [
-        ("share of steps", f"{waste.share:.1%}"), ("discarded steps", f"{waste.discarded_steps:,}"),
-        ("jobs issued again", f"{waste.reissued:,}"), ("recalled", f"{waste.recalled:,}"),
-        ("copied at a generation's end", f"{waste.copied:,}"), ("duplicate results", f"{waste.duplicate:,}"),
-        ("obsolete results", f"{waste.obsolete:,}"), ("errors", f"{waste.errors:,}"),
-        ("batches sent again", f"{waste.resent_batches:,}"), ("silences", f"{waste.silences:,}"),
-        *((f"dropped: {printable(why)}", f"{count:,}") for why, count in status.dropped.items() if count),
+    counts = [
+        ("discarded steps", waste.discarded_steps), ("jobs issued again", waste.reissued),
+        ("jobs recalled", waste.recalled), ("jobs copied at a generation's end", waste.copied),
+        ("duplicate results", waste.duplicate), ("obsolete results", waste.obsolete), ("errors", waste.errors),
+        ("batches sent again", waste.resent_batches), ("silences of workers", waste.silences),
+        *((f"messages dropped: {printable(why)}", count) for why, count in status.dropped.items()),
     ]  # fmt: skip
+    rows = [(name, f"{count:,}") for name, count in counts if count]
+    return {"text": f"{waste.share:.1%} of steps" if rows else "none", "rows": rows}
 
 
 def _problems(status: Status) -> list[str]:
@@ -209,14 +226,14 @@ def _problems(status: Status) -> list[str]:
 
 
 def _fleet(status: Status, link: str) -> str:
+    """What no tile says of the fleet: who is missing, and the classes of hosts."""
     counts = status.workers
     lost = counts.lost or 0
     silent = counts.known - counts.present - lost - counts.left
-    text = f"{counts.present} present, {plural(status.slots, 'slot')}"
-    text += "".join(f", {count} {state}" for count, state in ((silent, "silent"), (lost, "lost"), (counts.left, "left"))
-                    if count > 0)  # fmt: skip
-    text = text if link == LIVE else f"at the last: {text}"
-    return f"{text}; {status.classes.description}" if status.classes.total else text
+    parts = [f"{count} {state}" for count, state in ((silent, "silent"), (lost, "lost"), (counts.left, "left"))
+             if count > 0]  # fmt: skip
+    missing = f"{'' if link == LIVE else 'at the last: '}{', '.join(parts)}" if parts else ""
+    return "; ".join(filter(None, (missing, status.classes.description if status.classes.total else "")))
 
 
 def _workers(look: RunSnapshot, link: str) -> dict[str, list[Any]]:

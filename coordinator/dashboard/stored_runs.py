@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
@@ -10,24 +11,32 @@ from typing import Any
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import DreamfleetError, JournalError
+from dreamfleet.common.monitoring.eta import format_duration
 from dreamfleet.common.printable import format_setting, plural, printable
 from dreamfleet.common.protocol.tasks import DREAM
-from dreamfleet.common.runs.effort import START_EFFORT, Effort, parse_start_effort
+from dreamfleet.common.runs.effort import START_EFFORT, Effort, format_steps, parse_start_effort
 from dreamfleet.common.runs.records import (
     RunSettings,
     StoredGeneration,
     best_evaluation,
     count_episodes,
-    describe_score,
     expand_task_options,
 )
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import resume_command, run_paths
 from dreamfleet.common.runs.stages import stages_of
-from dreamfleet.common.runs.times import format_time
+from dreamfleet.common.runs.times import format_time, parse_time
 from dreamfleet.common.worlds.score_words import score_word_of_run
 from dreamfleet.coordinator.dashboard.curves import Quartiles, RunData, cumulative_effort, curves, downsample
-from dreamfleet.coordinator.dashboard.page_state import NONE, Facts, describe_optimiser, format_score
+from dreamfleet.coordinator.dashboard.host_history import host_history
+from dreamfleet.coordinator.dashboard.page_state import (
+    NONE,
+    Facts,
+    describe_optimiser,
+    format_score,
+    reported_caption,
+    tile,
+)
 
 COLUMNS = (
     "run", "created", "begun", "task", "generations", "mean", "best", "confirmed", "best_error", "confirmed_error",
@@ -53,19 +62,32 @@ def describe_run(runs_dir: Path, name: str) -> dict[str, Any]:
         efforts = run.efforts()
         spent = cumulative_effort(start, efforts, len(history))
         total = sum((each.effort for each in efforts), start)
-        reported = data.confirmed or best_evaluation(data.evaluations)
         word = score_word_of_run(run.spec, run.bundle_path)
-        judged = describe_score(reported, word) if reported else "no mean was evaluated"
         return {
             "run": run.name,
             "state": printable(run.state),
-            "sentence": printable(f"{run.state}; {judged}"),
+            "tiles": _tiles(run, data, total, word),
             "again": _resume_command(run),
-            "facts": _facts(run, data, total, word),
+            "facts": _about(run, settings),
+            "outcome": _outcome(run, data, total, word),
             "settings": flatten_settings(settings),
             "world": _world(run),
-            "curves": curves(data, read_quartiles(run, settings, downsample(history)), spent),
+            "curves": curves(data, read_quartiles(run, settings, downsample(history)), spent, word),
             "generations": [_generation_row(each) for each in history[-LAST:][::-1]],
+        }
+
+
+def describe_hosts(runs_dir: Path, name: str) -> dict[str, Any]:
+    """What each host of a run did over time; errors as `describe_run`."""
+    with open_run(runs_dir, name) as run, run.read_transaction():
+        state, ended = run.state, parse_time(run.ended_at or "")
+        until = time.time() if state == "live" else None if ended is None else ended.timestamp()
+        return {
+            "run": run.name,
+            "state": printable(state),
+            "classes": printable(run.classes.description),
+            "task": printable(run.spec.task),
+            **host_history(run.work_by_worker(), run.generation_times(), run.events(), until),
         }
 
 
@@ -134,18 +156,50 @@ def _world(run: RunFolder) -> str:
     return printable(task)
 
 
-def _facts(run: RunFolder, data: RunData, total: Effort, word: str) -> Facts:
-    settings, best = data.settings, best_evaluation(data.evaluations)
-    failed = sum(each.failed for each in data.history)
+def _tiles(run: RunFolder, data: RunData, total: Effort, word: str) -> list[dict[str, str]]:
+    """The headline figures."""
+    best = best_evaluation(data.evaluations)
+    reported = data.confirmed or best
+    tiles = [
+        tile("score", NONE, "no mean was evaluated") if reported is None
+        else tile("score", format_score(reported), reported_caption(reported, word)),
+    ]  # fmt: skip
+    if data.confirmed is not None and best is not None:
+        tiles.append(tile("best evaluation", format_score(best), reported_caption(best, word)))
+    lasted = run.duration_seconds
+    passed = "" if lasted is None else f"in {format_duration(lasted)}"
+    dreamt = f"{format_steps(total.dreamt)} dreamt" if total.dreamt else ""
+    return [
+        *tiles,
+        tile("generations", f"{len(data.history):,}", passed),
+        tile("steps in reality", format_steps(total.steps), dreamt),
+        tile("core-hours", f"{total.core_hours:.3g}", printable(run.classes.description)),
+    ]
+
+
+def _about(run: RunFolder, settings: RunSettings) -> Facts:
+    """What the run is."""
+    task, world = settings.task.task, _world(run)
     facts = [
-        ("task", settings.task.task),
+        ("task", task),
+        *([("world", world)] if world != task else []),
         ("begun", format_time(run.created)),
-        ("generations", f"{len(data.history):,}"),
-        *([("failed candidates", f"{failed:,}")] if failed else []),
-        ("population", f"{settings.population} candidates x {plural(settings.episodes, 'episode')}"),
+        ("ended", format_time(run.ended_at or "") or NONE),
+        ("population", f"{plural(settings.population, 'candidate')}, {plural(settings.episodes, 'episode')} each"),
         ("horizon", f"{settings.task.horizon:,} steps"),
-        ("optimiser", f"{describe_optimiser(settings)}, first step size {settings.sigma0:g}"),
+        ("optimiser", describe_optimiser(settings)),
+        ("first step size", f"{settings.sigma0:g}"),
         ("seed", str(settings.seed)),
+    ]
+    return [(name, printable(value)) for name, value in facts]
+
+
+def _outcome(run: RunFolder, data: RunData, total: Effort, word: str) -> Facts:
+    """What it came to, in words that stand beside another run's."""
+    best, failed = best_evaluation(data.evaluations), sum(each.failed for each in data.history)
+    facts = [
+        ("generations", f"{len(data.history):,}"),
+        ("failed candidates", f"{failed:,}"),
         ("spent", total.description),
         ("hosts", run.classes.description),
         ("best evaluation", NONE if best is None else

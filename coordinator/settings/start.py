@@ -17,7 +17,8 @@ from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.errors import ControllerError, DreamfleetError, JournalError
 from dreamfleet.common.files.regular_files import is_file, path_exists
 from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.common.runs.effort import START_EFFORT, Effort, parse_start_effort
+from dreamfleet.common.runs.effort import START_EFFORT, Effort
+from dreamfleet.common.runs.learning import total_effort
 from dreamfleet.common.runs.lookup import find_controller
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
@@ -122,11 +123,6 @@ def start_from_run(stored: RunFolder) -> StartPoint:
     """The mean of a run's latest generation."""
     mean, _ = latest_mean_and_sigma(stored)
     return StartPoint(mean, stored.spec.bundle, f"run {stored.name}", stored.spec.options, total_effort(stored))
-
-
-def total_effort(stored: RunFolder) -> Effort:
-    """What a run took so far, and what had been spent on its start."""
-    return sum((each.effort for each in stored.efforts()), parse_start_effort(stored.fact(START_EFFORT)) or Effort())
 
 
 def latest_mean_and_sigma(stored: RunFolder) -> tuple[NDArray[np.float64], float]:

@@ -22,7 +22,7 @@ from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.score_words import score_word
 
 if TYPE_CHECKING:
-    from dreamfleet.coordinator.analysis.comparison import ComparedRun, EqualBudget, EvaluatedMean
+    from dreamfleet.common.runs.comparison import ComparedRun, EqualBudget, EvaluatedMean
 
 SAME_SEEDS = (
     "all runs are judged on the same validation seeds, so their ± are not independent: differences are paired by seed"
@@ -43,7 +43,7 @@ def configure_compare(parser: argparse.ArgumentParser) -> None:
 
 def compare_runs(args: argparse.Namespace) -> int:
     """Print settings that differ, scores at equal budgets, and differences from the first run."""
-    from dreamfleet.coordinator.analysis.comparison import ComparedRun, at_equal_budget, differing_settings
+    from dreamfleet.common.runs.comparison import ComparedRun, at_equal_budget, differing_settings
 
     names = list(dict.fromkeys(args.run_names))
     if len(names) < 2:
@@ -117,8 +117,8 @@ def _format_evaluation(look: EvaluatedMean | None) -> str:
 
 def _run_differences(sides: Sequence[ComparedRun], equal: Sequence[EqualBudget]) -> Iterator[dict[str, Any]]:
     """Each run less the first: at equal budgets, then of confirmed scores."""
+    from dreamfleet.common.runs.comparison import difference
     from dreamfleet.common.runs.paired_difference import PairedDifference
-    from dreamfleet.coordinator.analysis.comparison import difference
 
     def paired(of: str, side: ComparedRun, one: dict[int, float], other: dict[int, float]) -> dict[str, Any]:
         found = difference(one, other)
@@ -189,7 +189,7 @@ def _draw_fitness(args: argparse.Namespace, out: Path) -> None:
 
 
 def _draw_learning(args: argparse.Namespace, out: Path) -> None:
-    from dreamfleet.coordinator.analysis.learning import LearningCurve
+    from dreamfleet.common.runs.learning import LearningCurve
     from dreamfleet.coordinator.analysis.plot import plot_learning, published_scores
 
     curves = []

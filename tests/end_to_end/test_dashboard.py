@@ -66,6 +66,14 @@ def wait(page, text, part="state"):
     )  # fmt: skip
 
 
+def drawn(page, text):
+    """Wait until the fitness chart says so of its last generation."""
+    page.wait_for_function(
+        "text => document.querySelector('[data-part=fitness]')?.getAttribute('aria-label')?.includes(text)", arg=text,
+        timeout=PATIENCE,
+    )  # fmt: skip
+
+
 def part(page, name):
     return page.locator(f"[data-part={name}]").first.text_content()  # also of rows out of sight
 
@@ -94,7 +102,7 @@ def test_it_follows_a_run_from_nobody_through_losses_to_its_end(page, processes,
     assert part(page, "run") == "test"
     worker = processes.worker("--task", tasks.SLOW_TOY, "--name", "alpha")
     wait(page, "running")
-    wait(page, "Generation 1:", "fitness-caption")
+    drawn(page, "Generation 1:")
     assert page.locator("[data-part=fitness] .scatterlayer .trace").count() >= 3
     assert page.locator("[data-part=cells] .cell").count() == 4
     assert "of 1,000 generations" in part(page, "eta")
@@ -119,7 +127,7 @@ def test_it_follows_a_run_from_nobody_through_losses_to_its_end(page, processes,
     wait(page, "ended")
     assert resumed.finish()[0] == 0
     assert "4 generations" in part(page, "sentence")
-    wait(page, "Generation 3:", "fitness-caption")
+    drawn(page, "Generation 3:")
     without_absence(page)
 
 
@@ -132,12 +140,34 @@ def test_a_killed_worker_goes_from_the_page_within_two_seconds(page, processes, 
     assert median(seconds) < 2, seconds
 
 
+PAINTED = "all => all.every(each => each.getContext('2d').getImageData(each.width - 4, 9, 1, 1).data[3] > 0)"
+
+
+def test_workers_out_of_sight_are_drawn_for_screenshots_and_print(browser, processes):
+    with serving(processes.endpoint, snapshot(workers=60)), dashboard(processes, "--port", 0) as started, \
+            tab(browser, viewport={"width": 1280, "height": 400}) as page:  # fmt: skip
+        page.goto(started.address)
+        page.wait_for_selector(".workers tbody tr:nth-child(60)", state="attached")
+        assert page.eval_on_selector_all(".workers canvas", PAINTED)
+        assert page.eval_on_selector_all(
+            "main *", "all => all.every(each => getComputedStyle(each).contentVisibility === 'visible')"
+        )
+
+
+def test_before_the_first_generation_a_chart_has_no_axes_and_says_what_comes(browser, processes):
+    with serving(processes.endpoint, snapshot(0)), dashboard(processes, "--port", 0) as started, \
+            tab(browser) as page:  # fmt: skip
+        page.goto(started.address)
+        page.wait_for_selector(".placeholder:has-text('Once the first generation closes')")
+        assert page.locator("main svg.main-svg").count() == 0
+
+
 def test_a_run_that_is_paused_says_why_and_one_that_is_left_how_to_go_on(page, processes, settings):
     coordinator = processes.coordinator(*settings, "--generations", 1000)
     wait(page, "waiting")
     assert processes.call("pause", "test", "--connect", processes.endpoint)[0] == 0
     wait(page, "paused")
-    wait(page, "paused: by hand", "sentence")
+    wait(page, "By hand", "sentence")
     coordinator.popen.send_signal(signal.SIGTERM)
     wait(page, "left open")
     wait(page, "--resume test", "sentence")
@@ -228,7 +258,16 @@ def test_past_runs_are_searched_sorted_opened_and_compared_by_keyboard(browser, 
         page.wait_for_selector("[data-part=fitness] .scatterlayer .trace")
         assert page.locator("[data-part=generations] tr").count() == 12
         page.goto(f"{started.address}#/live/dream")
-        wait(page, "dream lies here, ended: 12 generations", "task")
+        page.wait_for_url("**/#/run/dream")
+        wait(page, "ended: 12 generations")
+        page.fill("[data-part=settings-search]", "sigma0")
+        assert [each.split() for each in page.locator("[data-part=settings] tr:visible").all_inner_texts()] == [
+            ["sigma0", "0.1"]
+        ]
+        page.goto(f"{started.address}#/hosts/dream")
+        page.wait_for_selector("[data-part=rate] .scatterlayer .trace")
+        assert "vm" in part(page, "hosts")
+        page.wait_for_selector("text=This journal names no arrivals")
         page.goto(f"{started.address}#/run/broken")
         page.wait_for_selector("text=This cannot be shown")
         page.goto(f"{started.address}#/run/..%2F..%2Fetc")
@@ -249,7 +288,7 @@ def test_it_fits_a_phone_and_follows_the_systems_colours(browser, processes, wid
             tab(browser, viewport={"width": width, "height": 844}, color_scheme=scheme) as page:  # fmt: skip
         page.goto(started.address)
         wait(page, "running")
-        wait(page, "Generation 39", "fitness-caption")
+        drawn(page, "Generation 39")
         assert page.evaluate("document.documentElement.scrollWidth") == width
         cut = "all => all.filter(each => each.scrollWidth > each.clientWidth + 1).length"
         assert page.eval_on_selector_all("td.name, h1, .tile b", cut) == 0, "no name is cut"
@@ -267,11 +306,11 @@ def test_it_fits_a_phone_and_follows_the_systems_colours(browser, processes, wid
 def test_everything_can_be_reached_by_keyboard_and_the_focus_is_seen(page):
     page.wait_for_selector("#theme")
     reached = []
-    for _ in range(5):
+    for _ in range(6):
         page.keyboard.press("Tab")
         reached.append(page.evaluate("document.activeElement.textContent.trim()"))
         assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") != "none"
-    assert reached == ["Skip to the run", "dreamfleet", "Live", "Past runs", "Theme: system"]
+    assert reached == ["Skip to the run", "dreamfleet", "Live", "Runs", "Hosts", "Theme: system"]
 
 
 def moved(fleet, by):
@@ -295,7 +334,7 @@ def test_five_thousand_generations_and_five_hundred_workers_are_painted_in_no_ti
     with serving(processes.endpoint, snapshot(5000, workers=500, population=400)) as served, \
             dashboard(processes, "--port", 0) as started, tab(browser) as page:  # fmt: skip
         page.goto(started.address)
-        wait(page, "Generation 4999", "fitness-caption")
+        drawn(page, "Generation 4999")
         assert "Every 9th generation is drawn" in part(page, "fitness-caption")
         page.wait_for_selector(".workers tbody tr:nth-child(500)", state="attached")
         assert page.locator("[data-part=cells] .cell").count() == 400

@@ -99,7 +99,7 @@ def test_pictures_come_with_their_facts_while_somebody_sees_them(browser, proces
                                arg=page.get_attribute(PICTURE, "src"))  # fmt: skip
         page.focus("[data-part=view-pause]")
         page.keyboard.press("Enter")
-        assert page.inner_text("[data-part=view-pause]") == "Watch"
+        assert page.inner_text("[data-part=view-pause]") == "Play"
 
 
 @pytest.mark.slow

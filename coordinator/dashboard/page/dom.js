@@ -57,6 +57,36 @@ export const number = (value, digits = 1) =>
     ? "-"
     : value.toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits });
 
+// A score: with one decimal, so that a column of them is aligned, or in three significant digits if it is small.
+export const score = (value) =>
+  !value || Math.abs(value) >= 0.95 ? number(value) : value.toLocaleString("en", { minimumSignificantDigits: 3, maximumSignificantDigits: 3 });
+
+export const short = (seconds) => (seconds < 10 ? seconds.toPrecision(2) : number(seconds, 0));
+
+// A moment, with its day where they span more than one.
+export const clock = (moment, span = 0) => {
+  const day = { year: "numeric", month: "2-digit", day: "2-digit" };
+  const time = { hour: "2-digit", minute: "2-digit", second: "2-digit" };
+  return new Date(moment * 1000).toLocaleString("en-GB", { ...(span > 43200 && day), ...time });
+};
+
+export const tiles = (list, rows) =>
+  fill(
+    list,
+    rows,
+    () => {
+      const whole = make("div", "", { class: "tile" });
+      whole.append(make("span"), make("b"), make("span"));
+      return whole;
+    },
+    (each, row) => {
+      say(each.children[0], row.name);
+      say(each.children[1], row.value);
+      say(each.children[2], row.beneath);
+      each.classList.toggle("none", row.value === "-");
+    },
+  );
+
 export const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 
 export const ask = async (path) => {
@@ -67,3 +97,29 @@ export const ask = async (path) => {
 };
 
 export const runLink = (name) => `#/run/${encodeURIComponent(name)}`;
+export const liveLink = (name) => `#/live/${encodeURIComponent(name)}`;
+
+let turn = 0; // an answer that comes after another page was opened is nobody's
+
+export const leave = () => {
+  turn += 1;
+};
+
+const failed = (error) => {
+  const card = make("section", "", { class: "card full empty" });
+  card.append(make("h1", "This cannot be shown"), make("p", error.message), make("a", "All runs", { href: "#/runs" }));
+  document.getElementById("main").replaceChildren(card);
+};
+
+// A page that is filled with answers: it says that it waits, and what went wrong; `current` is whether it is still open.
+export const guarded = (work) => async (...words) => {
+  turn += 1;
+  const mine = turn;
+  const current = () => mine === turn;
+  document.getElementById("main").replaceChildren(make("p", "Loading…", { class: "muted loading", role: "status" }));
+  try {
+    await work(current, ...words);
+  } catch (error) {
+    if (current()) failed(error);
+  }
+};

@@ -1,7 +1,7 @@
 // The page of a live run: a frame a second fills it, and curves are drawn anew when a generation was closed.
 
 import * as charts from "./charts.js";
-import { ask, colour, facts, fill, make, number, open, runLink, say } from "./dom.js";
+import { ask, clock, colour, facts, fill, make, number, open, runLink, say, score, tiles } from "./dom.js";
 import * as view from "./view.js";
 
 const TONES = {
@@ -10,13 +10,12 @@ const TONES = {
 };
 const COLUMNS = [
   ["state", "state"], ["slots", "slots"], ["rate", "steps/s"], ["leases", "leases"], ["finished", "finished"],
-  ["load", "load"], ["heard", "heard"], ["picture", "picture"],
+  ["load", "load"], ["heard", "last seen"], ["picture", "picture"],
 ];
 const LEFT = new Set(["state", "picture"]);
 
 let page = null; // the parts, once they stand
 let curves = null;
-let lanes = null; // which rows are in sight
 let absent = null; // the run that was asked for, or "" for any, while none is live
 
 export const show = () => {
@@ -24,13 +23,6 @@ export const show = () => {
   page.body.hidden = page.tiles.hidden = true;
   view.show(page);
   curves = absent = null;
-  lanes?.disconnect();
-  lanes = new IntersectionObserver((seen) => {
-    for (const each of seen) {
-      each.target.inSight = each.isIntersecting;
-      if (each.isIntersecting) paintLane(each.target);
-    }
-  });
   say(page.run, "dreamfleet");
   say(page.sentence, "Asking the coordinator…");
   page.state.hidden = true;
@@ -40,14 +32,15 @@ export const drawCurves = (document) => {
   curves = document;
   if (page) view.drawCurves(curves);
   if (!page || page.body.hidden) return;
+  const last = curves.generation.length - 1;
+  charts.placeholder(page.fitness, last < 0 ? curves.coming : "");
+  page.search.hidden = last < 0; // the figures below it are known from the start
+  if (last < 0) return;
   charts.fitness(page.fitness, curves);
   charts.search(page.search, curves);
-  const last = curves.generation.length - 1;
-  const every = curves.step > 1 ? `Every ${curves.step}th generation is drawn. ` : "";
-  const text = last < 0 ? "No generation is closed yet." : `${every}Generation ${curves.generation[last]}: mean ${number(curves.mean[last])}, best ${number(curves.best[last])}.`;
-  say(page["fitness-caption"], text);
-  page.fitness.setAttribute("aria-label", `Fitness by generation. ${text}`);
-  page.search.setAttribute("aria-label", `Step size by generation${last < 0 ? "" : `, now ${curves.sigma[last]}`}`);
+  say(page["fitness-caption"], curves.step > 1 ? `Every ${curves.step}th generation is drawn.` : "");
+  page.fitness.setAttribute("aria-label", `Fitness by generation. Generation ${curves.generation[last]}: mean ${score(curves.mean[last])}, best ${score(curves.best[last])}.`);
+  page.search.setAttribute("aria-label", `Step size by generation, now ${curves.sigma[last]}`);
 };
 
 export const fillFrame = (frame, wanted) => {
@@ -55,6 +48,8 @@ export const fillFrame = (frame, wanted) => {
   page.state.hidden = false;
   choose(frame, wanted);
   if (frame.link === "absent") return fillAbsent(frame, wanted);
+  const ended = frame.link === "over" && frame.stored && frame.state === "ended";
+  if (ended && wanted) return location.replace(runLink(wanted)); // without a name the page waits for the next run
   absent = null;
   const first = page.body.hidden;
   page.body.hidden = page.tiles.hidden = false;
@@ -63,19 +58,21 @@ export const fillFrame = (frame, wanted) => {
   say(page.state, frame.lost ? `${frame.state} since ${clock(frame.lost)}` : frame.state);
   page.state.dataset.tone = TONES[frame.state] ?? "done";
   say(page.sentence, frame.sentence);
+  page.result.hidden = !frame.stored;
+  page.result.href = runLink(frame.run);
+  say(page.result, ended ? "Its result" : "Settings and generations");
+  page.history.hidden = !frame.stored;
+  page.history.href = `#/hosts/${encodeURIComponent(frame.run)}`;
   say(page.eta, frame.eta ? frame.eta.text : "");
   fill(page.bounds, frame.eta ? frame.eta.bounds : [], () => bar(), (each, row) => setBar(each, row.share, row.text));
   say(page.task, frame.task);
-  fill(page.tiles, frame.tiles, tile, (each, row) => {
-    say(each.children[0], row.name);
-    say(each.children[1], row.value);
-    say(each.children[2], row.beneath);
-  });
+  tiles(page.tiles, frame.tiles);
   page.troubles.hidden = !frame.troubles.length;
   fill(page.troubles, frame.troubles, () => make("li"), say);
   fillPopulation(frame);
   facts(page["search-facts"], frame.search);
-  facts(page.waste, frame.waste);
+  say(page.redundant, frame.redundant.text);
+  facts(page["redundant-facts"], frame.redundant.rows);
   say(page.fleet, frame.fleet);
   fillWorkers(frame);
   view.fill(frame);
@@ -98,18 +95,20 @@ const fillAbsent = (frame, wanted) => {
   if (absent === run) return;
   absent = run;
   page.task.replaceChildren();
+  page.result.hidden = page.history.hidden = true;
   const parts = page;
   const mine = () => page === parts && absent === run;
-  ask("runs").then(({ runs }) => mine() && page.task.replaceChildren(...ways(frame, run, runs)), () => mine() && page.task.replaceChildren(...ways(frame, run, [])));
+  ask("runs").then(({ runs }) => mine() && page.task.replaceChildren(...ways(frame, run, runs, wanted)), () => mine() && page.task.replaceChildren(...ways(frame, run, [], wanted)));
 };
 
 // What there is to do about a run that nobody serves: go on with what lies here, look at its result, or begin one.
-const ways = (frame, run, runs) => {
+const ways = (frame, run, runs, wanted) => {
   const stored = run ? runs.find((each) => each.run === run && !each.damaged) : latestOf(runs.filter((each) => each.again));
-  const past = make("a", "past runs", { href: "#/runs" });
+  const past = make("a", "all runs", { href: "#/runs" });
   if (!stored) return ["Start one: ", make("code", `dreamfleet coordinator --run ${run || "NAME"} --listen ${frame.address.split(",")[0]}`), ". Or look at ", past, "."];
   const link = make("a", stored.run, { href: runLink(stored.run) });
-  if (!stored.again) return [`Run `, link, ` lies here, ${stored.state}. Or look at `, past, "."];
+  if (wanted && stored.state.startsWith("ended")) location.replace(runLink(stored.run)); // its address leads to its result
+  if (!stored.again) return ["Run ", link, ` lies here, ${stored.state}. Or look at `, past, "."];
   return ["Run ", link, " was left open here. Continue it: ", make("code", stored.again), ". If it had a join file, add ", make("code", "--join FILE"), ". Or look at ", past, "."];
 };
 
@@ -127,8 +126,6 @@ const choose = (frame, wanted) => {
   });
 };
 
-const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString("en-GB");
-
 const bar = () => {
   const whole = make("div", "", { class: "bound", role: "progressbar", "aria-valuemin": "0", "aria-valuemax": "100" });
   whole.append(make("i"));
@@ -140,12 +137,6 @@ const setBar = (element, share, text) => {
   element.setAttribute("aria-label", text);
   element.setAttribute("aria-valuenow", String(Math.round(100 * share)));
   element.firstChild.style.width = `${100 * share}%`;
-};
-
-const tile = () => {
-  const whole = make("div", "", { class: "tile" });
-  whole.append(make("span"), make("b"), make("span"));
-  return whole;
 };
 
 const CELLS = [[400, 9], [120, 14], [64, 22], [32, 30], [12, 40], [-1, 56]]; // of more candidates than this, so wide
@@ -167,7 +158,7 @@ const fillPopulation = ({ candidates, evaluation }) => {
     const share = value === null ? 0 : high > low ? (value - low) / (high - low) : 1;
     const key = `${episodes}/${wanted[index]}/${value === null ? "" : share.toFixed(2)}`;
     const lost = wanted[index] === 0;
-    const scored = `${episodes} of ${wanted[index]} episodes${value === null ? "" : `, fitness ${number(value)}`}`;
+    const scored = `${episodes} of ${wanted[index]} episodes${value === null ? "" : `, fitness ${score(value)}`}`;
     const text = `candidate ${generation}/${index}: ${lost ? "failed" : scored}`;
     if (cell.described !== text) cell.title = cell.described = text;
     if (cell.key === key) return;
@@ -177,9 +168,9 @@ const fillPopulation = ({ candidates, evaluation }) => {
     cell.style.setProperty("--fill", value === null ? "var(--line-strong)" : shade(share));
   });
   page.cells.setAttribute("aria-label", open ? `${finished} of ${total} candidates of generation ${generation} are scored` : "no generation is open");
-  say(page.scale, known.length ? `fitness so far: ${number(low)} to ${number(high)}` : "");
+  say(page.scale, known.length ? `fitness so far: ${score(low)} to ${score(high)}` : "");
   fill(page.evaluation, evaluation, beside, (each, row) => {
-    say(each.firstChild, `${row.name}: ${row.done} of ${row.wanted} episodes`);
+    say(each.firstChild, `${row.name}: ${row.done} of ${row.of}`);
     setBar(each.lastChild, row.done / row.wanted, row.name);
   });
 };
@@ -201,11 +192,9 @@ const fillWorkers = (frame) => {
   page["no-workers"].hidden = count > 0;
   say(page["worker-command"], `dreamfleet worker --run ${frame.run} --connect tcp/COORDINATOR:7447`);
   const fleet = page.workers;
-  while (fleet.children.length > count) {
-    lanes.unobserve(fleet.lastElementChild);
-    fleet.lastElementChild.remove();
-  }
+  while (fleet.children.length > count) fleet.lastElementChild.remove();
   let before = "";
+  const inks = laneInks(); // read once: between changes of the page each reading would cost a layout of it
   for (let index = 0; index < count; index += 1) {
     if (!fleet.children[index]) fleet.append(workerRow());
     const row = fleet.children[index];
@@ -217,7 +206,7 @@ const fillWorkers = (frame) => {
     say(row.name.lastChild, workers.reason[index] ? `${life} ${workers.reason[index]}` : life);
     if (row.lane !== workers.lane[index]) {
       row.lane = workers.lane[index];
-      if (row.inSight) paintLane(row);
+      paintLane(row, inks);
     }
     COLUMNS.forEach(([key], at) => say(row.cells[at + 2], cell(key, workers[key][index])));
   }
@@ -229,7 +218,9 @@ const split = (worker) => {
 };
 
 const cell = (key, value) =>
-  value === null ? "-" : key === "heard" ? `${value.toFixed(1)} s ago` : key === "load" ? value.toFixed(2) : typeof value === "number" ? value.toLocaleString("en") : value;
+  value === null ? "-" : key === "heard" ? ago(value) : key === "load" ? value.toFixed(2) : typeof value === "number" ? value.toLocaleString("en") : value;
+
+const ago = (seconds) => (seconds < 99.95 ? `${seconds.toFixed(1)} s ago` : `${Math.round(seconds / 60)} min ago`);
 
 const workerRow = () => {
   const row = make("tr", "", { role: "row" }); // the roles that a grid would take from a table
@@ -241,35 +232,42 @@ const workerRow = () => {
   row.append(row.name, lane);
   for (const [key, label] of COLUMNS)
     row.append(make("td", "", { "data-label": label, role: "cell", class: key === "state" ? "tag" : LEFT.has(key) ? "" : "n" }));
-  lanes.observe(row);
   return row;
 };
 
-const paintLane = ({ canvas, lane }) => {
-  if (!lane) return;
+const laneInks = () => ({
+  x: colour("red"), "?": colour("amber"), ".": colour("line-strong"), " ": colour("soft"), speed: colour("blue"),
+});
+
+// Only what changed since it was painted last: of a lane mostly its newest slice.
+const paintLane = (row, inks) => {
+  const { canvas, lane, painted = "" } = row;
   const paper = canvas.getContext("2d");
   const wide = canvas.width / lane.length;
-  const inks = { x: colour("red"), "?": colour("amber"), ".": colour("line-strong"), " ": colour("soft") };
-  const blue = colour("blue");
-  paper.fillStyle = inks[" "];
-  paper.fillRect(0, 0, canvas.width, canvas.height);
   for (let at = 0; at < lane.length; at += 1) {
     const sign = lane[at];
-    if (sign === " ") continue;
-    const speed = Number(sign);
-    paper.globalAlpha = inks[sign] ? 1 : 0.25 + 0.75 * (speed / 9);
-    paper.fillStyle = inks[sign] ?? blue;
-    paper.fillRect(at * wide, 0, wide - 1, canvas.height);
+    if (sign === painted[at]) continue;
+    const last = sign === " " ? wide : wide - 1; // a gap between slices
+    paper.globalAlpha = 1;
+    paper.fillStyle = inks[" "];
+    paper.fillRect(at * wide, 0, wide, canvas.height);
+    if (!inks[sign]) paper.globalAlpha = 0.25 + 0.75 * (Number(sign) / 9);
+    paper.fillStyle = inks[sign] ?? inks.speed;
+    paper.fillRect(at * wide, 0, last, canvas.height);
   }
-  paper.globalAlpha = 1;
+  row.painted = lane;
 };
 
 export const redraw = () => {
-  if (page) for (const row of page.workers.children) if (row.inSight) paintLane(row);
+  if (!page) return;
+  const inks = laneInks();
+  for (const row of page.workers.children) {
+    row.painted = "";
+    paintLane(row, inks);
+  }
 };
 
 export const leave = () => {
   view.leave();
   page = null;
-  lanes?.disconnect();
 };

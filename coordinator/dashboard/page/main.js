@@ -1,7 +1,9 @@
 // Which page is shown, the stream of the runs' states, and the theme.
 
 import * as charts from "./charts.js";
-import { say } from "./dom.js";
+import * as compare from "./compare.js";
+import { leave, say } from "./dom.js";
+import * as hosts from "./hosts.js";
 import * as live from "./live.js";
 import * as runs from "./runs.js";
 import * as view from "./view.js";
@@ -96,16 +98,17 @@ const route = () => {
   hush();
   charts.forget();
   live.leave();
-  runs.leave();
+  leave();
   for (const link of document.querySelectorAll(".bar nav a")) {
-    const here = link.dataset.page === (page === "live" ? "live" : "runs");
+    const here = link.dataset.page === (page === "live" || page === "hosts" ? page : "runs");
     if (here) link.setAttribute("aria-current", "page");
     else link.removeAttribute("aria-current");
   }
   window.scrollTo(0, 0);
   if (page === "runs") runs.showRuns();
   else if (page === "run" && names[0]) runs.showRun(names[0]);
-  else if (page === "compare" && names[1]) runs.showCompare(names[0], names[1]);
+  else if (page === "compare" && names[1]) compare.show(names[0], names[1]);
+  else if (page === "hosts") hosts.show(names[0]);
   else {
     wanted = page === "live" ? (names[0] ?? "") : "";
     live.show();

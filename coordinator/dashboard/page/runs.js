@@ -1,7 +1,7 @@
-// Past runs: the list, one of them, and two on one chart.
+// The runs on this disk: the list, and one of them.
 
 import * as charts from "./charts.js";
-import { ask, facts, fill, make, number, open, runLink, say } from "./dom.js";
+import { ask, facts, fill, guarded, liveLink, make, number, open, runLink, say, score, tiles } from "./dom.js";
 
 const COLUMNS = [
   ["run", "run"], ["created", "begun"], ["task", "task"], ["generations", "generations"], ["mean", "last mean"],
@@ -11,31 +11,9 @@ const NUMBERS = new Set(["generations", "mean", "best", "confirmed"]);
 let order = { by: "created", down: true };
 let sought = "";
 let chosen = []; // names of two runs at most, the last two that were ticked
-let turn = 0; // an answer that comes after another page was opened is nobody's
-
-const failed = (error) => {
-  const root = document.getElementById("main");
-  const card = make("section", "", { class: "card full empty" });
-  card.append(make("h1", "This cannot be shown"), make("p", error.message), make("a", "All runs", { href: "#/runs" }));
-  root.replaceChildren(card);
-};
-
-const guarded = (work) => async (...words) => {
-  turn += 1;
-  const mine = turn;
-  try {
-    await work(() => mine === turn, ...words);
-  } catch (error) {
-    if (mine === turn) failed(error);
-  }
-};
-
-export const leave = () => {
-  turn += 1;
-};
 
 export const showRuns = guarded(async (current) => {
-  document.title = "dreamfleet: past runs";
+  document.title = "dreamfleet: runs";
   const page = open("runs");
   const load = async () => {
     const found = await ask("runs");
@@ -45,7 +23,7 @@ export const showRuns = guarded(async (current) => {
     chosen = chosen.filter((each) => names.has(each));
     list(page, found.runs);
   };
-  page.reload.addEventListener("click", () => load().catch((error) => current() && failed(error)));
+  page.reload.addEventListener("click", () => current() && showRuns());
   page.compare.addEventListener("click", () => {
     location.hash = `#/compare/${chosen.map(encodeURIComponent).join("/")}`;
   });
@@ -61,7 +39,7 @@ const list = (page, runs) => {
   };
   fill(page.head, [["pick", ""], ...COLUMNS], () => make("th", "", { scope: "col" }), (head, [key, label]) => {
     if (key === "pick") {
-      if (!head.firstChild) head.append(make("span", "two", { title: "Tick two runs to compare them" }));
+      if (!head.firstChild) head.append(make("span", "pick", { title: "Tick two runs to compare them" }));
       return;
     }
     if (!head.firstChild) {
@@ -112,8 +90,8 @@ const runRow = (each, page) => {
   row.append(pick);
   for (const [key, label] of COLUMNS) {
     const kind = key === "run" ? "name" : key === "state" ? "says" : NUMBERS.has(key) ? "n" : "";
-    const cell = make("td", "", { class: kind });
-    if (key === "run" && !each.damaged) cell.append(make("a", each.run, { href: runLink(each.run) }));
+    const cell = make("td", "", { class: `${kind} col-${key}` });
+    if (key === "run" && !each.damaged) cell.append(make("a", each.run, { href: each.state === "live" ? liveLink(each.run) : runLink(each.run) }));
     else say(cell, describe(each, key));
     if (key !== "run" && key !== "state") cell.dataset.label = label;
     row.append(cell);
@@ -124,9 +102,15 @@ const runRow = (each, page) => {
 const describe = (each, key) => {
   if (key === "created") return each.begun ?? "";
   const error = each[`${key}_error`];
-  if (typeof error === "number") return `${number(each[key])} ± ${number(error)}`;
+  if (typeof error === "number") return withError(each[key], error);
   if (key === "generations") return number(each.generations, 0);
-  return NUMBERS.has(key) ? number(each[key]) : (each[key] ?? "");
+  return NUMBERS.has(key) ? score(each[key]) : (each[key] ?? "");
+};
+
+// As many decimals as show the first figure of a small error.
+const withError = (mean, error) => {
+  const digits = error > 0 && error < 0.1 ? Math.min(6, -Math.floor(Math.log10(error))) : 1;
+  return `${number(mean, digits)} ± ${number(error, digits)}`;
 };
 
 export const showRun = guarded(async (current, name) => {
@@ -135,21 +119,18 @@ export const showRun = guarded(async (current, name) => {
   if (!current()) return;
   const page = open("run");
   say(page.run, found.run);
-  say(page.state, found.state.startsWith("ended") ? "ended" : found.state);
+  say(page.state, found.state);
   page.state.dataset.tone = found.state.startsWith("ended") ? "done" : found.state === "live" ? "good" : "wait";
-  say(page.sentence, found.sentence);
   page.again.hidden = !found.again;
   say(page.again.lastElementChild, found.again);
+  page.live.hidden = found.state !== "live";
+  page.live.href = liveLink(found.run);
+  page.hosts.href = `#/hosts/${encodeURIComponent(found.run)}`;
+  tiles(page.tiles, found.tiles);
   facts(page.facts, found.facts);
-  facts(page.settings, found.settings);
-  const { curves } = found;
-  charts.fitness(page.fitness, curves);
-  charts.search(page.search, curves);
-  const every = curves.step > 1 ? `Every ${curves.step}th generation is drawn.` : "";
-  say(page["fitness-caption"], curves.generation.length ? every : "No generation was closed.");
-  page.fitness.setAttribute("aria-label", `Fitness of ${found.run} by generation`);
-  page.search.setAttribute("aria-label", `Step size of ${found.run} by generation`);
-  page.generations.replaceChildren(...found.generations.map(generationRow));
+  fillSettings(page, found.settings);
+  fillCurves(page, found);
+  fillGenerations(page, found.generations);
   const others = (await ask("runs")).runs.filter((each) => !each.damaged && each.run !== found.run);
   if (!current()) return;
   page.other.replaceChildren(make("option", "choose a run", { value: "" }), ...others.map((each) => make("option", each.run)));
@@ -158,83 +139,44 @@ export const showRun = guarded(async (current, name) => {
   });
 });
 
-const generationRow = (each) => {
-  const row = make("tr");
-  const texts = [
-    number(each.generation, 0), number(each.mean), number(each.std), number(each.best), number(each.worst),
-    each.sigma.toPrecision(4), each.failed ? number(each.failed, 0) : "", number(each.steps, 0), number(each.seconds),
-  ];
-  row.append(...texts.map((text) => make("td", text, { class: "n" })));
-  return row;
+const fillCurves = (page, { run, curves }) => {
+  const none = curves.generation.length ? "" : "No generation was closed, so there is nothing to draw.";
+  charts.placeholder(page.fitness, none);
+  charts.placeholder(page.search, none);
+  if (none) return;
+  charts.fitness(page.fitness, curves);
+  charts.search(page.search, curves);
+  say(page["fitness-caption"], curves.step > 1 ? `Every ${curves.step}th generation is drawn.` : "");
+  page.fitness.setAttribute("aria-label", `Fitness of ${run} by generation`);
+  page.search.setAttribute("aria-label", `Step size of ${run} by generation`);
 };
 
-export const showCompare = guarded(async (current, one, other) => {
-  document.title = `${one} and ${other}`;
-  const runs = await Promise.all([one, other].map((name) => ask(`runs/${encodeURIComponent(name)}`)));
-  const names = (await ask("runs")).runs.filter((each) => !each.damaged).map((each) => each.run);
-  if (!current()) return;
-  const page = open("compare");
-  [page.a, page.b].forEach((select, index) => {
-    select.replaceChildren(...names.map((name) => make("option", name)));
-    select.value = runs[index].run;
-    select.addEventListener("change", () => {
-      location.hash = `#/compare/${encodeURIComponent(page.a.value)}/${encodeURIComponent(page.b.value)}`;
-    });
+const fillSettings = (page, settings) => {
+  const rows = settings.map(([name, value]) => {
+    const row = make("tr", "", { role: "row" }); // the roles that a grid would take from a table
+    row.append(make("th", name, { scope: "row", role: "rowheader" }), make("td", value, { role: "cell" }));
+    row.words = `${name} ${value}`.toLowerCase();
+    return row;
   });
-  const evaluated = runs.some(({ curves }) => curves.evaluations.generation.length);
-  let over = "generation";
-  let of = evaluated ? "evaluations" : "candidates";
-  const draw = () => {
-    charts.both(page.chart, runs, over, of);
-    page.chart.setAttribute("aria-label", `${of} of ${one} and ${other} over ${over}`);
-    say(page.caption, note(runs, of));
-  };
-  radios(page.over, "over", [["generation", "generations"], ["steps", "environment steps"], ["core_hours", "core-hours"]], over, (value) => {
-    over = value;
-    draw();
+  page.settings.replaceChildren(...rows);
+  page["settings-search"].addEventListener("input", () => {
+    const words = page["settings-search"].value.toLowerCase().split(/\s+/).filter(Boolean);
+    for (const row of rows) row.hidden = !words.every((word) => row.words.includes(word));
+    page["no-settings"].hidden = rows.some((row) => !row.hidden);
   });
-  radios(page.of, "of", [["evaluations", "evaluated means"], ["candidates", "candidates' means"]], of, (value) => {
-    of = value;
-    draw();
-  });
-  draw();
-  sides(page, runs);
-});
-
-// Two scores are of one kind only where the same world gives them, and two fitnesses where it is cut alike too.
-const note = (runs, of) => {
-  const kinds = new Set(runs.map(({ world, curves }) => (of === "candidates" ? `${world}: ${curves.fitness_axis}` : world)));
-  return kinds.size > 1 ? "Take care: these two are not scored alike, so their heights say nothing of which is better." : "";
 };
 
-const radios = (parent, name, options, chosenOne, take) => {
-  for (const [value, text] of options) {
-    const label = make("label");
-    const box = make("input", "", { type: "radio", name, value });
-    box.checked = value === chosenOne;
-    box.addEventListener("change", () => take(value));
-    label.append(box, ` ${text}`);
-    parent.append(label);
-  }
-};
-
-const sides = (page, runs) => {
-  for (const head of [page.names, page["names-too"]])
-    head.replaceChildren(make("th", "", { scope: "col" }), ...runs.map((each) => {
-      const cell = make("th", "", { scope: "col" });
-      cell.append(make("a", each.run, { href: runLink(each.run) }));
-      return cell;
-    }));
-  const tables = runs.map((each) => new Map(each.facts));
-  page.sides.replaceChildren(...[...tables[0].keys()].map((name) => sideRow(name, tables)));
-  const settings = runs.map((each) => new Map(each.settings));
-  const differ = [...new Set(settings.flatMap((each) => [...each.keys()]))].filter((name) => settings[0].get(name) !== settings[1].get(name));
-  page.differ.replaceChildren(...differ.map((name) => sideRow(name, settings)));
-  page.same.hidden = differ.length > 0;
-};
-
-const sideRow = (name, tables) => {
-  const row = make("tr");
-  row.append(make("th", name, { scope: "row" }), ...tables.map((each) => make("td", each.get(name) ?? "-")));
-  return row;
+const fillGenerations = (page, generations) => {
+  const hasFailed = generations.some((each) => each.failed);
+  page.failed.hidden = !hasFailed;
+  page["last-table"].hidden = !generations.length;
+  page.generations.replaceChildren(...generations.map((each) => {
+    const row = make("tr");
+    const texts = [
+      number(each.generation, 0), score(each.mean), score(each.std), score(each.best), score(each.worst),
+      each.sigma.toPrecision(4), ...(hasFailed ? [number(each.failed ?? 0, 0)] : []), number(each.steps, 0), number(each.seconds),
+    ];
+    row.append(...texts.map((text, at) => make("td", text, { class: at === 2 || at === 4 || at > 5 ? "n wide-only" : "n" })));
+    return row;
+  }));
 };

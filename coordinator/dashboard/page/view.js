@@ -9,6 +9,7 @@ const KINDS = { score: "a candidate", evaluate: "the mean, in reality", collect:
 let page = null; // the parts, once they stand
 let offered = false; // whether the dashboard has views at all
 let run = ""; // that is live
+let word = "seed"; // what its world calls one
 let lost = false; // whether its coordinator was, when last heard of
 let whom = ""; // as the address of a view asks for it
 let paused = matchMedia("(prefers-reduced-motion: reduce)").matches;
@@ -62,6 +63,7 @@ export const fill = (frame) => {
   }
   lost = frame.link === "lost";
   rates = new Map(frame.workers?.worker.map((name, index) => [name, frame.workers.rate[index]]));
+  word = frame.word ?? word;
   if (there) choices(frame);
   settle();
 };
@@ -114,7 +116,7 @@ const close = () => {
 // Open where somebody looks, shut where nobody does.
 export const settle = () => {
   if (!page) return;
-  say(page["view-pause"], paused ? "Watch" : "Pause");
+  say(page["view-pause"], paused ? "Play" : "Pause");
   const wanted = run && seen && !paused && !over && !document.hidden;
   if (!wanted) close();
   if (paused && !over) showText(page["view-picture"].hidden ? "Paused: nothing is drawn or sent." : "");
@@ -160,7 +162,7 @@ const draw = ({ facts: named, jpeg }) => {
 
 const rows = ({ worker, kind, generation, candidate, seed, step, score }) => {
   const found = [["worker", worker], ["drive of", worker ? (KINDS[kind] ?? kind) : "a mean, here"],
-    ["generation", generation], ["candidate", kind === "score" ? candidate : null], ["seed", seed], ["step", step],
+    ["generation", generation], ["candidate", kind === "score" ? candidate : null], [word, seed], ["step", step],
     ["score so far", score?.toFixed(1)], ["speed", speed(worker, step)]];
   return found.filter(([, value]) => value !== null && value !== undefined).map(([name, value]) => [name, String(value)]);
 };

@@ -5,11 +5,11 @@ import sqlite3
 from contextlib import closing
 
 from dreamfleet.common.cli import command_line
+from dreamfleet.common.runs.comparison import ComparedRun, at_equal_budget, difference, differing_settings
 from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.common.runs.records import StoredConfirmation
 from dreamfleet.common.runs.run_folder import CONFIRMED, RunFolder, open_run
 from dreamfleet.common.runs.seeds import CONFIRMING_OFFSET, VALIDATION
-from dreamfleet.coordinator.analysis.comparison import ComparedRun, at_equal_budget, difference, differing_settings
 
 
 def confirm(runs, name, scores):

@@ -9,9 +9,9 @@ import pytest
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.effort import START_EFFORT, Effort
+from dreamfleet.common.runs.learning import LearningCurve, Point
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.worlds.shipped import WORLDS
-from dreamfleet.coordinator.analysis.learning import LearningCurve, Point
 from dreamfleet.coordinator.analysis.plot import plot_learning
 
 FIRST, LAST = Effort(10**5, 10**4, 0, 10**9), Effort(2 * 10**5, 9 * 10**4, 0, 3 * 10**9)

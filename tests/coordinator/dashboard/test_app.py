@@ -25,7 +25,17 @@ from tests.support.processes import DEADLINE
 RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
 HOME = "http://127.0.0.1:8420"
 TOKEN = "correct horse battery"
-PATHS = ("/", "/runs", "/runs/dream", "/live", "/view?run=night", "/metrics", "/files/0/main.js")
+PATHS = (
+    "/",
+    "/runs",
+    "/runs/dream",
+    "/hosts/dream",
+    "/compare/dream/reality",
+    "/live",
+    "/view?run=night",
+    "/metrics",
+    "/files/0/main.js",
+)
 
 
 @pytest.fixture
@@ -56,7 +66,7 @@ def test_the_pages_files_load_and_may_be_cached_for_ever(runs):
             assert "immutable" in answer.headers["cache-control"]
             assert answer.headers.get("content-encoding", "identity") == packing
     folder = next(each for each in found if each.endswith("main.js")).rpartition("/")[0]
-    for name in ("charts.js", "dom.js", "live.js", "runs.js", "view.js"):
+    for name in ("charts.js", "compare.js", "dom.js", "hosts.js", "live.js", "runs.js", "view.js"):
         assert client.get(f"/{folder}/{name}").status_code == 200
 
 
@@ -114,7 +124,29 @@ def test_a_run_is_its_curves_facts_and_settings(runs):
     assert len(curves["evaluations"]["steps"]) == len(curves["evaluations"]["generation"]) > 0
     assert curves["dreamt"]
     assert ["task.task", "dream"] in document["settings"]
-    assert "spent" in dict(document["facts"])
+    assert "spent" in dict(document["outcome"])
+    assert document["tiles"][0]["name"] == "score"
+
+
+def test_two_runs_are_compared_as_by_the_verb(runs):
+    client = client_of(runs)
+    shutil.copytree(runs / "reality", runs / "again")
+    found = client.get("/compare/reality/again").json()
+    assert found["settings"] == []
+    assert [each["of"] for each in found["differences"]] == ["at equal steps in reality", "at equal core-hours"]
+    assert {(each["size"], each["verdict"]) for each in found["differences"]} == {
+        ("+0.0 ± 0.0", "bit-identical scores")
+    }
+    assert found["differences"][0]["on"].endswith("common tracks")
+    assert client.get("/compare/reality/nothing").status_code == 404
+
+
+def test_hosts_are_those_of_the_journal(runs):
+    found = client_of(runs).get("/hosts/reality").json()
+    (host,) = found["hosts"]
+    assert (host["host"], host["lives"], host["steps"]) == ("vm", 1, 5053)
+    assert sum(host["rate"]) * found["width"] == pytest.approx(5053, rel=1e-3)
+    assert client_of(runs).get("/hosts/nothing").status_code == 404
 
 
 def test_a_run_that_closed_no_generation_is_shown(runs):
@@ -137,9 +169,13 @@ def test_a_journal_whose_generations_are_far_apart_is_damaged_and_not_counted_th
 )
 def test_no_name_leads_out_of_the_runs_folder(runs, name):
     shutil.copytree(runs / "dream", runs.parent / "outside")
-    answer = client_of(runs).get(f"/runs/{name}")
-    assert answer.status_code in (404, 200)  # `..` is removed from a path by the client, which then requests the page
-    assert "curves" not in answer.text
+    for path in (f"/runs/{name}", f"/hosts/{name}", f"/compare/reality/{name}"):
+        answer = client_of(runs).get(path)
+        assert answer.status_code in (
+            404,
+            200,
+        )  # `..` is removed from a path by the client, which then requests the page
+        assert not {"curves", "width", "differences"} & set(re.findall(r'"(\w+)":', answer.text))
 
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS"])
@@ -233,7 +269,7 @@ def test_no_answer_holds_nan_or_infinity(runs):
     def refuse(word):
         raise AssertionError(word)
 
-    for path in ("/runs", "/runs/dream"):
+    for path in ("/runs", "/runs/dream", "/hosts/dream"):
         answer = client_of(runs).get(path)
         assert answer.status_code == 200
         json.loads(answer.text, parse_constant=refuse)

@@ -53,8 +53,16 @@ def test_only_a_dream_has_a_temperature_and_two_axes():
     dream = curves(data(3, settings=dataclasses.replace(STATUS.settings, task=task)), None)
     assert (dream["temperature"], dream["dreamt"]) == ([1.5, 1.5, 1.5], True)
     assert (dream["fitness_axis"], dream["score_axis"]) == (
-        "fitness over 1000 dreamt steps", "score in reality, 16 whole episodes",
+        "fitness over 1000 dreamt steps", "score in reality, mean of 16 seeds",
     )  # fmt: skip
+
+
+def test_an_empty_chart_says_what_will_come_and_a_world_names_its_episodes():
+    drawn = curves(data(0), None, word="track")
+    assert drawn["coming"].startswith("Once the first generation closes: ")
+    assert drawn["score_axis"] == "score, mean of 16 tracks"
+    never = curves(data(0, settings=dataclasses.replace(STATUS.settings, evaluate_every=0)), None)
+    assert "evaluated" not in never["coming"]
 
 
 def test_effort_includes_the_start_and_excludes_confirmations():

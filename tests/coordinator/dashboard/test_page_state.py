@@ -1,11 +1,11 @@
 """The page's document of live, lost and ended runs."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
 
-from dreamfleet.common.monitoring.status import FailureStatus, WorkerCount
+from dreamfleet.common.monitoring.status import EpisodeProgress, FailureStatus, WorkerCount
 from dreamfleet.coordinator.dashboard.page_state import RunSnapshot, page_state
 from tests.support.samples import STATUS
 
@@ -28,7 +28,7 @@ def test_only_a_live_run_shows_momentary_values(gone):
     assert not {"-", None} & set(momentary_values(page_state(look())))
     document = page_state(look(**gone))
     assert set(momentary_values(document)) == {"-", None}
-    assert "at the last" in document["fleet"]
+    assert "at the last" in next(each["beneath"] for each in document["tiles"] if each["name"] == "fleet")
     assert document["workers"]["finished"] == page_state(look())["workers"]["finished"], "finished jobs stay"
 
 
@@ -60,8 +60,46 @@ def test_failures_and_failed_episodes_are_named():
     failure = FailureStatus("4/0", "evaluate", (20003,), {"host-a": "no road"}, {"host-a": 2})
     document = page_state(look(failures=(failure,), best=replace(STATUS.best, failed=1)))
     assert document["troubles"] == ["the evaluation of generation 4's mean, seed 20003, failed on host-a (2x): no road"]
-    reported = next(each for each in document["tiles"] if each["name"] == "reported")
-    assert reported["beneath"] == "provisional, generation 4, 16 episodes; 1 more episode failed"
+    reported = next(each for each in document["tiles"] if each["name"] == "score")
+    assert reported["beneath"] == "provisional, generation 4, 16 seeds; 1 more episode failed"
+
+
+def test_a_running_run_says_each_fact_once():
+    document = page_state(look(state="running"))
+    assert document["sentence"] == "", "the open generation's card says it"
+    assert "a generation" not in document["eta"]["text"], "a tile has the pace"
+    paused = page_state(look(state="paused", why="by hand"))
+    assert (paused["state"], paused["sentence"]) == ("paused", "By hand")
+
+
+def test_redundant_work_is_one_line_unless_it_is_not_zero():
+    zeros = {each.name: 0 for each in fields(STATUS.waste)}
+    nothing = look(waste=replace(STATUS.waste, **zeros), dropped={"malformed": 0})
+    assert page_state(nothing)["redundant"] == {"text": "none", "rows": []}
+    some = page_state(look(waste=replace(STATUS.waste, **{**zeros, "silences": 3}), dropped={"bad\x1b": 2}))[
+        "redundant"
+    ]
+    assert some == {
+        "text": "0.0% of steps",
+        "rows": [("silences of workers", "3"), ("messages dropped: bad\\x1b", "2")],
+    }
+
+
+def test_the_score_before_the_first_evaluation_says_when_it_comes():
+    settings = replace(STATUS.settings, evaluate_every=10)
+    (score,) = (
+        each
+        for each in page_state(look(best=None, confirmed=None, settings=settings))["tiles"]
+        if each["name"] == "score"
+    )
+    assert (score["value"], score["beneath"]) == ("-", "first evaluation after generation 9")
+
+
+def test_episodes_of_a_mean_are_called_as_its_world_calls_them():
+    track = replace(look(evaluating=EpisodeProgress(3, 16)), word="track")
+    document = page_state(track)
+    assert document["evaluation"][0]["of"] == "16 tracks"
+    assert "16 tracks" in next(each["beneath"] for each in document["tiles"] if each["name"] == "score")
 
 
 def test_a_worker_that_left_is_shown_with_its_reason_and_is_not_counted_as_silent():

@@ -12,7 +12,6 @@ from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.effort import START_EFFORT, Effort, parse_start_effort
 from dreamfleet.common.runs.records import StoredConfirmation, StoredEvaluation
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.coordinator.settings.start import total_effort
 
 
 @dataclass(frozen=True)
@@ -53,6 +52,11 @@ class LearningCurve:
         found = (point for point, each in zip(points, run.evaluations(), strict=True)
                  if confirmed is not None and each.generation == confirmed.generation)  # fmt: skip
         return cls(run.name, _world(run), points, judged, next(found, None), total)
+
+
+def total_effort(stored: RunFolder) -> Effort:
+    """What a run took so far, and what had been spent on its start."""
+    return sum((each.effort for each in stored.efforts()), parse_start_effort(stored.fact(START_EFFORT)) or Effort())
 
 
 def _points(run: RunFolder) -> Iterator[Point]:

@@ -12,12 +12,11 @@ from typing import Any
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.effort import Effort
+from dreamfleet.common.runs.learning import LearningCurve, Point, total_effort
 from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, expand_task_options
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.serialization.optional_fields import to_dict
-from dreamfleet.coordinator.analysis.learning import LearningCurve, Point
-from dreamfleet.coordinator.settings.start import total_effort
 
 Scores = dict[int, float]  # by validation seed
 

@@ -1,0 +1,78 @@
+"""Two stored runs compared for the page, by the functions of `dreamfleet runs compare`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from dreamfleet.common.printable import format_setting, plural, printable
+from dreamfleet.common.runs.comparison import (
+    ComparedRun,
+    EqualBudget,
+    Scores,
+    at_equal_budget,
+    difference,
+    differing_settings,
+)
+from dreamfleet.common.runs.paired_difference import PairedDifference
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.standard_error import format_with_error
+from dreamfleet.common.worlds.score_words import score_word_of_run
+
+Sides = tuple[ComparedRun, ComparedRun]
+
+
+def compare_runs(runs_dir: Path, one: str, other: str) -> dict[str, Any]:
+    """The settings that differ, and the paired differences `other - one`; none if they are of several worlds.
+
+    `JournalError` or `UsageError` if a run is missing or unreadable.
+    """
+    with open_run(runs_dir, one) as first, open_run(runs_dir, other) as second:
+        sides = ComparedRun.of(first), ComparedRun.of(second)
+        word = score_word_of_run(second.spec, second.bundle_path)
+    worlds = {each.world for each in sides if each.world is not None}
+    equal = at_equal_budget(sides) if len(worlds) == 1 else []
+    pairs = _pairs(sides, equal) if len(worlds) == 1 else ()
+    return {
+        "worlds": sorted(map(printable, worlds)),
+        "differences": [_difference(of, sides, difference(*scores), word) for of, *scores in pairs],
+        "settings": [
+            [printable(name), *("default" if value is None else printable(format_setting(value)) for value in values)]
+            for name, values in differing_settings(sides).items()
+        ],
+    }
+
+
+def _pairs(sides: Sides, equal: Sequence[EqualBudget]) -> Iterator[tuple[str, Scores, Scores]]:
+    """What is compared: both runs' means at equal budgets, then their confirmed ones."""
+    for each in equal:
+        one, other = each.evaluated_means
+        if one is not None and other is not None:
+            yield f"at equal {each.what}", one.scores, other.scores
+    if all(each.confirmed is not None for each in sides):
+        yield "confirmed", sides[0].confirmed_scores, sides[1].confirmed_scores
+
+
+def _difference(of: str, sides: Sides, found: PairedDifference | str, word: str) -> dict[str, Any]:
+    """A difference with its texts: what it is of, its size and what follows from it."""
+    if isinstance(found, str):
+        return {"of": of, "verdict": f"no difference: fewer than 2 common {word}s"}
+    return {
+        "of": of,
+        "mean": found.mean,
+        "error": found.error,
+        "half": found.critical_value * found.error,  # a significant difference is larger
+        "size": format_with_error(found.mean, found.error, sign="+,"),
+        "on": plural(found.seeds, f"common {word}"),
+        "clear": found.is_significant,
+        "verdict": _verdict(sides, found),
+    }
+
+
+def _verdict(sides: Sides, found: PairedDifference) -> str:
+    if found.mean == found.error == 0:
+        return "bit-identical scores"
+    if not found.is_significant:
+        return f"not significant: under {found.threshold_text}"
+    return f"{printable(sides[found.mean > 0].name)} is better"

@@ -1,0 +1,163 @@
+"""What each host of a run did over time, from what its journal keeps: results, generations' times and events. Pure.
+
+The journal keeps no moment of a result, so a result counts evenly over the time in which its generation was scored. It
+keeps no number of slots either: what is known is the slot time of results, and how many workers were there.
+"""
+
+from __future__ import annotations
+
+import re
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from dreamfleet.common.printable import printable
+from dreamfleet.common.runs.records import StoredEvent, StoredWork
+
+BINS = 120  # of the run's time
+MOST_HOSTS = 200  # in the document; the others are summed
+MOST_EVENTS = 200  # the latest arrivals and departures
+Times = Mapping[int, tuple[float, float | None]]  # by generation: opened and closed
+_WORKER = re.compile(r"worker (\S+?)/(\S+) (.+)", re.DOTALL)
+_CAME = ("joined", "is back")
+
+
+@dataclass
+class _Host:
+    """One host's share."""
+
+    lives: set[str] = field(default_factory=set)
+    results: int = 0
+    steps: float = 0.0
+    seconds: float = 0.0
+    binned_steps: list[float] = field(default_factory=lambda: [0.0] * BINS)
+    present: list[tuple[float, float]] = field(default_factory=list)
+
+
+def host_history(
+    work: Sequence[StoredWork], times: Times, events: Sequence[StoredEvent], until: float | None
+) -> dict[str, Any]:
+    """The JSON document; `until` is the run's end, or now if it is live, in seconds since 1970; `None`: unknown."""
+    moments = [each for pair in times.values() for each in pair if each is not None]
+    moments += [each.happened for each in events]
+    if not moments:
+        return {"since": None, "width": 0.0, "hosts": [], "events": []}
+    since, end = min(moments), max(moments) if until is None else max(until, min(moments))
+    width = max(end - since, 1.0) / BINS
+    hosts: dict[str, _Host] = {}
+    spans = _Spans(work, times, end)
+    for each in work:
+        name, _, life = each.worker.rpartition("/")
+        host = hosts.setdefault(name or life, _Host())
+        host.lives.add(life)
+        host.results += each.results
+        host.steps += each.steps
+        host.seconds += each.seconds
+        for at, share in _shares(*spans(each), since, width):
+            host.binned_steps[at] += each.steps * share
+    for name, life, came, went in _stays(events, sorted(moments), end):
+        host = hosts.setdefault(name, _Host())
+        host.lives.add(life)
+        host.present.append((came, went))
+    ordered = sorted(hosts.items(), key=lambda each: (-each[1].steps, each[0]))
+    return {
+        "since": since,
+        "width": width,
+        "hosts": [_row(name, each, since, width) for name, each in ordered[:MOST_HOSTS]],
+        "more": max(len(ordered) - MOST_HOSTS, 0),
+        "events": [_event_row(each) for each in events if _WORKER.fullmatch(each.text)][: -MOST_EVENTS - 1 : -1],
+    }
+
+
+class _Spans:
+    """When work was done, as far as the journal tells: from and until."""
+
+    def __init__(self, work: Sequence[StoredWork], times: Times, end: float) -> None:
+        self._times, self._end = times, end
+        self._last = max((closed for _, closed in times.values() if closed is not None), default=end)
+        besides = {each.generation for each in work if each.kind != "score" and not each.confirming}
+        self._besides = sorted(besides)
+
+    def __call__(self, work: StoredWork) -> tuple[float, float]:
+        """Candidates: while their generation was open. A mean: in idle slots, until the next one's turn."""
+        if work.confirming:
+            return self._last, self._end
+        opened, closed = self._times.get(work.generation, (self._end, None))
+        if work.kind == "score":
+            return opened, self._end if closed is None else closed
+        following = bisect_right(self._besides, work.generation)
+        until = None
+        if following < len(self._besides):
+            until = self._times.get(self._besides[following], (self._end, None))[1]
+        return opened if closed is None else closed, self._end if until is None else until
+
+
+def _shares(began: float, ended: float, since: float, width: float) -> Iterator[tuple[int, float]]:
+    """The bins that a span lies in, and its share in each; the shares add up to 1."""
+    first = min(max((began - since) / width, 0.0), BINS - 1e-9)
+    last = min(max((ended - since) / width, first), float(BINS))
+    if last - first < 1e-9:
+        yield int(first), 1.0
+        return
+    for at in range(int(first), min(int(last), BINS - 1) + 1):
+        yield at, (min(last, at + 1.0) - max(first, float(at))) / (last - first)
+
+
+def _stays(
+    events: Sequence[StoredEvent], moments: Sequence[float], end: float
+) -> Iterator[tuple[str, str, float, float]]:
+    """From when to when each worker was there: its host, its life, and both moments."""
+    here: dict[tuple[str, str], float] = {}
+    incarnation = None
+    for each in events:
+        if each.incarnation != incarnation:  # its coordinator ended: the last sign of it is what the journal has
+            incarnation = each.incarnation
+            last = moments[max(bisect_left(moments, each.happened) - 1, 0)]
+            yield from ((*worker, came, max(last, came)) for worker, came in here.items())
+            here.clear()
+        if (found := _WORKER.fullmatch(each.text)) is None:
+            continue
+        worker = found[1], found[2]
+        if found[3] in _CAME:
+            here.setdefault(worker, each.happened)
+        elif worker in here:
+            came = here.pop(worker)
+            yield *worker, came, max(each.happened, came)
+    yield from ((*worker, came, max(end, came)) for worker, came in here.items())
+
+
+def _count_present(present: Sequence[tuple[float, float]], since: float, width: float) -> list[float]:
+    """How many workers were there, on average in each bin."""
+    counts = [0.0] * BINS
+    for came, went in present:
+        for at, share in _shares(came, went, since, width):
+            counts[at] += share * (went - came) / width
+    return [float(f"{each:.3g}") for each in counts]
+
+
+def _covered(present: Sequence[tuple[float, float]]) -> float:
+    """Seconds in which at least one worker was there."""
+    seconds, reached = 0.0, float("-inf")
+    for came, went in sorted(present):
+        seconds += max(went - max(came, reached), 0.0)
+        reached = max(reached, went)
+    return seconds
+
+
+def _row(name: str, host: _Host, since: float, width: float) -> dict[str, Any]:
+    return {
+        "host": printable(name),
+        "lives": len(host.lives),
+        "results": host.results,
+        "steps": host.steps,
+        "seconds": host.seconds,
+        "rate": [float(f"{each / width:.4g}") for each in host.binned_steps],
+        "there": _covered(host.present),
+        "workers": _count_present(host.present, since, width),
+        "present": host.present,
+    }
+
+
+def _event_row(event: StoredEvent) -> dict[str, Any]:
+    return {"at": event.happened, "text": printable(event.text)}
