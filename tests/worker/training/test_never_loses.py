@@ -13,19 +13,20 @@ from dreamfleet.common.errors import DatasetError, StoppedError, UsageError
 from dreamfleet.common.files.locks import folder_lock
 from dreamfleet.common.host.stop_signals import stop_on_signals
 from dreamfleet.worker.training import checkpoint, train_mdnrnn, train_vae, training_state
+from dreamfleet.worker.training.assemble import QUALITY, load_quality, record_quality
 from dreamfleet.worker.training.checkpoint import load_progress, load_weights
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.loss_curve import append_point
 from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.training.training_cli import run_training
 from dreamfleet.worker.training.training_state import numbered_path
-from dreamfleet.worker.verbs import train as verbs
+from dreamfleet.worker.verbs import train as verb
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.drives import write_drives
 
 LAYERS, RNN = VAEConfig(latent=4, channels=(2, 2, 4, 4)), MDNRNNConfig(latent=4, hidden=8, mixtures=2)
-FLAGS = ("--latent", "4", "--channels", "2", "2", "4", "4", "--batch", "8")
+FLAGS = ("--set", "latent=4", "channels=2,2,4,4", "--batch", "8")
 SHORT = TrainConfig(updates=6, batch=8, rate=1e-3, validate_every=2)
 
 
@@ -73,8 +74,8 @@ def test_a_training_goes_on_by_the_seed_that_it_was_begun_with(data):
 
 def call(*words):
     parser = argparse.ArgumentParser()
-    verbs.VAE.configure(parser)
-    return verbs.VAE.run(parser.parse_args([*map(str, words), *FLAGS]))
+    verb.configure(parser)
+    return verb.run(parser.parse_args(["vae", *map(str, words), *FLAGS]))
 
 
 def state(path):
@@ -185,6 +186,17 @@ def test_a_second_signal_says_what_is_kept(data, new, command):
         run_training(args, "VAE", 6, data / train_vae.CHECKPOINT, lambda _, stop: train(data, SHORT, twice, stop=stop))
 
 
+@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b"\xff", b'{"done_auc": "high"}', b"[" * 9000])
+def test_damaged_figures_are_replaced_by_a_training_and_named_for_a_bundle(data, content, caplog):
+    (data / QUALITY).write_bytes(content)
+    with pytest.raises(DatasetError, match=r"quality.json holds no figures .*delete it"):
+        load_quality(data)
+    record_quality(data, {"error": 2.0})
+    assert "the new figures replace it" in caplog.text
+    record_quality(data, {"kl": 1.0})
+    assert load_quality(data) == {"error": 2.0, "kl": 1.0}
+
+
 def test_a_second_training_of_a_model_in_a_folder_is_refused(data):
     with folder_lock(data / "vae.lock", "other"), pytest.raises(UsageError, match="another training of the VAE works"):
         call("--data", data, "--updates", 1)
@@ -206,12 +218,12 @@ def test_checkpoints_are_kept_beside_the_last_one(drives, data):
     last.write_bytes(kept.read_bytes())
     train(data)
     assert state(last) == state(drives / train_vae.CHECKPOINT)
-    with pytest.raises(UsageError, match=r"--keep-every must be at least 1, or 0"):
+    with pytest.raises(UsageError, match=r"keep_every must be at least 1, or 0"):
         replace(SHORT, keep_every=-1)
 
 
 def test_an_early_end_is_said_and_again_where_nothing_is_left_to_do(data, capsys):
-    words = ("--data", data, "--updates", 20, "--validate-every", 1, "--rate", 1e-12, "--patience", 2)
+    words = ("--data", data, "--updates", 20, "--rate", 1e-12, "--set", "validate_every=1", "patience=2")
     assert call(*words) == 0
     printed = capsys.readouterr().out
     assert "ended early after update 3, as --patience says: the checkpoint is that of update 1, the best" in printed
@@ -222,7 +234,7 @@ def test_an_early_end_is_said_and_again_where_nothing_is_left_to_do(data, capsys
     point = json.loads((data / "vae.jsonl").read_text().splitlines()[0])
     assert ended["held_out_loss"] == pytest.approx(point["held_out"], abs=1e-5)
     assert "ended_early" not in json.loads((data / "quality.json").read_text())
-    assert call(*words, "--patience", 0, "--updates", 2, "--json") == 0
+    assert call(*words, "--set", "patience=0", "--updates", 2, "--json") == 0
     assert json.loads(capsys.readouterr().out)["ended_early"] is None
 
 
