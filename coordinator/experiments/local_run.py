@@ -7,9 +7,10 @@ import re
 import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from random import SystemRandom
 from typing import Any
 
 from dreamfleet.common.cli import model_commands
@@ -25,11 +26,12 @@ from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.coordinator.settings.config import LimitsConfig, RunConfig
 
 START_SECONDS = 180.0  # a coordinator that ends earlier is seen at once; a busy host takes its time
+PORTS = range(20_000, 32_000)
 ANY_ADDRESS = re.compile(r"/(0\.0\.0\.0|\[::\]):")  # an endpoint that listens on all of this host's addresses
-# Settings of `coordinator` that each run of an experiment has its own of, with their defaults.
-RESERVED: dict[str, str | None] = {
-    "run_name": "run",
-    **dict.fromkeys(("resume", "init", "bundle", "seed", "runs_dir", "listen", "connect", "config", "subspace")),
+# Flags of `coordinator` that each run of an experiment has its own of, by the names of their values.
+RESERVED = {"run_name": "--run", "source": "--from"} | {
+    name: f"--{name.replace('_', '-')}"
+    for name in ("resume", "init", "bundle", "seed", "runs_dir", "listen", "connect", "config", "subspace")
 }
 
 
@@ -183,9 +185,8 @@ def parse_run_flags(flags: Sequence[str], sources: Mapping[str, Any], verb: str)
     from dreamfleet.coordinator.settings import run_setup
 
     parsed = build_parser("coordinator", run_setup).parse_all(list(flags))
-    if taken := [name for name, default in RESERVED.items() if getattr(parsed, name, default) != default]:
-        names = ", ".join(f"--{name.replace('_name', '').replace('_', '-')}" for name in taken)
-        raise UsageError(f"{names} in --run-flags: {verb} sets them for each run; give --config to {verb}")
+    if taken := [flag for name, flag in RESERVED.items() if getattr(parsed, name, None) is not None]:
+        raise UsageError(f"{', '.join(taken)} in --run-flags: {verb} sets them for each run; give --config to {verb}")
     args = argparse.Namespace(sources={**sources, "flags": parsed}, given=frozenset(vars(parsed)))
     config, limits = run_setup.load_run_config(args, base={})
     if limits == LimitsConfig():
@@ -194,6 +195,9 @@ def parse_run_flags(flags: Sequence[str], sources: Mapping[str, Any], verb: str)
 
 
 def _free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return int(found.getsockname()[1])
+    """A port that is free, below those that connections get: one of them could take it before the coordinator does."""
+    for port in SystemRandom().sample(PORTS, 100):
+        with socket.socket() as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
+    raise DreamfleetError("no port of this host is free: name one with listen")

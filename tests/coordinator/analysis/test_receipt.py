@@ -9,9 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC
-from dreamfleet.common.runs.run_paths import JOURNAL
+from dreamfleet.common.runs.effort import Effort
+from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL
+from dreamfleet.common.runs.run_provenance import RECEIPT, RunProvenance
+from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.coordinator.storage.journal import Journal
 
 RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
@@ -33,7 +37,8 @@ def change(tmp_path):
 @pytest.fixture
 def printed(tmp_path, capsys):
     def call(*words):
-        assert command_line.main(["runs", *words, "--runs-dir", str(tmp_path / "runs")]) == 0
+        group = [] if words[0] == "compare" else ["runs"]
+        assert command_line.main([*group, *words, "--runs-dir", str(tmp_path / "runs")]) == 0
         return capsys.readouterr().out
 
     return call
@@ -66,6 +71,17 @@ def test_receipt_and_comparison_count_the_same_effort(change, printed, tmp_path)
     assert "with the results of the open generation" in printed("receipt", "reality")
 
 
+def test_it_cites_the_software_in_the_version_that_served_the_run(change, printed, tmp_path):
+    run = tmp_path / "runs" / "reality"
+    found = Controller.load(run / CONTROLLER)
+    found.provenance[RECEIPT] = to_dict(RunProvenance(3, Effort(), versions={"dreamfleet": "0.0.7"}))
+    found.save(run / CONTROLLER)
+    said, facts = printed("receipt", "reality"), json.loads(printed("receipt", "reality", "--json"))
+    assert facts["software"] == {"title": "dreamfleet", "authors": "The dreamfleet authors", "version": "0.0.7"}
+    entry = ["@misc{dreamfleet,", "  title = {dreamfleet},", "  author = {{The dreamfleet authors}},"]
+    assert "\n".join([*entry, "  version = {0.0.7}", "}"]) in said
+
+
 @pytest.mark.slow
 def test_the_commands_of_a_run_in_an_environment_of_a_module_run_as_printed(processes):
     task, module = "gym:tests.support.dark_environments:Dark-v0", "tests.support.dark_environments"
@@ -77,7 +93,7 @@ def test_the_commands_of_a_run_in_an_environment_of_a_module_run_as_printed(proc
     code, out, err = processes.call("runs", "receipt", "test", "--runs-dir", processes.runs, "--json")
     assert code == 0, err
     commands = [shlex.split(each)[1:] for each in json.loads(out)["commands"].values()]
-    assert [each[0] for each in commands] == ["replay", "repeat", "evaluate"]
+    assert [each[:2] for each in commands] == [["verify", "candidate"], ["verify", "run"], ["evaluate", "--controller"]]
     assert all(each[-2:] == ["--trust", module] for each in commands)
     for words in (commands[0], commands[2]):
         code, _, err = processes.call(*words)
