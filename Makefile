@@ -92,7 +92,7 @@ bundle: $(VENV)/.dev  ## a world model like the shipped one, from nothing: an ho
 	  --run-flags "--generations 32 --collect-every 2 --collect-episodes 5" $(ARGS)
 
 reproduce: $(VENV)/.demo-doom  ## drive the shipped controllers again and compare with docs/lab/results; REPRODUCE=NAME: one of them
-	$(BIN)/dreamfleet reproduce $(if $(REPRODUCE),docs/lab/results/$(REPRODUCE).json,$(sort $(wildcard docs/lab/results/*.json))) $(ARGS)
+	$(BIN)/dreamfleet verify report $(if $(REPRODUCE),docs/lab/results/$(REPRODUCE).json,$(sort $(wildcard docs/lab/results/*.json))) $(ARGS)
 
 reproduce-evolution: $(VENV)/.demo  ## the run again that REPRODUCE=NAME came from (tiny), by its receipt; the same bits
 	$(BIN)/python deploy/reproduce_evolution.py $(or $(REPRODUCE),tiny) $(ARGS)

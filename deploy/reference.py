@@ -23,17 +23,26 @@ from dreamfleet.coordinator.experiments.demo import DemoConfig
 from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
 from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.spawn.config import SpawnConfig
+from dreamfleet.worker.baselines.agent_config import AgentConfig
+from dreamfleet.worker.baselines.learning_config import LearningConfig
 from dreamfleet.worker.service.config import WorkerConfig
+from dreamfleet.worker.training.presets import TrainConfig
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 
 FOLDER = Path(__file__).parents[1] / "docs" / "reference"
 NOTE = "<!-- Written by `make reference`: change the help text in the code, not this page. -->"
 # Table of the configuration file: its dataclass, and what it is of. The empty name is the top of the file.
-SECTIONS: Mapping[str, tuple[type, str]] = {
+# Several dataclasses in one table are of the trainings, whose keys are those of `--set` rather than flags.
+SECTIONS: Mapping[str, tuple[type | tuple[type, ...], str]] = {
     "": (
         GlobalConfig,
         "What every program of a fleet shares. These keys stand at the top of the file, before any table.",
     ),
-    "run": (RunConfig, "What is frozen with a new run. `dreamfleet fork` begins another run with other values."),
+    "run": (
+        RunConfig,
+        "What is frozen with a new run. `dreamfleet coordinator --from RUN` begins another run with other values.",
+    ),
     "limits": (LimitsConfig, "When a run ends: at the first limit that it reaches. 0 means no such limit."),
     "network": (NetworkConfig, "Where the coordinator is reached, and how it treats its workers. Kept with the run."),
     "worker": (WorkerConfig, "A worker process."),
@@ -42,6 +51,18 @@ SECTIONS: Mapping[str, tuple[type, str]] = {
     "spawn": (SpawnConfig, "Workers on other hosts. A `[[host]]` table overrides these."),
     "demo": (DemoConfig, "`dreamfleet demo`."),
     "iterate": (IterateConfig, "`dreamfleet iterate`."),
+    "vae": (
+        (TrainConfig, VAEConfig),
+        "`dreamfleet train vae`, over its preset; each key may be given as `--set KEY=VALUE`.",
+    ),
+    "mdnrnn": (
+        (TrainConfig, MDNRNNConfig),
+        "`dreamfleet train mdnrnn`, over its preset; each key may be given as `--set KEY=VALUE`.",
+    ),
+    "baseline": (
+        (LearningConfig, AgentConfig),
+        "`dreamfleet baseline train`, over its preset; each key may be given as `--set KEY=VALUE`.",
+    ),
 }
 ALL_VERBS = ("config", "log_level", "log_format", "trust", "help", "help_all")  # names of flags that each verb has
 LARGE = 1e9  # a bound from here on only guards the wire
@@ -97,8 +118,8 @@ def settings_page() -> str:
     return "\n".join(parts) + "\n"
 
 
-def _settings_table(table: str, section: type) -> Iterator[str]:
-    hints = get_type_hints(section, include_extras=True)
+def _settings_table(table: str, section: type | tuple[type, ...]) -> Iterator[str]:
+    hints = {name: hint for each in _types(section) for name, hint in get_type_hints(each, include_extras=True).items()}
     prefix = f"DREAMFLEET_{table.upper()}_" if table else "DREAMFLEET_"
     yield f"Variables begin with `{prefix}`: `{prefix}{next(_settings(section)).name.upper()}`.\n"
     yield "| key | default | values | meaning |\n|---|---|---|---|"
@@ -200,10 +221,10 @@ def _plain_help(text: str) -> str:
 def _table_of(action: argparse.Action, title: str) -> str | None:
     """The table of the configuration file that a flag sets, or None: the flag's name and text are the field's."""
     for table, (section, _) in SECTIONS.items():
-        for each in _settings(section):
+        for each in () if isinstance(section, tuple) else _settings(section):
             if each.name == action.dest and f"--{each.name.replace('_', '-')}" in action.option_strings:
                 text = _help(action)
-                if text.startswith(each.metadata["help"]) or (not text and title == _group_title(section)):
+                if text.startswith(each.metadata["help"]) or (not text and title == _group_title(_types(section)[0])):
                     return table
     return None
 
@@ -225,9 +246,13 @@ def _groups(points: Mapping[str, EntryPoint]) -> dict[str, list[str]]:
     return {**groups, **({"Other verbs" if groups else "All verbs": rest} if rest else {})}
 
 
-def _settings(section: type) -> Iterator[Field[Any]]:
+def _types(section: type | tuple[type, ...]) -> tuple[type, ...]:
+    return section if isinstance(section, tuple) else (section,)
+
+
+def _settings(section: type | tuple[type, ...]) -> Iterator[Field[Any]]:
     """The fields that a user may set."""
-    return (each for each in fields(section) if "help" in each.metadata)
+    return (each for one in _types(section) for each in fields(one) if "help" in each.metadata)
 
 
 def _default(each: Field[Any]) -> str:
@@ -249,7 +274,7 @@ def _values(hint: Any) -> str:
     if get_origin(hint) is Literal:
         return ", ".join(f"`{each}`" for each in get_args(hint))
     if get_origin(hint) is tuple:
-        return "texts"
+        return "texts" if get_args(hint)[0] is str else "numbers"
     return {int: "whole number", float: "number", bool: "true, false", str: "text", Path: "path"}[hint]
 
 

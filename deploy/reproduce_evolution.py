@@ -1,4 +1,4 @@
-"""Re-run the evolution of a controller on this host: `dreamfleet repeat` and one worker a core.
+"""Re-run the evolution of a controller on this host: `dreamfleet verify run` and one worker a core.
 
 Ctrl-C leaves the run open, and the same command goes on with it. Exits with 0 if the same controller is reported, to
 the bit.
@@ -31,7 +31,9 @@ def main() -> int:
             joined = ("--connect", endpoint, "--run", run, "--name", name, "--slots", 1)
             joined += ("--task", args.task) if args.task else ()
             stack.enter_context(VerbProcess("worker", *joined, log=args.runs_dir / run / f"{name}.log"))
-        return subprocess.run(command("repeat", args.controller, *where, "--listen", endpoint), check=False).returncode
+        return subprocess.run(
+            command("verify", "run", args.controller, *where, "--listen", endpoint), check=False
+        ).returncode
 
 
 if __name__ == "__main__":

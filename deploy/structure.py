@@ -13,6 +13,7 @@ import sys
 import tokenize
 from collections import Counter, defaultdict
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -116,6 +117,28 @@ def names_outside_rooms() -> set[str]:
     return found
 
 
+def surface() -> dict[str, int]:
+    """How large the command line is: verbs, distinct long flags, the most of one verb, lines of the longest help texts.
+
+    It needs an environment in which dreamfleet is installed.
+    """
+    from importlib.metadata import entry_points
+
+    from dreamfleet.common.cli.command_line import DESCRIPTION, EXIT_CODES, GROUP, build_parser, load_verb
+    from dreamfleet.common.cli.overview import overview
+
+    points = {each.name: each for each in entry_points(group=GROUP)}
+    parsers = [build_parser(name, load_verb(point)) for name, point in points.items()]
+    flags = [{flag for flag in each._option_string_actions if flag.startswith("--")} for each in parsers]
+    return {
+        "verbs": len(points),
+        "distinct_flags": len({flag for each in flags for flag in each if not flag.startswith("--no-")}),
+        "most_flags_of_a_verb": max(map(len, flags)),
+        "lines_of_help": overview(DESCRIPTION, EXIT_CODES, points, str).count("\n"),
+        "most_lines_of_a_verbs_help": max(each.format_help().count("\n") for each in parsers),
+    }
+
+
 def measure() -> dict[str, object]:
     """All figures, as `--json` prints them."""
     figures: dict[str, object] = {}
@@ -137,6 +160,8 @@ def measure() -> dict[str, object]:
     figures["files_under_40_lines"] = sum(2 < lines < 40 for lines in lengths.values())
     figures["files_over_400_lines"] = {path: lines for path, lines in lengths.items() if lines > LONG_FILE}
     figures["duplicate_class_names"] = class_names()
+    with suppress(ImportError):
+        figures["command_line"] = surface()
     figures["riddles"] = {part: sum(len(riddles(path)) for path in sources(part)) for part in (*SIDES, "tests")}
     return figures
 

@@ -220,7 +220,7 @@ class Bundle(Displayed):
         if self.sha256 != controller.bundle:
             raise ControllerError(
                 f"the controller belongs to {describe_bundle(controller.bundle)}, not to {self.path.name} "
-                f"({self.sha256[:12]}...): leave --bundle out, or fit it to this one by `dreamfleet refit`"
+                f"({self.sha256[:12]}...): leave --bundle out, or fit it to this one by `dreamfleet lab refit`"
             )
         return found
 

@@ -100,11 +100,11 @@ class Subspace:
                 raise ValueError(f"it has another format than {FORMAT}")
             return cls(arrays["weights"], arrays["offsets"], _as_tuple(about["names"]), about["bundle"])
         except OSError as error:
-            why = f"{error.strerror or error}: name a file of `dreamfleet subspace`, or none"
+            why = f"{error.strerror or error}: name a file of `dreamfleet lab subspace`, or none"
             raise UsageError(f"cannot read the subspace {path}: {why}") from error
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             why = one_line(str(error))[:_MAX_REASON]
-            raise UsageError(f"{path} is no subspace ({why}): `dreamfleet subspace` makes one") from error
+            raise UsageError(f"{path} is no subspace ({why}): `dreamfleet lab subspace` makes one") from error
 
 
 def _as_tuple(names: Any) -> tuple[Any, ...]:

@@ -15,10 +15,11 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points, version
-from itertools import takewhile
 from pathlib import Path
-from typing import Any, NoReturn, Protocol
+from typing import NoReturn, Protocol
 
+from dreamfleet.common.cli.parser import Parser
+from dreamfleet.common.cli.removed import describe_removed
 from dreamfleet.common.errors import DreamfleetError, MissingExtraError, UsageError
 from dreamfleet.common.host.logs import configure_logging, report_failure
 from dreamfleet.common.host.packages import extra_of
@@ -28,7 +29,6 @@ from dreamfleet.common.printable import one_line
 
 GROUP = "dreamfleet.verbs"
 EXIT_INTERRUPTED = 130
-MIN_LIKENESS = 0.65  # of an unknown flag and the one that is suggested
 DESCRIPTION = "Evolve World-Models controllers on whatever machines you have."
 EXIT_CODES = (
     "Exit codes: 0 done; 1 it failed, was refused, or the answer is no; 2 the command or a setting is wrong; 130 it "
@@ -62,48 +62,6 @@ class SimpleVerb:
     configure: Callable[[argparse.ArgumentParser], None]
     run: Callable[[argparse.Namespace], int]
     EXTRAS: tuple[str, ...] = ()
-
-
-class Parser(argparse.ArgumentParser):
-    """A verb's parser: each error is one line, and the one for an unknown flag suggests the nearest."""
-
-    def error(self, message: str) -> NoReturn:
-        """Raise a `UsageError`; argparse would print all flags first."""
-        raise UsageError(f"{message}; `{self.prog} --help` lists the flags")
-
-    def parse_all(self, words: Sequence[str]) -> argparse.Namespace:
-        """Parse `words`; exits with an error on an unknown one."""
-        args, unknown = self.parse_known_args(words)
-        if unknown:
-            self._refuse(unknown)
-        return args
-
-    def _refuse(self, unknown: Sequence[str]) -> NoReturn:
-        flags = [word.split("=")[0] for word in unknown if word.startswith("--")]
-        near = [each for flag in flags for each in _nearest_flag(flag, self._option_string_actions)]
-        if near:
-            raise UsageError(
-                f"unrecognized arguments: {' '.join(unknown)}; did you mean {', '.join(dict.fromkeys(near))}?"
-            )
-        self.error(f"unrecognized arguments: {' '.join(unknown)}")
-
-    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
-        if action.option_strings and "--" in arg_strings:  # of `--flag=--`: Python 3.11 drops it and gives a list
-            raise argparse.ArgumentError(action, "expected a value, not --")
-        if action.type is Path and "" in arg_strings:  # would be the current folder
-            raise argparse.ArgumentError(action, "expected a path, not an empty text")
-        return super()._get_values(action, arg_strings)
-
-
-def _nearest_flag(flag: str, known: Iterable[str]) -> list[str]:
-    """The known flag that is most like an unknown one, if any is: an equal beginning counts most."""
-
-    def likeness(other: str) -> float:
-        begins = len(list(takewhile(lambda pair: pair[0] == pair[1], zip(flag[2:], other[2:], strict=False))))
-        return difflib.SequenceMatcher(None, flag[2:], other[2:]).ratio() + 0.1 * min(begins, 4)
-
-    best = max((each for each in known if each.startswith("--")), key=likeness, default="")
-    return [best] if best and likeness(best) >= MIN_LIKENESS else []
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -186,7 +144,7 @@ def build_parser(name: str, verb: Configurable) -> Parser:
     from dreamfleet.common.cli.global_config import add_common_flags
 
     spoken = name.replace(".", " ")
-    parser = Parser(prog=f"dreamfleet {spoken}", description=verb.SUMMARY, epilog=EXIT_CODES)
+    parser = Parser(prog=f"dreamfleet {spoken}", description=verb.SUMMARY, epilog=EXIT_CODES, verb=name)
     verb.configure(parser)
     add_common_flags(parser)
     return parser
@@ -211,12 +169,8 @@ def _show_overview(points: Mapping[str, EntryPoint], words: Sequence[str]) -> No
     group = [name for name in points if name.startswith(f"{first}.")] if first else []
     spoken = list(words[: 2 if group else 1])
     if spoken and not spoken[-1].startswith("-") and (not group or len(spoken) == 2):
-        raise UsageError(_unknown_verb_text(" ".join(spoken), points))
-    parser = (
-        _help_parser(f"dreamfleet {first}", group, points)
-        if group
-        else _help_parser("dreamfleet", _top_level_names(points), points)
-    )
+        raise UsageError(describe_removed(words) or _unknown_verb_text(" ".join(spoken), points))
+    parser = _help_parser(f"dreamfleet {first}", group, points) if group else _Overview(points)
     parser.add_argument("--version", action="version", version=f"dreamfleet {version('dreamfleet')}")
     parser.parse_args(words[1:] if group else words)
     parser.error("name a verb; --help lists them")
@@ -226,17 +180,25 @@ def _top_level_names(points: Iterable[str]) -> list[str]:
     return sorted({name.partition(".")[0] for name in points})
 
 
+class _Overview(argparse.ArgumentParser):
+    """The parser of no verb: its help lists all verbs by what people do."""
+
+    def __init__(self, points: Mapping[str, EntryPoint]) -> None:
+        super().__init__(prog="dreamfleet", usage="dreamfleet VERB ...")
+        self._points = points
+
+    def format_help(self) -> str:
+        from dreamfleet.common.cli.overview import overview
+
+        return overview(DESCRIPTION, EXIT_CODES, self._points, lambda name: _summary(self._points[name]))
+
+
 def _help_parser(prog: str, names: Iterable[str], points: Mapping[str, EntryPoint]) -> argparse.ArgumentParser:
-    """A parser whose help lists verbs and groups of verbs; one that cannot be loaded is marked as broken."""
+    """A parser whose help lists a group's verbs; one that cannot be loaded is marked as broken."""
     parser = argparse.ArgumentParser(prog=prog, description=DESCRIPTION, epilog=EXIT_CODES)
     verbs = parser.add_subparsers(metavar="VERB")
     for name in sorted(names):
-        spoken = name.rpartition(".")[2]
-        if name in points:
-            verbs.add_parser(spoken, help=_summary(points[name]).replace("%", "%%"))
-        else:
-            within = sorted(each.partition(".")[2] for each in points if each.startswith(f"{spoken}."))
-            verbs.add_parser(spoken, help=f"{', '.join(within)}: see `dreamfleet {spoken} --help`")
+        verbs.add_parser(name.rpartition(".")[2], help=_summary(points[name]).replace("%", "%%"))
     return parser
 
 

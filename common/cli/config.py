@@ -11,7 +11,8 @@ import argparse
 import difflib
 import tomllib
 import types
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, Field, field, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -22,6 +23,19 @@ from dreamfleet.common.files.regular_files import read_text
 T = TypeVar("T")
 Table = Mapping[str, Any]
 MAX_BYTES = 1_000_000  # of a configuration file
+# What `--help` calls the value of a setting; others are N, a number, or TEXT.
+METAVARS = {
+    **dict.fromkeys(("connect", "listen"), "ENDPOINT"),
+    **dict.fromkeys(("access_dir", "runs_dir", "wheelhouse"), "FOLDER"),
+    **dict.fromkeys(("join", "schedule"), "FILE"),
+    **dict.fromkeys(("dream_minutes", "minutes"), "MINUTES"),
+    **dict.fromkeys(("horizon", "patience", "steps"), "STEPS"),
+    **dict.fromkeys(("optimiser_options", "variant"), "NAME=VALUE"),
+    "bundle": "BUNDLE", "env": "NAME=VALUE", "environment": "KEY=VALUE", "init": "CONTROLLER", "name": "NAME",
+    "preset": "PRESET", "run": "RUN", "subspace": "SUBSPACE", "target": "SCORE", "task": "TASK", "trust": "MODULE",
+    "world": "WORLD",
+}  # fmt: skip
+KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", Path: "a path"}
 
 
 def option(default: Any, text: str) -> Any:
@@ -34,20 +48,18 @@ def add_flags(
     *sections: type[Any],
     only: Iterable[str] | None = None,
     texts: Mapping[str, str] | None = None,
-    default: str | None = None,
 ) -> None:
     """Add a flag for each field of the sections that has a help text, or for those named in `only`.
 
-    A flag that is not given sets nothing. `texts` replaces help texts by field name; `default` is shown in place of the
-    fields' defaults.
+    A flag that is not given sets nothing. `texts` replaces help texts by field name.
     """
     wanted = None if only is None else frozenset(only)
     for section in sections:
         group = _group(parser, section.__name__.removesuffix("Config").lower())
         hints = get_type_hints(section)
-        for each in _configurable_fields(section):
+        for each in configurable_fields(section):
             if wanted is None or each.name in wanted:
-                text = (texts or {}).get(each.name) or each.metadata["help"] + _default_text(each, default)
+                text = (texts or {}).get(each.name) or each.metadata["help"] + _default_text(each)
                 group.add_argument(_flag(each), **_flag_options(each, hints[each.name], text))
 
 
@@ -89,6 +101,26 @@ def configured_values(
         **read_table(section, f"[{name}]" if name else "", table),
         **_from_environment(known, name, environment or {}),
     }
+
+
+def read_settings(
+    sections: Sequence[type[Any]], name: str, sources: Mapping[str, Any], texts: Sequence[str]
+) -> dict[str, Any]:
+    """The values by key that sections of one table `name` are given in the file, the environment, and `texts`.
+
+    Later ones in this order count. `texts` are KEY=VALUE; `sources` are as `complete_arguments` leaves them.
+    """
+    known = {key: hint for section in sections for key, hint in _field_types(section).items()}
+    values = _from_table(known, f"[{name}]", (sources.get("file") or {}).get(name, {}))
+    values.update(_from_environment(known, name, sources.get("environment") or {}))
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not (equals and key):
+            raise UsageError(f"--set {text!r}: write KEY=VALUE")
+        if key not in known:
+            raise UsageError(f"--set {text!r}: unknown key {key!r}{suggestion(key, known)}")
+        values[key] = _parse_text(known[key], value, f"--set {key}")
+    return values
 
 
 def read_table(section: type[Any], where: str, table: Table) -> dict[str, Any]:
@@ -155,8 +187,9 @@ def _from_environment(known: Mapping[str, Any], section: str, environment: Mappi
 def _convert_toml_value(hint: Any, value: Any, where: str) -> Any:
     """Convert a TOML value to the field's type."""
     base = _without_none(hint)
-    if get_origin(base) is tuple and isinstance(value, list) and all(isinstance(item, str) for item in value):
-        return tuple(value)
+    if get_origin(base) is tuple and isinstance(value, list):
+        with suppress(UsageError):  # the error below is of the whole list
+            return tuple(_convert_toml_value(get_args(base)[0], item, where) for item in value)
     if base is float and type(value) in (int, float):
         return float(value)
     if base is Path and isinstance(value, str) and value:
@@ -174,7 +207,7 @@ def _parse_text(hint: Any, text: str, where: str) -> Any:
     if base is Path and base is not hint and not text:
         return None  # as if unset: an empty path would be the current folder
     if get_origin(base) is tuple:
-        return tuple(part for part in text.split(",") if part)
+        return tuple(_parse_text(get_args(base)[0], part, where) for part in text.split(",") if part)
     if base is bool and text in ("true", "false"):
         return text == "true"
     if base is not bool and base in (int, float, str, Path):
@@ -204,19 +237,18 @@ def _describe_type(base: Any) -> str:
     if get_origin(base) is Literal:
         return "one of " + ", ".join(get_args(base))
     if get_origin(base) is tuple:
-        return "a list of texts"
-    words = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", Path: "a path"}
-    return words[base]
+        return f"a list of {KINDS[get_args(base)[0]].removeprefix('a ')}s"
+    return KINDS[base]
 
 
 def _flag(each: Field[Any]) -> str:
     return "--" + each.name.replace("_", "-")
 
 
-def _default_text(each: Field[Any], replacement: str | None) -> str:
+def _default_text(each: Field[Any]) -> str:
     default = each.default if each.default is not MISSING else None
-    shown = "" if default in (None, (), False, "") else str(default)
-    return f" (default {replacement or shown})" if replacement or shown else ""
+    shown = _flag(each) if default is True else default
+    return "" if default in (None, (), False, "") else f" (default {shown})"
 
 
 def _flag_options(each: Field[Any], hint: Any, text: str) -> dict[str, Any]:
@@ -225,10 +257,10 @@ def _flag_options(each: Field[Any], hint: Any, text: str) -> dict[str, Any]:
     if base is bool:
         return {**options, "action": argparse.BooleanOptionalAction}
     if get_origin(base) is tuple:
-        return {**options, "nargs": "+", "action": _TupleAction, "metavar": each.name.upper()}
+        return {**options, "nargs": "+", "action": _TupleAction, "metavar": METAVARS.get(each.name, each.name.upper())}
     if get_origin(base) is Literal:
         return {**options, "choices": get_args(base)}
-    return {**options, "type": base, "metavar": "N" if base in (int, float) else base.__name__.upper()}
+    return {**options, "type": base, "metavar": METAVARS.get(each.name, "N" if base in (int, float) else "TEXT")}
 
 
 class _TupleAction(argparse.Action):
@@ -241,10 +273,10 @@ class _TupleAction(argparse.Action):
 def _field_types(section: type[Any]) -> dict[str, Any]:
     """The type of each configurable field, by name."""
     hints = get_type_hints(section)
-    return {each.name: hints[each.name] for each in _configurable_fields(section)}
+    return {each.name: hints[each.name] for each in configurable_fields(section)}
 
 
-def _configurable_fields(section: type[Any]) -> list[Field[Any]]:
+def configurable_fields(section: type[Any]) -> list[Field[Any]]:
     """The fields with a help text; only the code sets the others."""
     return [each for each in fields(section) if "help" in each.metadata]
 

@@ -26,7 +26,8 @@ from dreamfleet.common.transport.network import DEFAULT_ENDPOINT, Network, check
 log = logging.getLogger(__name__)
 ARRAYS = ("stage", "host")  # arrays of tables
 # The tables of every verb: all verbs may share one file.
-TABLES = ("run", "limits", "network", "worker", "dashboard", "demo", "iterate", "router", "spawn")
+TABLES = ("run", "limits", "network", "worker", "dashboard", "demo", "iterate", "router", "spawn", "vae", "mdnrnn",
+          "baseline")  # fmt: skip
 OTHER_VARIABLES = ("DREAMFLEET_CACHE", "DREAMFLEET_CONFIG")
 PREFIX = "DREAMFLEET_"
 SIMILARITY_CUTOFF = 0.75  # similarity to a known name from which an unknown variable counts as a typing error

@@ -1,4 +1,4 @@
-"""KEY=VALUE texts of a flag, with values as in JSON."""
+"""KEY=VALUE texts of flags."""
 
 from __future__ import annotations
 
@@ -30,3 +30,15 @@ def _parse_argument(flag: str, text: str, example: str) -> tuple[str, Any]:
         return name, json.loads(value)
     except (ValueError, RecursionError):
         return name, value
+
+
+def as_setting(flag: str, values: Sequence[str]) -> str:
+    """What `--set` takes instead of a flag.
+
+    >>> as_setting("--decoder-channels", ("64", "32")), as_setting("--done", ()), as_setting("--no-done", ())
+    ('decoder_channels=64,32', 'done=true', 'done=false')
+    """
+    name = flag.removeprefix("--").replace("-", "_")
+    if not values:
+        return f"{name.removeprefix('no_')}={'false' if name.startswith('no_') else 'true'}"
+    return f"{name}={','.join(values)}"

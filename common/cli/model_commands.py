@@ -7,14 +7,20 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import Literal
 
+from dreamfleet.common.cli.key_values import as_setting
 from dreamfleet.common.errors import UsageError
 
 Words = tuple[str, ...]
 Model = Literal["vae", "mdnrnn"]
 MODELS: tuple[Model, ...] = ("vae", "mdnrnn")
+TRAINING_FLAGS = frozenset(  # of `train`, whose other settings are keys of `--set`
+    {"--data", "--preset", "--device", "--continue-from", "--new", "--decoder-only", "--summary", "--tensorboard",
+     "--json", "--updates", "--batch", "--rate", "--seed", "--set", "--config", "--quiet", "--log-level"}
+)  # fmt: skip
 WORLD_FLAGS = ("task", "environment", "observation", "crop", "size", "skip", "difference")  # as `collect` has them
 
 
@@ -58,8 +64,15 @@ def collect(
 def train(
     model: Model, data: Path, *more: object, seed: int, preset: str | None = None, device: str | None = None
 ) -> Words:
-    """The training of one model on the data set in `data`."""
-    return command("train", model, "--data", data, *options(preset=preset, device=device, seed=seed), "--json", *more)
+    """The training of one model on the data set in `data`.
+
+    Settings may stand among `more` as the flags that they once were, as files of begun work have them.
+
+    >>> " ".join(train("vae", Path("d"), "--updates", 9, "--channels", 8, 16, "--batch-norm", seed=1))
+    'train vae --data d --seed 1 --json --updates 9 --set channels=8,16 --set batch_norm=true'
+    """
+    given = options(preset=preset, device=device, seed=seed)
+    return command("train", model, "--data", data, *given, "--json", *_with_settings(command(*more)))
 
 
 def encode(data: Path) -> Words:
@@ -111,6 +124,21 @@ def split_flags(flag: str, text: str, owner: str = "", reserved: Sequence[str] =
     if taken := [each for each in reserved if any(each.startswith(word) for word in given)]:  # argparse takes prefixes
         raise UsageError(f"{flag}: leave out {', '.join(taken)}, which {owner} sets itself")
     return words
+
+
+def _with_settings(words: Words) -> Words:
+    """The same flags of a training, where those that are settings now stand as `--set KEY=VALUE`."""
+    found: list[str] = []
+    rest = list(words)
+    while rest:
+        flag, equals, value = rest.pop(0).partition("=")
+        values = [value] if equals else list(takewhile(lambda word: not word.startswith("--"), rest))
+        rest = rest if equals else rest[len(values) :]
+        if not flag.startswith("--") or flag in TRAINING_FLAGS:
+            found += [flag, *values]
+        else:
+            found += ["--set", as_setting(flag, values)]
+    return tuple(found)
 
 
 def _run_place(runs_dir: Path, listen: Sequence[str], *, as_json: bool) -> Words:

@@ -22,7 +22,7 @@ NAMES: dict[Kind, tuple[str, ...]] = {
     "baseline": ("learning", "notebook"),
 }
 VERBS: dict[Kind, str] = {
-    "run": "coordinator and fork", "training": "collect and train", "baseline": "baseline train",
+    "run": "coordinator", "training": "collect and train", "baseline": "baseline train",
 }  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
 from importlib.metadata import entry_points
 from io import StringIO
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +78,7 @@ class ProcessRunner:
 
         A wrong command is a `UsageError`, a stop a `StoppedError`, any other failure a `DreamfleetError`.
         """
+        name = " ".join(takewhile(lambda word: not word.startswith("-"), map(str, words[:2])))
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("w", encoding="utf-8", errors="backslashreplace") as kept:
 
@@ -96,10 +98,10 @@ class ProcessRunner:
         if code == 0:
             return out
         if code == StoppedError.exit_code:
-            raise StoppedError(f"{words[0]} was stopped")
+            raise StoppedError(f"{name} was stopped")
         if code == UsageError.exit_code:
             raise UsageError(child.last_line())
-        raise DreamfleetError(f"{child.last_line()} ({words[0]} exited with {code}; its log is {log})")
+        raise DreamfleetError(f"{child.last_line()} ({name} exited with {code}; its log is {log})")
 
 
 def wait_for_end(

@@ -174,7 +174,7 @@ def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
         yield (
             2,
             "failed",
-            f"{plural(failed, 'candidate')}, {status.generation.failed} of this generation; `runs story` lists why",
+            f"{plural(failed, 'candidate')}, {status.generation.failed} of this generation; `story` lists why",
         )
     if status.throughput.seconds is not None and status.elapsed is not None:
         worked = status.throughput.seconds + status.generation.seconds

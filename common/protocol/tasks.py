@@ -101,6 +101,9 @@ def _task_class(module: Any, name: str) -> Any:
     found = getattr(module, name)
     if not isinstance(found, type):
         raise TypeError(f"{name} of {module.__name__} is not a task: it is not a class")
+    if issubclass(found, getattr(sys.modules.get("gymnasium"), "Env", ())):
+        written = f"{GYM}:{module.__name__}:{name}"
+        raise TypeError(f"{name} of {module.__name__} is an environment of gymnasium and no task: write {written}")
     return found
 
 
@@ -135,9 +138,22 @@ def check_task(name: str) -> None:
     head, colon, _ = name.partition(":")
     if head in points or "." in head:
         return
+    if same := [each for each in points if _plain(each) == _plain(head)]:
+        raise UsageError(f"unknown task {name!r}: it is written {same[0]} here")
+    if not colon and _ENVIRONMENT.search(name):
+        raise UsageError(f"unknown task {name!r}: gymnasium's environments are written {GYM}:{name}")
     near = difflib.get_close_matches(head, points, n=1, cutoff=0.75)
     if near:
         raise UsageError(f"unknown task {name!r}: did you mean {near[0]}{':...' if colon else ''}?")
+
+
+def _plain(name: str) -> str:
+    """A name without what people write differently.
+
+    >>> _plain("CarRacing-v3") == _plain("car-racing")
+    True
+    """
+    return re.sub(r"[-_]", "", _ENVIRONMENT.sub("", name)).lower()
 
 
 def describe_task(name: str, options: Mapping[str, Any]) -> Description:

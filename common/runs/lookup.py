@@ -22,8 +22,8 @@ def find_controller(name: str, runs_dir: Path) -> tuple[Controller, Path | None]
     found, beside = find_agent(name, runs_dir)
     if isinstance(found, TrainedAgent):
         raise ControllerError(
-            f"{name} is a trained agent, which `evaluate`, `record` and `reproduce` take: a controller's parameters "
-            "are needed here"
+            f"{name} is a trained agent, which `evaluate`, `record` and `verify report` take: a controller's "
+            "parameters are needed here"
         )
     return found, beside
 
@@ -98,7 +98,7 @@ def find_subspace(name: str) -> Subspace:
     if not path_exists(Path(name)):
         names = ", ".join(sorted(each.stem for each in folder.glob("*.npz"))) or "none"
         raise UsageError(
-            f"no subspace {name!r}: name a file of `dreamfleet subspace`, one that ships ({names}), or none for all "
-            "parameters"
+            f"no subspace {name!r}: name a file of `dreamfleet lab subspace`, one that ships ({names}), or none for "
+            "all parameters"
         )
     return Subspace.load(Path(name))

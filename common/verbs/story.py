@@ -1,4 +1,4 @@
-"""`dreamfleet story`: recent events of a worker or a job."""
+"""`dreamfleet story`: what happened to a run: recent events of a live one, or what its journal keeps."""
 
 from __future__ import annotations
 
@@ -6,17 +6,25 @@ import argparse
 import json
 import re
 import sys
+from dataclasses import asdict
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, get_args
 
 from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
 from dreamfleet.common.cli.output import add_json_flag, print_rows
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.errors import ConnectionFailedError, UsageError
+from dreamfleet.common.files.regular_files import is_file
 from dreamfleet.common.printable import join_some
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_paths import JOURNAL
 
 if TYPE_CHECKING:
     from dreamfleet.common.monitoring.client import Client
 
-SUMMARY = "list recent events of a live run's workers and jobs: given, seen, lost, reissued, accepted, ..."
+SUMMARY = (
+    "list what happened to a run: recent events of a live one's workers and jobs (given, seen, lost, accepted, ...), "
+    "else what its journal on this disk keeps (workers that came and went, pauses, failures, restarts)"
+)
 EXTRAS = ()
 MOST_NAMED = 8  # workers by name
 LAST = 40  # events that people are shown unless they say otherwise
@@ -25,6 +33,7 @@ LAST = 40  # events that people are shown unless they say otherwise
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("run_name", nargs="?", metavar="RUN", help="name of the run (default: the only live one)")
+    parser.add_argument("--journal", action="store_true", help="read RUN's journal on this disk, even if it is live")
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--worker", metavar="W", help="of this worker, or of all lives of this host's worker")
     which.add_argument("--job", metavar="G/I", help="of this candidate's jobs: generation/index, such as 3/0")
@@ -33,15 +42,35 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="only events of these kinds, such as: joined back silent lost left reissued",
     )  # fmt: skip
     parser.add_argument(
-        "--last", type=int, metavar="N", help=f"so many events at most (default {LAST}; with --json all)"
+        "--last",
+        type=int,
+        metavar="N",
+        help=f"so many events at most (default {LAST} of a live run; all of a journal, or with --json)",
     )
-    add_global_flags(parser, "connect")
+    add_global_flags(parser, "connect", "runs_dir")
     add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the events, the newest last; the number left out goes to stderr."""
-    from dreamfleet.common.monitoring.client import Client
+    """Print the events of a live run, the newest last; those of the journal if asked, or if nobody answers."""
+    _check(args)
+    of_live = bool(args.worker or args.job or args.what)
+    if args.journal and (of_live or args.run_name is None):
+        raise UsageError(
+            "--journal needs a RUN, and keeps no events of single jobs: leave --worker, --job and --what out"
+        )
+    if args.journal:
+        return _print_journal(args)
+    try:
+        return _print_live(args)
+    except ConnectionFailedError as error:
+        if of_live or args.run_name is None or not is_file(args.runs_dir / args.run_name / JOURNAL):
+            raise
+        print(f"{error}; this is what its journal keeps", file=sys.stderr)
+        return _print_journal(args)
+
+
+def _check(args: argparse.Namespace) -> None:
     from dreamfleet.common.monitoring.status import EventKind
 
     if args.job is not None and not re.fullmatch(r"\d{1,12}/\d{1,12}", args.job):
@@ -52,6 +81,11 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--last must be at least 1")
     if strange := [each for each in args.what if each not in (words := get_args(EventKind))]:
         raise UsageError(f"--what {strange[0]!r}: there are {', '.join(words)}")
+
+
+def _print_live(args: argparse.Namespace) -> int:
+    from dreamfleet.common.monitoring.client import Client
+
     with Client(resolve_network(args)) as client:
         events, total = client.events(args.run_name, args.worker or "", args.job or "", args.what)
         if args.worker is not None and not events and not args.what:
@@ -71,6 +105,29 @@ def run(args: argparse.Namespace) -> int:
             file=sys.stderr,
         )
     return 0
+
+
+def _print_journal(args: argparse.Namespace) -> int:
+    """Print what happened to a run while nobody watched, the newest last."""
+    with open_run(args.runs_dir, args.run_name) as stored, stored.read_transaction():
+        events, failures = stored.events(), stored.failures()
+    events = events[-(args.last or len(events) or 1) :]
+    if args.json:
+        print(
+            json.dumps({"events": [asdict(each) for each in events], "failures": [asdict(each) for each in failures]})
+        )
+        return 0
+    print_rows([{"time (UTC)": _format_time(each.happened), "life": each.incarnation, "event": each.text}
+                for each in events], right=("life",))  # fmt: skip
+    return 0
+
+
+def _format_time(seconds: float) -> str:
+    """A wall clock's time to the second; the number itself where no calendar has it."""
+    try:
+        return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S")
+    except (ValueError, OverflowError, OSError):
+        return f"{seconds:g}"
 
 
 def _check_known(client: Client, run: str, worker: str) -> None:

@@ -130,8 +130,16 @@ def _commands(run: RunFolder) -> dict[str, str]:
     modules = _task_modules(run)
     trust, trust_all = trust_flag(modules), trust_flag([*modules, module_of(run.settings.optimiser)])
     words = {
-        f"one candidate's fitness again, {one}": ("replay", run.name, "--candidate", f"{last}/0", *beside, *trust),
-        f"the whole run again, {whole}": ("repeat", run.name, *beside, *trust_all),
+        f"one candidate's fitness again, {one}": (
+            "verify",
+            "candidate",
+            run.name,
+            "--candidate",
+            f"{last}/0",
+            *beside,
+            *trust,
+        ),
+        f"the whole run again, {whole}": ("verify", "run", run.name, *beside, *trust_all),
         "its score on unseen seeds": ("evaluate", "--controller", controller, "--episodes", "100", *trust),
     }
     return {why: shlex.join(("dreamfleet", *each)) for why, each in words.items()}

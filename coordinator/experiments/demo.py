@@ -234,7 +234,7 @@ class Demo:
         files = f": the controller, {PLOT}, {VIDEO}, the journal. Three things to try:"
         self._console.print(Text.assemble("\n", (f"In {folder}", "bold"), files))
         for command in (
-            shell_command("replay", folder.name, "--candidate", "0/0", "--runs-dir", self._runs_dir),
+            shell_command("verify", "candidate", folder.name, "--candidate", "0/0", "--runs-dir", self._runs_dir),
             shell_command(*model_commands.evaluate(controller, 100)),
             shell_command("coordinator", "--run", "mine", "--preset", "frugal", "--listen", self._endpoint)
             + f"   # and beside it: {shell_command('worker', '--connect', self._endpoint)}",

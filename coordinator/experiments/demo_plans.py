@@ -23,6 +23,9 @@ def find_plan(world: str) -> DemoPlan:
 
 
 def plan_defaults(name: str) -> str:
-    """The value of one of a plan's fields in each world, for a help text."""
+    """The value of one of a plan's fields, or its values in each world where they differ, for a help text."""
     assert name in {each.name for each in fields(DemoPlan)}
-    return ", ".join(f"{getattr(plan, name)} in {world}" for world, plan in PLANS.items())
+    values = {world: f"{getattr(plan, name)}" for world, plan in PLANS.items()}
+    if len(set(values.values())) == 1:
+        return next(iter(values.values()))
+    return ", ".join(f"{value} in {world}" for world, value in values.items())

@@ -26,10 +26,10 @@ from dreamfleet.coordinator.settings.config import LimitsConfig, RunConfig
 
 START_SECONDS = 180.0  # a coordinator that ends earlier is seen at once; a busy host takes its time
 ANY_ADDRESS = re.compile(r"/(0\.0\.0\.0|\[::\]):")  # an endpoint that listens on all of this host's addresses
-# Settings of `coordinator` that each run of an experiment has its own of, with their defaults.
-RESERVED: dict[str, str | None] = {
-    "run_name": "run",
-    **dict.fromkeys(("resume", "init", "bundle", "seed", "runs_dir", "listen", "connect", "config", "subspace")),
+# Flags of `coordinator` that each run of an experiment has its own of, by the names of their values.
+RESERVED = {"run_name": "--run", "source": "--from"} | {
+    name: f"--{name.replace('_', '-')}"
+    for name in ("resume", "init", "bundle", "seed", "runs_dir", "listen", "connect", "config", "subspace")
 }
 
 
@@ -183,9 +183,8 @@ def parse_run_flags(flags: Sequence[str], sources: Mapping[str, Any], verb: str)
     from dreamfleet.coordinator.settings import run_setup
 
     parsed = build_parser("coordinator", run_setup).parse_all(list(flags))
-    if taken := [name for name, default in RESERVED.items() if getattr(parsed, name, default) != default]:
-        names = ", ".join(f"--{name.replace('_name', '').replace('_', '-')}" for name in taken)
-        raise UsageError(f"{names} in --run-flags: {verb} sets them for each run; give --config to {verb}")
+    if taken := [flag for name, flag in RESERVED.items() if getattr(parsed, name, None) is not None]:
+        raise UsageError(f"{', '.join(taken)} in --run-flags: {verb} sets them for each run; give --config to {verb}")
     args = argparse.Namespace(sources={**sources, "flags": parsed}, given=frozenset(vars(parsed)))
     config, limits = run_setup.load_run_config(args, base={})
     if limits == LimitsConfig():

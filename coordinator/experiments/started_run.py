@@ -14,8 +14,9 @@ from typing import Any, Self
 from weakref import finalize
 
 from dreamfleet.common.cli import model_commands
-from dreamfleet.common.cli.command_line import Parser, build_parser
+from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.common.cli.config import suggestion
+from dreamfleet.common.cli.parser import Parser
 from dreamfleet.common.cli.verb_runner import POLL_INTERVAL
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
 from dreamfleet.common.host.resource_limits import usable_cores
@@ -30,7 +31,7 @@ from dreamfleet.coordinator.settings import run_setup
 
 STATUS_INTERVAL = 2.0  # seconds between looks whether the run is paused
 # Flags of `coordinator` that are no settings here: a secured fleet is started from the command line.
-NO_SETTINGS = ("help", "json", "connect", "join", "access_dir", "config", "quiet", "runs_dir")
+NO_SETTINGS = ("help", "help_all", "json", "connect", "join", "access_dir", "config", "quiet", "runs_dir")
 # The run stays on this host, even if its user is in a fleet.
 ALONE = {"DREAMFLEET_JOIN": "", "DREAMFLEET_CONNECT": ""}
 Callback = Callable[[StoredGeneration, "StartedRun"], object]

@@ -33,7 +33,8 @@ class FailureLimit:
         if generation.all_failed and not self._generations.can_try_again(generation):
             return (
                 f"all candidates failed in generation {generation.number} on each set of seeds, so that none can be "
-                "ranked; `dreamfleet resume` tries them again, `dreamfleet fork` begins another run at the mean"
+                "ranked; `dreamfleet resume` tries them again, `dreamfleet coordinator --from` begins another run at "
+                "the mean"
             )
         failed, counted = self._generations.count_recent_failures(generation, self._since)
         total = len(counted) * generation.population

@@ -153,7 +153,7 @@ class Run:
         while self.ended is None and self.paused is None and self.generation.complete and not self._is_waiting:
             reseeds = self.generations.can_reseed(self.generation)
             if not reseeds and (why := self.failure_limit.find_excess(self.generation)) is not None:
-                self.pause(f"{why} (`dreamfleet runs story` lists why)")
+                self.pause(f"{why} (`dreamfleet story` lists why)")
             elif (note := self.generations.try_again(self.generation)) is not None:
                 self.fleet.notes.append(note)
                 self._replace_generation(self.generations.reload(self.generation.number))

@@ -120,8 +120,8 @@ class RunConfig:
     )
     subspace: str | None = option(
         None,
-        "search only in the features of this subspace, from the run's first mean: a file of `dreamfleet subspace`, or "
-        "a shipped name; none: all parameters",
+        "search only in the features of this subspace, from the run's first mean: a file of `dreamfleet lab subspace`, "
+        "or a shipped name; none: all parameters",
     )
     racing: bool = frozen_option(
         RunSettings, False, "let only the better half of the candidates drive the second half of the episodes"

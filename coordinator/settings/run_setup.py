@@ -13,28 +13,32 @@ from dreamfleet.coordinator.settings.config import NO_SUBSPACE, LimitsConfig, Ne
 from dreamfleet.coordinator.settings.presets import find_preset
 from dreamfleet.coordinator.settings.schedule import find_schedule, split_first_stage
 
+DEFAULT_NAME = "run"
 SUMMARY = "start a run: CMA-ES decides, workers score"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    name = parser.add_mutually_exclusive_group()
-    name.add_argument("--run", dest="run_name", default="run", help="name of the new run (default run)")
-    name.add_argument("--resume", metavar="RUN", help="continue this run from its journal, with the limits and the "
-                      "network that it last had where no other are given")  # fmt: skip
     parser.add_argument(
-        "--init",
-        metavar="CONTROLLER",
-        help="begin with these parameters instead of zeros: a file, a run, or what ships",
-    )
-    add_settings(parser)
-
-
-def add_settings(parser: argparse.ArgumentParser, default: str | None = None) -> None:
-    """The arguments of whatever serves a run; `default` is shown instead of the settings' defaults."""
+        "--run", dest="run_name", metavar="NAME",
+        help=f"name of the new run: a-z, 0-9 and '-' (default {DEFAULT_NAME}, or RUN-fork with --from RUN)",
+    )  # fmt: skip
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument("--resume", metavar="RUN", help="continue this run from its journal, with the limits and the "
+                     "network that it last had where no other are given")  # fmt: skip
+    how.add_argument(
+        "--from", dest="source", metavar="RUN",
+        help="begin a new run where this one stands: with its mean, step size, temperature, stage and all settings, "
+        "which flags may change; RUN is only read",
+    )  # fmt: skip
+    how.add_argument(
+        "--init", metavar="CONTROLLER",
+        help="begin a new run with this controller's parameters instead of zeros, and take over nothing else: a file, "
+        "a run, or one that ships",
+    )  # fmt: skip
     add_json_flag(parser)
     add_global_flags(parser, "runs_dir", "join", "access_dir")
-    add_flags(parser, RunConfig, default=default)
+    add_flags(parser, RunConfig)
     add_flags(parser, LimitsConfig, NetworkConfig)
 
 
@@ -64,7 +68,7 @@ def _with_subspace(config: RunConfig) -> RunConfig:
     if config.subspace is None:
         return config
     if not config.subspace:
-        raise UsageError(f"--subspace is empty: name a file of `dreamfleet subspace`, or {NO_SUBSPACE}")
+        raise UsageError(f"--subspace is empty: name a file of `dreamfleet lab subspace`, or {NO_SUBSPACE}")
     return replace(config, loaded_subspace=None if config.subspace == NO_SUBSPACE else find_subspace(config.subspace))
 
 

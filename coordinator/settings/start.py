@@ -69,7 +69,7 @@ class StartPoint:
         if self.bundle != spec.bundle:
             raise ControllerError(
                 f"{self.source} belongs to {describe_bundle(self.bundle)}, not to {describe_bundle(spec.bundle)}: "
-                "give its own --bundle, or fit it to this one by `dreamfleet refit`"
+                "give its own --bundle, or fit it to this one by `dreamfleet lab refit`"
             )
         self._check_options(spec)
         if len(self.mean) != shape.size:

@@ -134,7 +134,7 @@ def check_unique(hosts: list[Host]) -> list[Host]:
     names = [each.name for each in hosts]
     if twice := sorted({each for each in names if names.count(each) > 1}):
         raise UsageError(
-            f"several hosts are called {', '.join(twice)}: give each a name of its own in a file, for `up`"
+            f"several hosts are called {', '.join(twice)}: give each a name of its own in a file, for --hosts"
         )
     return hosts
 

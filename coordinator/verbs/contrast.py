@@ -1,4 +1,4 @@
-"""`dreamfleet contrast`: kinds of MDN-RNNs on equal data, several seeds each."""
+"""`dreamfleet lab contrast`: kinds of MDN-RNNs on equal data, several seeds each."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.coordinator.experiments.local_run import LocalFleet, parse_run_flags
 
     contrast = Contrast(parse_kinds(args.kind), tuple(args.seeds), args.mdnrnn_flags, args.run_flags)
-    parse_run_flags(contrast.common_run_flags, args.sources, "contrast")  # wrong flags end it now
+    parse_run_flags(contrast.common_run_flags, args.sources, "lab contrast")  # wrong flags end it now
     file = ("--config", str(args.config)) if args.config else ()
     check_modules(PACKAGES)
     with folder_lock(args.out / LOCK, "contrast"), stop_on_signals() as stop:

@@ -21,7 +21,7 @@ from dreamfleet.common.protocol.tasks import module_of
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE, LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.settings.presets import find_preset
-from dreamfleet.coordinator.settings.run_setup import SUMMARY, check_target, configure, load_run_config
+from dreamfleet.coordinator.settings.run_setup import DEFAULT_NAME, SUMMARY, check_target, configure, load_run_config
 from dreamfleet.coordinator.settings.schedule import find_schedule, split_first_stage
 
 if TYPE_CHECKING:
@@ -49,10 +49,13 @@ def run(args: argparse.Namespace) -> int:
     """Serve the run until it ends; after Ctrl-C it can be resumed."""
     from dreamfleet.coordinator.settings.start import find_start
 
-    if args.resume and args.init:
-        raise UsageError("--init is of a new run: a continued one has its parameters; `fork` begins another from it")
     if args.resume:
+        if args.run_name is not None:
+            raise UsageError("--run names a new run: a continued one keeps its name, so leave it or --resume out")
         return _resume(args)
+    if args.source:
+        return _serve_fork(args)
+    args.run_name = args.run_name or DEFAULT_NAME
     return serve_new_run(args, {}, find_start(args.init, args.runs_dir) if args.init else None)
 
 
@@ -64,6 +67,15 @@ def serve_new_run(
     config, limits = load_run_config(args, base)
     config = adjust(config)
     return serve_request(args, build_request(args, args.run_name, config, limits, {}, start))
+
+
+def _serve_fork(args: argparse.Namespace) -> int:
+    """Serve a new run that begins where another one stands."""
+    from dreamfleet.coordinator.settings.fork import Fork
+
+    fork = Fork.of(args.runs_dir, args.source, args.given)
+    args.run_name = args.run_name or f"{args.source}-fork"
+    return serve_new_run(args, fork.settings, fork.start, fork.adapt)
 
 
 def _resume(args: argparse.Namespace) -> int:
@@ -122,8 +134,8 @@ def serve_request(
 def _refuse_frozen(args: argparse.Namespace) -> None:
     if flags := [f"--{each.name.replace('_', '-')}" for each in fields(RunConfig) if each.name in args.given]:
         raise UsageError(
-            f"{', '.join(flags)}: frozen with run {args.resume}; `dreamfleet fork {args.resume}` begins another run "
-            "from it"
+            f"{', '.join(flags)}: frozen with run {args.resume}; `dreamfleet coordinator --from {args.resume}` begins "
+            "another run from it"
         )
 
 

@@ -19,7 +19,7 @@ EXTRAS = ("worker", "views")
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("--run", dest="run_name", help="name of the run (default: demo and the time)")
+    parser.add_argument("--run", dest="run_name", metavar="NAME", help="name of the run (default: demo and the time)")
     add_global_flags(parser, "runs_dir")
     add_flags(parser, DemoConfig)
 

@@ -1,4 +1,4 @@
-"""`dreamfleet runs list|show|story|archive|backup|delete|export`: the runs on this disk."""
+"""`dreamfleet runs list|show|archive|backup|delete|export`: the runs on this disk."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import json
 import shutil
 import sys
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -87,37 +86,6 @@ def _run_row(path: Path) -> dict[str, object]:
     except JournalError as error:
         return {"run": path.name, "created": None, "task": None, "generations": None, "mean": None,
                 "evaluated": None, "confirmed": None, "classes": None, "state": str(error)}  # fmt: skip
-
-
-def configure_story(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `runs story`."""
-    add_run_arguments(parser)
-    parser.add_argument("--last", type=int, metavar="N", help="so many events at most (default all)")
-
-
-def show_story(args: argparse.Namespace) -> int:
-    """Print what happened to a run while nobody watched, the newest last."""
-    if args.last is not None and args.last < 1:
-        raise UsageError("--last must be at least 1")
-    with open_run(args.runs_dir, args.run_name) as stored, stored.read_transaction():
-        events, failures = stored.events(), stored.failures()
-    events = events[-(args.last or len(events) or 1) :]
-    if args.json:
-        print(
-            json.dumps({"events": [asdict(each) for each in events], "failures": [asdict(each) for each in failures]})
-        )
-        return 0
-    print_rows([{"time (UTC)": _format_time(each.happened), "life": each.incarnation, "event": each.text}
-                for each in events], right=("life",))  # fmt: skip
-    return 0
-
-
-def _format_time(seconds: float) -> str:
-    """A wall clock's time to the second; the number itself where no calendar has it."""
-    try:
-        return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S")
-    except (ValueError, OverflowError, OSError):
-        return f"{seconds:g}"
 
 
 def show_run(args: argparse.Namespace) -> int:
@@ -274,6 +242,9 @@ def export_run(args: argparse.Namespace) -> int:
     from dreamfleet.coordinator.analysis.export import export_csv, export_parquet, export_tensorboard
 
     kinds = {"csv": export_csv, "parquet": export_parquet, "tensorboard": export_tensorboard}
+    if args.run_name.endswith(f".{args.kind}"):
+        command = f"dreamfleet runs export RUN --{args.kind} --out FOLDER"
+        raise UsageError(f"{args.run_name} is a file's name: --{args.kind} takes none, so write {command}")
     folder = args.out or Path(f"{args.run_name}-{args.kind}")
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"--out {folder} is no folder: name one")
@@ -285,9 +256,6 @@ def export_run(args: argparse.Namespace) -> int:
 
 
 LIST = SimpleVerb("list the runs on this disk", configure_list, list_runs)
-STORY = SimpleVerb(
-    "list what happened to a run: workers that came and went, pauses, failures, restarts", configure_story, show_story
-)
 SHOW = SimpleVerb("show one run from its journal: settings, history, evaluations", add_run_arguments, show_run)
 ARCHIVE = SimpleVerb("move a run that nobody serves into the archive", add_run_arguments, archive_run)
 BACKUP = SimpleVerb(

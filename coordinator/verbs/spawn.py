@@ -1,4 +1,4 @@
-"""`dreamfleet spawn|up|down`: workers on other hosts, over ssh."""
+"""`dreamfleet spawn|down`: workers on other hosts, over ssh."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from dreamfleet.common.cli.command_line import SimpleVerb
 from dreamfleet.common.cli.config import add_flags, load
-from dreamfleet.common.cli.global_config import add_global_flags, read_config_file, resolve_network
+from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
 from dreamfleet.common.cli.output import add_json_flag, print_rows
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.files.regular_files import read_regular
+from dreamfleet.common.files.regular_files import is_file, read_regular
 from dreamfleet.common.monitoring.eta import format_duration
 from dreamfleet.common.printable import one_line, printable
 from dreamfleet.common.security.credentials import MAX_BYTES
@@ -24,37 +25,25 @@ from dreamfleet.coordinator.spawn.remote_host import FAILED, FleetAddress, HostS
 
 def configure_spawn(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `spawn`."""
-    parser.add_argument("hosts", nargs="+", metavar="HOST", help="as ssh takes it: user@host, or ssh://user@host:port")
+    _add_host_arguments(parser)
     parser.add_argument("--name", help="of host and worker, if only one is given (default its address without user)")
-    _add_start_flags(parser)
+    add_global_flags(parser, "connect")
+    parser.add_argument("--follow", action="store_true", help="show the workers' logs until Ctrl-C; they go on")
+    parser.add_argument("--check", action="store_true", help="only look at each host, and change nothing there")
+    add_flags(parser, SpawnConfig)
+    add_json_flag(parser)
 
 
 def start_workers(args: argparse.Namespace) -> int:
-    """Start a worker on each host that was named."""
-    if args.name is not None and len(args.hosts) > 1:
-        raise UsageError("--name is one worker's: for several hosts write a file, for `dreamfleet up`")
-    spawn = load(SpawnConfig, "spawn", **args.sources)
-    return _start(args, check_unique([Host(args.name or default_name(each), each, spawn) for each in args.hosts]))
-
-
-def configure_up(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `up`."""
-    parser.add_argument(  # read as --config is: its top level and [spawn] hold for all hosts
-        "config", type=Path, metavar="FILE", help="TOML file with a [[host]] table for each (docs/how-to/hosts.md)"
-    )
-    _add_start_flags(parser)
-
-
-def start_workers_of_file(args: argparse.Namespace) -> int:
-    """Start a worker on each host of the file."""
-    return _start(args, read_hosts(args.sources["file"].get(HOSTS, []), args.sources))
+    """Start a worker on each host that was named; one whose worker runs is left alone."""
+    if args.name is not None and (args.file or len(args.hosts) > 1):
+        raise UsageError("--name is one worker's: for several hosts write a file with their names, for --hosts")
+    return _start(args, _find_hosts(args, args.name))
 
 
 def configure_down(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `down`."""
-    parser.add_argument(
-        "hosts", nargs="+", metavar="FILE|HOST", help="the file of `up`: its workers; or hosts: every worker there"
-    )
+    _add_host_arguments(parser)
     parser.add_argument("--now", action="store_true", help="do not wait for what they score")
     parser.add_argument("--keep", action="store_true", help="leave environments and world models for the next time")
     add_flags(parser, SpawnConfig, only=("ssh", "remote_dir", "remote_python"))
@@ -63,25 +52,41 @@ def configure_down(parser: argparse.ArgumentParser) -> None:
 
 def end_workers(args: argparse.Namespace) -> int:
     """End the workers; exit 1 if a host failed."""
-    path = Path(args.hosts[0])
-    of_file = len(args.hosts) == 1 and (path.suffix == ".toml" or path.is_file())
-    if of_file:
-        file = read_config_file(path)
-        hosts = read_hosts(file.get(HOSTS, []), {**args.sources, "file": file})
-    else:
-        spawn = load(SpawnConfig, "spawn", **args.sources)
-        hosts = check_unique([Host(default_name(each), each, spawn) for each in args.hosts])
-    rows = end(hosts, all_workers=not of_file, now=args.now, keep=args.keep)
+    hosts = _find_hosts(args)
+    rows = end(hosts, all_workers=args.file is None, now=args.now, keep=args.keep)
     _print_hosts(args, rows)
     return _exit_code(rows)
 
 
-def _add_start_flags(parser: argparse.ArgumentParser) -> None:
-    add_global_flags(parser, "connect")
-    parser.add_argument("--follow", action="store_true", help="show the workers' logs until Ctrl-C; they go on")
-    parser.add_argument("--check", action="store_true", help="only look at each host, and change nothing there")
-    add_flags(parser, SpawnConfig)
-    add_json_flag(parser)
+class _HostsFile(argparse.Action):
+    """Takes the file of hosts as --config is taken: its top level and [spawn] hold for all hosts."""
+
+    def __call__(self, _parser: Any, namespace: argparse.Namespace, values: Any, _flag: str | None = None) -> None:
+        namespace.config = namespace.file = values
+
+
+def _add_host_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "hosts", nargs="*", metavar="HOST", help="a host as ssh takes it: user@host, or ssh://user@host:port"
+    )
+    parser.add_argument(
+        "--hosts", dest="file", type=Path, metavar="FILE", action=_HostsFile,
+        help="the hosts of this TOML file instead: a [[host]] table for each (docs/how-to/hosts.md)",
+    )  # fmt: skip
+
+
+def _find_hosts(args: argparse.Namespace, name: str | None = None) -> list[Host]:
+    """The hosts of the file or of the command line; a single one's worker may have a `name`."""
+    if args.file is not None:
+        if args.config != args.file:
+            raise UsageError("--hosts is a file of settings itself: leave --config out")
+        if args.hosts:
+            raise UsageError("give the hosts of a file with --hosts, or hosts by their names, and not both")
+        return read_hosts(args.sources["file"].get(HOSTS, []), args.sources)
+    if files := [each for each in args.hosts if each.endswith(".toml") or is_file(Path(each))]:
+        raise UsageError(f"{files[0]} is a file: give it as --hosts {files[0]}")
+    spawn = load(SpawnConfig, "spawn", **args.sources)
+    return check_unique([Host(name or default_name(each), each, spawn) for each in args.hosts])
 
 
 def _start(args: argparse.Namespace, hosts: Sequence[Host]) -> int:
@@ -125,17 +130,12 @@ def _exit_code(rows: Sequence[HostStatus]) -> int:
 
 
 SPAWN = SimpleVerb(
-    "install and start a worker on other hosts over ssh; it gets its join file, and goes on when ssh ends",
+    "install and start a worker on other hosts over ssh, each with its join file; it goes on when ssh ends",
     configure_spawn,
     start_workers,
 )
-UP = SimpleVerb(
-    "start a worker on each host of a file, over ssh; a host whose worker runs is left alone",
-    configure_up,
-    start_workers_of_file,
-)
 DOWN = SimpleVerb(
-    "end the workers that spawn and up started, once they finish what they score, and remove them from their hosts",
+    "end the workers that spawn started, once they finish what they score, and remove them from their hosts",
     configure_down,
     end_workers,
 )

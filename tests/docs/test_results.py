@@ -30,8 +30,8 @@ def test_a_record_is_of_a_shipped_controller_and_the_page_has_its_figures(path, 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("reproduce",), " reproduce " + " ".join(f"docs/lab/results/{path.name}" for path in RECORDS)),
-        (("reproduce", "REPRODUCE=tiny"), " reproduce docs/lab/results/tiny.json"),
+        (("reproduce",), " verify report " + " ".join(f"docs/lab/results/{path.name}" for path in RECORDS)),
+        (("reproduce", "REPRODUCE=tiny"), " verify report docs/lab/results/tiny.json"),
         (("reproduce-evolution",), "reproduce_evolution.py tiny"),
         (("reproduce-evolution", "REPRODUCE=real"), "reproduce_evolution.py real"),
     ],

@@ -160,9 +160,10 @@ def test_a_worker_or_viewer_without_a_coordinator(processes):
 
 
 def test_runs_that_do_not_exist(processes):
-    for verb in (("runs", "show"), ("runs", "delete"), ("runs", "archive"), ("replay", "--candidate", "0/0")):
+    candidate = ("verify", "candidate", "--candidate", "0/0")
+    for verb in (("runs", "show"), ("runs", "delete"), ("runs", "archive"), candidate):
         complains(processes, *verb, "night", "--runs-dir", processes.runs, says="no run 'night'")
-    complains(processes, "replay", "night", "--candidate", "first", says="write generation/index")
+    complains(processes, "verify", "candidate", "night", "--candidate", "first", says="write generation/index")
 
 
 def test_a_run_is_listed_shown_archived_and_deleted(processes, random_bundle):

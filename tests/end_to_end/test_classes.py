@@ -147,7 +147,7 @@ def test_another_kernel_of_openblas_is_another_class_whose_results_are_replayed_
 
     def replayed(candidate, where=(), *more):
         replay = processes.start(
-            "replay", "test", "--runs-dir", processes.runs, "--candidate", candidate, *more, inside=where
+            "verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", candidate, *more, inside=where
         )
         code, out = replay.finish()
         return code, out, "".join(replay.lines)

@@ -26,7 +26,7 @@ def data(tmp_path):
 
 @pytest.mark.slow
 def test_a_stopped_contrast_continues_and_compares_the_kinds(processes, data, tmp_path):
-    words = ("contrast", "--data", data, "--out", tmp_path / "out", "--seeds", 1, *SMALL)
+    words = ("lab", "contrast", "--data", data, "--out", tmp_path / "out", "--seeds", 1, *SMALL)
     first = processes.start(*words)
     first.wait_for("plain-1 is finished")
     first.popen.send_signal(signal.SIGTERM)
@@ -52,12 +52,14 @@ def test_a_stopped_contrast_continues_and_compares_the_kinds(processes, data, tm
 def test_what_cannot_be_contrasted_is_said_at_once(processes, tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
-    code, _, err = processes.call("contrast", "--data", empty, "--out", tmp_path / "out")
+    code, _, err = processes.call("lab", "contrast", "--data", empty, "--out", tmp_path / "out")
     assert (code, "has no episodes: collect, train the VAE and encode there first" in err) == (1, True), err
     for flags, why in (
         ("--sigma0 0.1", "a run would never end"),
-        ("--generations 2 --seed 4", "--seed in --run-flags: contrast sets them for each run"),
+        ("--generations 2 --seed 4", "--seed in --run-flags: lab contrast sets them for each run"),
         ("--generations 2 --population 1", "--population must be from 2 to"),
     ):
-        code, _, err = processes.call("contrast", "--data", empty, "--out", tmp_path / "out", "--run-flags", flags)
+        code, _, err = processes.call(
+            "lab", "contrast", "--data", empty, "--out", tmp_path / "out", "--run-flags", flags
+        )
         assert (code, why in err) == (2, True), err

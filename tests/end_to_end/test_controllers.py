@@ -19,7 +19,7 @@ def test_a_hidden_controller_on_the_latent_alone_is_evolved_replayed_and_judged(
         assert run.candidate(1, 0).shape == (shape.size,)
     assert (shape.features, shape.hidden, shape.size) == (32, 4, 4 * 33 + 3 * 5)
     assert Controller.load(path).shape == shape
-    replayed = processes.call("replay", "test", "--candidate", "1/2", "--runs-dir", processes.runs)
+    replayed = processes.call("verify", "candidate", "test", "--candidate", "1/2", "--runs-dir", processes.runs)
     assert replayed[0] == 0, replayed
     judged = processes.call(
         "evaluate", "--controller", path, "--bundle", random_bundle.path, "--episodes", 1, "--jobs", 1, "--json"

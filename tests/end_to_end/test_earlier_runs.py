@@ -42,7 +42,7 @@ def test_they_open(runs, name):
 def test_their_candidates_are_scored_as_they_were(processes, runs, name):
     with open_run(runs, name) as run:
         here = run.fingerprint == fingerprint()
-    code, out, err = processes.call("replay", name, "--runs-dir", runs, "--candidate", "1/2")
+    code, out, err = processes.call("verify", "candidate", name, "--runs-dir", runs, "--candidate", "1/2")
     assert code in (0, 1), err
     assert not here or (code == 0 and "DIFFERS" not in out)
 

@@ -30,10 +30,10 @@ FIXTURES = ROOT / "tests" / "fixtures"
 OWN, GYM = f"{MARK}:World", f"gym:{MARK}:X-v0"
 # Verbs that read no file, journal, message or report of somebody else in which a task or an optimiser has a name.
 NAMELESS = {
-    "access.init", "access.issue", "access.list", "access.revoke", "baseline.evaluate", "baseline.export",
-    "baseline.record", "baseline.train", "bench.dispatch", "contrast", "dashboard", "demo", "doctor", "down", "drain",
-    "encode", "iterate", "pause", "pipeline", "resume", "router", "spawn", "status", "stop", "story", "tasks",
-    "train.mdnrnn", "train.vae", "up", "worker",
+    "access.init", "access.issue", "access.list", "access.revoke", "baseline.export",
+    "baseline.train", "completion", "dashboard", "demo", "doctor", "down", "drain", "encode",
+    "iterate", "lab.contrast", "pause", "pipeline", "resume", "router", "spawn", "status", "stop",
+    "tasks", "train", "worker",
 }  # fmt: skip
 
 
@@ -138,53 +138,53 @@ def commands(port=0):
         yield "live", "--controller", file, "--out", "pictures", "--seconds", "0.1"
     for file in CONTROLLERS:
         yield "collect", "--data", "new", "--controller", file, "--episodes", "2", "--jobs", "1"
-        yield "refit", file, "--to", "tiny", "--data", "data", "--out", "b.npz"
+        yield "lab", "refit", file, "--to", "tiny", "--data", "data", "--out", "b.npz"
         yield "coordinator", "--run", "x", "--init", file, "--bundle", beside(file), *serve
     for file in BUNDLES[:1]:
-        yield "bench", "policy", "--bundle", file
-        yield "bench", "dream", "--bundle", file
-        yield "bench", "live", "--bundle", file
-        yield "bench", "env", "--bundle", file, "--episodes", "1"
+        yield "lab", "bench", "policy", "--bundle", file
+        yield "lab", "bench", "dream", "--bundle", file
+        yield "lab", "bench", "live", "--bundle", file
+        yield "lab", "bench", "env", "--bundle", file, "--episodes", "1"
     for file in BUNDLES:
         yield "coordinator", "--run", "x", "--bundle", file, *serve
         yield "inspect", file, "--out", "page.html"
-        yield "subspace", file, "--data", "data", "--out", "s.npz"
-        yield "unbundle", file, "--data", "unbundled"
+        yield "lab", "subspace", file, "--data", "data", "--out", "s.npz"
+        yield "bundle", "--extract", file, "--data", "unbundled"
         yield "drive", "--dream", "--bundle", file, "--steps", "1"
-    yield "repeat", "optimiser", "--run", "again", *serve
+    yield "verify", "run", "optimiser", "--run", "again", *serve
     for run in RUNS:
-        yield "fork", run, "--run", f"{run}-more", *serve
+        yield "coordinator", "--from", run, "--run", f"{run}-more", *serve
         own = ("--listen", "tcp/127.0.0.1:0") if run == "optimiser" else serve  # it is refused after it listens
         yield "coordinator", "--resume", run, *own
-        yield "replay", run, "--candidate", "1/0"
+        yield "verify", "candidate", run, "--candidate", "1/0"
         yield "inspect", run, "--out", "page.html"
         yield "live", "--controller", run, "--generation", "3", "--out", "pictures", "--seconds", "0.1"
         yield "collect", "--data", "new", "--from-run", run
         yield "runs", "show", run
-        yield "runs", "story", run
+        yield "story", run, "--journal"
         yield "runs", "receipt", run
         yield "runs", "plot", run, "--out", "a.png"
         yield "runs", "export", run, "--csv", "--out", f"csv-{run}"
-        yield "runs", "compare", run, run
+        yield "compare", run, "own"
         yield "runs", "backup", run, "--to", f"backup-{run}"
     yield "runs", "archive", "gym"
     yield "runs", "list"
     yield "runs", "delete", "own", "--yes"
     for report in ("own.json", "gym.json"):
-        yield "reproduce", report, "--episodes", "1", "--jobs", "1"
+        yield "verify", "report", report, "--episodes", "1", "--jobs", "1"
         yield "compare", report, report
         yield "bundle", "--data", "data", "--out", "c.zip", "--measured", report
 
 
 def test_every_verb_is_tried_or_reads_no_names():
-    tried = {".".join(words[: 2 if words[0] in ("runs", "bench") else 1]) for words in commands()}
+    tried = {".".join(words[: 2 if words[0] in ("runs", "lab", "verify") else 1]) for words in commands()}
     assert not tried & NAMELESS
     assert tried | NAMELESS == {each.name for each in entry_points(group=command_line.GROUP)}
 
 
 def call(words, capfd):
     """The exit code and stderr of a verb; one that serves a run changes the process, so it gets its own."""
-    if words[0] in ("coordinator", "fork", "repeat"):
+    if words[0] == "coordinator" or words[:2] == ("verify", "run"):
         done = subprocess.run(command(*words), capture_output=True, text=True, timeout=DEADLINE, check=False)
         return done.returncode, done.stderr
     try:
@@ -204,10 +204,10 @@ def test_no_verb_imports_what_a_file_names(folder, mark, capfd):
             assert "Traceback" not in said, (words, said)
             if f"--trust {MARK}" in said:
                 assert code == 2, words
-                refused.add(words[0])
+                refused.add(" ".join(words[: 2 if words[0] in ("lab", "verify") else 1]))
     assert refused >= {
-        "bench", "coordinator", "drive", "evaluate", "fork", "inspect", "live", "record", "repeat", "replay",
-        "reproduce", "subspace",
+        "coordinator", "drive", "evaluate", "inspect", "lab bench", "lab subspace", "live", "record",
+        "verify candidate", "verify report", "verify run",
     }  # fmt: skip
 
 

@@ -113,7 +113,7 @@ def test_three_hosts_score_soon_after_one_command_and_another_leaves_nothing(
         await_that(lambda: status(network), "the coordinator does not come up")
 
         began = time.monotonic()
-        up = newcomer.rows("up", file)
+        up = newcomer.rows("spawn", "--hosts", file)
         printed_after = time.monotonic() - began
         await_that(lambda: status(network).slots == len(NAMES) * SLOTS, "the fleet is not whole")
         await_that(lambda: status(network).throughput.environment_steps, "nobody scores")
@@ -160,7 +160,7 @@ def test_a_wrong_key_a_full_disk_and_no_python_are_rows_of_their_own_while_anoth
             f'[[host]]\naddress = "good"\n[[host]]\naddress = "locked"\nssh = "ssh -F {stranger}"\n'
             f'[[host]]\naddress = "full"\nremote_dir = "{disk.path}/fleet"\n[[host]]\naddress = "bare"\n'
         )
-        rows = newcomer.rows("up", file, code=1)
+        rows = newcomer.rows("spawn", "--hosts", file, code=1)
         file.unlink()
         assert {name: row["state"] for name, row in rows.items()} == {
             "good": "started", "locked": "failed", "full": "failed", "bare": "failed",

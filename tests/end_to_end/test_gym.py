@@ -48,7 +48,7 @@ def test_a_run_without_a_bundle_evolves_and_any_fleet_gives_its_bits(processes):
                 "--evaluate-every", 2, "--evaluation-episodes", 3)  # fmt: skip
     assert evolve(processes, "one", 1, *settings) == evolve(processes, "two", 2, *settings)
     assert not (processes.runs / "one" / "bundle.zip").exists()
-    code, out, err = processes.call("replay", "one", "--runs-dir", processes.runs, "--candidate", "2/3")
+    code, out, err = processes.call("verify", "candidate", "one", "--runs-dir", processes.runs, "--candidate", "2/3")
     assert (code, out.count("same bits")) == (0, 2), err
     code, out, err = processes.call(
         "evaluate", "--controller", "one", "--runs-dir", processes.runs, "--episodes", 3, "--json"
@@ -62,7 +62,7 @@ def test_a_run_without_a_bundle_evolves_and_any_fleet_gives_its_bits(processes):
     code, out, err = processes.call("inspect", "one", "--runs-dir", processes.runs, "--out", processes.folder / "page")
     assert code == 0, err
     forked = processes.start(
-        "fork", "one", "--run", "fork", "--runs-dir", processes.runs, "--listen", processes.endpoint,
+        "coordinator", "--from", "one", "--run", "fork", "--runs-dir", processes.runs, "--listen", processes.endpoint,
         "--generations", 1,
     )  # fmt: skip
     processes.worker("--run", "fork", "--exit-when-done")
@@ -159,7 +159,7 @@ def test_a_run_in_an_environment_that_is_not_deterministic_promises_no_bits(proc
     assert coordinator.finish()[0] == 0
     code, out, err = processes.call("runs", "show", "test", "--runs-dir", processes.runs)
     assert (code, "not deterministic: 100.0% of results cannot be recomputed to the bit" in out) == (0, True), err
-    replay = ("replay", "test", "--runs-dir", processes.runs, "--candidate", "1/0")
+    replay = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", "1/0")
     code, out, err = processes.call(*replay)
     assert (code, "another fitness: the environment is not deterministic" in out, "DIFFERS" in out) == (1, True, False)
     assert "not the same again anywhere" in err

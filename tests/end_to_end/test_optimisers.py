@@ -40,7 +40,7 @@ def test_a_run_of_another_optimiser_is_continued_and_forked_to_one_of_ones_own(p
     assert np.array_equal(candidates(processes, "parts"), candidates(processes, "whole"))
 
     own = ("--optimiser", OWN, "--optimiser-options", "parents=1")
-    fork = processes.start("fork", "whole", *own, "--generations", 1, *common)
+    fork = processes.start("coordinator", "--from", "whole", *own, "--generations", 1, *common)
     processes.worker("--task", tasks.SLOW_TOY, "--run", "whole-fork")
     assert fork.finish()[0] == 0
     with open_run(processes.runs, "whole") as one, open_run(processes.runs, "whole-fork") as other:

@@ -174,7 +174,7 @@ def test_a_fork_begins_where_its_run_was_and_may_change_what_is_frozen(processes
     processes.worker("--task", tasks.TOY, "--exit-when-done")
     assert first.finish()[0] == 0
     common = ("--runs-dir", processes.runs, "--listen", processes.endpoint, "--generations", 1, "--beat", "0.2")
-    fork = processes.start("fork", "test", "--population", 6, *common)
+    fork = processes.start("coordinator", "--from", "test", "--population", 6, *common)
     processes.worker("--task", tasks.TOY, "--run", "test-fork")
     assert fork.finish()[0] == 0
     with open_run(processes.runs, "test") as one, open_run(processes.runs, "test-fork") as other:

@@ -53,6 +53,6 @@ def run_with_a_death(processes):
 def test_one_worker_and_three_of_which_one_is_killed_give_the_same_bits(processes):
     alone, three = run_alone(processes), run_with_a_death(processes)
     assert alone == three
-    code, out, err = processes.call("replay", "alone", "--runs-dir", processes.runs, "--candidate", "2/3")
+    code, out, err = processes.call("verify", "candidate", "alone", "--runs-dir", processes.runs, "--candidate", "2/3")
     assert code == 0, err
     assert out.count("same bits") == EPISODES

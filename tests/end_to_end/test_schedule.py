@@ -86,7 +86,7 @@ def test_a_run_of_three_stages_gives_the_same_bits_however_often_it_is_killed(pr
     assert sorted(map(len, steps[-7:])) == [2] * 3 + [4] * 4
     for generation in (3, 4, 6):
         code, out, err = processes.call(
-            "replay", "night", "--runs-dir", processes.runs, "--candidate", f"{generation}/1"
+            "verify", "candidate", "night", "--runs-dir", processes.runs, "--candidate", f"{generation}/1"
         )
         assert (code, "DIFFERS" in out) == (0, False), err
     code, out, err = processes.call("runs", "show", "night", "--runs-dir", processes.runs)
@@ -112,8 +112,8 @@ def test_a_live_run_shows_its_stage_and_a_fork_begins_with_it(processes, begin):
     with open_run(processes.runs, "night") as run:
         stage = scoring_params_of(run, len(run.history())).stage
     forked = processes.start(
-        "fork", "night", "--runs-dir", processes.runs, "--run", "other", "--listen", processes.endpoint, "--beat", 0.2,
-        "--generations", 1,
+        "coordinator", "--from", "night", "--runs-dir", processes.runs, "--run", "other", "--listen",
+        processes.endpoint, "--beat", 0.2, "--generations", 1,
     )  # fmt: skip
     forked.wait_for(f"generation 0 is in stage 1 of {4 - stage.number} ({stage.horizon} steps")
     status = processes.statuses()[0]

@@ -33,8 +33,8 @@ def words(processes, random_bundle, encoded, tmp_path):
         "iterate": ("iterate", *drives, "--drives", 10_000, "--drive-steps", 20, "--local", 1, "--run-flags", RUN),
         "pipeline": ("pipeline", *drives, "--preset", "tiny", "--collect-flags", "--episodes 10000 --steps 20"),
         "contrast": (
-            "contrast", "--data", tmp_path / "encoded", "--out", tmp_path / "out", "--local", 1, "--run-flags", RUN,
-            "--mdnrnn-flags", "--updates 1000000 --batch 2 --latent 4 --hidden 4 --validate-every 1000000",
+            "lab", "contrast", "--data", tmp_path / "encoded", "--out", tmp_path / "out", "--local", 1, "--run-flags",
+            RUN, "--mdnrnn-flags", "--updates 1000000 --batch 2 --latent 4 --hidden 4 --validate-every 1000000",
         ),
     }  # fmt: skip
 

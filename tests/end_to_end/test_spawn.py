@@ -66,21 +66,21 @@ def test_up_brings_hosts_to_a_run_again_leaves_them_and_down_leaves_nothing(proc
     a, b = hosts.add("a"), hosts.add("b")
     coordinator = processes.coordinator(*TOY, "--generations", 10**6)
     file = write_file(processes, hosts, "a", "b", more="tunnel = false")
-    assert {row["state"] for row in rows_of(processes, "up", file, "--check").values()} == {"ready"}
+    assert {row["state"] for row in rows_of(processes, "spawn", "--hosts", file, "--check").values()} == {"ready"}
     assert not a.root().exists()
 
-    first = rows_of(processes, "up", file)
+    first = rows_of(processes, "spawn", "--hosts", file)
     assert {name: row["state"] for name, row in first.items()} == {"a": "started", "b": "started"}
     pids = [state(host)["pid"] for host in (a, b)]
     coordinator.wait_for("generation 1: mean")
     await_that(lambda: processes.status()["slots"] == 2, "two workers never joined")
 
-    again = rows_of(processes, "up", file)
+    again = rows_of(processes, "spawn", "--hosts", file)
     assert {row["state"] for row in again.values()} == {"running"}
     assert "joined run test" in again["a"]["what"]
     assert [state(host)["pid"] for host in (a, b)] == pids
     file.write_text(file.read_text().replace("slots = 1", "slots = 2", 1))
-    changed = rows_of(processes, "up", file)
+    changed = rows_of(processes, "spawn", "--hosts", file)
     assert {name: row["state"] for name, row in changed.items()} == {"a": "replaced", "b": "running"}
 
     assert {row["state"] for row in rows_of(processes, "down", file).values()} == {"left"}
@@ -142,7 +142,7 @@ def test_a_log_is_followed_until_the_worker_ends_or_somebody_has_seen_enough(pro
 def test_two_commands_at_once_start_one_worker(processes, hosts):
     a = hosts.add("a")
     file = write_file(processes, hosts, "a", more="tunnel = false")
-    both = [processes.start("up", file, "--json") for _ in range(2)]
+    both = [processes.start("spawn", "--hosts", file, "--json") for _ in range(2)]
     states = [json.loads(each.finish()[1])["hosts"][0]["state"] for each in both]
     assert sorted(states) == ["running", "started"]
     pid = state(a)["pid"]
@@ -175,7 +175,7 @@ def test_each_thing_that_stands_in_the_way_is_said_and_the_others_come_up(proces
     rows += f'[[host]]\naddress = "mute"\nssh = "{hosts.ssh} -o ConnectTimeout=2"\n'
     file = tmp_path / "hosts.toml"
     file.write_text(f'[spawn]\ntunnel = false\nssh = "{hosts.ssh}"\nslots = 1\n{rows}')
-    found = rows_of(processes, "up", file, code=1)
+    found = rows_of(processes, "spawn", "--hosts", file, code=1)
     assert found.pop("good")["state"] == "started"
     assert {row["state"] for row in found.values()} == {"failed"}
     reasons = {
@@ -253,7 +253,7 @@ def test_three_hosts_install_from_wheels_alone_one_of_them_after_it_was_killed_a
         rows = "".join(f'[[host]]\naddress = "{name}"\nslots = 1\n' for name in cables)
         file.write_text(f'connect = [{listed}]\n[spawn]\nssh = "{hosts.ssh}"\nwheelhouse = "{house}"\n{rows}')
 
-        interrupted = processes.start("up", file)
+        interrupted = processes.start("spawn", "--hosts", file)
         interrupted.wait_for("x installs the worker", timeout=600)
         await_that(lambda: pip_of(there[0]) is not None, "pip never ran")
         pip, agent = pip_of(there[0])
@@ -263,7 +263,7 @@ def test_three_hosts_install_from_wheels_alone_one_of_them_after_it_was_killed_a
         assert code == 1
         assert "try `ssh x` by hand" in out
 
-        found = rows_of(processes, "up", file, patience=900)
+        found = rows_of(processes, "spawn", "--hosts", file, patience=900)
         assert {name: row["state"] for name, row in found.items()} == {"x": "started", "y": "running", "z": "running"}
         coordinator.wait_for("generation 1: mean", timeout=600)
         rows_of(processes, "down", file, patience=900)

@@ -75,7 +75,7 @@ def test_a_fork_that_never_began_goes_on_from_its_source_though_that_is_gone(pro
     first = processes.coordinator(*settings, "--init", controller, name="first")
     processes.worker("--task", tasks.TOY, "--run", "first", "--exit-when-done")
     assert first.finish()[0] == 0
-    refused(processes, "fork", "first")
+    refused(processes, "coordinator", "--from", "first")
     processes.call("runs", "delete", "first", "--yes", "--runs-dir", processes.runs)
     assert np.abs(continued(processes, "first-fork") - mean).max() < 10 * SIGMA
 

@@ -31,7 +31,7 @@ def stopped(process, number, there):
 def test_training_keeps_all_updates(processes, tmp_path, number):
     write_drives(tmp_path, episodes=4, steps=8)
     curve = tmp_path / "vae.jsonl"
-    flags = ("--updates", 100_000, "--batch", 8, "--channels", 2, 2, 4, 4, "--validate-every", 100_000)
+    flags = ("--updates", 100_000, "--batch", 8, "--set", "channels=2,2,4,4", "validate_every=100000")
     training = processes.start("train", "vae", "--data", tmp_path, *flags)
     said = stopped(training, number, lambda: curve.exists() and curve.read_text().count("update") >= 2)
     update = load_progress(tmp_path / "vae.safetensors")["update"]
@@ -45,7 +45,7 @@ def test_a_training_that_was_killed_goes_on_to_the_same_bits(processes, tmp_path
     for name, killed in ("whole", False), ("killed", True):
         folder = tmp_path / name
         write_drives(folder, episodes=4, steps=8)
-        flags = ("--updates", 60, "--batch", 8, "--channels", 2, 2, 4, 4, "--validate-every", 7, "--keep-every", 20)
+        flags = ("--updates", 60, "--batch", 8, "--set", "channels=2,2,4,4", "validate_every=7", "keep_every=20")
         if killed:
             training = processes.start("train", "vae", "--data", folder, *flags)
             while not (folder / "vae.000020.safetensors").exists():

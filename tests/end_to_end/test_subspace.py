@@ -88,8 +88,8 @@ def test_the_same_bits_through_kills_and_again_by_the_receipt(processes, begin, 
 
     kept = processes.folder / "kept.npz"
     (processes.runs / "night" / CONTROLLER).rename(kept)
-    again = processes.start("repeat", kept, "--bundle", random_bundle.path, "--runs-dir", processes.runs, "--listen",
-                            processes.endpoint, "--beat", 0.2, "--json")  # fmt: skip
+    again = processes.start("verify", "run", kept, "--bundle", random_bundle.path, "--runs-dir", processes.runs,
+                            "--listen", processes.endpoint, "--beat", 0.2, "--json")  # fmt: skip
     processes.worker("--task", tasks.TOY, "--run", "kept-again", "--exit-when-done")
     code, out = again.finish()
     assert (code, json.loads(out)["same"]) == (0, True)
@@ -100,7 +100,17 @@ def test_a_fork_goes_on_in_it_or_leaves_it_with_a_step_of_its_own(processes, beg
     processes.worker("--task", tasks.TOY, "--run", "night")
     coordinator.wait_for("generation 1: mean")
     coordinator.end()
-    fork = ("fork", "night", "--runs-dir", processes.runs, "--listen", processes.endpoint, "--beat", 0.2)
+    fork = (
+        "coordinator",
+        "--from",
+        "night",
+        "--runs-dir",
+        processes.runs,
+        "--listen",
+        processes.endpoint,
+        "--beat",
+        0.2,
+    )
     code, _, err = processes.call(*fork, "--subspace", "none")
     assert (code, "give --sigma0 too" in err) == (2, True), err
     (processes.folder / "fleet.toml").write_text('[run]\nsubspace = "none"\n')
@@ -117,7 +127,7 @@ def test_a_fork_goes_on_in_it_or_leaves_it_with_a_step_of_its_own(processes, beg
         assert [each.whole for each in same.settings.stages] == [False, True]
         assert not any(each.whole for each in free.settings.stages)
     (processes.folder / "fleet.toml").write_text('[run]\nsubspace = "gone.npz"\n')
-    again = processes.start("coordinator", "--resume", "night", "--runs-dir", processes.runs, "--listen",
-                            processes.endpoint, "--config", processes.folder / "fleet.toml")  # fmt: skip
+    again = processes.start("coordinator", "--resume", "night", "--runs-dir", processes.runs,
+                            "--listen", processes.endpoint, "--config", processes.folder / "fleet.toml")  # fmt: skip
     again.wait_for("the settings name another")
     again.end()

@@ -48,7 +48,7 @@ def evolve(processes, name, workers):
 def test_any_fleet_gives_the_same_bits_and_the_verbs_take_the_run(processes):
     assert evolve(processes, "one", 1) == evolve(processes, "two", 2)
     runs = ("--runs-dir", processes.runs)
-    code, out, err = processes.call("replay", "one", *runs, "--candidate", "1/3")
+    code, out, err = processes.call("verify", "candidate", "one", *runs, "--candidate", "1/3")
     assert (code, out.count("same bits")) == (0, 2), err
     code, out, err = processes.call("evaluate", "--controller", "one", *runs, "--episodes", 3)
     assert (code, "below the world's threshold of 750" in out) == (0, True), err

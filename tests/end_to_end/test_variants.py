@@ -53,7 +53,7 @@ def test_a_run_evolves_to_the_same_bits_and_is_replayed(processes, evolve, kind)
         assert {each.steps for each in run.results(1, 2)} == {HORIZON}
         controller = Controller.load(run.controller_path)
         assert controller.options == run.spec.options != ""
-    code, out, err = processes.call("replay", "one", "--runs-dir", processes.runs, "--candidate", "1/2")
+    code, out, err = processes.call("verify", "candidate", "one", "--runs-dir", processes.runs, "--candidate", "1/2")
     assert (code, out.count("same bits")) == (0, 1), err
 
 
@@ -100,7 +100,7 @@ def test_a_run_begins_from_a_controller_that_drives_alike_alone(processes, rando
             ("coordinator", "--run", "two", "--init", "tiny", "--bundle", "tiny", "--variant", "pedals=one"),
             "the plain way",
         ),
-        (("fork", "one", "--variant", "feedback=last"), "leave --variant out, and it brings its own"),
+        (("coordinator", "--from", "one", "--variant", "feedback=last"), "leave --variant out, and it brings its own"),
         (("coordinator", "--run", "two", "--variant", "pedal=one"), "knows no option pedal: known are actions, "),
         (("coordinator", "--run", "two", "--task", "gym:CartPole-v1", "--variant", "pedals=one"), "with a world model"),
     ):
@@ -113,7 +113,7 @@ def test_a_run_begins_from_a_controller_that_drives_alike_alone(processes, rando
         ("brought", ("coordinator", "--run", "brought", "--init", "one", "--bundle", random_bundle.path)),
         ("paying", ("coordinator", "--run", "paying", "--init", "one", "--bundle", random_bundle.path,
                     "--variant", "pedals=one", "time_cost=0.5")),
-        ("forked", ("fork", "one", "--run", "forked")),
+        ("forked", ("coordinator", "--from", "one", "--run", "forked")),
     ):  # fmt: skip
         settings = ("--population", 4, "--episodes", 1, "--horizon", 5, "--generations", 1, "--evaluate-every", 0)
         coordinator = processes.start(*begun, *runs, "--listen", processes.endpoint, "--beat", 0.2, *settings)

@@ -43,7 +43,7 @@ def test_a_bundles_world_gives_the_same_bits_on_one_worker_and_on_two(processes,
     assert (settings.task.task, settings.controller.actions) == ("dream", 3)
     assert any(fitness for each in alone[0] for fitness in each), "somebody lived"
     runs = ("--runs-dir", processes.runs)
-    code, out, err = processes.call("replay", "alone", *runs, "--candidate", "1/2", "--trust", MODULE)
+    code, out, err = processes.call("verify", "candidate", "alone", *runs, "--candidate", "1/2", "--trust", MODULE)
     assert (code, out.count("same bits")) == (0, EPISODES), err
 
 

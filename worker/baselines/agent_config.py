@@ -43,20 +43,20 @@ class AgentConfig:
 
     def __post_init__(self) -> None:
         if self.picture not in (64, 96):
-            raise UsageError(f"--picture must be 64 or 96, not {self.picture}")
+            raise UsageError(f"picture must be 64 or 96, not {self.picture}")
         counts = {len(self.channels), len(self.kernels), len(self.strides)}
         if len(counts) > 1 or 0 in counts:
-            raise UsageError("--channels, --kernels and --strides must name the same number of layers, at least one")
+            raise UsageError("channels, kernels and strides must name the same number of layers, at least one")
         if min(*self.channels, *self.kernels, *self.strides, self.hidden, self.frame_skip) < 1:
-            raise UsageError("--channels, --kernels, --strides, --hidden and --frame-skip must be at least 1")
+            raise UsageError("channels, kernels, strides, hidden and frame_skip must be at least 1")
         if min(self.sides) < 1:
-            raise UsageError(f"--kernels and --strides leave nothing of {self.picture} pixels: make them smaller")
+            raise UsageError(f"kernels and strides leave nothing of {self.picture} pixels: make them smaller")
         if self.frame_skip > MAX_FRAME_SKIP:
-            raise UsageError(f"--frame-skip must be at most {MAX_FRAME_SKIP}, not {self.frame_skip}")
+            raise UsageError(f"frame_skip must be at most {MAX_FRAME_SKIP}, not {self.frame_skip}")
         if self.parameters > MOST_PARAMETERS:
             raise UsageError(
                 f"these layers have {self.parameters:,} parameters, at most {MOST_PARAMETERS:,} are allowed: make "
-                "--channels, --kernels or --hidden smaller"
+                "channels, kernels or hidden smaller"
             )
 
     @property

@@ -1,4 +1,4 @@
-"""Find a baseline by name, to evaluate and record it: the random drivers, and the trained network."""
+"""Find whom to evaluate, record or watch: a controller, or a baseline, which has no world model."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from dreamfleet.common.errors import MissingExtraError, UsageError
+from dreamfleet.common.errors import MissingExtraError
+from dreamfleet.common.files.regular_files import is_file, path_exists
+from dreamfleet.common.runs.lookup import find_agent, find_bundle_of
 from dreamfleet.worker.baselines.policies import RandomPolicy
-from dreamfleet.worker.baselines.presets import DISCRETE, DRQN
+from dreamfleet.worker.baselines.presets import CHECKPOINT, DISCRETE, RANDOM
 from dreamfleet.worker.car_racing.agents import NetworkAgent, PictureAgent
 from dreamfleet.worker.car_racing.preprocessing import RAW
+from dreamfleet.worker.scoring.agents import Agent, make_agent
 
 
 @dataclass(frozen=True)
@@ -38,22 +41,25 @@ class RandomAgent(PictureAgent):
         return lambda seed: RandomPolicy(np.random.default_rng(seed), discrete=self.name == DISCRETE)
 
 
-def find_baseline(name: str, data: Path | None) -> PictureAgent:
-    """Return the baseline `name`; the network is loaded from `data`, its training's folder, as export would write it.
+def find_driver(name: str, runs_dir: Path, bundle: str | None = None) -> Agent:
+    """The agent of this name: what `find_agent` finds, a random driver, or the network in its training's folder.
 
-    `UsageError` for a missing or superfluous folder, `DatasetError` for a damaged or foreign checkpoint.
+    `bundle` names another world model than the controller's own. `DatasetError` for a damaged or foreign checkpoint.
     """
-    if name != DRQN:
-        if data is not None:
-            raise UsageError(f"{name} learns nothing: leave --data out")
+    if is_file(Path(name) / CHECKPOINT):
+        return _find_network(Path(name))
+    if name in (RANDOM, DISCRETE) and not (path_exists(Path(name)) or path_exists(runs_dir / name)):
         return RandomAgent(name)
-    if data is None:
-        raise UsageError(f"{DRQN} needs --data: the folder in which `dreamfleet baseline train {DRQN}` keeps it")
+    controller, beside = find_agent(name, runs_dir)
+    return make_agent(controller, find_bundle_of(controller, bundle, beside))
+
+
+def _find_network(folder: Path) -> Agent:
     if find_spec("torch") is None:
         raise MissingExtraError(
-            f"{DRQN} needs torch, which is not installed: pip install 'dreamfleet[train]'; an agent that `dreamfleet "
-            "baseline export` wrote needs no torch: `dreamfleet evaluate --controller FILE`"
+            f"the training in {folder} needs torch, which is not installed: pip install 'dreamfleet[train]'; an agent "
+            "that `dreamfleet baseline export` wrote needs no torch: `dreamfleet evaluate --controller FILE`"
         )
     from dreamfleet.worker.baselines.export import export_agent
 
-    return NetworkAgent(export_agent(data))
+    return NetworkAgent(export_agent(folder))

@@ -14,9 +14,8 @@ from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.worker.baselines.agent_config import AgentConfig
 from dreamfleet.worker.baselines.network import Networks
-from dreamfleet.worker.baselines.presets import DRQN
+from dreamfleet.worker.baselines.presets import CHECKPOINT, DRQN
 from dreamfleet.worker.baselines.progress import parse_progress
-from dreamfleet.worker.baselines.train import CHECKPOINT
 from dreamfleet.worker.training.checkpoint import load_checkpoint, load_config
 from dreamfleet.worker.training.data.dataset import preprocessing_of_size
 from dreamfleet.worker.worldmodel.mdnrnn_graph import Weights, lstm

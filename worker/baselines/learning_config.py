@@ -47,29 +47,25 @@ class LearningConfig:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if isinstance(value, float) and not math.isfinite(value):
-                raise UsageError(f"{_flag(name)} must be a number, not {value}")
+                raise UsageError(f"{name} must be a number, not {value}")
             if isinstance(value, int) and value > MOST:
-                raise UsageError(f"{_flag(name)} must be at most {MOST}, not {value}")
+                raise UsageError(f"{name} must be at most {MOST}, not {value}")
         for name in AT_LEAST_ONE:
             if getattr(self, name) < 1:
-                raise UsageError(f"{_flag(name)} must be at least 1, not {getattr(self, name)}")
+                raise UsageError(f"{name} must be at least 1, not {getattr(self, name)}")
         for name in NOT_NEGATIVE:
             if getattr(self, name) < 0:
-                raise UsageError(f"{_flag(name)} must not be negative, not {getattr(self, name)}")
+                raise UsageError(f"{name} must not be negative, not {getattr(self, name)}")
         for name in ("gamma", "epsilon_first", "epsilon_last"):
             if not 0 <= getattr(self, name) <= 1:
-                raise UsageError(f"{_flag(name)} must be from 0 to 1, not {getattr(self, name)}")
+                raise UsageError(f"{name} must be from 0 to 1, not {getattr(self, name)}")
         if (read := self.batch * (self.burn_in + self.trace + self.n_step)) > MOST_READ:
             raise UsageError(
-                f"an update would read {read:,} pictures, {MOST_READ:,} at most: make --batch, --trace, --burn-in or "
-                "--n-step smaller"
+                f"an update would read {read:,} pictures, {MOST_READ:,} at most: make batch, trace, burn_in or "
+                "n_step smaller"
             )
         if self.rate <= 0:
-            raise UsageError(f"--rate must be positive, not {self.rate}")
-
-
-def _flag(name: str) -> str:
-    return "--" + name.replace("_", "-")
+            raise UsageError(f"rate must be positive, not {self.rate}")
 
 
 def epsilon_of(config: LearningConfig, episode: int) -> float:

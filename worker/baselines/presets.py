@@ -9,6 +9,7 @@ from dreamfleet.worker.baselines.agent_config import AgentConfig
 from dreamfleet.worker.baselines.learning_config import LearningConfig
 
 RANDOM, DISCRETE, DRQN = NAMES = ("random", "random-discrete", "drqn")
+CHECKPOINT = "drqn.safetensors"  # in the folder of a training
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from dreamfleet.worker.baselines.learner import Learner
 from dreamfleet.worker.baselines.learning_config import LearningConfig, epsilon_of
 from dreamfleet.worker.baselines.network import Networks
 from dreamfleet.worker.baselines.policies import QPolicy
+from dreamfleet.worker.baselines.presets import CHECKPOINT
 from dreamfleet.worker.baselines.progress import (
     EpisodeRecord,
     TrainingProgress,
@@ -41,7 +42,7 @@ from dreamfleet.worker.training.data.dataset import find_world, preprocessing_of
 from dreamfleet.worker.training.torch_setup import on_one_thread
 from dreamfleet.worker.training.training_state import disable_triton_after_mesa, resume_command
 
-CHECKPOINT, CURVE, LOCK = "drqn.safetensors", "drqn.jsonl", "drqn.lock"
+CURVE, LOCK = "drqn.jsonl", "drqn.lock"
 
 OnEpisode = Callable[[int, TrainingReport | None], None]
 """Called after each episode with the number driven, and a report when one is due."""

@@ -5,11 +5,13 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Mapping
+from importlib import import_module
 from importlib.metadata import packages_distributions
 from math import isfinite
 from typing import Any
 
 import gymnasium
+from gymnasium.envs.registration import EnvSpec
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.foreign_code import contained
@@ -28,6 +30,13 @@ ENGINES = {
     "gymnasium.envs.mujoco": ("mujoco",),
     "gymnasium.envs.classic_control": (),
     "gymnasium.envs.toy_text": (),
+}
+
+# Packages of environments that gymnasium knows by name alone: how a name begins, the distribution, and its module.
+PACKAGES = {
+    "ALE/": ("ale-py", "ale_py"),
+    "MiniGrid-": ("minigrid", "minigrid"),
+    "dm_control/": ("'shimmy[dm-control]'", "shimmy"),
 }
 
 Environment = gymnasium.Env[Any, Any]
@@ -57,12 +66,14 @@ def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
         raise UsageError(f"render_mode=human opens a window in every process that plays {name}: leave it out")
     try:
         with contained(f"making {name}"):
-            return gymnasium.make(name, disable_env_checker=True, **arguments)
+            return gymnasium.make(_unregistered_class(name) or name, disable_env_checker=True, **arguments)
     except gymnasium.error.DependencyNotInstalled as error:
         raise UsageError(f"{name} lacks a package on this host: {error}") from error
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
         module, colon, _ = name.rpartition(":")
         remedy = "" if colon else f"; an environment of another package is written {GYM}:its_module:Its-v0"
+        if known := next((each for start, each in PACKAGES.items() if name.startswith(start)), None):
+            remedy = f"; install it on this host with `pip install {known[0]}`, and write {GYM}:{known[1]}:{name}"
         if colon and isinstance(error, ModuleNotFoundError):
             remedy = f"; install the package of {module} on this host, or name its folder in PYTHONPATH"
         raise UsageError(f"gymnasium makes no environment {name!r} here ({error}){remedy}") from error
@@ -70,6 +81,19 @@ def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
         raise UsageError(f"{name} takes no such arguments: {error}") from error
     except (Exception, SystemExit) as error:  # environments may raise anything
         raise UsageError(f"{name} cannot be made: {type(error).__name__}: {error}") from error
+
+
+def _unregistered_class(name: str) -> EnvSpec | None:
+    """The specification of `module:Class` where the module registers no environment of that name; else None."""
+    module, colon, attribute = name.rpartition(":")
+    if not colon:
+        return None
+    found = getattr(import_module(module), attribute, None)
+    if not (isinstance(found, type) and issubclass(found, gymnasium.Env)):
+        return None
+    if any(attribute in (name, name.rpartition("-v")[0]) for name in gymnasium.registry):
+        return None
+    return EnvSpec(attribute, entry_point=name)
 
 
 def _check_arguments(task: str, arguments: Any) -> None:

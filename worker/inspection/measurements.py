@@ -93,7 +93,7 @@ def _dream_controller(bundle: Bundle, driving: DriverChoice) -> Controller:
     if controller is None or controller.bundle != bundle.sha256:
         raise UsageError(
             "these dreams need a --controller that was evolved with this world model: it drives them; "
-            "`dreamfleet refit CONTROLLER --to BUNDLE --data FOLDER` fits another one to it"
+            "`dreamfleet lab refit CONTROLLER --to BUNDLE --data FOLDER` fits another one to it"
         )
     return controller
 

@@ -118,7 +118,7 @@ def measure_survival(
     number of policies so far that were driven, and then of those that were dreamt too.
     """
     if not bundle.manifest.models.get("mdnrnn", {}).get("done"):
-        raise UsageError(f"{bundle.path.name} predicts no ends: train its MDN-RNN with --done")
+        raise UsageError(f"{bundle.path.name} predicts no ends: train its MDN-RNN with --set done=true")
     if controller is not None and controller.bundle != bundle.sha256:
         raise UsageError("the controller must be of this world model, as it acts in its dreams too")
     fitting = bundle if controller is None else bundle.for_controller(controller)

@@ -1,4 +1,4 @@
-"""What the verbs `record` and `baseline record` share: their arguments, and one video a seed."""
+"""The arguments of `record`, and one video a seed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dreamfleet.common.runs.seeds import TEST
 
 
 def add_video_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that both verbs take."""
+    """Add the arguments about seeds, steps and files."""
     parser.add_argument(
         "--seed", type=int, nargs="+", default=[TEST.start], metavar="N",
         help=f"seed of the episode (default {TEST.start}); with several seeds there is one video each, drive-N.mp4",

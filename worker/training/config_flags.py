@@ -1,67 +1,109 @@
-"""Flags that override a preset's training and layers, one per field."""
+"""Flags, and keys of `--set`, that override a preset's training and layers, one per field."""
 
 from __future__ import annotations
 
 import argparse
 import types
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields, replace
-from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from dreamfleet.common.cli.output import add_json_flag
-from dreamfleet.common.cli.presets import preset_help_text
-from dreamfleet.worker.training.presets import PRESETS
+from dreamfleet.common.cli.config import configurable_fields, read_settings
+from dreamfleet.common.cli.parser import Parser
+from dreamfleet.common.errors import UsageError
 
 T = TypeVar("T")
-FIXED = ("actions",)  # fields that the task determines
 
 
-def add_training_flags(parser: argparse.ArgumentParser, model: Literal["vae", "mdnrnn"]) -> None:
-    """Add the flags of a model's `train` verb."""
-    parser.add_argument("--data", type=Path, required=True, help="folder of the data set")
-    parser.add_argument("--preset", help=preset_help_text("training"))
-    parser.add_argument("--device", default="cpu", help="cpu, cuda, or auto (default cpu)")
-    parser.add_argument("--continue-from", type=Path, metavar="FILE", help="begin from this checkpoint's weights")
-    parser.add_argument(
-        "--new", action="store_true",
-        help="begin anew: delete the folder's checkpoint, its curve and the checkpoints of --keep-every",
-    )  # fmt: skip
-    parser.add_argument(
-        "--summary",
-        action="store_true",
-        help="print layers and parameters without training; a model to continue from must have these layers",
-    )
-    parser.add_argument(
-        "--tensorboard", type=Path, metavar="FOLDER", help="also write the losses there as TensorBoard events"
-    )
-    add_json_flag(parser)
-    add_config_flags(parser, "training", {name: getattr(each, model) for name, each in PRESETS.items()})
-    add_config_flags(parser, "layers", {name: getattr(each, f"{model}_layers") for name, each in PRESETS.items()})
+def add_config_flags(
+    parser: argparse.ArgumentParser, title: str, presets: Mapping[str, Any], only: Collection[str] | None = None,
+    *, shows_default: bool = True,
+) -> None:  # fmt: skip
+    """Add a flag for each field of the presets' configuration, or for those in `only`.
 
-
-def add_config_flags(parser: argparse.ArgumentParser, title: str, presets: Mapping[str, Any]) -> None:
-    """Add a flag for each field of the presets' configuration; a flag that is not given sets no attribute.
-
-    The help shows the first preset's value, which is the default, and those of presets that differ.
+    A flag that is not given sets no attribute. The help shows the first preset's value, which is the default.
     """
-    config = type(next(iter(presets.values())))
-    group, hints = parser.add_argument_group(f"{title}, instead of the preset's"), get_type_hints(config)
-    for each in fields(config):
-        if each.name not in FIXED:
-            flag, text = "--" + each.name.replace("_", "-"), each.metadata.get("help")
-            defaults = _describe_defaults({name: getattr(preset, each.name) for name, preset in presets.items()})
-            text = text and f"{text} ({defaults})" if defaults else text
-            group.add_argument(flag, default=argparse.SUPPRESS, help=text, **_options(hints[each.name]))
+    first = next(iter(presets.values()))
+    group, hints = parser.add_argument_group(f"{title}, instead of the preset's"), get_type_hints(type(first))
+    for each in configurable_fields(type(first)):
+        if only is None or each.name in only:
+            default = _describe(getattr(first, each.name))
+            text = each.metadata["help"] + (f" (default {default})" if default and shows_default else "")
+            options = {"default": argparse.SUPPRESS, "help": text, **_options(hints[each.name])}
+            group.add_argument("--" + each.name.replace("_", "-"), **options)
+
+
+def add_settings_flag(
+    parser: argparse.ArgumentParser, tables: Mapping[str, Sequence[Mapping[str, Any]]], flags: Collection[str]
+) -> None:
+    """Add `--set` for the fields of each table's configurations, each by preset, that are not in `flags`.
+
+    `--help-all` lists the keys, with the values of all presets.
+    """
+    kinds = {table: [type(next(iter(each.values()))) for each in configs] for table, configs in tables.items()}
+    parser.add_argument(
+        "--set", nargs="+", action=_Set, tables=kinds, default=[], metavar="KEY=VALUE", dest="settings",
+        help="any other setting instead of the preset's, such as hidden=128 or channels=32,64; --help-all lists the "
+        f"keys, which a file for --config may hold too, in {' or '.join(f'[{name}]' for name in tables)}",
+    )  # fmt: skip
+    for table, configs in tables.items():
+        texts = {}
+        for presets in configs:
+            for each in configurable_fields(type(next(iter(presets.values())))):
+                defaults = _describe_defaults({name: getattr(preset, each.name) for name, preset in presets.items()})
+                texts[each.name] = each.metadata["help"] + (f" ({defaults})" if defaults else "")
+        if isinstance(parser, Parser):
+            parser.add_keys(f"keys of --set, or in [{table}]", {k: v for k, v in texts.items() if k not in flags})
+
+
+class _Set(argparse.Action):
+    """Collects KEY=VALUE texts; `UsageError` for one that no table takes, or not that of the model given before."""
+
+    def __init__(self, *, tables: Mapping[str, Sequence[type[Any]]], **more: Any) -> None:
+        super().__init__(**more)
+        self._tables = tables
+
+    def __call__(self, _parser: Any, namespace: argparse.Namespace, values: Any, _flag: str | None = None) -> None:
+        model = str(getattr(namespace, "model", ""))
+        refusals = []
+        for table in (model,) if model in self._tables else self._tables:
+            try:
+                read_settings(self._tables[table], table, {}, values)
+                break
+            except UsageError as error:
+                refusals.append(error)
+        else:
+            raise refusals[-1]
+        namespace.settings = [*namespace.settings, *values]
+
+
+def apply_settings(configs: tuple[Any, ...], table: str, args: argparse.Namespace) -> tuple[Any, ...]:
+    """Presets' configurations with what `--set`, the environment, [`table`] of the file and flags say instead."""
+    sections = [type(each) for each in configs]
+    values = read_settings(sections, table, getattr(args, "sources", {}), args.settings)
+    names = [{each.name for each in configurable_fields(section)} for section in sections]
+    return tuple(
+        replace(each, **{**{key: value for key, value in values.items() if key in known}, **_given(each, args)})
+        for each, known in zip(configs, names, strict=True)
+    )
+
+
+def _describe(value: Any) -> str:
+    """A value as `--set` takes it; empty for an empty one.
+
+    >>> _describe((32, 64)), _describe(True), _describe(1e-3)
+    ('32,64', 'true', '0.001')
+    """
+    if isinstance(value, bool):
+        return str(value).lower()
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
 def _describe_defaults(values: Mapping[str, Any]) -> str:
     """Describe a field's values: `default 1500; notebook 30000; article, paper 60000`; empty if all are empty."""
     names: dict[str, list[str]] = {}
     for name, value in values.items():
-        plain = ("on" if value else "off") if isinstance(value, bool) else value
-        said = " ".join(map(str, plain)) if isinstance(plain, tuple) else str(plain)
-        names.setdefault(said, []).append(name)
+        names.setdefault(_describe(value), []).append(name)
     (first, _), *others = names.items()
     default = [f"default {first}"] if first else []
     return "; ".join((*default, *(f"{', '.join(each)} {said}" for said, each in others)))
@@ -69,9 +111,13 @@ def _describe_defaults(values: Mapping[str, Any]) -> str:
 
 def apply_flags(config: T, args: argparse.Namespace) -> T:
     """Return a preset's configuration with the given flags applied."""
-    given = {each.name: getattr(args, each.name) for each in fields(config) if hasattr(args, each.name)}  # type: ignore[arg-type]
-    given = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
-    return replace(config, **given)  # type: ignore[type-var]
+    return replace(config, **_given(config, args))  # type: ignore[type-var]
+
+
+def _given(config: Any, args: argparse.Namespace) -> dict[str, Any]:
+    """The values of a configuration's fields for which flags were given."""
+    given = {each.name: getattr(args, each.name) for each in fields(config) if hasattr(args, each.name)}
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
 
 
 def _options(hint: Any) -> dict[str, Any]:

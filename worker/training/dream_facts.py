@@ -69,7 +69,9 @@ def describe_world(
     source = reward or _default_source(recorded, layers)
     _check_predicted(source, layers)
     if end is not None and not layers.done:
-        raise UsageError("--end is about the ends that a done head predicts: `dreamfleet train mdnrnn --done` adds one")
+        raise UsageError(
+            "--end is about the ends that a done head predicts: `dreamfleet train mdnrnn --set done=true` adds one"
+        )
     default = EndRule(DRAWN) if source == "survival" else EndRule()
     rule = replace(EndRule.parse(end) if end else default, odds_weight=layers.done_weight)
     _warn_of_gaps(source, recorded)
@@ -107,7 +109,9 @@ def _default_source(recorded: RecordedRewards, layers: MDNRNNConfig) -> Source:
 def _check_predicted(source: Source, layers: MDNRNNConfig) -> None:
     if source == "survival":
         if not layers.done:
-            raise UsageError("survival is until the end that a done head predicts: `dreamfleet train mdnrnn --done`")
+            raise UsageError(
+                "survival is until the end that a done head predicts: `dreamfleet train mdnrnn --set done=true`"
+            )
     elif not layers.has_reward_head or (source == "value") != (layers.reward == "value"):
         raise UsageError(
             f"the {source} of a reward is not what this MDN-RNN predicts, which is {layers.reward!r}: "

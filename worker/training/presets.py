@@ -43,13 +43,13 @@ class TrainConfig:
     def __post_init__(self) -> None:
         for name in ("updates", "batch", "validate_every"):
             if getattr(self, name) < 1:
-                raise UsageError(f"--{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
+                raise UsageError(f"{name} must be at least 1, not {getattr(self, name)}")
         if self.keep_every < 0:
-            raise UsageError(f"--keep-every must be at least 1, or 0 for none, not {self.keep_every}")
+            raise UsageError(f"keep_every must be at least 1, or 0 for none, not {self.keep_every}")
         if not (self.rate > 0 and self.clip >= 0 and 0 < self.decay <= 1 and self.patience >= 0):
-            raise UsageError("--rate must be positive, --decay in (0, 1], --clip and --patience not negative")
+            raise UsageError("rate must be positive, decay in (0, 1], clip and patience not negative")
         if not 0 <= self.seed <= LARGEST_SEED:
-            raise UsageError(f"--seed must be from 0 to {LARGEST_SEED}, not {self.seed}")
+            raise UsageError(f"seed must be from 0 to {LARGEST_SEED}, not {self.seed}")
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ ARTICLE = TrainingPreset(
     vae_layers=vae_config.ARTICLE,
     mdnrnn_layers=mdnrnn_config.ARTICLE,
 )
-# Compares plain and attentive at equal numbers of parameters: `--window 0 --hidden 256` is the plain one.
+# Compares plain and attentive at equal numbers of parameters: window=0 and hidden=256 is the plain one.
 ATTENTIVE = TrainingPreset(
     name="attentive",
     collect=CollectConfig(episodes=500, steps=384),

@@ -44,7 +44,9 @@ def train_mdnrnn(
     vae, mirrors = latents_encoder_hash(folder), encodes_mirrored(folder)
     latents = load_steps(train[0], "mu")["mu"].shape[1]
     if layers.latent != latents:
-        raise DatasetError(f"the encoded rollouts have {latents} latents, this MDN-RNN {layers.latent}: give --latent")
+        raise DatasetError(
+            f"the encoded rollouts have {latents} latents, this MDN-RNN {layers.latent}: give --set latent={latents}"
+        )
     layers = fit_layers(layers, folder, continue_from, new)
     torch.manual_seed(config.seed)
     model = MDNRNN(layers).to(device)

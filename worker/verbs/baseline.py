@@ -1,11 +1,10 @@
-"""`dreamfleet baseline train|evaluate|record|export`: agents without a world model, by the judge of controllers."""
+"""`dreamfleet baseline train|export`: agents without a world model, by the judge of controllers."""
 
 from __future__ import annotations
 
 import argparse
 import os
 import sys
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,20 +12,14 @@ from dreamfleet.common.cli.command_line import SimpleVerb
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.files.atomic_write import check_output_path, open_output
-from dreamfleet.common.host.resource_limits import pin_thread_pools, usable_cores
-from dreamfleet.common.runs.seeds import TEST, VALIDATION
-from dreamfleet.worker.tools.video_cli import add_video_flags, record_videos, video_paths
+from dreamfleet.common.files.atomic_write import check_output_path
 
 if TYPE_CHECKING:
     from dreamfleet.worker.baselines.progress import TrainingReport
 
 
-def _add_agent_arguments(parser: argparse.ArgumentParser) -> None:
-    from dreamfleet.worker.baselines.presets import NAMES
-
-    parser.add_argument("agent", choices=NAMES, help="the driver")
-    parser.add_argument("--data", type=Path, help="the folder of its training, if it is drqn")
+LEARNING_FLAGS = ("episodes", "steps", "seed")  # other settings are keys of --set
+TABLE = "baseline"
 
 
 def _check_learns(agent: str, hint: str) -> None:
@@ -39,30 +32,32 @@ def _check_learns(agent: str, hint: str) -> None:
 def configure_train(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `baseline train`."""
     from dreamfleet.worker.baselines.presets import NAMES, PRESETS
-    from dreamfleet.worker.training.config_flags import add_config_flags
+    from dreamfleet.worker.training.config_flags import add_config_flags, add_settings_flag
 
     parser.add_argument("agent", choices=NAMES, help="drqn; random drivers learn nothing")
     parser.add_argument("--data", type=Path, required=True, help="folder of the training and of the trained network")
     parser.add_argument("--preset", default="learning", help=f"{preset_help_text('baseline')} (default learning)")
     parser.add_argument("--device", default="cpu", help="cpu, cuda, or auto (default cpu)")
     parser.add_argument("--new", action="store_true", help="start over, replacing the checkpoint that is there")
-    add_config_flags(parser, "learning", {name: each.learning for name, each in PRESETS.items()})
-    add_config_flags(parser, "layers and driving", {name: each.agent for name, each in PRESETS.items()})
+    learning = {name: each.learning for name, each in PRESETS.items()}
+    add_config_flags(parser, "learning", learning, LEARNING_FLAGS)
+    add_settings_flag(parser, {TABLE: (learning, {name: each.agent for name, each in PRESETS.items()})}, LEARNING_FLAGS)
     add_json_flag(parser)
 
 
 def train_baseline(args: argparse.Namespace) -> int:
     """Train, with a report every few episodes on stderr, and print the figures."""
     from dreamfleet.worker.baselines.presets import DRQN, find_preset
-    from dreamfleet.worker.training.config_flags import apply_flags
+    from dreamfleet.worker.training.config_flags import apply_settings
 
-    _check_learns(args.agent, f"`dreamfleet baseline evaluate {args.agent}` judges it")
+    _check_learns(args.agent, f"`dreamfleet evaluate --controller {args.agent}` judges it")
     preset = find_preset(args.preset)
-    config, layers = apply_flags(preset.learning, args), apply_flags(preset.agent, args)
+    config, layers = apply_settings((preset.learning, preset.agent), TABLE, args)
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.common.host.stop_signals import stop_on_signals
-    from dreamfleet.worker.baselines.train import CHECKPOINT, train_drqn
+    from dreamfleet.worker.baselines.presets import CHECKPOINT
+    from dreamfleet.worker.baselines.train import train_drqn
     from dreamfleet.worker.training.training_cli import explain_interrupt
     from dreamfleet.worker.training.training_state import select_device
 
@@ -80,62 +75,6 @@ def train_baseline(args: argparse.Namespace) -> int:
         figures = train_drqn(args.data, layers, config, report_progress, device, stop, args.new)
     print_answer(args, "  ".join(f"{name} {value}" for name, value in figures.items()), **figures)
     return 0
-
-
-def configure_evaluate(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `baseline evaluate`."""
-    _add_agent_arguments(parser)
-    parser.add_argument("--episodes", type=int, default=100, help="tracks (default 100)")
-    parser.add_argument(
-        "--first-seed", type=int, default=TEST.start,
-        help=f"first track's seed: test tracks from {TEST.start} (default), validation tracks from {VALIDATION.start}",
-    )  # fmt: skip
-    parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one per core)")
-    parser.add_argument("--json", action="store_true", help="print every figure and drive as JSON")
-    parser.add_argument("--out", type=Path, help="also write that JSON to this file, for `compare`")
-
-
-def evaluate_baseline(args: argparse.Namespace) -> int:
-    """Drive, and print the scores."""
-    pin_thread_pools()  # of NumPy and torch, which are not loaded yet
-    from dreamfleet.common.runs.evaluation_report import check_seed_range
-
-    if args.episodes < 1 or args.first_seed < 0 or args.jobs < 1:
-        raise UsageError("--episodes and --jobs must be at least 1, --first-seed at least 0")
-    check_seed_range(args.first_seed, args.episodes)
-    if args.out:
-        check_output_path(args.out)
-    seeds = tuple(range(args.first_seed, args.first_seed + args.episodes))
-    if not any(seeds[0] in each and seeds[-1] in each for each in (TEST, VALIDATION)):
-        print("note: some of these tracks are neither test nor validation tracks", file=sys.stderr)
-    from dreamfleet.worker.baselines.agents import find_baseline
-    from dreamfleet.worker.verbs.evaluate import judge
-
-    name = args.agent if args.data is None else f"{args.agent} {args.data}"
-    agent = find_baseline(args.agent, args.data)
-    judgement = judge(name, agent, seeds, args.jobs)
-    print(judgement.to_json() if args.json else judgement.describe(agent.world.score_word), flush=True)
-    if args.out:
-        with open_output(args.out) as file:
-            file.write(f"{judgement.to_json()}\n".encode())
-    return 0
-
-
-def configure_record(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `baseline record`."""
-    _add_agent_arguments(parser)
-    add_video_flags(parser)
-
-
-def record_baseline(args: argparse.Namespace) -> int:
-    """Record, and print the scores."""
-    videos = video_paths(args)
-    os.environ["SDL_VIDEODRIVER"] = "dummy"
-    from dreamfleet.worker.baselines.agents import find_baseline
-    from dreamfleet.worker.tools.recording import record
-
-    agent = find_baseline(args.agent, args.data)
-    return record_videos(args, videos, partial(record, agent, steps=args.steps), agent.world.score_word)
 
 
 def configure_export(parser: argparse.ArgumentParser) -> None:
@@ -172,13 +111,6 @@ TRAIN = SimpleVerb(
     train_baseline,
     EXTRAS=("train",),
 )
-EVALUATE = SimpleVerb(
-    "judge a baseline on unseen tracks as controllers are judged, in gymnasium's own unmodified environment",
-    configure_evaluate,
-    evaluate_baseline,
-    EXTRAS=("worker",),
-)
-RECORD = SimpleVerb("record a baseline's drives as mp4s", configure_record, record_baseline, EXTRAS=("worker", "views"))
 EXPORT = SimpleVerb(
     "write a trained baseline as one file, which `evaluate --controller` and `record` take without torch",
     configure_export,

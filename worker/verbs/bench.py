@@ -1,4 +1,4 @@
-"""`dreamfleet bench policy|dream|dispatch|live|env`: how fast the parts are."""
+"""`dreamfleet lab bench PART`: how fast the parts are."""
 
 from __future__ import annotations
 
@@ -6,20 +6,44 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from dreamfleet.common.cli.command_line import SimpleVerb
+from dreamfleet.common.cli.output import add_json_flag
+from dreamfleet.common.errors import UsageError
 
 if TYPE_CHECKING:
     from dreamfleet.common.artifacts.bundle import Bundle
 
+SUMMARY = "measure how fast a part is: policy, dream, env, live or dispatch"
 EXTRAS = ("worker",)
+BUNDLE, EPISODES = "tiny", 3
 
 
-def configure_bundle(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of a benchmark of one world model."""
-    parser.add_argument("--bundle", default="tiny", help="the world model (default tiny)")
-    _add_json_flag(parser)
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    texts = "; ".join(f"{name}: {part.text}" for name, part in PARTS.items())
+    parser.add_argument("part", metavar="PART", choices=tuple(PARTS), help=texts)
+    parser.add_argument("--bundle", help=f"the world model of policy, dream, env and live (default {BUNDLE})")
+    parser.add_argument(
+        "--workers", type=int, metavar="N", help="of dispatch: let N simulated workers join and work too"
+    )
+    parser.add_argument("--episodes", type=int, metavar="N", help=f"of env: episodes of each kind (default {EPISODES})")
+    parser.add_argument(
+        "--exact", action="store_true", default=None,
+        help="of env: compare with gymnasium's over whole episodes instead, which takes about ten minutes",
+    )  # fmt: skip
+    add_json_flag(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure the part, and print the figures."""
+    part = PARTS[args.part]
+    given = [name for name in ("bundle", "workers", "episodes", "exact") if getattr(args, name) is not None]
+    if foreign := [name for name in given if name not in part.flags]:
+        raise UsageError(f"--{foreign[0]} is of {', '.join(n for n, p in PARTS.items() if foreign[0] in p.flags)}")
+    args.bundle = args.bundle or BUNDLE
+    return part.measure(args)
 
 
 def measure_policy(args: argparse.Namespace) -> int:
@@ -36,19 +60,11 @@ def measure_dream(args: argparse.Namespace) -> int:
     return _print_figures(args, measure_on_one_thread(bench_dream, args.bundle))
 
 
-def configure_dispatch(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `bench dispatch`."""
-    parser.add_argument(
-        "--workers", type=int, default=0, metavar="N", help="also let N simulated workers join and work"
-    )
-    _add_json_flag(parser)
-
-
 def measure_dispatch(args: argparse.Namespace) -> int:
     """Measure how fast a coordinator dispatches."""
     from dreamfleet.worker.bench.dispatch import bench_dispatch
 
-    return _print_figures(args, bench_dispatch(max(0, args.workers)))
+    return _print_figures(args, bench_dispatch(max(0, args.workers or 0)))
 
 
 def measure_live(args: argparse.Namespace) -> int:
@@ -62,21 +78,15 @@ def measure_live(args: argparse.Namespace) -> int:
     return _print_figures(args, bench_live(find_bundle(args.bundle)))
 
 
-def configure_env(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `bench env`."""
-    parser.add_argument("--bundle", default="tiny", help="the world model of the fitness step (default tiny)")
-    parser.add_argument("--episodes", type=int, default=3, help="whole episodes of each kind (default 3)")
-    parser.add_argument("--exact", action="store_true", help="compare instead of measuring: about ten minutes")
-    _add_json_flag(parser)
-
-
 def measure_env(args: argparse.Namespace) -> int:
     """Measure the environment on one thread, or compare it with gymnasium's; exit 1 if anything differs."""
     if args.exact:
         return _compare(args)
     from dreamfleet.worker.bench.environment import bench_env
 
-    figures = measure_on_one_thread(bench_env, args.bundle, max(1, args.episodes))
+    figures = measure_on_one_thread(
+        bench_env, args.bundle, max(1, EPISODES if args.episodes is None else args.episodes)
+    )
     _print_figures(args, figures)
     return 0 if figures["exact"] else 1
 
@@ -128,10 +138,6 @@ def _pin_libraries() -> None:
     pin_thread_pools()
 
 
-def _add_json_flag(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
-
-
 def _print_figures(args: argparse.Namespace, figures: Mapping[str, Any]) -> int:
     if args.json:
         print(json.dumps(figures))
@@ -141,27 +147,20 @@ def _print_figures(args: argparse.Namespace, figures: Mapping[str, Any]) -> int:
     return 0
 
 
-POLICY = SimpleVerb(
-    "measure a policy step against this core's matrix rate and against torch", configure_bundle, measure_policy, EXTRAS
-)
-DREAM = SimpleVerb(
-    "measure dreamed steps a second, against their matrix products alone and against torch",
-    configure_bundle,
-    measure_dream,
-    EXTRAS,
-)
-DISPATCH = SimpleVerb(
-    "measure dispatch through real Zenoh: 50 ms jobs, null jobs, many workers; peers where installed",
-    configure_dispatch,
-    measure_dispatch,
-    EXTRAS,
-)
-LIVE = SimpleVerb(
-    "measure what the live view costs a slot: unwatched, and watched", configure_bundle, measure_live, EXTRAS
-)
-ENV = SimpleVerb(
-    "measure the environment against gymnasium's own; --exact proves the two equal over whole episodes",
-    configure_env,
-    measure_env,
-    EXTRAS,
-)
+@dataclass(frozen=True)
+class Part:
+    """A part that can be measured: what about it, by which function, and the flags that it takes."""
+
+    text: str
+    measure: Callable[[argparse.Namespace], int]
+    flags: tuple[str, ...] = ("bundle",)
+
+
+PARTS = {
+    "policy": Part("a policy step, against this core's matrix rate and against torch", measure_policy),
+    "dream": Part("dreamed steps a second, against their matrix products alone and against torch", measure_dream),
+    "env": Part("the environment against gymnasium's own", measure_env, ("bundle", "episodes", "exact")),
+    "live": Part("what the live view costs a slot, unwatched and watched", measure_live),
+    "dispatch": Part("jobs a second through real Zenoh, beside Dask and Ray where installed", measure_dispatch,
+                     ("workers",)),
+}  # fmt: skip

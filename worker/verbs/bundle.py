@@ -1,4 +1,4 @@
-"""`dreamfleet bundle|unbundle`: freeze a trained world model into one file, and back."""
+"""`dreamfleet bundle`: freeze a trained world model into one file, and back."""
 
 from __future__ import annotations
 
@@ -7,21 +7,28 @@ from pathlib import Path
 
 from dreamfleet.common.artifacts.bundle import MAX_RECORDED_STATES
 from dreamfleet.common.artifacts.world_facts import EndRule
-from dreamfleet.common.cli.command_line import SimpleVerb
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path
 
+SUMMARY = "freeze a trained world model into one file that workers fetch by its hash; --extract takes one apart"
+EXTRAS = ("train",)
 RECORDED = 512  # states of the default layers are 0.6 MB
 
 
-def configure_bundle(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `bundle`."""
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
     parser.add_argument("--data", type=Path, required=True, help="folder of the data set and its trained models")
-    parser.add_argument("--out", type=Path, required=True, help="the bundle to write, NAME.zip")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--out", type=Path, metavar="FILE", help="the bundle to write, NAME.zip")
+    what.add_argument(
+        "--extract", metavar="BUNDLE",
+        help="the other way: write the VAE and MDN-RNN of this bundle, a file or one that ships, into --data as "
+        "checkpoints from which training can continue",
+    )  # fmt: skip
     parser.add_argument("--with-weights", action="store_true", help="keep the training weights in it")
     parser.add_argument(
-        "--recorded", type=int, default=RECORDED, metavar="N",
+        "--recorded", type=int, metavar="N",
         help=f"recorded states at which dreams may begin, with the model's memory (default {RECORDED}; 0: none)",
     )  # fmt: skip
     parser.add_argument(
@@ -45,15 +52,25 @@ def _end_rule(text: str) -> str:
     return text
 
 
-def write_bundle(args: argparse.Namespace) -> int:
-    """Write the bundle, and print its SHA-256."""
+def run(args: argparse.Namespace) -> int:
+    """Write the bundle and print its SHA-256, or write checkpoints and print their paths."""
+    if args.extract is None:
+        return _write_bundle(args)
+    others = ("recorded", "reward", "end")
+    if given := [name for name in others if getattr(args, name) is not None] + ["measured"] * bool(args.measured):
+        raise UsageError(f"--{given[0]} is of a bundle to write: leave it or --extract out")
+    return _write_checkpoints(args)
+
+
+def _write_bundle(args: argparse.Namespace) -> int:
     from dreamfleet.worker.training.assemble import assemble
 
-    if not 0 <= args.recorded <= MAX_RECORDED_STATES:
-        raise UsageError(f"--recorded must be from 0 to {MAX_RECORDED_STATES}, not {args.recorded}")
+    recorded = RECORDED if args.recorded is None else args.recorded
+    if not 0 <= recorded <= MAX_RECORDED_STATES:
+        raise UsageError(f"--recorded must be from 0 to {MAX_RECORDED_STATES}, not {recorded}")
     check_output_path(args.out)
     bundle = assemble(
-        args.data, args.out, args.out.stem, with_weights=args.with_weights, recorded=args.recorded,
+        args.data, args.out, args.out.stem, with_weights=args.with_weights, recorded=recorded,
         measured=args.measured, reward=args.reward, end=args.end,
     )  # fmt: skip
     size = bundle.path.stat().st_size / 1e6
@@ -68,35 +85,11 @@ def write_bundle(args: argparse.Namespace) -> int:
     return 0
 
 
-def configure_unbundle(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `unbundle`."""
-    parser.add_argument("bundle", metavar="BUNDLE", help="a file, or one that ships")
-    parser.add_argument(
-        "--data", type=Path, required=True, help="folder of a data set, for its models; made if missing"
-    )
-    add_json_flag(parser)
-
-
-def write_checkpoints(args: argparse.Namespace) -> int:
-    """Write both checkpoints, and print their paths."""
+def _write_checkpoints(args: argparse.Namespace) -> int:
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.worker.training.unbundle import unbundle
 
-    bundle = find_bundle(args.bundle)
+    bundle = find_bundle(args.extract)
     vae, mdnrnn = unbundle(bundle, args.data)
     print_answer(args, f"{vae} and {mdnrnn}, of {bundle.sha256[:12]}", vae=vae, mdnrnn=mdnrnn, bundle=bundle.sha256)
     return 0
-
-
-BUNDLE = SimpleVerb(
-    "freeze a trained world model into one file that workers fetch by its hash",
-    configure_bundle,
-    write_bundle,
-    EXTRAS=("train",),
-)
-UNBUNDLE = SimpleVerb(
-    "write a bundle's VAE and MDN-RNN as checkpoints that training can continue from",
-    configure_unbundle,
-    write_checkpoints,
-    EXTRAS=("train",),
-)

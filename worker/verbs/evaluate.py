@@ -21,11 +21,15 @@ if TYPE_CHECKING:
 
 SUMMARY = "judge a controller on unseen seeds, in whole episodes of the world itself"
 EXTRAS = ("worker",)
+CONTROLLER = (
+    "who drives: a controller's file, a run, one that ships, a trained agent's file or its training's folder, or "
+    "random or random-discrete, which act by chance"
+)
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("--controller", help="a file, a run, one that ships, or a trained agent's file")
+    parser.add_argument("--controller", help=CONTROLLER)
     parser.add_argument(
         "--run", dest="run_name", metavar="RUN", help="judge this live run's reported controller instead"
     )
@@ -38,7 +42,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one per core)")
     add_global_flags(parser, "runs_dir")
     parser.add_argument("--json", action="store_true", help="print every figure and drive as JSON")
-    parser.add_argument("--out", type=Path, help="also write that JSON to this file, for `compare` and `reproduce`")
+    parser.add_argument("--out", type=Path, help="also write that JSON to this file, for `compare` and `verify report`")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -93,7 +97,8 @@ def judge(name: str, agent: Agent, seeds: tuple[int, ...], jobs: int) -> Evaluat
 def _choose_agent(args: argparse.Namespace) -> tuple[str, Agent]:
     """The name and controller to judge: from this disk, or from a live run."""
     from dreamfleet.common.monitoring.client import Client
-    from dreamfleet.common.runs.lookup import find_agent, find_bundle_of
+    from dreamfleet.common.runs.lookup import find_bundle_of
+    from dreamfleet.worker.baselines.agents import find_driver
     from dreamfleet.worker.scoring.agents import make_agent
     from dreamfleet.worker.service.bundle_fetch import fetch_bundle_of
 
@@ -107,5 +112,4 @@ def _choose_agent(args: argparse.Namespace) -> tuple[str, Agent]:
         return run, make_agent(reported, find_bundle_of(reported, args.bundle))
     if live or not args.controller:
         raise UsageError("give either --controller, or --run (and --connect) to judge what a live run reports")
-    controller, beside = find_agent(args.controller, args.runs_dir)
-    return args.controller, make_agent(controller, find_bundle_of(controller, args.bundle, beside))
+    return args.controller, find_driver(args.controller, args.runs_dir, args.bundle)

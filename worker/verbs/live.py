@@ -15,6 +15,7 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.runs.seeds import TEST
+from dreamfleet.worker.verbs.evaluate import CONTROLLER
 
 if TYPE_CHECKING:
     from dreamfleet.common.artifacts.bundle import Bundle
@@ -39,9 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     whom = parser.add_mutually_exclusive_group()
     whom.add_argument("--worker", metavar="NAME", help="what this worker scores (default: the busiest worker's)")
     whom.add_argument("--best", action="store_true", help="drive the run's best mean so far here, seed after seed")
-    whom.add_argument(
-        "--controller", help="no run: a file, a run on this disk, one that ships, or a trained agent's file"
-    )
+    whom.add_argument("--controller", help=f"needs no live run; {CONTROLLER}")
     parser.add_argument(
         "--generation", type=int, metavar="G", help="of the run that --controller names: the evaluated mean"
     )
@@ -194,14 +193,14 @@ def _best_driver(client: Client, run: str) -> Driver:
 
 def _named_driver(args: argparse.Namespace) -> Callable[[], Driver]:
     """The controller of `--controller`."""
-    from dreamfleet.common.runs.lookup import find_agent, find_bundle_of, find_evaluated_mean
+    from dreamfleet.common.runs.lookup import find_bundle_of, find_evaluated_mean
+    from dreamfleet.worker.baselines.agents import find_driver
     from dreamfleet.worker.scoring.agents import make_agent
 
     if args.generation is not None:
         mean, folder = find_evaluated_mean(args.controller, args.runs_dir, args.generation)
         agent = make_agent(mean, find_bundle_of(mean, args.bundle, folder))
     else:
-        controller, beside = find_agent(args.controller, args.runs_dir)
-        agent = make_agent(controller, find_bundle_of(controller, args.bundle, beside))
+        agent = find_driver(args.controller, args.runs_dir, args.bundle)
     facts = {"controller": args.controller, "generation": args.generation}
     return lambda: (agent, facts)

@@ -16,7 +16,7 @@ from dreamfleet.common.host.stop_signals import interrupted_by_signals
 
 SUMMARY = "make a preset's world model: collect, train vae, encode, train mdnrnn, bundle; run again, it resumes"
 EXTRAS = ("train",)
-EXAMPLES = {"collect": "--steps 200", "vae": "--batch 50", "mdnrnn": "--hidden 128", "bundle": "--reward value"}
+EXAMPLES = {"collect": "--steps 200", "vae": "--batch 50", "mdnrnn": "--set hidden=128", "bundle": "--reward value"}
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -55,7 +55,9 @@ def run(args: argparse.Namespace) -> int:
     flags = (world_flags(vars(args)), args.collect_flags, args.vae_flags, args.mdnrnn_flags, args.bundle_flags)
     source = Pipeline(preset, args.data, args.scale, args.seed, *flags)
     check_modules(("gymnasium", "onnx", "onnxruntime", "safetensors", "torch"))
-    runner = InProcessRunner(source.stages(max(1, args.jobs), args.device, args.out))  # wrong flags end it here
+    file = ("--config", str(args.config)) if args.config else ()
+    stages = source.stages(max(1, args.jobs), args.device, args.out)
+    runner = InProcessRunner({name: (*words, *file) for name, words in stages.items()})  # wrong flags end it here
     check_output_path(args.out or source.bundle)
     if not args.json:
         runner.run_all()

@@ -8,6 +8,7 @@ from functools import partial
 
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.worker.tools.video_cli import add_video_flags, record_videos, video_paths
+from dreamfleet.worker.verbs.evaluate import CONTROLLER
 
 SUMMARY = "record drives as mp4s: the world, what the model sees, what it decodes, what it dreams"
 EXTRAS = ("worker", "views")
@@ -15,7 +16,7 @@ EXTRAS = ("worker", "views")
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("--controller", required=True, help="a file, a run, one that ships, or a trained agent's file")
+    parser.add_argument("--controller", required=True, help=CONTROLLER)
     add_video_flags(parser)
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
     parser.add_argument("--temperature", type=float, default=1.0, help="of the dream beside the drive (default 1.0)")
@@ -26,12 +27,10 @@ def run(args: argparse.Namespace) -> int:
     """Record, and print the scores."""
     videos = video_paths(args)
     os.environ["SDL_VIDEODRIVER"] = "dummy"
-    from dreamfleet.common.runs.lookup import find_agent, find_bundle_of
+    from dreamfleet.worker.baselines.agents import find_driver
     from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
-    from dreamfleet.worker.scoring.agents import make_agent
     from dreamfleet.worker.tools.recording import record
 
-    controller, beside = find_agent(args.controller, args.runs_dir)
-    agent = make_agent(controller, find_bundle_of(controller, args.bundle, beside))
+    agent = find_driver(args.controller, args.runs_dir, args.bundle)
     film = partial(record, agent, steps=args.steps, dreaming=ParallelDreamConfig(args.temperature))
     return record_videos(args, videos, film, agent.world.score_word)

@@ -1,4 +1,4 @@
-"""`dreamfleet refit`: a controller for another world model."""
+"""`dreamfleet lab refit`: a controller for another world model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`dreamfleet subspace`: fewer features for a search."""
+"""`dreamfleet lab subspace`: fewer features for a search."""
 
 from __future__ import annotations
 

@@ -25,6 +25,4 @@ def check_factors(config: Any, *names: str) -> None:
     """`UsageError` names the first of these fields that is out of bounds."""
     for name in names:
         if not LEAST <= getattr(config, name) <= MOST:
-            raise UsageError(
-                f"--{name.replace('_', '-')} must be from {LEAST:g} to {MOST:g}, not {getattr(config, name):g}"
-            )
+            raise UsageError(f"{name} must be from {LEAST:g} to {MOST:g}, not {getattr(config, name):g}")

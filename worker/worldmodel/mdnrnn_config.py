@@ -58,26 +58,24 @@ class MDNRNNConfig:
         if min(self.latent, self.actions, self.hidden, self.mixtures, self.attention_units) < 1 or self.window < 0:
             raise UsageError("an MDN-RNN's sizes must be at least 1, its window at least 0")
         if not 0 <= self.dropout < 1:
-            raise UsageError(f"--dropout must be from 0 to below 1, not {self.dropout}")
+            raise UsageError(f"dropout must be from 0 to below 1, not {self.dropout}")
         if self.previous_reward and self.reward == "none":
             raise UsageError("the previous reward as an input needs a reward head: in a dream nothing else predicts it")
         if self.lost < 0 or (self.lost and not self.done):
-            raise UsageError("--lost is a number of steps that a done head predicts: give --done, and 0 or more")
+            raise UsageError("lost is a number of steps that a done head predicts: give done=true, and 0 or more")
         check_factors(self, "z_factor", "reward_factor", "done_factor", "done_weight")
         if self.reward_factor != 1 and self.reward == "none":
-            raise UsageError(
-                "--reward-factor is the weight of a reward head's loss: give --reward another kind than none"
-            )
+            raise UsageError("reward_factor is the weight of a reward head's loss: give another reward than none")
         if (self.done_factor, self.done_weight) != (1, 1) and not self.done:
-            raise UsageError("--done-factor and --done-weight are of a done head's loss: give --done")
+            raise UsageError("done_factor and done_weight are of a done head's loss: give done=true")
         if self.reward_scale not in (0, 1):
             check_factors(self, "reward_scale")
             if self.reward != "value":
-                raise UsageError("--reward-scale divides the rewards whose value is predicted: give --reward value")
+                raise UsageError("reward_scale divides the rewards whose value is predicted: give reward=value")
         if self.first_reward and not self.previous_reward:
-            raise UsageError("--first-reward is the --previous-reward of the first step: give that too")
+            raise UsageError("first_reward is the label of previous_reward at the first step: give that too")
         if not abs(self.first_reward) <= MOST_REWARD:
-            raise UsageError(f"--first-reward must be from -{MOST_REWARD} to {MOST_REWARD}, not {self.first_reward}")
+            raise UsageError(f"first_reward must be from -{MOST_REWARD} to {MOST_REWARD}, not {self.first_reward}")
 
     @property
     def inputs(self) -> int:

@@ -69,18 +69,16 @@ class VAEConfig:
         if min(self.channels, default=0) < 1 or self.latent < 1:
             raise UsageError(f"a VAE has layers of channels and a latent, not {self.channels}, {self.latent}")
         if not 0 <= self.dropout < 1 or self.kl_tolerance < 0 or self.dense < 0:
-            raise UsageError("--dropout must be from 0 to below 1; a tolerance and a width must not be negative")
+            raise UsageError("dropout must be from 0 to below 1; a tolerance and a width must not be negative")
         check_factors(self, "error_factor")
         if not 0 <= self.pixel_weight <= MOST:
-            raise UsageError(f"--pixel-weight must be from 0 to {MOST:g}, not {self.pixel_weight:g}")
+            raise UsageError(f"pixel_weight must be from 0 to {MOST:g}, not {self.pixel_weight:g}")
         count = len(self.channels)
         wanted = {"kernels": count, "strides": count, "decoder_channels": count - 1, "decoder_kernels": count}
         for name, length in wanted.items():
             given = getattr(self, name)
             if given and (len(given) != length or min(given) < 1):
-                raise UsageError(
-                    f"--{name.replace('_', '-')} takes {length} numbers above 0, as --channels are {count}"
-                )
+                raise UsageError(f"{name} takes {length} numbers above 0, as channels are {count}")
         if min(self.sides) < 1:
             raise UsageError(f"the encoder's convolutions leave nothing of {self.picture} pixels: choose fewer")
         if min(self.decoder_sides) < 1 or any(layer.before < 0 for layer in self.up):

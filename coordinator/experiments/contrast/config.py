@@ -58,7 +58,7 @@ class Contrast:
             *((f"--kind {name}", text) for name, text in self.kinds),
             ("--mdnrnn-flags", self.mdnrnn_flags),
         ):
-            split_flags(flag, text, "contrast", RESERVED_FLAGS)
+            split_flags(flag, text, "lab contrast", RESERVED_FLAGS)
 
     @property
     def trials(self) -> tuple[Trial, ...]:

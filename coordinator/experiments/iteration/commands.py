@@ -34,7 +34,7 @@ class Commands:
 
     def unbundle(self) -> Words:
         """Write the models of the initial world model as checkpoints."""
-        return command("unbundle", self.layout.bundle(0), "--data", self.layout.round(0), "--json")
+        return command("bundle", "--extract", self.layout.bundle(0), "--data", self.layout.round(0), "--json")
 
     def collect(self, number: int) -> Words:
         """Random drives: the first round's, or those that a later round adds."""
@@ -92,13 +92,13 @@ class Commands:
         """The last round's optimum fitted to this round's new world model."""
         layout = self.layout
         optimum, bundle = layout.optimum(number - 1), layout.bundle(number)
-        return command("refit", optimum, "--to", bundle, "--data", layout.root, "--out", path, "--json")
+        return command("lab", "refit", optimum, "--to", bundle, "--data", layout.root, "--out", path, "--json")
 
     def subspace(self, number: int, path: Path) -> Words:
         """The subspace of what the model that counts foretells of the last drives."""
         bundle = self.layout.bundle(self.ledger.model_round(number))
         views = ("--views", self.config.views) if self.config.views else ()
-        return command("subspace", bundle, "--data", self.layout.root, *views, "--out", path, "--json")
+        return command("lab", "subspace", bundle, "--data", self.layout.root, *views, "--out", path, "--json")
 
     def gate(self, number: int) -> dict[str, dict[str, Words]]:
         """What is measured of the `old` and the `new` world model: `probe`, `losses`, `survival`.

@@ -83,7 +83,7 @@ class IterateConfig:
         False, "let each such evolution search what its model foretells of the last drives alone: needs --go-on"
     )
     views: int = option(
-        0, "beside it so many directions that foretell what the model will see, as `subspace` finds them"
+        0, "beside it so many directions that foretell what the model will see, as `lab subspace` finds them"
     )
     gate_drives: int = option(20, "drives of `inspect --probe` that a new world model is held to the old by; 0: none")
     gate_losses: int = option(30, "losses of `inspect --losses` that it is held to it by; 0: none")

@@ -12,6 +12,9 @@ from pathlib import Path
 import pytest
 
 from dreamfleet.common.cli import command_line
+from dreamfleet.common.cli.first_flags import FIRST_FLAGS
+from dreamfleet.common.cli.overview import GROUPS, WIDTH
+from dreamfleet.common.cli.removed import REMOVED_FLAGS, REMOVED_VERBS
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host import packages
 from dreamfleet.common.host.standard_streams import LAST_STREAM
@@ -32,6 +35,9 @@ def points(*more):
         (("coordinator", "--populaton", "8"), "unrecognized arguments: --populaton 8; did you mean --population?"),
         (("coordinator", "--evaluate-evry=3"), "did you mean --evaluate-every?"),
         (("coordinator", "--popsize", "8"), "unrecognized arguments: --popsize 8; did you mean --population?"),
+        (("evaluate", "drqn", "--data", "x"), "--data is gone: name the training's folder as --controller FOLDER"),
+        (("runs", "export", "dream", "--csv", "out.csv"), "--csv takes no value, and 'out.csv' stands behind it"),
+        (("runs", "export", "--csv", "out.csv"), "write dreamfleet runs export RUN --csv --out FOLDER"),
         (("worker", "--conect", "tcp/a:1"), "did you mean --connect?"),
         (("train", "vae", "--data", "x", "--updats", "3"), "did you mean --updates?"),
         (("status", "--xyzzy"), "unrecognized arguments: --xyzzy; `dreamfleet status --help` lists the flags\n"),
@@ -75,16 +81,16 @@ def test_help_lists_the_exit_codes(words, capsys):
 
 def test_every_verb_has_the_flags_for_config_and_logs():
     for name, point in points().items():
-        text = command_line.build_parser(name, point.load()).format_help()
+        text = command_line.build_parser(name, point.load()).format_all_help()
         assert "--config" in text, name
         assert "--log-level" in text, name
 
 
-SILENT = {"dashboard", "demo", "router", "worker"}  # these work for a person who watches, or for nobody
+SILENT = {"completion", "dashboard", "demo", "router", "worker"}  # these work for a person who watches, or for nobody
 
 
 def test_every_verb_with_output_has_json():
-    verbs = {name: command_line.build_parser(name, point.load()).format_help() for name, point in points().items()}
+    verbs = {name: command_line.build_parser(name, point.load()).format_all_help() for name, point in points().items()}
     assert {name for name, text in verbs.items() if "--json" not in text} <= SILENT
 
 
@@ -93,7 +99,7 @@ def test_a_broken_verb_does_not_affect_others(capsys, tmp_path):
     with pytest.raises(SystemExit):
         command_line.run_verb(points(BROKEN), ["--help"])
     output = " ".join(capsys.readouterr().out.split())
-    assert re.search(r"broken BROKEN: the verb 'broken' cannot be loaded from tests\.no_such_module", output)
+    assert re.search(r"broken +BROKEN: the verb 'broken' cannot be loaded from tests\.no_such_module", output)
     assert "score candidates for a run" in output
     with pytest.raises(DreamfleetError, match=r"'broken' cannot be loaded .*ModuleNotFoundError"):
         command_line.run_verb(points(BROKEN), ["broken"])
@@ -103,14 +109,6 @@ def test_the_module_and_the_version():
     command = [sys.executable, "-m", "dreamfleet", "--version"]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=DEADLINE)
     assert re.fullmatch(r"dreamfleet \d+\.\d+\.\d+\S*\n", done.stdout)
-
-
-def test_the_help_of_fork_shows_its_own_defaults(capsys):
-    with pytest.raises(SystemExit):
-        command_line.main(["fork", "--help"])
-    output = " ".join(capsys.readouterr().out.split())
-    assert "candidates a generation (default RUN's own)" in output
-    assert "(default 32)" not in output
 
 
 def test_closed_streams_are_replaced(tmp_path):
@@ -264,3 +262,45 @@ def test_a_lack_of_memory_is_one_line(monkeypatch, capsys):
     assert capsys.readouterr().err.startswith(
         "dreamfleet: not enough memory on this host (Unable to allocate 81.7 GiB): "
     )
+
+
+@pytest.mark.parametrize("name", sorted(points()))
+def test_help_shows_the_first_flags_and_help_all_the_rest(name):
+    parser = command_line.build_parser(name, points()[name].load())
+    short, whole = parser.format_help(), parser.format_all_help()
+    known = {flag for flag in parser._option_string_actions if flag.startswith("--")}
+    assert {*FIRST_FLAGS.get(name, ())} <= known
+    assert len(short.splitlines()) <= 75
+    assert f"`{parser.prog} --help-all` shows " in short
+    assert all(flag in whole for flag in known if not flag.startswith("--no-"))
+
+
+def test_the_tables_of_flags_name_what_is_there():
+    assert FIRST_FLAGS.keys() <= points().keys()
+    for verb, flag in REMOVED_FLAGS:
+        assert flag not in command_line.build_parser(verb, points()[verb].load())._option_string_actions
+
+
+def test_each_verb_stands_once_in_the_overview():
+    named = [name for entries in GROUPS.values() for names in entries for name in names]
+    assert sorted(named) == sorted(points())
+
+
+def test_the_overview_fits_a_terminal_and_loads_no_verb(capsys, monkeypatch):
+    monkeypatch.setattr(command_line, "load_verb", lambda point: pytest.fail(f"{point.name} was loaded"))
+    with pytest.raises(SystemExit) as left:
+        command_line.main(["--help"])
+    lines = capsys.readouterr().out.splitlines()
+    assert left.value.code == 0
+    assert max(map(len, lines)) <= WIDTH
+    assert len(lines) <= 75
+
+
+@pytest.mark.parametrize("old", sorted(REMOVED_VERBS))
+def test_a_removed_verb_is_answered_with_the_new_one(old, capsys):
+    new = REMOVED_VERBS[old]
+    assert {old, old.replace(" ", ".")}.isdisjoint(points())
+    assert any(new.split(" --")[0] == name.replace(".", " ") for name in points())
+    assert command_line.main([*old.split(), "night", "--seed", "3"]) == UsageError.exit_code
+    error = capsys.readouterr().err
+    assert error == f"dreamfleet: `{old}` is now `{new}`: dreamfleet {new} night --seed 3\n"

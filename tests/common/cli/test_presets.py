@@ -1,6 +1,5 @@
 """Presets: errors name the kind of a preset, as kinds share names; help and docs list the values."""
 
-import argparse
 import re
 import shlex
 
@@ -13,8 +12,7 @@ from dreamfleet.coordinator.settings import presets as runs
 from dreamfleet.coordinator.verbs import coordinator
 from dreamfleet.worker.baselines import presets as baselines
 from dreamfleet.worker.training import presets
-from dreamfleet.worker.training.config_flags import add_training_flags
-from dreamfleet.worker.verbs import baseline
+from dreamfleet.worker.verbs import baseline, train
 from tests.support.processes import ROOT
 
 
@@ -34,15 +32,13 @@ def test_the_error_names_the_other_kind_of_a_preset():
 
 
 def test_help_lists_each_presets_values():
-    training, learning = argparse.ArgumentParser(), argparse.ArgumentParser()
-    add_training_flags(training, "vae")
-    baseline.configure_train(learning)
-    help_text = " ".join(training.format_help().split())
-    assert "(default 1500; notebook 30000; article 60000; attentive 19200; paper 1000000; takecover 2500)" in help_text
+    training, learning = build_parser("train", train), build_parser("baseline.train", baseline.TRAIN)
+    help_text = " ".join(training.format_all_help().split())
+    assert "(default 0; pixels, takecover 1.0)" in help_text
     assert "0: never (default 0; attentive, paper 10)" in help_text
-    assert "else such that the picture's size results (notebook 5 5 6 6)" in help_text
-    assert "else the encoder's in reverse --" in help_text
-    assert "(default 2000; notebook 500)" in " ".join(learning.format_help().split())
+    assert "else such that the picture's size results (notebook 5,5,6,6)" in help_text
+    assert "else the encoder's in reverse decoder_kernels" in help_text
+    assert "(default 16; notebook 64)" in " ".join(learning.format_all_help().split())
 
 
 def test_docs_list_each_run_presets_values():

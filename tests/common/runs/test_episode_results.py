@@ -209,7 +209,7 @@ def test_a_single_differing_seed_is_not_reproduced():
 
 
 @pytest.mark.parametrize("words", [("--episodes", "99999999999"), ("--first-seed", "9223372036854775807")])
-@pytest.mark.parametrize("verb", [("evaluate", "--controller", "tiny"), ("baseline", "evaluate", "random")])
+@pytest.mark.parametrize("verb", [("evaluate", "--controller", "tiny"), ("evaluate", "--controller", "random")])
 def test_seeds_out_of_range_are_refused_before_the_episodes(verb, words, capsys):
     assert command_line.main([*verb, *words]) == 2
     assert "--episodes must be at most 100000, and seeds below" in capsys.readouterr().err

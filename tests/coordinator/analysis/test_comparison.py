@@ -71,7 +71,7 @@ def test_confirmed_scores_are_compared_on_common_tracks(runs):
 def test_the_verb_prints_the_difference_as_text_and_as_json(runs, capsys):
     confirm(runs, "dream", [1.0, 2.0, 3.0, 4.0])
     confirm(runs, "reality", [2.0, 3.5, 3.5, 5.5])
-    words = ["runs", "compare", "dream", "reality", "--runs-dir", str(runs)]
+    words = ["compare", "dream", "reality", "--runs-dir", str(runs)]
     assert command_line.main(words) == 0
     text = capsys.readouterr().out
     assert "the same validation seeds" in text
@@ -86,11 +86,11 @@ def test_the_verb_prints_the_difference_as_text_and_as_json(runs, capsys):
 
 
 def test_runs_without_scores_are_compared_by_their_settings(runs, capsys):
-    assert command_line.main(["runs", "compare", "reality", "hidden", "--runs-dir", str(runs)]) == 0
+    assert command_line.main(["compare", "reality", "hidden", "--runs-dir", str(runs)]) == 0
     text = capsys.readouterr().out
     assert "covariance\tdiagonal\tfull" in text
     assert "less" not in text
-    assert command_line.main(["runs", "compare", "reality", "--runs-dir", str(runs)]) == 2
+    assert command_line.main(["compare", "reality", "--runs-dir", str(runs)]) == 2
     assert "two runs or more" in capsys.readouterr().err
 
 

@@ -17,7 +17,7 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.host.processes import command
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.coordinator.verbs.runs_analysis import SAME_SEEDS
+from dreamfleet.coordinator.verbs.compare import SAME_SEEDS
 from tests.support.disks import small_disk
 from tests.support.events import scalars
 from tests.support.processes import DEADLINE
@@ -98,8 +98,9 @@ def test_the_receipt_says_what_a_paper_cites(runs, capsys):
     assert command_line.main(["runs", "receipt", "reality", "--runs-dir", str(runs)]) == 0
     text = capsys.readouterr().out
     with open_run(runs, "reality") as run:
-        for part in (run.uid, run.spec.bundle, f"seed: {run.settings.seed};", "dreamfleet replay reality --candidate",
-                     "dreamfleet repeat reality ", "@misc{dreamfleet-reality,"):  # fmt: skip
+        for part in (run.uid, run.spec.bundle, f"seed: {run.settings.seed};",
+                     "dreamfleet verify candidate reality --candidate", "dreamfleet verify run reality ",
+                     "@misc{dreamfleet-reality,"):  # fmt: skip
             assert part in text
     assert command_line.main(["runs", "receipt", "reality", "--runs-dir", str(runs), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
@@ -147,8 +148,8 @@ def test_an_evaluation_of_one_episode_has_no_error_in_any_export_or_view(runs, t
         assert "score/evaluated_error" not in scalars(out)
     capsys.readouterr()
     shutil.copytree(runs / "reality", runs / "other")
-    for verb in (["show", "reality"], ["compare", "reality", "other"], ["show", "reality", "--json"]):
-        assert command_line.main(["runs", *verb, "--runs-dir", str(runs)]) == 0
+    for verb in (["runs", "show", "reality"], ["compare", "reality", "other"], ["runs", "show", "reality", "--json"]):
+        assert command_line.main([*verb, "--runs-dir", str(runs)]) == 0
     told = capsys.readouterr().out
     assert "±" not in told.replace(SAME_SEEDS, "")
     assert {each["error"] for each in json.loads(told[told.index("{\n") :])["evaluations"]} == {None}

@@ -33,7 +33,8 @@ def change(tmp_path):
 @pytest.fixture
 def printed(tmp_path, capsys):
     def call(*words):
-        assert command_line.main(["runs", *words, "--runs-dir", str(tmp_path / "runs")]) == 0
+        group = [] if words[0] == "compare" else ["runs"]
+        assert command_line.main([*group, *words, "--runs-dir", str(tmp_path / "runs")]) == 0
         return capsys.readouterr().out
 
     return call
@@ -77,7 +78,7 @@ def test_the_commands_of_a_run_in_an_environment_of_a_module_run_as_printed(proc
     code, out, err = processes.call("runs", "receipt", "test", "--runs-dir", processes.runs, "--json")
     assert code == 0, err
     commands = [shlex.split(each)[1:] for each in json.loads(out)["commands"].values()]
-    assert [each[0] for each in commands] == ["replay", "repeat", "evaluate"]
+    assert [each[:2] for each in commands] == [["verify", "candidate"], ["verify", "run"], ["evaluate", "--controller"]]
     assert all(each[-2:] == ["--trust", module] for each in commands)
     for words in (commands[0], commands[2]):
         code, _, err = processes.call(*words)

@@ -1,6 +1,5 @@
 """A run of several stages, against its journal, without a transport."""
 
-import argparse
 import io
 import random
 from dataclasses import replace
@@ -16,7 +15,7 @@ from dreamfleet.common.runs.scoring_params import scoring_params_of
 from dreamfleet.common.runs.stages import begun_stages
 from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.settings.config import LimitsConfig
-from dreamfleet.coordinator.verbs import fork
+from dreamfleet.coordinator.settings.fork import Fork
 from tests.coordinator.evaluated import EVERY, Evaluated
 from tests.coordinator.run.test_run import SETTINGS
 from tests.support.samples import SPEC
@@ -199,29 +198,24 @@ def test_a_result_is_bounded_by_the_horizon_of_its_own_stage(staged):
     assert bench.run.generation.done == 1, "no older version took it in"
 
 
-def forked(bench, monkeypatch, given=frozenset()):
-    served = []
-    monkeypatch.setattr(
-        "dreamfleet.coordinator.verbs.coordinator.serve_new_run", lambda _args, settings, *_: served.append(settings)
-    )
-    fork.run(argparse.Namespace(source="night", runs_dir=bench.path.parent, run_name=None, given=given))
-    return served[0]
+def forked(bench, given=frozenset()):
+    return Fork.of(bench.path.parent, "night", given).settings
 
 
-def test_a_fork_begins_with_the_stage_that_its_run_is_in_and_goes_on_with_the_others(staged, monkeypatch):
+def test_a_fork_begins_with_the_stage_that_its_run_is_in_and_goes_on_with_the_others(staged):
     bench = staged("night", generations=4)
     bench.drive(lambda _: 0)
     with RunFolder(bench.path) as run:
         assert scoring_params_of(run, 4).stage.number == 2
-    settings = forked(bench, monkeypatch)
+    settings = forked(bench)
     assert settings["stages"] == (StageSettings(score=500.0), *STAGES[2:])
     assert [settings[name] for name in ("horizon", "patience", "episodes", "racing")] == [400, 0, 2, True]
     assert settings["sigma0"] == bench.run.generations.sigma
 
 
-def test_a_fork_of_the_last_stage_has_no_schedule(staged, monkeypatch):
+def test_a_fork_of_the_last_stage_has_no_schedule(staged):
     bench = staged("night")
     bench.drive(lambda _: 0)
-    settings = forked(bench, monkeypatch)
+    settings = forked(bench)
     assert settings["stages"] == ()
     assert (settings["horizon"], settings["population"]) == (600, 8)

@@ -122,11 +122,11 @@ def test_a_file_describes_its_training_and_is_reproducible(tmp_path, capsys):
     assert (agent.manifest.frame_skip, len(agent.manifest.choices), agent.task) == (3, 5, "car-racing")
 
 
-def test_evaluate_and_baseline_evaluate_give_the_same_report_and_compare_takes_both(trained, file, tmp_path, capsys):
+def test_a_training_and_its_file_give_the_same_report_and_compare_takes_both(trained, file, tmp_path, capsys):
     drives = ["--episodes", "3", "--first-seed", str(SEED), "--out"]
     one, other = str(tmp_path / "one.json"), str(tmp_path / "other.json")
     assert main(["evaluate", "--controller", str(file), "--jobs", "1", *drives, one]) == 0
-    assert main(["baseline", "evaluate", "drqn", "--data", str(trained), "--jobs", "1", *drives, other]) == 0
+    assert main(["evaluate", "--controller", str(trained), "--jobs", "1", *drives, other]) == 0
     found = [read_evaluation_report(tmp_path / name) for name in ("one.json", "other.json")]
     assert replace(found[0], name="", seconds=0) == replace(found[1], name="", seconds=0)
     assert {each.steps for each in found[0].drives} == {STEPS}
@@ -135,7 +135,7 @@ def test_evaluate_and_baseline_evaluate_give_the_same_report_and_compare_takes_b
     capsys.readouterr()
     assert main(["compare", one, other, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["differences"][0]["mean"] == 0
-    assert main(["reproduce", one, "--jobs", "1"]) == 0
+    assert main(["verify", "report", one, "--jobs", "1"]) == 0
 
 
 def test_it_goes_to_other_processes(file):
@@ -147,7 +147,7 @@ def test_it_goes_to_other_processes(file):
 def test_a_video_shows_the_same_drive(trained, file, tmp_path, capsys):
     drive = ["--seed", str(SEED), "--steps", str(STEPS), "--json", "--out", str(tmp_path / "drive.mp4")]
     assert main(["record", "--controller", str(file), *drive]) == 0
-    assert main(["baseline", "record", "drqn", "--data", str(trained), *drive]) == 0
+    assert main(["record", "--controller", str(trained), *drive]) == 0
     scores = [json.loads(line)["score"] for line in capsys.readouterr().out.splitlines()]
     assert scores == [agent_evaluator.AgentEvaluator(make_agent(TrainedAgent.load(file))).drive(SEED).score] * 2
 
@@ -169,7 +169,9 @@ print(observation.shape)
 
 
 def test_where_parameters_are_needed_an_agent_is_refused(file, tmp_path):
-    with pytest.raises(ControllerError, match="is a trained agent, which `evaluate`, `record` and `reproduce` take"):
+    with pytest.raises(
+        ControllerError, match="is a trained agent, which `evaluate`, `record` and `verify report` take"
+    ):
         find_controller(str(file), tmp_path)
 
 

@@ -1,17 +1,18 @@
 """Baselines are evaluated and recorded in gymnasium's own environment, like controllers."""
 
-import argparse
 import json
+from pathlib import Path
 
 import av
 import numpy as np
 import pytest
 import torch
 
-from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.common.cli import command_line
+from dreamfleet.common.errors import ControllerError, DatasetError
 from dreamfleet.common.runs.evaluation_report import read_evaluation_report
 from dreamfleet.worker.baselines.agent_config import AgentConfig
-from dreamfleet.worker.baselines.agents import find_baseline
+from dreamfleet.worker.baselines.agents import find_driver
 from dreamfleet.worker.baselines.network import Networks
 from dreamfleet.worker.baselines.presets import DISCRETE, DRQN, NAMES, RANDOM
 from dreamfleet.worker.baselines.train import CHECKPOINT
@@ -19,7 +20,6 @@ from dreamfleet.worker.scoring.episode import EpisodeConfig
 from dreamfleet.worker.tools import agent_evaluator, evaluation
 from dreamfleet.worker.tools.recording import record
 from dreamfleet.worker.training.checkpoint import save_checkpoint
-from dreamfleet.worker.verbs import baseline
 from dreamfleet.worker.worldmodel.vae import VAE
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 
@@ -45,62 +45,69 @@ def trained(tmp_path):
     return keep(tmp_path / "trained", Networks(LAYERS))
 
 
-def call(verb, *words):
-    parser = argparse.ArgumentParser()
-    verb.configure(parser)
-    return verb.run(parser.parse_args(list(map(str, words))))
+def call(*words):
+    return command_line.main(list(map(str, words)))
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_judgement_is_a_controllers_and_the_same_again(name, trained, tmp_path, capsys):
-    out, data = tmp_path / "figures.json", ("--data", trained) if name == DRQN else ()
-    words = (name, *data, "--episodes", 2, "--first-seed", SEED, "--jobs", 1, "--json", "--out", out)
-    assert call(baseline.EVALUATE, *words) == 0
+    out, who = tmp_path / "figures.json", trained if name == DRQN else name
+    words = (
+        "evaluate",
+        "--controller",
+        who,
+        "--episodes",
+        2,
+        "--first-seed",
+        SEED,
+        "--jobs",
+        1,
+        "--json",
+        "--out",
+        out,
+    )
+    assert call(*words) == 0
     printed = capsys.readouterr()
-    assert "note:" not in printed.err
     found = read_evaluation_report(out)
     assert json.loads(printed.out)["scores"] == list(found.results.scores)
     assert (found.world, found.bundle, found.results.seeds) == ("car-racing", "", (SEED, SEED + 1))
     assert {each.steps for each in found.drives} == {STEPS}
     assert all(each.speed is not None and each.braking is not None for each in found.drives)
-    assert call(baseline.EVALUATE, *words) == 0
+    assert call(*words) == 0
     assert read_evaluation_report(out).drives == found.drives
 
 
 def test_chance_is_the_episodes_and_within_the_world():
     for name in (RANDOM, DISCRETE):
-        policies = find_baseline(name, None).make_policies()
+        policies = find_driver(name, Path()).make_policies()
         drawn = [[policies(seed).act(None).tolist() for seed in (1, 2, 3)] for _ in range(2)]
         assert drawn[0] == drawn[1]
         assert len({*map(tuple, drawn[0])}) > 1
-    policy = find_baseline(RANDOM, None).make_policies()(0)
+    policy = find_driver(RANDOM, Path()).make_policies()(0)
     actions = np.array([policy.act(None) for _ in range(1000)])
     assert actions.min(axis=0) == pytest.approx([-1, 0, 0], abs=0.02)
     assert actions.max(axis=0) == pytest.approx([1, 1, 1], abs=0.02)
-    policy = find_baseline(DISCRETE, None).make_policies()(0)
+    policy = find_driver(DISCRETE, Path()).make_policies()(0)
     assert len({tuple(policy.act(None)) for _ in range(200)}) == 5
 
 
 def test_a_video_has_a_frame_a_step_and_the_drives_score(trained, tmp_path, capsys):
     out = tmp_path / "drive.mp4"
-    assert call(baseline.RECORD, DRQN, "--data", trained, "--seed", SEED, "--steps", STEPS, "--out", out, "--json") == 0
+    assert call("record", "--controller", trained, "--seed", SEED, "--steps", STEPS, "--out", out, "--json") == 0
     score = json.loads(capsys.readouterr().out)["score"]
-    assert score == agent_evaluator.AgentEvaluator(find_baseline(DRQN, trained)).drive(SEED).score
-    assert score == record(find_baseline(DRQN, trained), SEED, STEPS, out)
+    assert score == agent_evaluator.AgentEvaluator(find_driver(str(trained), Path())).drive(SEED).score
+    assert score == record(find_driver(str(trained), Path()), SEED, STEPS, out)
     with av.open(str(out)) as container:
         assert len(list(container.decode(container.streams.video[0]))) == STEPS
 
 
 def test_what_is_no_agent_is_one_line(trained, tmp_path):
-    with pytest.raises(UsageError, match=r"no agent at .*: train one with `dreamfleet baseline train drqn"):
-        find_baseline(DRQN, tmp_path / "absent")
-    with pytest.raises(UsageError, match="drqn needs --data"):
-        find_baseline(DRQN, None)
-    with pytest.raises(UsageError, match="random learns nothing: leave --data out"):
-        find_baseline(RANDOM, trained)
+    with pytest.raises(ControllerError, match="no controller"):
+        find_driver(str(tmp_path / "absent"), Path())
+    folder = keep(tmp_path / "vae", VAE(VAEConfig(latent=4, channels=(2, 2, 4, 4))))
     with pytest.raises(DatasetError, match=r"drqn\.safetensors is damaged"):
-        find_baseline(DRQN, keep(tmp_path / "vae", VAE(VAEConfig(latent=4, channels=(2, 2, 4, 4)))))
+        find_driver(str(folder), Path())
     path = trained / CHECKPOINT
     path.write_bytes(path.read_bytes()[:-50])
     with pytest.raises(DatasetError, match=r"drqn\.safetensors is damaged"):
-        find_baseline(DRQN, trained)
+        find_driver(str(trained), Path())

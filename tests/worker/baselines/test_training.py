@@ -28,8 +28,8 @@ SHORT = LearningConfig(
     learn_every=2, target_every=3, replay=20, report_every=2,
 )  # fmt: skip
 FLAGS = (
-    "--channels", "2", "--kernels", "8", "--strides", "8", "--hidden", "4", "--frame-skip", "3", "--steps", "12",
-    "--random-episodes", "1", "--batch", "2", "--report-every", "1", "--learn-every", "1",
+    "--set", "channels=2", "kernels=8", "strides=8", "hidden=4", "frame_skip=3", "random_episodes=1", "batch=2",
+    "report_every=1", "learn_every=1", "--steps", "12",
 )  # fmt: skip
 
 
@@ -124,7 +124,9 @@ def test_flags_change_what_a_preset_says(tmp_path, capsys):
     assert found == replace(LAYERS, picture=96, choices="notebook", heads="softmax")
     with pytest.raises(DatasetError, match=r"is of another model: picture 96, not 64; choices notebook.*or --new"):
         call("drqn", "--data", tmp_path, *FLAGS, "--episodes", 3)
-    with pytest.raises(UsageError, match="random-discrete learns nothing: `dreamfleet baseline evaluate"):
+    with pytest.raises(
+        UsageError, match="random-discrete learns nothing: `dreamfleet evaluate --controller random-discrete`"
+    ):
         call("random-discrete", "--data", tmp_path)
 
 
@@ -199,11 +201,11 @@ def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(whole, tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"picture": 80}, "--picture must be 64 or 96"),
+        ({"picture": 80}, "picture must be 64 or 96"),
         ({"kernels": (3, 3)}, "the same number of layers"),
         ({"kernels": (65,)}, "leave nothing of 64 pixels"),
         ({"frame_skip": 0}, "must be at least 1"),
-        ({"frame_skip": 10**9}, "--frame-skip must be at most 1000000"),
+        ({"frame_skip": 10**9}, "frame_skip must be at most 1000000"),
         ({"hidden": 10**9}, "parameters, at most 50,000,000 are allowed"),
     ],
 )

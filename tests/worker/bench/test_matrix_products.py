@@ -1,4 +1,4 @@
-"""The lower bounds of `bench policy` and `bench dream` ignore slow libraries and inherited settings."""
+"""The lower bounds of `lab bench policy` and `lab bench dream` ignore slow libraries and inherited settings."""
 
 import os
 

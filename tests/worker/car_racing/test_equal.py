@@ -1,4 +1,4 @@
-"""The native picture is gymnasium's, to the bit. `dreamfleet bench env --exact` compares far more."""
+"""The native picture is gymnasium's, to the bit. `dreamfleet lab bench env --exact` compares far more."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,5 @@
 import json
+import re
 
 import gymnasium
 import numpy as np
@@ -8,7 +9,7 @@ from dreamfleet.common.artifacts.actions import Continuous, Discrete
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.common.protocol.tasks import describe_task, family_of
+from dreamfleet.common.protocol.tasks import describe_task, family_of, load_task
 from dreamfleet.worker.gym.task import DEFAULT_MAX_STEPS
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tasks.api import Assignment
@@ -128,6 +129,25 @@ def test_observations_are_normalised_by_what_the_run_froze():
 def test_an_unusable_environment_is_refused_with_the_reason(name, says):
     with pytest.raises(UsageError, match=says):
         describe_task(name, {})
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("ALE/Nothing-v5", "`pip install ale-py`, and write gym:ale_py:ALE/Nothing-v5"),
+        ("MiniGrid-Nothing-v0", "`pip install minigrid`, and write gym:minigrid:MiniGrid-Nothing-v0"),
+    ],
+)
+def test_an_environment_of_a_known_package_says_how_to_install_and_write_it(name, says):
+    with pytest.raises(UsageError, match=re.escape(says)):
+        describe_task(f"gym:{name}", {})
+
+
+def test_a_class_that_its_module_does_not_register_is_made_as_it_is():
+    name = f"gym:{Strange.__module__}:Strange"
+    assert describe_task(name, {}).observations == 2
+    with pytest.raises(UsageError, match=f"is an environment of gymnasium and no task: write {name}"):
+        load_task(name.removeprefix("gym:"))
 
 
 class Strange(gymnasium.Env):

@@ -98,7 +98,7 @@ def test_numbers_are_held_at_their_bounds():
 
 def test_a_model_without_ends_and_a_stranger_are_refused(dodge, tmp_path):
     endless = write_random_bundle(tmp_path / "endless.zip", vae=VAE, rnn=MDNRNNConfig(latent=5, hidden=8))
-    with pytest.raises(UsageError, match=r"endless\.zip predicts no ends: train its MDN-RNN with --done"):
+    with pytest.raises(UsageError, match=r"endless\.zip predicts no ends: train its MDN-RNN with --set done=true"):
         measure_survival(endless, None, SurvivalConfig(2))
     with pytest.raises(UsageError, match="must be of this world model"):
         measure_survival(dodge, controller_of(endless), SurvivalConfig(2))

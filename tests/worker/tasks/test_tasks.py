@@ -8,7 +8,7 @@ from dreamfleet.common.artifacts.bundle import BundleManifest, write_bundle
 from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.errors import BundleError, ControllerError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.common.protocol.tasks import describe_task, is_self_describing
+from dreamfleet.common.protocol.tasks import check_task, describe_task, is_self_describing
 from dreamfleet.worker.car_racing.preprocessing import BOX, RAW
 from dreamfleet.worker.scoring.episode import run_episode, score
 from dreamfleet.worker.scoring.scorer import Scorer
@@ -47,6 +47,20 @@ def test_a_name_of_an_environment_without_its_family_is_offered_with_it(name, mo
     assert "--bundle" not in str(refused.value), "its module is here"
     with pytest.raises(UsageError, match=f"write gym:tests.support.tasks:{name} if"):
         find_task(f"tests.support.tasks:{name}")
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("CarRacing-v3", "it is written car-racing here"),
+        ("carracing", "it is written car-racing here"),
+        ("LunarLander-v3", "gymnasium's environments are written gym:LunarLander-v3"),
+        ("car-racin", "did you mean car-racing"),
+    ],
+)
+def test_a_name_of_gymnasium_is_answered_with_ours(name, says):
+    with pytest.raises(UsageError, match=says):
+        check_task(name)
 
 
 def test_only_a_missing_module_is_to_be_installed():

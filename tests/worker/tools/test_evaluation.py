@@ -84,7 +84,9 @@ def test_an_episode_that_fails_is_reported_and_the_others_go_on(processes, contr
         30 - failed,
         [each.seed for each in report.failed],
     )
-    code, out, err = processes.call("reproduce", tmp_path / "toy.json", "--bundle", random_bundle.path, "--jobs", jobs)
+    code, out, err = processes.call(
+        "verify", "report", tmp_path / "toy.json", "--bundle", random_bundle.path, "--jobs", jobs
+    )
     assert (code, f"the same {30 - failed} scores" in out) == (0, True), err
 
 
@@ -212,16 +214,16 @@ def test_the_report_is_what_it_prints_and_can_be_repeated_to_the_bit(processes, 
     assert (recorded.task, recorded.world, recorded.threshold) == (tasks.TOY, tasks.TOY, None)
     assert recorded.fingerprint == fingerprint(find_task(tasks.TOY).world.packages)
     assert [each.finished for each in recorded.drives] == [None] * 3
-    code, said, err = processes.call("reproduce", out, "--episodes", 2, "--jobs", 1)
+    code, said, err = processes.call("verify", "report", out, "--episodes", 2, "--jobs", 1)
     assert (code, "the same 2 scores to the bit" in said) == (0, True), err
     out.write_text(replace(recorded, drives=(replace(recorded.drives[0], steps=9), *recorded.drives[1:])).to_json())
-    code, said, err = processes.call("reproduce", out, "--jobs", 1, "--json")
+    code, said, err = processes.call("verify", "report", out, "--jobs", 1, "--json")
     assert (code, json.loads(said)["reproduced"]) == (1, False), err
     out.write_text(replace(recorded, controller="ef" * 32).to_json())
-    code, _, err = processes.call("reproduce", out)
+    code, _, err = processes.call("verify", "report", out)
     assert (code, "records the controller efefefefefef" in err) == (1, True)
     out.write_text(replace(recorded, bundle="ef" * 32).to_json())
-    code, _, err = processes.call("reproduce", out)
+    code, _, err = processes.call("verify", "report", out)
     assert (code, "records drives by the world model efefefefefef" in err) == (1, True)
 
 

@@ -22,7 +22,7 @@ def finished_run(processes, random_bundle):
 
 
 def test_a_fitness_that_differs_from_the_stored_one_is_reported_and_exits_1(processes, finished_run):
-    replay = ("replay", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
+    replay = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
     code, out, _ = processes.call(*replay)
     assert (code, out.count("same bits")) == (0, 2)
     with closing(sqlite3.connect(finished_run / JOURNAL)) as connection, connection:
@@ -30,7 +30,7 @@ def test_a_fitness_that_differs_from_the_stored_one_is_reported_and_exits_1(proc
     connection.close()
     code, out, _ = processes.call(*replay)
     assert (code, out.count("same bits"), out.count("DIFFERS")) == (1, 1, 1)
-    code, _, err = processes.call("replay", "test", "--runs-dir", processes.runs, "--candidate", "5/0")
+    code, _, err = processes.call("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", "5/0")
     assert code == 1
     assert "candidate 5/0" in err
 
@@ -39,7 +39,7 @@ def test_results_of_another_host_class_are_counted_and_optionally_compared(proce
     with closing(sqlite3.connect(finished_run / JOURNAL)) as connection, connection:
         connection.execute("UPDATE result SET fitness = fitness + 0.5, host_class = 'there' WHERE episode = 1")
     connection.close()
-    replay = ("replay", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
+    replay = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
     code, out, err = processes.call(*replay)
     assert (code, out.count("same bits"), out.count("not checkable here: of class there")) == (0, 1, 1)
     assert "1 of 2 episodes were scored by hosts of another class" in err
@@ -79,7 +79,7 @@ def test_an_episode_fails_only_in_a_fresh_process(processes, random_bundle, monk
     monkeypatch.setenv("DREAMFLEET_TRUST", rough_tasks.MODULE)
     task = rough_tasks.name_of(rough_tasks.Poisoned)
     score_generation(processes, random_bundle, task, 2)
-    code, out, err = processes.call("replay", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
+    code, out, err = processes.call("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
     assert (code, out.count("same bits")) == (0, 2), (out, err)
 
 
@@ -89,7 +89,17 @@ def test_what_only_python_itself_should_raise_is_an_episodes_failure(processes, 
     score_generation(processes, random_bundle, task, 2)
     monkeypatch.setenv(rough_tasks.PLACE, place)
     monkeypatch.setenv(rough_tasks.ERROR, "KeyboardInterrupt")
-    replay = ("replay", "test", "--runs-dir", processes.runs, "--candidate", "0/1", "--trust", rough_tasks.MODULE)
+    replay = (
+        "verify",
+        "candidate",
+        "test",
+        "--runs-dir",
+        processes.runs,
+        "--candidate",
+        "0/1",
+        "--trust",
+        rough_tasks.MODULE,
+    )
     code, out, err = processes.call(*replay)
     assert (code, out.count("fails now (KeyboardInterrupt:)"), "Traceback" in err) == (1, 2, False), (out, err)
 
@@ -119,7 +129,7 @@ def test_a_candidate_that_failed_is_driven_again_and_its_cause_compared(processe
     with RunFolder(folder) as run:
         place = run.failures()[0]
         failed = sum((each.generation, each.candidate) == (0, place.candidate) for each in run.failures())
-    replay = ("replay", "test", "--runs-dir", processes.runs, "--candidate", f"0/{place.candidate}")
+    replay = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", f"0/{place.candidate}")
     code, out, err = processes.call(*replay)
     assert (code, out.count("same cause"), "DIFFERS" in out) == (0, failed, False), err
     assert "failed then (ArithmeticError: the world of" in out
@@ -150,7 +160,7 @@ def test_a_candidate_that_scored_and_now_fails_differs(processes, brittle_run):
         connection.execute("DELETE FROM failure")
     connection.close()
     code, out, err = processes.call(
-        "replay", "test", "--runs-dir", processes.runs, "--candidate", f"0/{place.candidate}"
+        "verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", f"0/{place.candidate}"
     )
     assert (code, "stored -1.0  fails now (ArithmeticError" in out, "DIFFERS" in out) == (1, True, True), err
     assert "Traceback" not in err
@@ -162,7 +172,7 @@ def test_a_candidate_that_was_drawn_anew_is_compared_with_its_final_vector_alone
         stored = {number: len(run.results(0, number)) for number in numbers}
     number = max(stored, key=stored.__getitem__)
     assert stored[number] > 3, "choose another seed"
-    replay = ("replay", "test", "--runs-dir", processes.runs, "--candidate", f"0/{number}")
+    replay = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", f"0/{number}")
     code, out, err = processes.call(*replay)
     assert (code, out.count("same bits"), len(out.splitlines())) == (0, 3, 3), (out, err)
 
@@ -174,7 +184,7 @@ def test_a_candidate_whose_generation_got_other_seeds_is_compared_on_these_alone
         seeds = run.training_seeds(0)
         assert run.failures()[0].seed not in seeds
         number = next(number for number in range(12) if run.fitness(0, number) is not None)
-    replay = ("replay", "test", "--runs-dir", processes.runs, "--candidate", f"0/{number}")
+    replay = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", f"0/{number}")
     code, out, err = processes.call(*replay)
     assert (code, out.count("same bits"), len(out.splitlines())) == (0, 3, 3), (out, err)
     with closing(sqlite3.connect(folder / JOURNAL)) as connection, connection:

@@ -1,4 +1,4 @@
-"""`record` and `baseline record` take the same arguments and print the same answers."""
+"""`record` takes the same arguments of a controller and of a random driver, and prints the same answers."""
 
 import json
 
@@ -13,10 +13,10 @@ from dreamfleet.common.errors import UsageError
 FIRST, SECOND, STEPS = 20_000, 20_001, 5
 
 
-@pytest.fixture(params=["record", "baseline record"])
+@pytest.fixture(params=["evolved", "random"])
 def verb(request, random_bundle, tmp_path):
-    if request.param == "baseline record":
-        return ["baseline", "record", "random"]
+    if request.param == "random":
+        return ["record", "--controller", "random"]
     shape, path = random_bundle.controller_shape, tmp_path / "controller.npz"
     Controller(shape, np.zeros(shape.size, np.float32), "car-racing", random_bundle.sha256).save(path)
     return ["record", "--controller", str(path), "--bundle", str(random_bundle.path)]

@@ -16,7 +16,7 @@ from dreamfleet.worker.training.checkpoint import load_config, load_progress, lo
 from dreamfleet.worker.training.data.rollouts import load_rollouts
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.presets import TrainConfig
-from dreamfleet.worker.verbs import train as verbs
+from dreamfleet.worker.verbs import train as verb
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae import VAE, PixelWeights
@@ -133,7 +133,7 @@ def test_a_factor_that_weighs_nothing_or_all_is_refused(value):
         lambda: VAEConfig(error_factor=value), lambda: MDNRNNConfig(z_factor=value),
         lambda: MDNRNNConfig(reward_factor=value), lambda: MDNRNNConfig(done=True, done_factor=value),
     ):  # fmt: skip
-        with pytest.raises(UsageError, match=r"-factor must be from 1e-06 to 1e\+06, not"):
+        with pytest.raises(UsageError, match=r"_factor must be from 1e-06 to 1e\+06, not"):
             change()
     with pytest.raises(UsageError, match="a reward head"):
         MDNRNNConfig(reward="none", reward_factor=2.0)
@@ -144,9 +144,9 @@ def test_flags_pass_through_an_iteration_to_the_training(trained, tmp_path):
     assert IterateConfig(vae_flags="--error-factor 4").vae_flags
     words = commands(vae_flags="--error-factor 4").train(1, "vae")
     parser = argparse.ArgumentParser()
-    verbs.VAE.configure(parser)
-    given = [str(tmp_path) if word == "data/rounds/01" else word for word in words[2:]]
-    assert verbs.VAE.run(parser.parse_args([*given, "--updates", "1", "--channels", "2", "2", "4", "4"])) == 0
+    verb.configure(parser)
+    given = [str(tmp_path) if word == "data/rounds/01" else word for word in words[1:]]
+    assert verb.run(parser.parse_args([*given, "--updates", "1", "--set", "channels=2,2,4,4"])) == 0
     assert load_config(tmp_path / train_vae.CHECKPOINT, VAEConfig).error_factor == 4.0
 
 

@@ -19,13 +19,13 @@ from dreamfleet.worker.training.loss_curve import append_point
 from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.training.training_cli import run_training
 from dreamfleet.worker.training.training_state import numbered_path
-from dreamfleet.worker.verbs import train as verbs
+from dreamfleet.worker.verbs import train as verb
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.drives import write_drives
 
 LAYERS, RNN = VAEConfig(latent=4, channels=(2, 2, 4, 4)), MDNRNNConfig(latent=4, hidden=8, mixtures=2)
-FLAGS = ("--latent", "4", "--channels", "2", "2", "4", "4", "--batch", "8")
+FLAGS = ("--set", "latent=4", "channels=2,2,4,4", "--batch", "8")
 SHORT = TrainConfig(updates=6, batch=8, rate=1e-3, validate_every=2)
 
 
@@ -73,8 +73,8 @@ def test_a_training_goes_on_by_the_seed_that_it_was_begun_with(data):
 
 def call(*words):
     parser = argparse.ArgumentParser()
-    verbs.VAE.configure(parser)
-    return verbs.VAE.run(parser.parse_args([*map(str, words), *FLAGS]))
+    verb.configure(parser)
+    return verb.run(parser.parse_args(["vae", *map(str, words), *FLAGS]))
 
 
 def state(path):
@@ -206,12 +206,12 @@ def test_checkpoints_are_kept_beside_the_last_one(drives, data):
     last.write_bytes(kept.read_bytes())
     train(data)
     assert state(last) == state(drives / train_vae.CHECKPOINT)
-    with pytest.raises(UsageError, match=r"--keep-every must be at least 1, or 0"):
+    with pytest.raises(UsageError, match=r"keep_every must be at least 1, or 0"):
         replace(SHORT, keep_every=-1)
 
 
 def test_an_early_end_is_said_and_again_where_nothing_is_left_to_do(data, capsys):
-    words = ("--data", data, "--updates", 20, "--validate-every", 1, "--rate", 1e-12, "--patience", 2)
+    words = ("--data", data, "--updates", 20, "--rate", 1e-12, "--set", "validate_every=1", "patience=2")
     assert call(*words) == 0
     printed = capsys.readouterr().out
     assert "ended early after update 3, as --patience says: the checkpoint is that of update 1, the best" in printed
@@ -222,7 +222,7 @@ def test_an_early_end_is_said_and_again_where_nothing_is_left_to_do(data, capsys
     point = json.loads((data / "vae.jsonl").read_text().splitlines()[0])
     assert ended["held_out_loss"] == pytest.approx(point["held_out"], abs=1e-5)
     assert "ended_early" not in json.loads((data / "quality.json").read_text())
-    assert call(*words, "--patience", 0, "--updates", 2, "--json") == 0
+    assert call(*words, "--set", "patience=0", "--updates", 2, "--json") == 0
     assert json.loads(capsys.readouterr().out)["ended_early"] is None
 
 

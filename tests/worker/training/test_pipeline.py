@@ -212,11 +212,11 @@ def test_the_world_is_passed_to_collect_alone():
 
 
 def test_each_stage_has_its_flags():
-    flags = {f"{name}_flags": f"--of {name}" for name in ("collect", "vae", "mdnrnn", "bundle")}
+    flags = {f"{name}_flags": f"--set of={name}" for name in ("collect", "vae", "mdnrnn", "bundle")}
     stages = Pipeline(PRESETS["pixels"], Path("data"), **flags).stages(2, "cpu")
     said = {name: " ".join(words) for name, words in stages.items()}
-    assert said["bundle"] == "bundle --data data --out data/pixels.zip --json --of bundle"
-    assert {name: text.partition("--of ")[2].split(" ")[0] for name, text in said.items()} == {
+    assert said["bundle"] == "bundle --data data --out data/pixels.zip --json --set of=bundle"
+    assert {name: text.partition("--set of=")[2].split(" ")[0] for name, text in said.items()} == {
         "collect": "collect", "train.vae": "vae", "encode": "", "train.mdnrnn": "mdnrnn", "bundle": "bundle",
     }  # fmt: skip
 
@@ -224,8 +224,8 @@ def test_each_stage_has_its_flags():
 def test_a_share_of_every_amount_is_rounded_up():
     stages = Pipeline(PRESETS["notebook"], Path("data"), scale=0.02).stages(2, "cpu")
     assert "--episodes 20" in " ".join(stages["collect"])
-    assert "--updates 600 --validate-every 4" in " ".join(stages["train.vae"])
-    assert "--updates 200 --validate-every 4" in " ".join(stages["train.mdnrnn"])
+    assert "--updates 600 --set validate_every=4" in " ".join(stages["train.vae"])
+    assert "--updates 200 --set validate_every=4" in " ".join(stages["train.mdnrnn"])
     least = Pipeline(PRESETS["tiny"], Path("data"), scale=1e-6).stages(2, "cpu")
     assert "--episodes 2" in " ".join(least["collect"])
     assert "--updates 1" in " ".join(least["train.vae"])
@@ -250,7 +250,7 @@ def test_what_cannot_be_is_refused_before_anything_is_driven(tmp_path, flags, sa
 
 
 def test_an_unknown_flag_of_a_stage_is_refused_before_anything_is_driven(tmp_path):
-    with pytest.raises(UsageError, match="unrecognized arguments: --ghost"):
+    with pytest.raises(UsageError, match="unknown key 'ghost'"):
         call("--data", tmp_path / "data", "--mdnrnn-flags", "--ghost 1")
     assert not (tmp_path / "data").exists()
 
@@ -262,11 +262,11 @@ def test_another_preset_than_the_data_sets_is_refused(tmp_path):
 
 
 def test_a_seed_beyond_torchs_is_refused():
-    with pytest.raises(UsageError, match="--seed must be from 0 to 8796093022208"):
+    with pytest.raises(UsageError, match="seed must be from 0 to 8796093022208"):
         TrainConfig(**{**vars(PRESETS["tiny"].vae), "seed": 10**20})
 
 
 @pytest.mark.parametrize("config", [VAEConfig, MDNRNNConfig])
 def test_a_size_beyond_torchs_is_refused(config):
-    with pytest.raises(UsageError, match=r"--latent must be at most 16384, not 18446744073709551616"):
+    with pytest.raises(UsageError, match=r"latent must be at most 16384, not 18446744073709551616"):
         config(latent=2**64)

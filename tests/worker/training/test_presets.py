@@ -7,6 +7,7 @@ from dataclasses import fields
 import pytest
 import torch
 
+from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.common.cli.presets import NAMES
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.worker.training import train_mdnrnn, train_vae
@@ -16,8 +17,7 @@ from dreamfleet.worker.training.data.dataset import load_arrays
 from dreamfleet.worker.training.data.rollouts import Rollouts, load_rollouts, model_inputs, teacher_force
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.presets import PRESETS, TrainConfig
-from dreamfleet.worker.verbs import collect
-from dreamfleet.worker.verbs import train as verbs
+from dreamfleet.worker.verbs import collect, train
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import NOTEBOOK, REWARDED, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
@@ -27,7 +27,7 @@ from tests.support.drives import write_drive, write_drives
 pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
 SHORT = TrainConfig(updates=2, batch=8, rate=1e-3)
 SMALL = {64: VAEConfig(channels=(2, 2, 4, 4)), 96: VAEConfig(picture=96, channels=(2, 2, 4, 4))}
-VERBS = (collect, verbs.VAE, verbs.MDNRNN)
+VERBS = ((collect,), (train, "vae"), (train, "mdnrnn"))
 
 
 def ignore(_done, _note):
@@ -126,7 +126,7 @@ def test_a_drive_follows_from_the_first_reward_in_training_and_behind_it():
     assert states[0][0, 2 * NOTEBOOK.hidden] == 1
 
 
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("verb", [collect, train])
 def test_every_flag_says_what_it_does(verb):
     parser = argparse.ArgumentParser()
     verb.configure(parser)
@@ -136,12 +136,11 @@ def test_every_flag_says_what_it_does(verb):
 
 @pytest.mark.parametrize(
     ("verb", "kinds"),
-    [(collect, (CollectConfig,)), (verbs.VAE, (TrainConfig, VAEConfig)), (verbs.MDNRNN, (TrainConfig, MDNRNNConfig))],
+    [("collect", (CollectConfig,)), ("train", (TrainConfig, VAEConfig, MDNRNNConfig))],
 )
-def test_every_amount_and_layer_has_a_flag(verb, kinds):
-    parser = argparse.ArgumentParser()
-    verb.configure(parser)
-    said = {each.dest for each in parser._actions}
+def test_every_amount_and_layer_has_a_flag_or_a_key(verb, kinds):
+    parser = build_parser(verb, {"collect": collect, "train": train}[verb])
+    said = {each.dest for each in parser._actions} | {key for texts in parser.keys.values() for key in texts}
     assert {each.name for kind in kinds for each in fields(kind)} - said <= {"actions"}
 
 
@@ -151,14 +150,14 @@ def test_a_later_verb_without_the_data_sets_preset_is_refused(tmp_path, capsys):
         == 0
     )
     assert load_preset(tmp_path) == "article"
-    for verb in VERBS:
+    for verb, *model in VERBS:
         with pytest.raises(
             UsageError, match=r"begun with the preset article, and without .* tiny: give --preset article"
         ):
-            call(verb, "--data", str(tmp_path))
+            call(verb, *model, "--data", str(tmp_path))
         with pytest.raises(UsageError, match="--preset paper is another: give --preset article"):
-            call(verb, "--data", str(tmp_path), "--preset", "paper")
-    assert call(verbs.VAE, "--data", str(tmp_path), "--preset", "article", "--summary") == 0
+            call(verb, *model, "--data", str(tmp_path), "--preset", "paper")
+    assert call(train, "vae", "--data", str(tmp_path), "--preset", "article", "--summary") == 0
     assert "2,115,971" in capsys.readouterr().out
 
 

@@ -133,8 +133,8 @@ def test_equal_folders_record_equal_states_and_none_are_the_bundle_of_before(tra
 
 def call(capsys, folder, *flags):
     parser = argparse.ArgumentParser()
-    verbs.configure_bundle(parser)
-    assert verbs.write_bundle(parser.parse_args(["--data", str(folder), "--out", str(folder / "b.zip"), *flags])) == 0
+    verbs.configure(parser)
+    assert verbs.run(parser.parse_args(["--data", str(folder), "--out", str(folder / "b.zip"), *flags])) == 0
     return capsys.readouterr().out
 
 

@@ -156,7 +156,7 @@ def test_where_one_of_both_cannot_be_written_neither_is(tmp_path, monkeypatch):
 
 def test_models_that_are_there_stay(tmp_path, capsys):
     write_random_bundle(tmp_path / "a.zip", 3, EYES, MEMORY)
-    assert main(["unbundle", str(tmp_path / "a.zip"), "--data", str(tmp_path / "data"), "--json"]) == 0
+    assert main(["bundle", "--extract", str(tmp_path / "a.zip"), "--data", str(tmp_path / "data"), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed["bundle"] == Bundle.open(tmp_path / "a.zip").sha256
     before = (tmp_path / "data" / "vae.safetensors").read_bytes()

@@ -4,6 +4,7 @@ import json
 import numpy as np
 import pytest
 
+from dreamfleet.common.cli import command_line
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.worker.training.checkpoint import load_config
 from dreamfleet.worker.verbs import collect, train
@@ -21,8 +22,8 @@ def call(verb, *arguments):
 def test_flags_change_what_a_preset_says(tmp_path, capsys):
     write_drives(tmp_path, episodes=3, steps=4)
     call(
-        train.VAE, "--data", str(tmp_path), "--updates", "1", "--channels", "2", "2", "4", "4", "--no-batch-norm",
-        "--padding", "same",
+        train, "vae", "--data", str(tmp_path), "--updates", "1", "--set", "channels=2,2,4,4", "batch_norm=false",
+        "--set", "padding=same",
     )  # fmt: skip
     assert load_config(tmp_path / "vae.safetensors", VAEConfig) == VAEConfig(channels=(2, 2, 4, 4), padding="same")
     assert "reconstruction_error" in capsys.readouterr().out
@@ -30,7 +31,7 @@ def test_flags_change_what_a_preset_says(tmp_path, capsys):
 
 def test_a_flag_says_how_large_pictures_are(tmp_path, capsys):
     write_drives(tmp_path, episodes=3, steps=4, picture=96)
-    call(train.VAE, "--data", str(tmp_path), "--updates", "1", "--picture", "96", "--channels", "2", "2", "4", "4")
+    call(train, "vae", "--data", str(tmp_path), "--updates", "1", "--set", "picture=96", "channels=2,2,4,4")
     assert load_config(tmp_path / "vae.safetensors", VAEConfig).picture == 96
     assert call(collect, "--data", str(tmp_path), "--episodes", "3", "--picture", "96") == 0
     assert "0 episodes, 0 frames new; 3 episodes in all" in capsys.readouterr().out
@@ -49,9 +50,43 @@ def test_a_set_that_has_more_than_is_asked_for_is_counted_whole(tmp_path, capsys
     assert "5/5" in printed.err
 
 
-@pytest.mark.parametrize(("verb", "count"), [(train.VAE, "4,348,547"), (train.MDNRNN, "422,368")])
-def test_a_summary_trains_nothing(tmp_path, capsys, verb, count):
-    assert call(verb, "--data", str(tmp_path / "absent"), "--preset", "paper", "--summary") == 0
+def test_a_file_and_variables_say_settings_too(tmp_path, monkeypatch, capsys):
+    write_drives(tmp_path, episodes=3, steps=4)
+    (tmp_path / "settings.toml").write_text("[vae]\nchannels = [2, 2, 4, 4]\nlatent = 9\nkl_tolerance = 1\n")
+    monkeypatch.setenv("DREAMFLEET_VAE_LATENT", "8")
+    words = ["train", "vae", "--data", str(tmp_path), "--config", str(tmp_path / "settings.toml"), "--updates", "1"]
+    assert command_line.main([*words, "--set", "kl_tolerance=0.25"]) == 0
+    found = load_config(tmp_path / "vae.safetensors", VAEConfig)
+    assert found == VAEConfig(channels=(2, 2, 4, 4), latent=8, kl_tolerance=0.25)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("vae", "--latent", "64"), "--latent is a setting now: give --set latent=64"),
+        (("vae", "--channels", "2", "4"), "--channels is a setting now: give --set channels=2,4"),
+        (("mdnrnn", "--done"), "--done is a setting now: give --set done=true"),
+        (("vae", "--no-batch-norm"), "--no-batch-norm is a setting now: give --set batch_norm=false"),
+        (("vae", "--set", "latnt=3"), "unknown key 'latnt': did you mean 'latent'?"),
+        (("vae", "--set", "hidden=3"), "unknown key 'hidden'"),
+        (("vae", "--set", "xyzzy=3"), "known are updates, batch, rate"),
+        (("vae", "--set", "latent"), "write KEY=VALUE"),
+        (("vae", "--set", "latent=many"), "--set latent must be a whole number, not 'many'"),
+        (("vae", "--set", "channels=2,x"), "--set channels must be a whole number, not 'x'"),
+        (("vae", "--set", "padding=odd"), "--set padding must be one of valid, same"),
+        (("mdnrnn", "--decoder-only"), "--decoder-only is of the VAE"),
+    ],
+)
+def test_a_wrong_setting_is_one_line_with_the_right_one(tmp_path, capsys, words, said):
+    assert command_line.main(["train", *words, "--data", str(tmp_path)]) == UsageError.exit_code
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(("model", "count"), [("vae", "4,348,547"), ("mdnrnn", "422,368")])
+def test_a_summary_trains_nothing(tmp_path, capsys, model, count):
+    assert call(train, model, "--data", str(tmp_path / "absent"), "--preset", "paper", "--summary") == 0
     assert count in capsys.readouterr().out
 
 
@@ -82,10 +117,10 @@ def test_flags_of_controllers_that_do_not_drive_are_refused(tmp_path, flags, sai
 def test_losses_go_to_tensorboard_too_and_a_continued_training_adds_to_them(tmp_path, capsys):
     data, events = tmp_path / "data", tmp_path / "events"
     write_drives(data, episodes=3, steps=4)
-    layers = ("--channels", "2", "2", "4", "4")
-    flags = ("--data", str(data), *layers, "--validate-every", "1", "--tensorboard", str(events))
+    settings = ("--set", "channels=2,2,4,4", "validate_every=1")
+    flags = ("vae", "--data", str(data), *settings, "--tensorboard", str(events))
     for updates in ("1", "3"):
-        call(train.VAE, *flags, "--updates", updates)
+        call(train, *flags, "--updates", updates)
     points = [json.loads(line) for line in (data / "vae.jsonl").read_text().splitlines()]
     found = scalars(events / "vae")
     assert [step for step, _ in found["loss/held_out"]] == [1, 2, 3]

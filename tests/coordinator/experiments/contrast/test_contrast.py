@@ -40,7 +40,7 @@ def test_kinds_take_turns_and_own_flags_come_last():
         ({"kinds": (("alone", ""),)}, "twice or more"),
         ({"kinds": (("one", ""), ("one", "--hidden 8"))}, "--kind one is given twice"),
         ({"kinds": (("../up", ""), ("one", ""))}, "a name is of a-z"),
-        ({"kinds": (("one", "--seed 3"), ("two", ""))}, "leave out --seed, which contrast sets itself"),
+        ({"kinds": (("one", "--seed 3"), ("two", ""))}, "leave out --seed, which lab contrast sets itself"),
         ({"kinds": (("one", "--hid 'x"), ("two", ""))}, "No closing quotation"),
         ({"mdnrnn_flags": "--data elsewhere"}, "leave out --data"),
         ({"seeds": ()}, "one at least"),

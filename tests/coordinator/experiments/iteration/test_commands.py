@@ -78,14 +78,16 @@ def test_updates_among_the_flags_of_every_round_count_in_later_rounds_too():
 
 def test_with_init_the_first_round_goes_on_as_later_ones_do():
     made = commands(entry(0, "init", sha256="ab", controller="tiny"), init="tiny", vae="keep", mdnrnn_flags="--done")
-    assert said(made.unbundle()) == "unbundle data/rounds/00/bundle.zip --data data/rounds/00 --json"
+    assert said(made.unbundle()) == "bundle --extract data/rounds/00/bundle.zip --data data/rounds/00 --json"
     train = said(made.train(1, "mdnrnn"))
-    assert "--seed 0 --json --updates 600 --done --continue-from data/rounds/00/mdnrnn.safetensors" in train
+    assert "--seed 0 --json --updates 600 --set done=true --continue-from data/rounds/00/mdnrnn.safetensors" in train
     vae, mdnrnn = (said(words) for words in made.check_trainings())
     assert mdnrnn == f"{train} --summary"
     assert "--continue-from data/rounds/00/vae.safetensors --summary" in vae, "one that stays sees the drives too"
     assert "--episodes 80" in said(made.drive([Path("0.npz")]))
-    assert said(made.refit(1, Path("moved.npz"))).startswith("refit data/rounds/00/controller.npz --to data/rounds/01/")
+    assert said(made.refit(1, Path("moved.npz"))).startswith(
+        "lab refit data/rounds/00/controller.npz --to data/rounds/01/"
+    )
     old = said(made.gate(1)["old"]["probe"])
     assert old.startswith("inspect data/rounds/00/bundle.zip --probe --controller data/rounds/00/controller.npz")
     assert "--bundle data/rounds/00/bundle.zip" in said(made.begin_run(1, (), ())), "no gate has passed another"
@@ -105,7 +107,7 @@ def test_both_models_are_measured_on_the_same_drives_and_tracks():
 def test_the_optimum_is_fitted_to_the_new_model_by_all_drives():
     words = said(commands(*ROUND_2, entry(2, "bundle")).refit(2, Path("moved.npz")))
     assert words == (
-        "refit data/runs/round-01/controller.npz --to data/rounds/02/round-2.zip --data data --out moved.npz --json"
+        "lab refit data/runs/round-01/controller.npz --to data/rounds/02/round-2.zip --data data --out moved.npz --json"
     )
 
 
@@ -128,7 +130,9 @@ def test_an_evolution_in_a_subspace_names_its_file():
     made = commands(*ROUND_2, entry(2, "bundle"), entry(2, "gate", kept=False), run_flags="--generations 3")
     few = Path("few.npz")
     words = said(made.subspace(2, few))
-    assert words == "subspace data/rounds/01/round-1.zip --data data --out few.npz --json", "of the model that counts"
+    assert words == "lab subspace data/rounds/01/round-1.zip --data data --out few.npz --json", (
+        "of the model that counts"
+    )
     assert "--init start.npz --subspace few.npz" in said(made.begin_run(2, (), (), Path("start.npz"), few))
     seeing = commands(*ROUND_2, views=8, subspace=True, go_on=True)
     assert "--data data --views 8 --out" in said(seeing.subspace(2, few))

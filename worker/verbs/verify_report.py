@@ -1,4 +1,4 @@
-"""`dreamfleet reproduce`: check recorded scores."""
+"""`dreamfleet verify report`: check recorded scores."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`dreamfleet repeat`: re-run a run from its controller's provenance."""
+"""`dreamfleet verify run`: re-run a run from its controller's provenance."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ EXTRAS = ()
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("controller", metavar="CONTROLLER", help="a file, a run, or one that ships; it is only read")
-    parser.add_argument("--run", dest="run_name", help="the new run, or one to resume (default CONTROLLER-again)")
+    parser.add_argument(
+        "--run", dest="run_name", metavar="NAME", help="the new run, or one to resume (default CONTROLLER-again)"
+    )
     parser.add_argument(
         "--optimiser", metavar="MODULE:ATTRIBUTE", help="the run's optimiser, if it is no installed one"
     )

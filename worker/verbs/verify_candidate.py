@@ -1,4 +1,4 @@
-"""`dreamfleet replay`: recompute a stored fitness bit by bit."""
+"""`dreamfleet verify candidate`: recompute a stored fitness bit by bit."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ def first(processes, random_bundle, tmp_path):
 
 
 def test_a_run_is_repeated_to_the_bit_through_a_kill(processes, first, random_bundle):
-    words = ("repeat", first, "--bundle", random_bundle.path, "--runs-dir", processes.runs, "--listen",
+    words = ("verify", "run", first, "--bundle", random_bundle.path, "--runs-dir", processes.runs, "--listen",
              processes.endpoint, "--beat", 0.2, "--json")  # fmt: skip
     again = processes.start(*words)
     processes.worker("--task", tasks.TOY, "--run", "kept-again")

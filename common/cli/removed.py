@@ -1,0 +1,43 @@
+"""Names that verbs and flags once had, and what stands for them now: an old command is answered with the new one."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+
+REMOVED_VERBS = {
+    "baseline evaluate": "evaluate --controller",
+    "baseline record": "record --controller",
+    "bench": "lab bench",
+    "contrast": "lab contrast",
+    "fork": "coordinator --from",
+    "refit": "lab refit",
+    "repeat": "verify run",
+    "replay": "verify candidate",
+    "reproduce": "verify report",
+    "runs compare": "compare",
+    "runs story": "story --journal",
+    "subspace": "lab subspace",
+    "unbundle": "bundle --extract",
+    "up": "spawn --hosts",
+}
+
+# By the verb's entry point and the flag: what to do instead.
+REMOVED_FLAGS = {
+    ("evaluate", "--data"): "name the training's folder as --controller FOLDER",
+    ("record", "--data"): "name the training's folder as --controller FOLDER",
+}
+
+
+def describe_removed(words: Sequence[str]) -> str | None:
+    """The answer to a command that begins with a removed verb, with the command to give instead; else None.
+
+    >>> describe_removed(["replay", "night", "--candidate", "3/0"])
+    '`replay` is now `verify candidate`: dreamfleet verify candidate night --candidate 3/0'
+    """
+    for length in (2, 1):
+        old = " ".join(words[:length])
+        if new := REMOVED_VERBS.get(old):
+            command = shlex.join(("dreamfleet", *new.split(), *words[length:]))
+            return f"`{old}` is now `{new}`: {command}"
+    return None

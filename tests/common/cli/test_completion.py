@@ -1,0 +1,48 @@
+"""`dreamfleet completion` writes scripts that complete in real shells."""
+
+import subprocess
+
+import pytest
+
+from dreamfleet.common.cli import command_line
+from tests.support.processes import DEADLINE
+
+# What bash does for a person who types the words and presses Tab.
+PRESS_TAB = """
+source "$1"; shift
+COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); COMP_LINE="$*"; COMP_POINT=${#COMP_LINE}
+$(complete -p dreamfleet | sed 's/.*-F \\([^ ]*\\).*/\\1/') dreamfleet "${COMP_WORDS[COMP_CWORD]}"
+printf '%s\\n' "${COMPREPLY[@]}"
+"""
+
+
+@pytest.fixture
+def script(tmp_path, capsys):
+    assert command_line.main(["completion", "bash"]) == 0
+    path = tmp_path / "dreamfleet.bash"
+    path.write_text(capsys.readouterr().out)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        (("coord",), {"coordinator"}),
+        (("verify", ""), {"run", "report", "candidate"}),
+        (("runs", "re"), {"receipt"}),
+        (("coordinator", "--popul"), {"--population"}),
+        (("train", "mdn"), {"mdnrnn"}),
+    ],
+)
+def test_bash_completes_verbs_and_flags(script, typed, offered):
+    command = ["bash", "-c", PRESS_TAB, "-", script, "dreamfleet", *typed]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE, check=True)
+    assert offered <= {line.strip() for line in done.stdout.splitlines()}, done.stderr
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_other_shells_get_scripts_too(shell, capsys):
+    assert command_line.main(["completion", shell]) == 0
+    text = capsys.readouterr().out
+    assert "coordinator" in text
+    assert "population" in text
