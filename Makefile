@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constr
 SOURCES := pyproject.toml constraints.txt $(wildcard worker/car_racing/native/*)
 
 .PHONY: demo test test-doom test-newest slow setup check wheel long box2d-py simulate chaos weekend fuzz sanitize bundle worker-size \
-  stranger reproduce reproduce-evolution lock audit sbom structure reference clean
+  stranger reproduce reproduce-evolution lock audit sbom structure words site reference clean
 
 demo: $(VENV)/.demo $(if $(filter takecover,$(WORLD)),$(VENV)/.demo-doom)  ## evolve a controller here (WORLD=takecover: there), judge it, plot it, record it
 	$(BIN)/dreamfleet demo $(if $(WORLD),--world $(WORLD)) $(ARGS)
@@ -47,13 +47,20 @@ $(VENV)/.demo-doom: $(VENV)/.demo
 
 $(VENV)/.dev: $(VENV)/bin/python $(SOURCES)
 	$(PIP) --editable '.[dev]'
-	touch $@ $(VENV)/.demo
+	touch $@ $(VENV)/.demo $(VENV)/.docs
 
-check: $(VENV)/.dev  ## style, types, import contracts, and a wheel that installs into an empty environment
+$(VENV)/.docs: $(VENV)/bin/python $(SOURCES)
+	$(PIP) --editable '.[docs]'
+	touch $@
+
+check: $(VENV)/.dev  ## style, types, import contracts, spelling, the site's links, and a wheel that installs into an empty environment
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/codespell
+	$(BIN)/python deploy/words.py --spelling
+	$(MAKE) site
 	$(BIN)/python deploy/check_wheel.py
 
 long: $(VENV)/.dev  ## proofs that take half an hour: five run seeds of the demo improve
@@ -124,6 +131,16 @@ sbom: $(SUPPLY)/.done  ## build/worker.cdx.json: what a worker's environment is 
 
 structure:  ## figures of the structure: rooms, floors, imports between rooms, files a folder, class names, wording
 	$(PYTHON) deploy/structure.py $(ARGS)
+
+words:  ## words a page, sentences of more than 30 words, words to avoid; PAGES='README.md printed': which ones
+	@$(PYTHON) deploy/words.py $(PAGES) $(ARGS)
+
+site: $(VENV)/.docs  ## build/site: README and all documents as a site that needs no network; every link is checked
+	rm -rf build/pages && mkdir -p build/pages/deploy
+	cp -r README.md CONTRIBUTING.md CHANGELOG.md docs build/pages
+	cp deploy/*.md build/pages/deploy
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "build/site/index.html; with search: $(PYTHON) -m http.server --directory build/site"
 
 reference: $(VENV)/.dev  ## docs/reference/verbs.md and settings.md from the parsers
 	$(BIN)/python deploy/reference.py

@@ -21,6 +21,8 @@ from rich.progress import (
 )
 from rich.table import Column, Table
 
+from dreamfleet.common.host.foreign_code import answer_kept
+
 UNLIMITED_WIDTH = 10_000  # columns: a console on which nothing is truncated
 LARGEST_TOTAL = 10**15  # items: of more, rich cannot estimate the remaining time
 LOG_INTERVAL = 60.0  # seconds between two lines where no bar can be drawn, such as in a log
@@ -85,7 +87,10 @@ def make_progress(unit: str, console: Console) -> Progress:
 
 @contextmanager
 def progress_bar(description: str, total: int, unit: str) -> Iterator[Bar]:
-    """A progress bar on stderr; hidden when only warnings and errors are logged (`-q`)."""
+    """A progress bar on stderr; hidden when only warnings and errors are logged (`-q`).
+
+    A simulator may work inside: what is printed meanwhile goes to stderr too, and the current folder is kept.
+    """
     quiet = logging.getLogger("dreamfleet").level > logging.INFO
-    with make_progress(unit, Console(stderr=True, quiet=quiet)) as progress:
+    with answer_kept(), make_progress(unit, Console(stderr=True, quiet=quiet)) as progress:
         yield Bar(progress, description, total)

@@ -30,9 +30,15 @@ def contained(what: str) -> Iterator[None]:
         stack.enter_context(_warning_if_slow(what))
         if not os.environ.get(VARIABLE):  # else another process ends them
             stack.enter_context(Descendants().starting())
-        stack.enter_context(_folder_kept())
+        stack.enter_context(answer_kept())
         stack.enter_context(_handlers_kept())
-        stack.enter_context(_stdout_kept())
+        yield
+
+
+@contextmanager
+def answer_kept() -> Iterator[None]:
+    """Run foreign code inside, at length: it leaves the current folder as it was, and what it prints goes to stderr."""
+    with _folder_kept(), _stdout_kept():
         yield
 
 

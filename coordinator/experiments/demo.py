@@ -44,7 +44,7 @@ from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.common.runs.standard_error import format_with_error, standard_error
 from dreamfleet.common.worlds.profile import DemoPlan
 from dreamfleet.coordinator.experiments.demo_plans import PLANS, find_plan, plan_defaults
-from dreamfleet.coordinator.experiments.local_run import START_SECONDS, LocalRun
+from dreamfleet.coordinator.experiments.local_run import START_SECONDS, LocalRun, has_begun
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE
 
 REFRESH = 0.5
@@ -133,7 +133,10 @@ class Demo:
         self._console = Console()
 
     def play(self) -> None:
-        """Evolve, judge, plot, record, and print what to try next."""
+        """Evolve, judge, plot, record, and print what to try next; `UsageError` if a run of that name exists."""
+        for name in (each.run for each in self._demo_runs):
+            if has_begun(self._runs_dir, name):
+                raise UsageError(f"run {name} exists: give another --run; `dreamfleet runs delete {name}` removes it")
         with ExitStack() as stack:
             self._show_page(stack)
             for demo_run in self._demo_runs:

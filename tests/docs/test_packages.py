@@ -1,4 +1,4 @@
-"""README and CI install the programs of one list."""
+"""CONTRIBUTING and CI install the programs of one list."""
 
 import pytest
 
@@ -9,8 +9,8 @@ from tests.support.programs import packages, require_programs
 INSTALL = "apt-get install --no-install-recommends "
 
 
-def test_readme_installs_the_packages_of_the_list():
-    (line,) = (line for line in (ROOT / "README.md").read_text().splitlines() if line.startswith(INSTALL))
+def test_contributing_installs_the_packages_of_the_list():
+    (line,) = (line for line in (ROOT / "CONTRIBUTING.md").read_text().splitlines() if line.startswith(INSTALL))
     assert line.removeprefix(INSTALL).split() == sorted(packages().values())
 
 

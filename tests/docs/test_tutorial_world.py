@@ -1,16 +1,9 @@
 """The tutorial's own code and commands make a world model of its world, from an empty folder, on a small share."""
 
-import os
-import re
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
-from tests.support.processes import DEADLINE, ROOT, free_port
+from tests.docs.tutorial import WHOLE, run_tutorial
 
-PAGE = (ROOT / "docs" / "tutorials" / "own-world-model.md").read_text()
 SHARES = {
     "--scale 0.5": "--scale 0.005 --jobs 1",
     "--episodes 1000": "--episodes 8",
@@ -21,29 +14,10 @@ SHARES = {
 }
 
 
-def blocks(language):
-    return re.findall(rf"^```{language}\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
-
-
 @pytest.mark.slow
+@pytest.mark.timeout(WHOLE + 60)
 def test_its_commands_work_as_they_stand(tmp_path):
-    (world,), (install, *commands) = blocks("python"), blocks("sh")
-    assert "pip install" in install
-    script = "".join(commands)
-    for whole, share in SHARES.items():
-        assert whole in script
-        script = script.replace(whole, share)
-    (tmp_path / "my_world.py").write_text(world)
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    own = {
-        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}", "OMP_NUM_THREADS": "1",
-        "DREAMFLEET_CACHE": str(tmp_path / "cache"), "DREAMFLEET_LISTEN": endpoint, "DREAMFLEET_CONNECT": endpoint,
-    }  # fmt: skip
-    done = subprocess.run(
-        ("bash", "-ec", script), cwd=tmp_path, env={**os.environ, **own}, capture_output=True, text=True,
-        timeout=DEADLINE, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    printed = run_tutorial("own-world-model.md", "my_world.py", SHARES, tmp_path)
     for made in ("data/pixels.zip", "inspection/index.html", "runs/canyon/controller.npz", "drive.mp4"):
         assert (tmp_path / made).exists()
-    assert "judged in gym:my_world:Canyon-v0" in done.stdout
+    assert "judged in gym:my_world:Canyon-v0" in printed

@@ -10,6 +10,7 @@ import pytest
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.coordinator.experiments.demo import Demo, DemoConfig, median_drive, plan_runs
 
 
@@ -64,6 +65,16 @@ def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle):
         assert (processes.runs / made).stat().st_size > 1000
     assert "evolving in the dream" in out
     assert "the dashboard is at http://127.0.0.1:" in out
+
+
+@pytest.mark.parametrize("name", ["shown-dream", "shown"])
+def test_a_run_of_its_name_is_refused_before_anything_begins(name, tmp_path, capsys):
+    (tmp_path / name).mkdir()
+    (tmp_path / name / JOURNAL).touch()
+    assert main(["demo", "--run", "shown", "--runs-dir", str(tmp_path), "--no-page"]) == 2
+    said = capsys.readouterr().err
+    assert f"run {name} exists: give another --run; `dreamfleet runs delete {name}` removes it" in said
+    assert [each.name for each in tmp_path.iterdir()] == [name]
 
 
 def test_what_it_begins_is_of_no_other_fleet(monkeypatch):

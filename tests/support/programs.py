@@ -33,7 +33,7 @@ def require_programs(*names):
     if all(find_program(name) for name in names):
         return
     missing = " ".join(package for program, package in listed.items() if not find_program(program))
-    reason = f"{NOT_INSTALLED}{missing} (README.md has the line that installs them)"
+    reason = f"{NOT_INSTALLED}{missing} (CONTRIBUTING.md has the line that installs them)"
     if os.environ.get("CI", "").lower() in TRUE:
         pytest.fail(f"{reason}; in CI no test is skipped for that", pytrace=False)
     pytest.skip(reason)

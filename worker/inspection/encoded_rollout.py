@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.foreign_code import answer_kept
 from dreamfleet.common.runs.seeds import VALIDATION
 from dreamfleet.worker.scoring.actors import check_same_pictures
 from dreamfleet.worker.scoring.disturbance import numbered_choices
@@ -143,7 +144,8 @@ def record_drive(
         raise UsageError(f"task {bundle.manifest.task} has no driver: look at a run, whose controller drives")
     environment = task.make_environment(assignment)
     try:
-        moments = list(run_episode(environment, policy, EpisodeConfig(config.seed, config.steps)))
+        with answer_kept():  # the page is written behind it
+            moments = list(run_episode(environment, policy, EpisodeConfig(config.seed, config.steps)))
     finally:
         close_environment(environment)
     seen = np.stack([moment.seen for moment in moments])

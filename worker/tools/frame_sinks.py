@@ -31,7 +31,7 @@ SendFrame = Callable[[CaptionedFrame | None], bool]
 @contextmanager
 def open_sink(out: str, rate: int, stdout: BinaryIO) -> Iterator[SendFrame]:
     """Open what `--out` names: a video file, a folder, or `-`; `UsageError` if it cannot be written."""
-    path = Path(out)
+    path = Path(out).absolute()  # a simulator may change the current folder of its process
     if out == "-":
         yield lambda shown: shown is None or _write_part(stdout, shown)
     elif path.suffix == VIDEO:

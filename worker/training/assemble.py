@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -68,14 +69,33 @@ MEASURED, CIRCUMSTANCES = (
 )  # keys of the output of `inspect --json`
 MOST_FIGURES = 1 << 18  # bytes; a manifest has at most a million
 INITIAL_LATENTS = 256
+log = logging.getLogger(__name__)
 
 
 def record_quality(folder: Path, figures: dict[str, float]) -> None:
     """Store a model's quality figures in the data folder, for the manifest."""
     path = folder / QUALITY
-    known = json.loads(path.read_text()) if path.exists() else {}
+    try:
+        known = load_quality(folder)
+    except DatasetError as error:
+        log.warning("%s; the new figures replace it", error)
+        known = {}
     with explain_write_errors(path), atomic_write(path) as file:
         file.write(json.dumps({**known, **figures}, indent=1).encode())
+
+
+def load_quality(folder: Path) -> dict[str, Any]:
+    """The figures that `record_quality` stored, empty if none; `DatasetError` if they are damaged."""
+    path = folder / QUALITY
+    try:
+        figures = json.loads(read_regular(path, MOST_FIGURES))
+        if not isinstance(figures, dict) or not all(type(each) in (int, float) for each in figures.values()):
+            raise TypeError("it is no object of numbers")
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        raise DatasetError(f"{path} holds no figures ({error}): delete it, and a bundle has none") from error
+    return figures
 
 
 def assemble(
@@ -139,12 +159,12 @@ def _load_models(folder: Path) -> tuple[Weights, Weights, VAEConfig, MDNRNNConfi
 
 def _make_provenance(folder: Path) -> dict[str, Any]:
     """What a bundle's manifest says of its data, the quality of its models, and the packages that trained them."""
-    paths, quality = episode_paths(folder), folder / QUALITY
+    paths = episode_paths(folder)
     return {
         "episodes": len(paths),
         "frames": sum(len(load_arrays(path, "reward")["reward"]) for path in paths),
         "held_out_episodes": len(split_held_out(paths)[1]),
-        "quality": json.loads(quality.read_text()) if quality.exists() else {},
+        "quality": load_quality(folder),
         "versions": {package: package_version(package) for package in ("dreamfleet", "gymnasium", "torch")},
     }
 

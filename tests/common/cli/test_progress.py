@@ -2,6 +2,8 @@
 
 import io
 import logging
+import os
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -53,3 +55,17 @@ def test_a_total_beyond_every_number_is_drawn():
     for done in range(9):
         bar.update(done)
         progress.get_renderable()
+
+
+def test_what_a_simulator_prints_and_where_it_goes_meanwhile_is_undone(capfd):
+    before = Path.cwd()
+    with progress_bar("evaluate", 4, "episodes"):
+        print("from Python")  # noqa: T201
+        os.write(1, b"from native code\n")
+        os.chdir("/")
+    print("the answer")  # noqa: T201
+    out, err = capfd.readouterr()
+    assert out == "the answer\n"
+    assert "from Python" in err
+    assert "from native code" in err
+    assert Path.cwd() == before

@@ -13,6 +13,7 @@ from dreamfleet.common.errors import DatasetError, StoppedError, UsageError
 from dreamfleet.common.files.locks import folder_lock
 from dreamfleet.common.host.stop_signals import stop_on_signals
 from dreamfleet.worker.training import checkpoint, train_mdnrnn, train_vae, training_state
+from dreamfleet.worker.training.assemble import QUALITY, load_quality, record_quality
 from dreamfleet.worker.training.checkpoint import load_progress, load_weights
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.loss_curve import append_point
@@ -183,6 +184,17 @@ def test_a_second_signal_says_what_is_kept(data, new, command):
     args = argparse.Namespace(data=data, new=new, json=False)
     with pytest.raises(StoppedError, match=rf"vae\.safetensors keeps what was made up to update 2; .*{command}"):
         run_training(args, "VAE", 6, data / train_vae.CHECKPOINT, lambda _, stop: train(data, SHORT, twice, stop=stop))
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b"\xff", b'{"done_auc": "high"}', b"[" * 9000])
+def test_damaged_figures_are_replaced_by_a_training_and_named_for_a_bundle(data, content, caplog):
+    (data / QUALITY).write_bytes(content)
+    with pytest.raises(DatasetError, match=r"quality.json holds no figures .*delete it"):
+        load_quality(data)
+    record_quality(data, {"error": 2.0})
+    assert "the new figures replace it" in caplog.text
+    record_quality(data, {"kl": 1.0})
+    assert load_quality(data) == {"error": 2.0, "kl": 1.0}
 
 
 def test_a_second_training_of_a_model_in_a_folder_is_refused(data):

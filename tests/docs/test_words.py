@@ -1,0 +1,57 @@
+"""Documents are short and plain: README's length, sentences over thirty words, words that are read twice."""
+
+import pytest
+
+from deploy.words import PRINTED, banned_in, long_sentences, measure, sentences, words
+from tests.support.processes import ROOT
+
+README_WORDS = 900  # code blocks included
+# What still stands in pages and printed texts. These numbers may only shrink.
+ALLOWED = {"long": 4, "banned": 12, PRINTED: 24}
+CLEAN = ("README.md", "CONTRIBUTING.md", "docs/index.md", "docs/tutorials/")
+
+
+@pytest.fixture(scope="module")
+def figures():
+    return measure()
+
+
+def test_readme_is_read_in_five_minutes(figures):
+    assert len((ROOT / "README.md").read_text().split()) <= README_WORDS
+
+
+def test_pages_that_are_read_first_have_no_long_sentence_and_no_banned_word(figures):
+    pages = [page for page in figures if page.startswith(CLEAN)]
+    assert {page: long_sentences(page) for page in pages if long_sentences(page)} == {}, "`make words PAGES=PAGE`"
+    assert {page: banned_in(page) for page in pages if banned_in(page)} == {}, "deploy/banned-words.txt has better ones"
+
+
+def test_the_others_get_no_worse(figures):
+    pages = [figure for name, figure in figures.items() if name != PRINTED]
+    found = {"long": sum(each["long"] for each in pages), "banned": sum(each["banned"] for each in pages)}
+    found[PRINTED] = figures[PRINTED]["banned"]
+    assert {name: count for name, count in found.items() if count > ALLOWED[name]} == {}, "`make words` lists the pages"
+
+
+def test_sentences_are_cut_where_a_reader_stops():
+    page = """# A head
+
+One sentence, e.g. this. Another `--flag x.y` here! (A third.)
+Its end.
+
+- An item
+  of two lines. `code` begins this one
+
+| a cell. Two | *b* |
+|---|---|
+
+```sh
+no sentence
+```
+"""
+    found = list(sentences(page))
+    assert found == [
+        "A head", "One sentence, e.g. this.", "Another CODE here!", "(A third.)", "Its end.", "An item of two lines.",
+        "CODE begins this one", "a cell.", "Two", "*b*", "---", "---",
+    ]  # fmt: skip
+    assert [len(words(each)) for each in found[:3]] == [2, 4, 3]
