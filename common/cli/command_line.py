@@ -169,7 +169,7 @@ def _show_overview(points: Mapping[str, EntryPoint], words: Sequence[str]) -> No
     group = [name for name in points if name.startswith(f"{first}.")] if first else []
     spoken = list(words[: 2 if group else 1])
     if spoken and not spoken[-1].startswith("-") and (not group or len(spoken) == 2):
-        raise UsageError(describe_removed(words) or _unknown_verb_text(" ".join(spoken), points))
+        raise UsageError(describe_removed(words) or _unknown_verb_text(words, spoken, points))
     parser = _help_parser(f"dreamfleet {first}", group, points) if group else _Overview(points)
     parser.add_argument("--version", action="version", version=f"dreamfleet {version('dreamfleet')}")
     parser.parse_args(words[1:] if group else words)
@@ -209,7 +209,14 @@ def _summary(point: EntryPoint) -> str:
         return f"BROKEN: {error}"
 
 
-def _unknown_verb_text(spoken: str, points: Iterable[str]) -> str:
-    known = sorted({*(name.replace(".", " ") for name in points), *_top_level_names(points)})
-    near = difflib.get_close_matches(spoken, known, n=1)
-    return f"unknown verb {spoken!r}" + (f": did you mean {near[0]!r}?" if near else "; `dreamfleet --help` lists them")
+def _unknown_verb_text(words: Sequence[str], spoken: Sequence[str], points: Iterable[str]) -> str:
+    """The error of a command whose first words, `spoken`, name no verb: it suggests verbs that people may mean."""
+    verbs = [name.replace(".", " ") for name in points]
+    same = sorted(verb for verb in verbs if " " in verb and verb.split()[1] == spoken[-1])  # without its group
+    two = difflib.get_close_matches(" ".join(words[:2]), [verb for verb in verbs if " " in verb], n=1, cutoff=0.8)
+    known = sorted({*verbs, *_top_level_names(points)})
+    near = two or same or difflib.get_close_matches(" ".join(spoken), known, n=1)
+    meant = " or ".join(f"{each!r}" for each in near)
+    return f"unknown verb {' '.join(spoken)!r}" + (
+        f": did you mean {meant}?" if near else "; `dreamfleet --help` lists them"
+    )

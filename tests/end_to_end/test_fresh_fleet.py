@@ -123,7 +123,7 @@ def test_three_hosts_score_soon_after_one_command_and_another_leaves_nothing(
         )
         assert {row["state"] for row in up.values()} == {"started"}
         assert took < SOON
-        assert {row["state"] for row in newcomer.rows("down", file).values()} == {"left"}
+        assert {row["state"] for row in newcomer.rows("down", "--hosts", file).values()} == {"left"}
         assert [list(host.home.iterdir()) for host in there] == [[], [], []]
     assert list(newcomer.folder.iterdir()) == []
 

@@ -83,7 +83,7 @@ def test_up_brings_hosts_to_a_run_again_leaves_them_and_down_leaves_nothing(proc
     changed = rows_of(processes, "spawn", "--hosts", file)
     assert {name: row["state"] for name, row in changed.items()} == {"a": "replaced", "b": "running"}
 
-    assert {row["state"] for row in rows_of(processes, "down", file).values()} == {"left"}
+    assert {row["state"] for row in rows_of(processes, "down", "--hosts", file).values()} == {"left"}
     assert not any(runs(pid) for pid in pids)
     assert [list(host.home.iterdir()) for host in (a, b)] == [[], []]
     assert {row["state"] for row in rows_of(processes, "down", "a", "b", "--ssh", hosts.ssh).values()} == {"nothing"}
@@ -146,7 +146,7 @@ def test_two_commands_at_once_start_one_worker(processes, hosts):
     states = [json.loads(each.finish()[1])["hosts"][0]["state"] for each in both]
     assert sorted(states) == ["running", "started"]
     pid = state(a)["pid"]
-    rows_of(processes, "down", file, "--now")
+    rows_of(processes, "down", "--hosts", file, "--now")
     assert not runs(pid)
 
 
@@ -266,7 +266,7 @@ def test_three_hosts_install_from_wheels_alone_one_of_them_after_it_was_killed_a
         found = rows_of(processes, "spawn", "--hosts", file, patience=900)
         assert {name: row["state"] for name, row in found.items()} == {"x": "started", "y": "running", "z": "running"}
         coordinator.wait_for("generation 1: mean", timeout=600)
-        rows_of(processes, "down", file, patience=900)
+        rows_of(processes, "down", "--hosts", file, patience=900)
         assert [list(host.home.iterdir()) for host in there] == [[], [], []]
 
 

@@ -55,6 +55,10 @@ def test_the_error_for_an_unknown_flag_suggests_the_nearest(words, said, capsys)
     [
         (("wokrer",), "unknown verb 'wokrer': did you mean 'worker'?"),
         (("runs", "lits"), "unknown verb 'runs lits': did you mean 'runs list'?"),
+        (("run", "list"), "unknown verb 'run': did you mean 'runs list'?"),
+        (("receipt", "night"), "unknown verb 'receipt': did you mean 'runs receipt'?"),
+        (("export",), "unknown verb 'export': did you mean 'baseline export' or 'runs export'?"),
+        (("lab", "benhc"), "unknown verb 'lab benhc': did you mean 'lab bench'?"),
         (("xyzzy",), "unknown verb 'xyzzy'; `dreamfleet --help` lists them"),
     ],
 )
