@@ -65,6 +65,7 @@ SECTIONS: Mapping[str, tuple[type | tuple[type, ...], str]] = {
     ),
 }
 ALL_VERBS = ("config", "log_level", "log_format", "trust", "help", "help_all")  # names of flags that each verb has
+OF_ONE_VERB = ("dashboard", "demo", "iterate", "router")  # tables that only the verb of that name reads
 LARGE = 1e9  # a bound from here on only guards the wire
 JSON = "print the answer as JSON"
 UNITS = {
@@ -91,7 +92,8 @@ example.
 VERBS_HEAD = f"""{NOTE}
 # Verbs
 
-`dreamfleet VERB --help` shows a verb's flags. [Exit codes](exit-codes.md) says how a verb ends.
+`dreamfleet VERB --help` shows a verb's first flags, and `--help-all` all of them.
+[Exit codes](exit-codes.md) says how a verb ends.
 
 A flag in capitals takes a value: `--run RUN`. *Settings* names the tables of [settings](settings.md) whose keys are
 flags of that verb too; they are described there. Each verb also has these:
@@ -150,7 +152,7 @@ def _verb(name: str, summary: str, parser: argparse.ArgumentParser) -> Iterator[
     for each in parser._actions:
         if each.dest in ALL_VERBS or _help(each) == JSON:
             continue
-        table = _table_of(each, titles.get(id(each), ""))
+        table = _table_of(name, each, titles.get(id(each), ""))
         if table is None:
             own.append(each)
         elif table not in of_tables:
@@ -218,10 +220,11 @@ def _plain_help(text: str) -> str:
     return re.sub(r" \(default:? [^()]*\)$", "", " ".join(text.split())).replace("%%", "%")
 
 
-def _table_of(action: argparse.Action, title: str) -> str | None:
-    """The table of the configuration file that a flag sets, or None: the flag's name and text are the field's."""
+def _table_of(verb: str, action: argparse.Action, title: str) -> str | None:
+    """The table of the configuration file that a verb's flag sets, or None: name and text are those of the field."""
     for table, (section, _) in SECTIONS.items():
-        for each in () if isinstance(section, tuple) else _settings(section):
+        other = isinstance(section, tuple) or (table in OF_ONE_VERB and table != verb)
+        for each in () if other else _settings(section):
             if each.name == action.dest and f"--{each.name.replace('_', '-')}" in action.option_strings:
                 text = _help(action)
                 if text.startswith(each.metadata["help"]) or (not text and title == _group_title(_types(section)[0])):

@@ -22,7 +22,7 @@ BUNDLE, EPISODES = "tiny", 3
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    texts = "; ".join(f"{name}: {part.text}" for name, part in PARTS.items())
+    texts = ". ".join(f"`{name}`: {part.text}" for name, part in PARTS.items())
     parser.add_argument("part", metavar="PART", choices=tuple(PARTS), help=texts)
     parser.add_argument("--bundle", help=f"the world model of policy, dream, env and live (default {BUNDLE})")
     parser.add_argument(
