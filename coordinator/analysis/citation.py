@@ -117,7 +117,8 @@ def _rows(
         yield "hosts", receipt.classes.description
         yield from ((f"class {name}", hosts) for name, hosts in receipt.classes.rows)
     elif receipt.fingerprint is not None:
-        yield "hosts", f"`{receipt.fingerprint}`" + (", and others: its last bits are its own" if receipt.mixed else "")
+        others = ", and others: no run on one host is bit-identical" if receipt.mixed else ""
+        yield "hosts", f"`{receipt.fingerprint}`{others}"
     if receipt.versions is not None:
         yield "coordinator", ", ".join(f"{name} {version}" for name, version in receipt.versions.items())
 
@@ -134,11 +135,11 @@ def _commands(run: RunFolder) -> dict[str, str]:
     """Commands that check the run, keyed by what they show."""
     last, classes = max((each.number for each in run.history()), default=0), run.classes
     beside, controller = ("--runs-dir", str(run.path.parent)), str(run.controller_path)
-    one, whole = "to the bit, on any host of its class", "to the bit"
+    one, whole = "bit-identical on any host of its class", "bit-identical"
     if classes.mixed:
-        whole = "not to the bit: hosts of several classes scored"
+        whole = "not bit-identical: hosts of several classes scored"
     if classes.varying:
-        one = whole = "not to the bit: the environment is not deterministic"
+        one = whole = "not bit-identical: the environment is not deterministic"
     modules = _task_modules(run)
     trust, trust_all = trust_flag(modules), trust_flag([*modules, module_of(run.settings.optimiser)])
     words = {

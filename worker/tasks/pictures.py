@@ -178,7 +178,7 @@ class CropAndResize(gymnasium.ObservationWrapper[Pixels, Any, NDArray[Any]]):
         top, bottom, left, right = crop or (0, height, 0, width)
         if not is_crop((top, bottom, left, right), height, width):
             raise UsageError(
-                f"the crop {top}:{bottom},{left}:{right} is no part of a picture of {height} rows and {width} columns "
+                f"the crop {top}:{bottom},{left}:{right} is not within a picture of {height} rows and {width} columns "
                 f"with at least {SHORTEST} of each"
             )
         self._size, self._crop = size, (top, bottom, left, right)

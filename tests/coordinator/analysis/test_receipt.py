@@ -54,13 +54,13 @@ def test_failed_candidates_are_counted(change, printed):
 
 
 def test_no_bits_are_promised_where_there_are_none(change, printed):
-    assert "the whole run again, to the bit" in printed("receipt", "reality")
+    assert "the whole run again, bit-identical" in printed("receipt", "reality")
     change(("UPDATE result SET host_class = 'another' WHERE generation = 1",))
-    assert "the whole run again, not to the bit: hosts of several classes scored" in printed("receipt", "reality")
+    assert "the whole run again, not bit-identical: hosts of several classes scored" in printed("receipt", "reality")
     change(("UPDATE result SET host_class = ?", (NON_DETERMINISTIC,)))
     said = printed("receipt", "reality")
-    assert said.count("not to the bit: the environment is not deterministic") == 2
-    assert ", to the bit" not in said
+    assert said.count("not bit-identical: the environment is not deterministic") == 2
+    assert ", bit-identical" not in said
 
 
 def test_receipt_and_comparison_count_the_same_effort(change, printed, tmp_path):

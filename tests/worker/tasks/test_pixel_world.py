@@ -158,7 +158,7 @@ def test_a_part_of_the_picture_is_resized():
     assert (environment.reset()[0] == 200).all()
     assert (CropAndResize(Halves(), 96).reset()[0][:, :48] == 0).all()
     for crop, name in {(0, 9, 0, 16): "0:9,0:16", (0, 8, 9, 16): "0:8,9:16", (0, 1, 0, 1): "0:1,0:1"}.items():
-        with pytest.raises(UsageError, match=f"{name} is no part of a picture of 8 rows and 16 columns with at least"):
+        with pytest.raises(UsageError, match=f"{name} is not within a picture of 8 rows and 16 columns with at least"):
             CropAndResize(Halves(), 64, crop=crop)
     with pytest.raises(UsageError, match=r"what is observed is Box.*a picture is uint8"):
         CropAndResize(gymnasium.make("CartPole-v1"), 64)
