@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 from collections.abc import Sequence
 
@@ -34,6 +35,25 @@ def shorten_words(text: str) -> str:
 def plural(count: float, noun: str, nouns: str = "") -> str:
     """Format a number with its noun in singular or plural: 1 seed, 1,000 seeds, 1.5 minutes, 2 batches."""
     return f"{count:{',' if isinstance(count, int) else 'g'}} {noun if count == 1 else nouns or f'{noun}s'}"
+
+
+def format_number(value: float | None, sign: str = "") -> str:
+    """Format a measured number in four significant digits, from a thousand on all whole ones; - if it is missing.
+
+    `sign` is `+` if positive numbers show theirs, `,` if thousands have commas, or both.
+
+    >>> format_number(875.62), format_number(-3.98712), format_number(0.00004127), format_number(12345.6)
+    ('875.6', '-3.987', '4.127e-05', '12346')
+    >>> format_number(21), format_number(None), format_number(0.5, "+")
+    ('21.0', '-', '+0.5')
+    """
+    if value is None or math.isnan(value):
+        return "-"
+    plus, comma = "+" if "+" in sign else "", "," if "," in sign else ""
+    if 999.95 <= abs(value) < 1e12:
+        return f"{value:{plus}{comma}.0f}"
+    text = f"{value:{plus}z.4g}"
+    return text if {".", "e", "f"} & set(text) else f"{text}.0"
 
 
 def join_some(names: Sequence[str], limit: int) -> str:

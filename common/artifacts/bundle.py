@@ -296,7 +296,7 @@ def _check_latents(path: Path, manifest: BundleManifest, data: bytes) -> None:
         latents = read_float_array(data)
     except ValueError as error:
         raise BundleError(
-            f"{path}: {INITIAL_LATENTS_PART} is no array of latents ({error}); build the bundle again"
+            f"{path}: {INITIAL_LATENTS_PART} is not an array of latents ({error}); build the bundle again"
         ) from error
     if latents.ndim != 3 or latents.shape[1:] != (2, manifest.latent) or not len(latents):
         raise BundleError(
@@ -313,7 +313,7 @@ def _check_recorded_states(path: Path, manifest: BundleManifest, data: bytes) ->
         states = read_float_array(data)
     except ValueError as error:
         raise BundleError(
-            f"{path}: {RECORDED_STATES} is no array of states ({error}); build the bundle again"
+            f"{path}: {RECORDED_STATES} is not an array of states ({error}); build the bundle again"
         ) from error
     min_width = 2 * (manifest.latent + manifest.hidden)
     if states.ndim != 2 or not 1 <= len(states) <= MAX_RECORDED_STATES or states.shape[1] < min_width:
@@ -348,10 +348,10 @@ def _read_manifest(archive: Archive, path: Path) -> BundleManifest:
             raise BundleError(f"{path} has bundle format {plain['format']!r:.20}; this version reads {FORMAT}")
         manifest = from_plain(BundleManifest, plain)
         if not all(isinstance(each, dict) for each in manifest.models.values()):
-            raise MalformedError("models are no configurations")
+            raise MalformedError("models are not configurations")
         for name in ("reward_scale", "first_reward"):
             if any(not _is_number(each.get(name, 0)) for each in manifest.models.values()):
-                raise MalformedError(f"{name} is no finite number")
+                raise MalformedError(f"{name} is not a finite number")
         if not all(map(str.isprintable, (manifest.name, manifest.task, manifest.preprocessing))):
             raise MalformedError("a name holds control characters")
         if manifest.world is not None and manifest.world.actions.actions != manifest.actions:

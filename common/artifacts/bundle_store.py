@@ -112,7 +112,7 @@ class BundleStore:
 def _check_sha256(sha256: str) -> str:
     """Return `sha256` if it is a hash, else raise `BundleError`: it comes from the network and names a file."""
     if not _SHA256.fullmatch(sha256):
-        raise BundleError(f"{sha256!r} is no hash of a bundle: the run's specification is damaged")
+        raise BundleError(f"{sha256!r} is not the hash of a bundle: the run's specification is damaged")
     return sha256
 
 

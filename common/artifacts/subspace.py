@@ -104,7 +104,7 @@ class Subspace:
             raise UsageError(f"cannot read the subspace {path}: {why}") from error
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             why = one_line(str(error))[:_MAX_REASON]
-            raise UsageError(f"{path} is no subspace ({why}): `dreamfleet lab subspace` makes one") from error
+            raise UsageError(f"{path} is not a subspace ({why}): `dreamfleet lab subspace` makes one") from error
 
 
 def _as_tuple(names: Any) -> tuple[Any, ...]:

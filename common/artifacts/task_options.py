@@ -18,7 +18,7 @@ def read_options(task: str, text: str, known: Collection[str]) -> dict[str, Any]
     try:
         names = json.loads(text or "{}")
         if not isinstance(names, dict):
-            raise TypeError("it is no object")
+            raise TypeError("it is not an object")
     except (ValueError, TypeError, RecursionError) as error:
         raise UsageError(f"{task}'s options must be a JSON object, not {text!r:.200}") from error
     check_options(task, names, known)

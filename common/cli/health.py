@@ -61,7 +61,7 @@ def _check_task(task: str) -> Iterator[Finding]:
     if found.fault:
         yield Finding(name, False, True, found.fault, "worker", f"dreamfleet tasks {task}")
         return
-    remedy = "results cannot be recomputed to the bit until that is mended"
+    remedy = "recomputed results are not bit-identical until that is fixed"
     text = "; ".join([found.varies or "can be scored", *found.warnings])
     yield Finding(name, not found.varies, False, text, "worker", remedy)
 

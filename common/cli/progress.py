@@ -25,6 +25,7 @@ from dreamfleet.common.host.foreign_code import answer_kept
 
 UNLIMITED_WIDTH = 10_000  # columns: a console on which nothing is truncated
 LARGEST_TOTAL = 10**15  # items: of more, rich cannot estimate the remaining time
+SPEED_PERIOD = 600.0  # seconds of the past that the remaining time is estimated from: steps may take a minute
 LOG_INTERVAL = 60.0  # seconds between two lines where no bar can be drawn, such as in a log
 BAR_WIDTH, MIN_BAR_WIDTH = 40, 8  # columns of a bar: preferred, and the least before other columns are left out
 
@@ -52,7 +53,7 @@ class FittedProgress(Progress):
 
     def __init__(self, *columns: ProgressColumn, drop_order: Sequence[ProgressColumn], console: Console) -> None:
         self._drop_order, self._console = drop_order, console
-        super().__init__(*columns, console=console)
+        super().__init__(*columns, console=console, speed_estimate_period=SPEED_PERIOD)
 
     def make_tasks_table(self, tasks: Iterable[Task]) -> Table:
         """The line with the columns that fit the console's width now."""

@@ -95,7 +95,7 @@ class NonblockingStream(io.TextIOBase):
                 dropped = self._dropped if self._waiting == 0 else 0
                 self._dropped -= dropped
                 if dropped:
-                    self._put(f"{dropped} lines were dropped here: nobody read them in time\n")
+                    self._put(f"{dropped} lines were dropped here: they were not read in time\n")
                 elif self._waiting == 0:
                     self._written.set()
 

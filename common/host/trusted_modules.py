@@ -32,7 +32,7 @@ def check_trusted(module: str, chooser: str) -> None:
     """`UsageError` unless the module is trusted; `chooser` says what names it, such as `task 'mine:Task'`."""
     if not is_trusted(module):
         raise UsageError(
-            f"{chooser} is code in the module {module!r}, which nobody here has named: if you trust that module, say "
+            f"{chooser} is code in the module {module!r}, which is not trusted here: if you trust that module, pass "
             f"--trust {module}, or {VARIABLE}={module} in the environment"
         )
 

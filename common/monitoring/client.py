@@ -153,8 +153,8 @@ class Client(Displayed):
         rows = document.get("story")
         if not isinstance(rows, list):
             raise MalformedError(
-                f"the coordinator of run {document.get('run')} sends no events: a worker's join file has no right to "
-                "them, or its dreamfleet is older than this verb; use a viewer's, or install a newer one there"
+                f"the coordinator of run {document.get('run')} sends no events: a worker's join file may not read "
+                "them, so use a viewer's; an older dreamfleet sends none, so install a newer one"
             )
         return [from_plain_lenient(Event, row) for row in rows], int(document.get("total", len(rows)))
 

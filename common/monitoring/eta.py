@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
-from dreamfleet.common.monitoring.status import EpisodeProgress, Status
-from dreamfleet.common.printable import plural
+from dreamfleet.common.monitoring.status import EpisodeProgress, Status, WorkerCount
+from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.runs.effort import format_steps
 from dreamfleet.common.runs.records import describe_score, format_mean
 
@@ -88,15 +88,19 @@ def summarise_status(status: Status) -> str:
     opened, best = status.generation, status.confirmed or status.best
     score = "nothing evaluated yet" if best is None else f"best mean {format_mean(best)}"
     workers, slots = plural(status.workers.present, "worker"), plural(status.slots, "slot")
-    lost = f", {status.workers.lost} lost" if status.workers.lost else ""
-    lost += f", {status.workers.left} left" if status.workers.left else ""
+    lost = describe_departed(status.workers)
     failed = status.failed + opened.failed
     failures = f", {plural(failed, 'failed candidate')}" if failed else ""
     return (
         f"{_summarise_progress(status)}{failures}, {score}, "
-        f"{status.throughput.steps_per_second:,.0f} steps/s, {workers} with {slots}{lost}, "
+        f"{status.throughput.steps_per_second:,.0f} steps/s, {workers} with {slots}{f' ({lost})' if lost else ''}, "
         f"{estimate_eta(status).description}"
     )
+
+
+def describe_departed(workers: WorkerCount) -> str:
+    """The workers that went in the last minutes, such as "1 lost, 2 left"; empty if none did."""
+    return ", ".join(f"{count} {how}" for how, count in (("lost", workers.lost), ("left", workers.left)) if count)
 
 
 def format_duration(seconds: float) -> str:
@@ -127,7 +131,8 @@ def _open_generation_seconds(status: Status, pace: float | None) -> float | None
     opened, rate = status.generation, status.throughput.episodes_per_second
     left = None if pace is None else max(pace - opened.seconds, 0.0)
     needed = max(opened.episodes - opened.episodes_done, 0) / rate if rate else None
-    return max((each for each in (left, needed) if each is not None), default=None)
+    retries = (each.retry_in for each in status.failures if each.kind == "score")  # it cannot close before these
+    return max((each for each in (left, needed, *retries) if each is not None), default=None)
 
 
 def _closing_episodes(status: Status) -> int:
@@ -190,7 +195,7 @@ def _uncounted_limits(status: Status) -> Iterator[str]:
     """Describe the limits that depend on the results of evaluations."""
     target, parted = status.limits.get("target"), status.limits.get("parted")
     if isinstance(target, (int, float)):
-        best = "" if status.best is None else f" (best {status.best.mean:.0f})"
+        best = "" if status.best is None else f" (best {format_number(status.best.mean)})"
         yield f"until an evaluation reaches {target:g}{best}"
     if isinstance(parted, int) and parted:
         yield f"until {parted} evaluations in a row fall behind"
@@ -242,7 +247,8 @@ def _describe_waiting(status: Status) -> str:
         return "waiting for workers: none has joined yet"
     left = sorted((each for each in status.worker_list if each.reason), key=lambda each: each.heard)
     last = f"; {left[0].worker} left {format_duration(left[0].heard)} ago: {left[0].reason}" if left else ""
-    return f"waiting for workers: none{f' of {known}' if known else ''} is present{last}"
+    gone = describe_departed(status.workers)
+    return f"waiting for workers: none is present{f' ({gone})' if gone else ''}{last}"
 
 
 def _format_episodes(part: EpisodeProgress) -> str:
@@ -254,7 +260,7 @@ def _describe_paused(status: Status) -> str:
 
 
 def _describe_ended(status: Status) -> str:
-    return f"ended: {status.why or 'stopped'}; {describe_score(status.confirmed or status.best)}"
+    return f"ended: {status.why or 'stopped'}; {describe_score(status.confirmed or status.best, status.score_word)}"
 
 
 def _describe_left(status: Status) -> str:

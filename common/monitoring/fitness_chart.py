@@ -22,6 +22,8 @@ class ScoreWithError(Protocol):
         """The standard error."""
 
 
+# Of a confirmed score: its error bar, which may be short, shows within the marker.
+HOLLOW_STAR: dict[str, Any] = {"markersize": 13, "markerfacecolor": "none", "markeredgewidth": 1.5, "capsize": 4}
 PLOT_COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:olive")
 
 
@@ -48,7 +50,8 @@ def draw_fitness(axes: Any, run: RunFolder) -> list[Any]:
     dreams_only = dreamt and not any(each.stage.driven for each in stages)
     real = axes.twinx() if dreams_only and evaluations else axes
     if evaluations:
-        episodes = f"{settings.evaluation_episodes} whole episodes"
+        word = score_word_of_run(run.spec, run.bundle_path)
+        episodes = f"{settings.evaluation_episodes} {word}s, whole episodes"
         real.errorbar(
             [each.generation for each in evaluations], [each.mean for each in evaluations],
             error_bars(evaluations), fmt="o-" if dreamt else "o", color="tab:green", capsize=3,
@@ -71,6 +74,6 @@ def _draw_confirmed(axes: Any, run: RunFolder) -> None:
     if (confirmed := run.confirmation()) is not None:
         word = score_word_of_run(run.spec, run.bundle_path)
         axes.errorbar(
-            confirmed.generation, confirmed.mean, error_bars([confirmed]), fmt="*", color="tab:red", capsize=3,
-            markersize=10, label=f"reported: confirmed on {confirmed.episodes} fresh {word}s (± standard error)",
+            confirmed.generation, confirmed.mean, error_bars([confirmed]), fmt="*", color="tab:red", **HOLLOW_STAR,
+            label=f"reported: confirmed on {confirmed.episodes} fresh {word}s (± standard error)",
         )  # fmt: skip

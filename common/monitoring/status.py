@@ -234,6 +234,7 @@ class FailureStatus:
     seeds: tuple[Count, ...]
     errors: dict[str, str]  # the last error of each worker
     attempts: dict[str, int]  # failures of each worker
+    retry_in: float | None = field(default=None, metadata=OPTIONAL)  # seconds; `None`: as soon as a slot is free
 
     @property
     def subject(self) -> str:
@@ -297,6 +298,7 @@ class Status(Displayed):
     ending: bool = field(default=False, metadata=OPTIONAL)  # a limit is reached: only evaluations are left
     # Episodes of evaluations and of the confirmation until the run's end.
     closing: Count = field(default=0, metadata=OPTIONAL)
+    score_word: Word = field(default="seed", metadata=OPTIONAL)  # what the world calls a scored seed: "track", "game"
 
     def _display(self) -> tuple[str, dict[str, object]]:
         now, best = self.generation, self.confirmed or self.best

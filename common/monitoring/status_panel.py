@@ -24,7 +24,7 @@ from dreamfleet.common.monitoring.status import (
 )
 from dreamfleet.common.monitoring.terminal_charts import bar_chart, candidate_grid, candidate_grid_height, share_bar
 from dreamfleet.common.monitoring.worker_table import WorkerTable
-from dreamfleet.common.printable import plural, printable
+from dreamfleet.common.printable import format_number, plural, printable
 from dreamfleet.common.protocol.tasks import DREAM, is_unregistered
 from dreamfleet.common.runs.records import (
     RunSettings,
@@ -159,17 +159,17 @@ def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
     warm = "" if temperature is None or size.driven == 1 else f", temperature {temperature:g}"
     length = describe_steps(now.horizon, size.driven, dreamt=task.task == DREAM and size.driven > 0)
     yield 6, "task", f"{task.task}, {length}{warm}"
-    yield 7, "population", f"{size.population} x {size.episodes}"
+    yield 7, "population", f"{plural(size.population, 'candidate')} x {plural(size.episodes, 'episode')}"
     if stage is not None:
         yield 4, "stage", f"{stage.number} of {stage.total}, since generation {stage.since}"
     yield 0, "last generation", _describe_generation(status.last) if status.last else "-"
-    yield 5, "step size", f"{status.generation.sigma:.4f} ({_describe_optimiser(settings)})"
-    yield 1, "evaluated mean", _describe_evaluation(status.evaluation)
+    yield 5, "step size", f"{format_number(status.generation.sigma)} ({_describe_optimiser(settings)})"
+    yield 1, "evaluated mean", _describe_evaluation(status.evaluation, status.score_word)
     yield 2, "reported", _describe_reported(status)
     rate, steps = status.throughput.steps_per_second, status.throughput.environment_steps
-    yield 3, "throughput", f"{rate:,.0f} steps/s, {steps:,} in all"
-    resent = f", {plural(waste.resent_batches, 'batch', 'batches')} sent again" if waste.resent_batches else ""
-    yield 4, "waste", f"{waste.share:.1%}, {plural(waste.reissued, 'job')} issued again{resent}"
+    yield 3, "throughput", f"{rate:,.0f} steps/s, {steps:,} steps in all"
+    resent = f", {plural(waste.resent_batches, 'batch', 'batches')} resent" if waste.resent_batches else ""
+    yield 4, "redundant work", f"{waste.share:.1%} of steps, {plural(waste.reissued, 'job')} reissued{resent}"
     if failed := status.failed + status.generation.failed:
         yield (
             2,
@@ -178,7 +178,7 @@ def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
         )
     if status.throughput.seconds is not None and status.elapsed is not None:
         worked = status.throughput.seconds + status.generation.seconds
-        yield 6, "time", f"{format_duration(worked)} of work in {format_duration(status.elapsed)}"
+        yield 6, "time", f"{format_duration(worked)} of work, {format_duration(status.elapsed)} since it began"
     if status.classes.total:
         yield 4 if status.classes.mixed or status.classes.varying else 7, "hosts", status.classes.description
     if status.expires is not None:
@@ -221,29 +221,31 @@ def _fact(each: tuple[int, str, str], width: int) -> list[Text]:
 
 
 def _describe_generation(last: StoredGeneration) -> str:
-    return f"mean {last.mean:.1f}, deviation {last.std:.1f}  ({last.worst:.0f} to {last.best:.0f})"
+    mean, std, worst, best = map(format_number, (last.mean, last.std, last.worst, last.best))
+    return f"mean {mean}, deviation {std} ({worst} to {best})"
 
 
 def _describe_optimiser(settings: RunSettings) -> str:
     return settings.covariance if settings.optimiser == "cma" else settings.optimiser
 
 
-def _describe_evaluation(each: StoredEvaluation | StoredConfirmation | None) -> str:
+def _describe_evaluation(each: StoredEvaluation | StoredConfirmation | None, word: str) -> str:
     if each is None:
         return "-"
-    seeds = count_episodes(each, "fresh seed" if isinstance(each, StoredConfirmation) else "seed")
+    seeds = count_episodes(each, f"fresh {word}" if isinstance(each, StoredConfirmation) else word)
     return f"{format_mean(each)} on {seeds} (generation {each.generation})"
 
 
 def _describe_reported(status: Status) -> str:
     if status.confirmed is not None or status.best is None:
-        return _describe_evaluation(status.confirmed)
-    return f"{_describe_evaluation(status.best)}, provisional"
+        return _describe_evaluation(status.confirmed, status.score_word)
+    return f"{_describe_evaluation(status.best, status.score_word)}, provisional"
 
 
 def _describe_failure(failure: FailureStatus) -> str:
     worker, error = next(iter(failure.errors.items()), ("a worker", "no reason was given"))
-    return f"{failure.subject}, failed on {worker}: {error}; it is tried again"
+    when = "" if failure.retry_in is None else f" in {format_duration(failure.retry_in)}"
+    return f"{failure.subject}, failed on {worker}: {error}; it is tried again{when}"
 
 
 def _progress_lines(status: Status, width: int) -> Iterator[Text]:
@@ -277,7 +279,7 @@ def _candidate_lines(status: Status, population: Population, width: int, lines: 
         parts = [f"{done:,}/{wanted:,} episodes", *([f"{failed} failed (x)"] if failed else [])]
     if found:
         values = [each.fitness or 0.0 for each in found]
-        parts.append(f"so far {min(values):.0f} to {max(values):.0f}")
+        parts.append(f"so far {format_number(min(values))} to {format_number(max(values))}")
     if population.total > len(population.done):
         parts.append(f"the first {len(population.done)} of {population.total} candidates")
     caption = f"generation {population.generation}".ljust(LABEL_WIDTH) + ", ".join(parts)
@@ -293,10 +295,10 @@ def _curve_lines(
     their fitness may not be comparable.
     """
     caption = "mean fitness by generation"
-    margin = max(len(f"{each.mean:.0f}") for each in history) + 1
+    margin = max(len(format_number(each.mean)) for each in history) + 1
     room = width - margin - (len(caption) + 1 + margin if lines == 1 else 0)
     means = _downsample([each.mean for each in history], max(room, 1))
-    low, high = f"{min(means):.0f}", f"{max(means):.0f}"
+    low, high = format_number(min(means)), format_number(max(means))
     since = 0 if stage is None else stage.since
     earlier = round(sum(each.number < since for each in history) / len(history) * len(means))  # bars
     if lines == 1:

@@ -16,7 +16,7 @@ from rich.text import Text
 
 from dreamfleet.common.monitoring.eta import format_duration
 from dreamfleet.common.monitoring.status import WorkerStatus
-from dreamfleet.common.printable import printable
+from dreamfleet.common.printable import plural, printable
 
 COLUMN_GAP = 2  # spaces between two columns
 SLOW_FACTOR = 1.5  # the slowest worker is marked if its seconds a job exceed the median by this factor
@@ -24,16 +24,27 @@ COLUMNS: dict[str, Callable[[WorkerStatus], str]] = {
     "worker": lambda each: each.worker,
     "state": lambda each: each.state if each.state == "present" else f"{each.state} for {format_duration(each.heard)}",
     "slots": lambda each: str(each.slots),
-    "a job": lambda each: "-" if each.job_seconds is None else format_duration(each.job_seconds),
+    "per job": lambda each: "-" if each.job_seconds is None else format_duration(each.job_seconds),
     "round trip": lambda each: "-" if each.round_trip is None else f"< {format_duration(each.round_trip)}",
     "resent": lambda each: str(each.resent),
-    "leases": lambda each: str(each.leases),
+    "assigned": lambda each: str(each.leases),
     "finished": lambda each: str(each.finished),
-    "steps/s": lambda each: f"{each.steps_per_second:.0f}",
+    "steps/s": lambda each: f"{each.steps_per_second:,.0f}",
     "load": lambda each: str(each.load),
     "picture": lambda each: each.drawn_by,
 }
-DROP_ORDER = ("picture", "load", "leases", "finished", "steps/s", "resent", "round trip", "slots", "a job", "state")
+DROP_ORDER = (
+    "picture",
+    "load",
+    "assigned",
+    "finished",
+    "steps/s",
+    "resent",
+    "round trip",
+    "slots",
+    "per job",
+    "state",
+)
 LEFT_ALIGNED = ("worker", "state", "picture")
 
 
@@ -61,7 +72,7 @@ class WorkerTable:
                 shown.add(row)
         found = _build_table(self.workers, shown, slowest, width)
         if self.known > len(shown):
-            found.append(Text(f"and {self.known - len(shown)} more", style="dim"))
+            found.append(Text(f"and {plural(self.known - len(shown), 'more worker')}", style="dim"))
         return found
 
 

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
-from dreamfleet.common.printable import printable, truncate
+from dreamfleet.common.printable import plural, printable, truncate
 from dreamfleet.common.protocol.messages import HostClass
 from dreamfleet.common.serialization.validation import Count, Length, Text
 
@@ -71,13 +71,13 @@ class HostClasses:
             return "no result yet"
         if self.varying:
             share = self.varying / max(self.results, 1)
-            return f"not deterministic: {share:.1%} of results cannot be recomputed to the bit"
+            return f"not deterministic: {share:.1%} of the results are not bit-identical when recomputed"
         if not self.mixed:
-            by = ", by its fingerprint" if self.largest[0].host_class.startswith(BY_FINGERPRINT) else ""
-            return f"one class{by}: to the bit"
+            by = " (by fingerprint)" if self.largest[0].host_class.startswith(BY_FINGERPRINT) else ""
+            return f"one class{by}: all results are bit-identical"
         shares = ", ".join(f"{each.results / max(self.results, 1):.1%}" for each in self.largest)
         more = f" and {self.total - len(self.largest)} more" if self.total > len(self.largest) else ""
-        return f"mixed: {self.total} classes, {shares}{more} of results"
+        return f"mixed: {self.total} classes with {shares}{more} of the results"
 
     @property
     def rows(self) -> list[tuple[str, str]]:
@@ -116,4 +116,4 @@ def _fingerprints(counted: ResultCounts, host_class: str) -> tuple[str, ...]:
 
 def _describe_hosts(each: HostClassShare) -> str:
     hosts = [f"[{printable(fingerprint)}]" for fingerprint in each.fingerprints]
-    return f"{each.results:,} results of {', '.join(hosts)}"
+    return f"{plural(each.results, 'result')} of {', '.join(hosts)}"

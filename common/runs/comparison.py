@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.runs.effort import Effort
+from dreamfleet.common.runs.effort import START_EFFORT, Effort, parse_start_effort
 from dreamfleet.common.runs.learning import LearningCurve, Point, total_effort
 from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, expand_task_options
@@ -37,7 +37,8 @@ class ComparedRun:
     name: str
     settings: RunSettings
     world: str | None  # task of the evaluations; `None` before the first
-    total: Effort
+    total: Effort  # with what was inherited
+    inherited: Effort  # spent on the run's start: by the run that it forked, or on the controller
     evaluated_means: tuple[EvaluatedMean, ...]
     confirmed: StoredConfirmation | None
     confirmed_scores: Scores
@@ -58,7 +59,15 @@ class ComparedRun:
         )
         scores = {} if confirmed is None else run.scores(confirmed.generation, confirming=True)
         world = None if curve is None else curve.world
-        return cls(run.name, run.settings, world, total_effort(run), evaluated_means, confirmed, scores)
+        inherited = parse_start_effort(run.fact(START_EFFORT)) or Effort()
+        total = total_effort(run)
+        return cls(run.name, run.settings, world, total, inherited, evaluated_means, confirmed, scores)
+
+    @property
+    def spent(self) -> str:
+        """What was spent in all, and which part of it before the run began, in words."""
+        before = f" ({self.inherited.description} of it inherited)" if self.inherited != Effort() else ""
+        return f"{self.total.description}{before}"
 
     def last_within_budget(self, spent: Callable[[Effort], float], most: float) -> EvaluatedMean | None:
         """The last evaluated mean within the budget. Its score plays no part in the choice, so luck does not either."""

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import read_text
+from dreamfleet.common.printable import format_number
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.common.runs.standard_error import format_with_error, score_digits
@@ -81,11 +82,11 @@ class EvaluationReport:
         named = "gymnasium's threshold" if self.judge == GYMNASIUM else "the world's threshold"
         beyond, count = self.results.mean - self.threshold, len(self.drives)
         if beyond >= 0 and count >= MIN_EPISODES_TO_SOLVE and self.failed:
-            return f"{beyond:.1f} above {named} of {self.threshold:g} without the failed episodes"
+            return f"{format_number(beyond)} above {named} of {self.threshold:g} without the failed episodes"
         if beyond >= 0 and count >= MIN_EPISODES_TO_SOLVE:
             return f"solved: {named} is a mean of {self.threshold:g}"
         few = "" if count >= MIN_EPISODES_TO_SOLVE else f", on fewer than {MIN_EPISODES_TO_SOLVE} {word}s"
-        return f"{abs(beyond):.1f} {'above' if beyond >= 0 else 'below'} {named} of {self.threshold:g}{few}"
+        return f"{format_number(abs(beyond))} {'above' if beyond >= 0 else 'below'} {named} of {self.threshold:g}{few}"
 
     def _describe_score(self, word: str) -> str:
         found = self.results

@@ -79,7 +79,7 @@ class PairedDifference:
     def description(self) -> str:
         """A text for display."""
         if self.mean == self.error == 0:
-            return f"the same scores, to the bit, on {self.seeds} equal seeds"
+            return f"bit-identical scores on {self.seeds} equal seeds"
         size = format_with_error(self.mean, self.error, sign="+")
         found = f"{size} (standard error) on {self.seeds} equal seeds"
         if self.is_significant:

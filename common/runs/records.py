@@ -305,8 +305,9 @@ def describe_score(found: StoredEvaluation | StoredConfirmation | None, word: st
     score += " (standard error)" if found.error is not None else ""
     if isinstance(found, StoredConfirmation):
         seeds = count_episodes(found, f"fresh validation {word}")
-        return f"{score} on {seeds}; confirmed: they took no part in its choice"
-    return f"{score} on {count_episodes(found, f'validation {word}')}; provisional: it is the best of all looks so far"
+        return f"{score} on {seeds}; confirmed: they were not used to choose it"
+    judged = count_episodes(found, f"validation {word}")
+    return f"{score} on {judged}; provisional: it is the best of all evaluations so far"
 
 
 def count_episodes(found: StoredEvaluation | StoredConfirmation, noun: str = "episode") -> str:

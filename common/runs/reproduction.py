@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from dreamfleet.common.printable import plural
+from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
 from dreamfleet.common.runs.evaluation_report import EvaluationReport
 from dreamfleet.common.runs.paired_difference import PairedDifference
@@ -63,9 +63,9 @@ class Reproduction:
             now = self.repeated.results.failure_text
             return f"{name}: NOT reproduced: {now}; all had a score when they were recorded"
         if not self.differing_seeds:
-            host = "" if self.same_fingerprint else ", though this host is of another fingerprint"
-            left = f"; {plural(failed, 'episode')} that failed then not driven again" if failed else ""
-            return f"{name}: reproduced: the same {count} scores to the bit, mean {mean:.1f}{host}{left}"
+            host = "" if self.same_fingerprint else ", although this host has another fingerprint"
+            left = f"; {plural(failed, 'episode')} that had failed: not driven again" if failed else ""
+            return f"{name}: reproduced: {plural(count, 'bit-identical score')}, mean {format_number(mean)}{host}{left}"
         if self.same_fingerprint:
             seeds = ", ".join(map(str, self.differing_seeds[:5])) + (", ..." if len(self.differing_seeds) > 5 else "")
             return (
@@ -75,7 +75,7 @@ class Reproduction:
             )
         hosts = f"recorded on [{self.recorded.fingerprint}], this host is [{self.repeated.fingerprint}]"
         if count < 2:
-            was = f"{mean:.1f} instead of {self.pairs[0][0].score:.1f}"
-            return f"{name}: NOT reproduced: {was} on one seed, and a mean of other bits takes 2 seeds or more; {hosts}"
+            was = f"{format_number(mean)} instead of {format_number(self.pairs[0][0].score)}"
+            return f"{name}: NOT reproduced: {was} on one seed; without equal bits a comparison takes 2 seeds; {hosts}"
         verdict = "reproduced" if self.is_reproduced else "NOT reproduced"
-        return f"{name}: {verdict}: mean {mean:.1f}, {self.difference.description}; {hosts}"
+        return f"{name}: {verdict}: mean {format_number(mean)}, {self.difference.description}; {hosts}"

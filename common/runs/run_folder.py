@@ -246,6 +246,11 @@ class RunFolder(Displayed):
             found.append(StoredGeneration(number, *fitness, to_finite(sigma), *effort, clamp_count(failed)))
         return found
 
+    def unscored_generations(self) -> set[int]:
+        """The closed generations without a mean fitness, which `history` gives as 0: journals had them once."""
+        rows = self._journal.rows("i", "SELECT number FROM generation WHERE closed IS NOT NULL AND mean IS NULL")
+        return {number for (number,) in rows}
+
     def quartiles(self, generations: Iterable[int]) -> dict[int, tuple[float, float]]:
         """The lower and upper quartile of the candidates' fitness, by generation; open generations are left out."""
         query = "SELECT fitness FROM candidate WHERE generation = ? AND fitness IS NOT NULL"
@@ -333,5 +338,5 @@ class RunFolder(Displayed):
 
     def _vector(self, data: Any, what: str) -> NDArray[np.float32]:
         if not isinstance(data, bytes) or len(data) % 4:
-            raise self._journal.damage_error(f"{what} is no vector")
+            raise self._journal.damage_error(f"{what} is not a vector")
         return np.frombuffer(data, dtype="<f4").astype(np.float32)

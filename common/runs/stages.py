@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
-from dreamfleet.common.printable import plural
+from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.records import STAGE_FIELDS, RunSettings, StageSettings, StoredEvaluation, StoredGeneration
 
@@ -51,7 +51,7 @@ class Stage:
     def description(self) -> str:
         """The settings as a text."""
         patience = f", patience {self.patience}" if self.patience else ""
-        search = f"a new search with step size {self.sigma0:g}" if self.starts_new_search else "the search goes on"
+        search = f"a new search with step size {self.sigma0:g}" if self.starts_new_search else "the search continues"
         raced = ", racing" if self.racing else ""
         driven = ", all driven" if self.driven == 1 else f", {self.driven:.0%} of them driven" if self.driven else ""
         search += "" if self.whole else " in the subspace"
@@ -201,5 +201,5 @@ class StageTracker:
             return f"{self._steps} environment steps"
         found = finished.get(self.required_evaluation(self._generation))
         if found is not None and end.score is not None and found.mean >= end.score and found.is_sound:
-            return f"the mean of generation {found.generation} reached {found.mean:.1f}"
+            return f"the mean of generation {found.generation} reached {format_number(found.mean)}"
         return ""

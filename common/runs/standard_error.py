@@ -9,7 +9,9 @@ import math
 from collections.abc import Sequence
 from statistics import stdev
 
-SMALL, MAX_DIGITS = 0.1, 6  # below it a score has more decimals than one, up to so many
+from dreamfleet.common.printable import format_number
+
+MAX_DIGITS = 6  # decimals of a score
 
 
 def sample_std(values: Sequence[float]) -> float | None:
@@ -33,21 +35,26 @@ def error_from_population_std(std: float, count: int) -> float | None:
 
 
 def score_digits(mean: float, error: float | None) -> int:
-    """Decimals of a score: one, or as many as show the first figure of a small error, or of a small mean without one.
+    """Decimals of a score: one, or as many as show the first figure of a small error.
 
-    >>> score_digits(875.62, 4.73), score_digits(0.1234, 0.0031)
-    (1, 3)
+    Without an error the mean has four significant digits, and at least one decimal.
+
+    >>> score_digits(875.62, 4.73), score_digits(0.1234, 0.0031), score_digits(-3.98712, None)
+    (1, 3, 3)
     """
-    size = abs(error or mean)
-    return min(MAX_DIGITS, -math.floor(math.log10(size))) if 0 < size < SMALL else 1
+    size, figures = (abs(error), 0) if error else (abs(mean), 3)
+    wanted = figures - math.floor(math.log10(size)) if 0 < size < math.inf else 1
+    return min(max(wanted, 1), MAX_DIGITS)
 
 
 def format_with_error(mean: float, error: float | None, digits: int | None = None, sign: str = "") -> str:
     """A mean ± its standard error; the mean alone if it has none. `sign` is the format's, such as `+` or `,`.
 
-    Without `digits` it has those of `score_digits`.
+    Without `digits` it has those of `score_digits`, and without an error too those of `format_number`.
     """
-    digits = score_digits(mean, error) if digits is None else digits
     plus, comma = "+" if "+" in sign else "", "," if "," in sign else ""
+    if digits is None and (not error or abs(error) < 10**-MAX_DIGITS):  # no error says which digits are noise
+        return f"{format_number(mean, sign)}{'' if error is None else f' ± {error:.1g}'}"
+    digits = score_digits(mean, error) if digits is None else digits
     after = "" if error is None else f" ± {error:{comma}.{digits}f}"
     return f"{mean:{plus}z{comma}.{digits}f}{after}"

@@ -120,7 +120,7 @@ def read_join_file(path: Path, now: datetime | None = None) -> Credentials:
     except OSError as error:
         raise AccessError(f"{path} cannot be read as a join file: {error.strerror}") from error
     except (ValueError, RecursionError) as error:  # not quoted: it may contain secrets
-        raise AccessError(f"{path} is no join file: it is not TOML; have another issued") from error
+        raise AccessError(f"{path} is not a join file: it is not TOML; have another issued") from error
     _check_private(path, found)
     credentials = _parse_credentials(path, document)
     if credentials.time_left(now or datetime.now(UTC)) <= timedelta():
@@ -140,29 +140,29 @@ def _check_private(path: Path, found: os.stat_result) -> None:
 def _parse_credentials(path: Path, document: dict[str, Any]) -> Credentials:
     version = document.pop("version", None)
     if version != VERSION:
-        raise AccessError(f"{path} is no join file of this version: have another issued")
+        raise AccessError(f"{path} is not a join file of this version: have another issued")
     kinds: dict[str, tuple[type, Any]] = {each.name: (str, each.default) for each in fields(Credentials)}
     kinds |= {"seat": (int, MISSING), "expires": (datetime, MISSING), "connect": (list, [])}
     for name, (kind, default) in kinds.items():
         if name not in document and default is MISSING:
-            raise AccessError(f"{path} is no join file: {name!r} is missing")
+            raise AccessError(f"{path} is not a join file: {name!r} is missing")
         if type(document.get(name, default)) is not kind:
-            raise AccessError(f"{path} is no join file: {name!r} has the wrong type")
+            raise AccessError(f"{path} is not a join file: {name!r} has the wrong type")
     if unknown := sorted(set(document) - set(kinds)):
-        raise AccessError(f"{path} is no join file: {unknown[0]!r} is unknown")
+        raise AccessError(f"{path} is not a join file: {unknown[0]!r} is unknown")
     values = {**document, "connect": tuple(document.get("connect", ()))}
     if values["role"] not in SEATS or not 1 <= values["seat"] <= SEATS[values["role"]] or not values["expires"].tzinfo:
-        raise AccessError(f"{path} is no join file: its role, seat or end is invalid")
+        raise AccessError(f"{path} is not a join file: its role, seat or end is invalid")
     if not all(isinstance(each, str) for each in values["connect"]):
-        raise AccessError(f"{path} is no join file: 'connect' has the wrong type")
+        raise AccessError(f"{path} is not a join file: 'connect' has the wrong type")
     credentials = Credentials(**values)
     has_certificate = bool(credentials.certificate and credentials.key)
     if not (has_certificate or credentials.password) or (credentials.can_listen and not has_certificate):
-        raise AccessError(f"{path} is no join file: its certificate, key or password is missing")
+        raise AccessError(f"{path} is not a join file: its certificate, key or password is missing")
     try:
         bytes.fromhex(credentials.secret)
     except ValueError:
-        raise AccessError(f"{path} is no join file: 'secret' is not hexadecimal") from None
+        raise AccessError(f"{path} is not a join file: 'secret' is not hexadecimal") from None
     return credentials
 
 

@@ -43,7 +43,7 @@ class Network:
         for endpoint in self.listen:
             if self.credentials is None and not insecure and not is_loopback(endpoint):
                 raise UsageError(
-                    f"{endpoint} can be reached from other hosts, and anyone who reaches it owns the run: give --join "
+                    f"{endpoint} is open to other hosts, and anyone who reaches it controls the run: give --join "
                     "FILE (`dreamfleet access`, docs/how-to/security.md), or --insecure inside a network that you trust"
                 )
 
@@ -70,7 +70,7 @@ def check_endpoint(endpoint: str) -> str:
     found = _ENDPOINT.fullmatch(endpoint)
     if not found or int(found[3]) > 65535:
         hint = "" if "/" in endpoint or ":" in endpoint else "; a run's name goes elsewhere: see --help"
-        raise UsageError(f"{endpoint!r} is no endpoint: write it as tcp/HOST:PORT, such as {DEFAULT_ENDPOINT}{hint}")
+        raise UsageError(f"{endpoint!r} is not an endpoint: write tcp/HOST:PORT, such as {DEFAULT_ENDPOINT}{hint}")
     return endpoint
 
 

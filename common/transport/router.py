@@ -9,6 +9,7 @@ from threading import Event
 
 import zenoh
 
+from dreamfleet.common.printable import plural
 from dreamfleet.common.transport.network import Network
 from dreamfleet.common.transport.session import open_session
 
@@ -33,5 +34,5 @@ def run_router(network: Network, stopped: Event) -> None:
 def _log_sessions(session: zenoh.Session) -> None:
     found = Counter(str(each.whatami) for each in session.info.transports())
     facts = {"event": "sessions", "clients": found["client"], "routers": found["router"]}
-    log.info("%d sessions: %d clients, %d routers", found.total(), found["client"], found["router"],
-             extra={"facts": facts})  # fmt: skip
+    log.info("%s: %s, %s", plural(found.total(), "session"), plural(found["client"], "client"),
+             plural(found["router"], "router"), extra={"facts": facts})  # fmt: skip

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import monotonic, sleep
+from time import monotonic, sleep, time
 from typing import Any
 
 import zenoh
@@ -29,6 +29,7 @@ from dreamfleet.common.transport.network import SECURED_PREFIX, Network, check_e
 
 CONNECT_TIMEOUT = 3.0  # seconds to open a link; TLS takes four or more round trips
 LEASE_MS = 4000  # after so long without a message the other side drops a session's liveliness tokens
+CLOCK_END = 2**32  # seconds since 1970: Zenoh counts them in 32 bits
 MAX_SESSIONS = 10_000
 MAX_RECEIVED = 128 * 1024  # bytes of a message; for a larger one Zenoh closes the link
 # Bytes of a message that a router forwards; Zenoh drops larger ones silently. More than the protocol's MAX_MESSAGE, so
@@ -49,6 +50,7 @@ def open_session(network: Network, *, timeout: float | None = CONNECT_TIMEOUT) -
     to others as they become reachable.
     """
     check_room_for_session()
+    check_clock(time())
     with _password_file(network) as dictionary:
         if network.listen or len(network.connect) < 2:
             session = _open_or_explain(network, lambda: _open_zenoh(zenoh_config(network, timeout, dictionary)))
@@ -59,6 +61,14 @@ def open_session(network: Network, *, timeout: float | None = CONNECT_TIMEOUT) -
     if network.listen and network.credentials is not None:
         limit_connections(session, {int(each.rpartition(":")[2]) for each in network.listen})
     return session
+
+
+def check_clock(seconds: float) -> None:
+    """`DreamfleetError` if Zenoh cannot write this time, in seconds since 1970, in its messages: it would panic."""
+    if not 0 <= seconds < CLOCK_END:
+        raise DreamfleetError(
+            f"this host's clock is {seconds:.0f} s past 1970, and Zenoh works from 1970 to February 2106: set the clock"
+        )
 
 
 def _reachable_first(network: Network, timeout: float) -> Network:
@@ -196,7 +206,7 @@ def _connection_error(network: Network, error: zenoh.ZError) -> ConnectionFailed
     if found := diagnose_connection(network.connect, network.credentials):
         return HandshakeRejectedError(found)
     return ConnectionFailedError(
-        f"nobody answers at {', '.join(network.connect)}: start `dreamfleet coordinator` or `dreamfleet router` "
+        f"no one answers at {', '.join(network.connect)}: start `dreamfleet coordinator` or `dreamfleet router` "
         f"there, or name another address with --connect {protocol}HOST:PORT"
     )
 

@@ -45,8 +45,12 @@ class ControlVerb:
         return 0
 
 
-PAUSE = ControlVerb("pause", "give out no more jobs; what runs is finished and counts", "is paused; go on with resume")
-RESUME = ControlVerb("resume", "go on after a pause; jobs that failed are tried again", "goes on")
+PAUSE = ControlVerb(
+    "pause",
+    "give out no more jobs; what runs is finished and counts",
+    "is paused; `dreamfleet resume` continues it",
+)
+RESUME = ControlVerb("resume", "go on after a pause; jobs that failed are tried again", "continues")
 DRAIN = ControlVerb(
     "drain", "give out no more jobs, wait for those that run, then leave; the run can be continued", "is draining",
     coordinator_leaves=True,

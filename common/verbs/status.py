@@ -70,7 +70,7 @@ def _can_redraw() -> bool:
 
 def print_runs(documents: Sequence[dict[str, Any]]) -> None:
     """One line per run; an unreadable status is a note."""
-    from dreamfleet.common.monitoring.eta import estimate_eta
+    from dreamfleet.common.monitoring.eta import describe_departed, estimate_eta
     from dreamfleet.common.monitoring.status import read_status
     from dreamfleet.common.printable import plural
     from dreamfleet.common.runs.records import format_mean
@@ -88,7 +88,7 @@ def print_runs(documents: Sequence[dict[str, Any]]) -> None:
             "state": each.state,
             "generation": each.generation.number,
             "best": None if (best := each.confirmed or each.best) is None else format_mean(best),
-            "workers": f"{each.workers.present}" + (f", {each.workers.lost} lost" if each.workers.lost else ""),
+            "workers": ", ".join(filter(None, (str(each.workers.present), describe_departed(each.workers)))),
             "steps/s": f"{each.throughput.steps_per_second:,.0f}",
             "to go": estimate_eta(each).description,
         }

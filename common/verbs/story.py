@@ -98,10 +98,10 @@ def _print_live(args: argparse.Namespace) -> int:
                  **({"why": each.why or None} if any(one.why for one in events) else {})}
                 for each in events], right=("seconds ago",))  # fmt: skip
     if not events:
-        print("nothing of that is kept: it is too long ago, or not yet", file=sys.stderr)
+        print("no such event is kept: it is too old, or has not happened yet", file=sys.stderr)
     elif total > len(events):
         print(
-            f"the last {len(events)} of {total} events that are kept; --last shows more, --what chooses",
+            f"the last {len(events)} of {total} kept events; --last shows more, --what filters",
             file=sys.stderr,
         )
     return 0
@@ -137,5 +137,5 @@ def _check_known(client: Client, run: str, worker: str) -> None:
     hosts = list(dict.fromkeys(each.partition("/")[0] for each in known))
     if worker in (*known, *hosts):
         return
-    there = f"known are {join_some(hosts, MOST_NAMED)}" if hosts else "none has come"
+    there = f"known are {join_some(hosts, MOST_NAMED)}" if hosts else "none has joined"
     raise UsageError(f"run {run} knows no worker {worker!r}: {there}")

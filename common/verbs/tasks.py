@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     elif args.task is not None:
         return _check(args)
     if args.environment:
-        raise UsageError("--environment is of one gym:ENVIRONMENT: name it, such as gym:LunarLander-v3")
+        raise UsageError("--environment needs one gym:ENVIRONMENT: name it, such as gym:LunarLander-v3")
     rows = [_row(name, point) for name, point in points.items()]
     if args.json:
         print(json.dumps(rows, indent=2))

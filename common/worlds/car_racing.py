@@ -81,6 +81,7 @@ FRUGAL: dict[str, Any] = {
 }  # fmt: skip
 PROFILE = WorldProfile(
     task=CAR_RACING,
+    score_word="track",
     run_presets={
         "article": ARTICLE,
         "dream": DREAM,
@@ -116,7 +117,6 @@ PROFILE = WorldProfile(
         quick_steps=700_000,
         # To drive on grass predicts losses that one track may not show.
         variant="offroad_cost=2",
-        word="track",
         judge="gymnasium's own environment",
         video_steps=1000,
     ),

@@ -49,8 +49,11 @@ class DemoPlan:
     able_score: float
     quick_steps: int
     variant: str = ""  # of the run in reality: NAME=VALUE, or none
-    word: str = "seed"  # a scored seed
     judge: str  # what the outcome is judged in
+    tracks: int = 16  # unseen tracks or games that the outcome is judged on
+    # Generations between evaluations, episodes of each, and of the confirmation: in the dream, and in reality.
+    dream_evaluations: tuple[int, int, int] = (2, 8, 16)
+    real_evaluations: tuple[int, int, int] = (3, 16, 64)
     video_steps: int
     random_score: float | None = None  # of random play
     packages: tuple[str, ...] = ()  # that the world needs beside the demonstration's own
@@ -61,6 +64,7 @@ class WorldProfile:
     """A world that ships. `task` is its task's name."""
 
     task: str
+    score_word: str = "seed"  # what a scored seed is called: "track", "game"
     # Settings of runs by preset name, as `coordinator` takes them.
     run_presets: Mapping[str, dict[str, Any]] = field(default_factory=dict)
     # Training presets by name: the fields of `TrainingPreset` (worker/training/presets.py) that differ, as mappings.

@@ -9,6 +9,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.world_facts import WorldFacts
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.worlds.profile import WorldProfile
 from dreamfleet.common.worlds.shipped import WORLDS
 
 
@@ -20,8 +21,7 @@ def score_word(task: str, facts: WorldFacts | None = None) -> str:
     """
     if facts is not None:
         return facts.score_word
-    demo = WORLDS[task].demo if task in WORLDS else None
-    return "seed" if demo is None else demo.word
+    return WORLDS[task].score_word if task in WORLDS else WorldProfile.score_word
 
 
 def score_word_of_run(spec: TaskSpec, bundle: Path) -> str:

@@ -1,4 +1,4 @@
-"""Two stored runs compared for the page, by the functions of `dreamfleet runs compare`."""
+"""Two stored runs compared for the page, by the functions of `dreamfleet compare`."""
 
 from __future__ import annotations
 

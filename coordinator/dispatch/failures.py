@@ -38,6 +38,7 @@ class JobFailure:
 
     work: Work
     history: tuple[Attempt, ...]
+    retry_at: float = 0.0  # seconds of the monotonic clock before which it is not tried again; 0: it waits for a slot
 
     @property
     def errors(self) -> dict[str, str]:

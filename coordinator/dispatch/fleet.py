@@ -392,8 +392,8 @@ class Fleet:
         """Release and log a worker that is gone or silent; its host's record counts a loss of jobs."""
         if member.is_guest:
             return  # it has no jobs, and a stranger can invent names without end
-        freed = f"{plural(len(member.leases), 'job')} {'is' if len(member.leases) == 1 else 'are'} free again"
-        self.notes.append(f"worker {member.identity} {what}: {freed}")
+        freed = f"; {plural(len(member.leases), 'job')} requeued" if member.leases else ""
+        self.notes.append(f"worker {member.identity} {what}{freed}")
         gone: EventKind = "lost" if member.is_lost else "left"
         self.event_log.add(now, "silent" if member.gone_since is None else gone, member.identity, why=member.farewell)
         if member.is_lost:
@@ -433,7 +433,7 @@ class Fleet:
         given.setdefault(move.taker, []).append(self.jobs[move.digest].work)
 
     def _drop_lease(self, member: Member, digest: bytes, *, counted: bool = False) -> None:
-        """End a lease without a valid result; `counted`: what the worker did is waste already.
+        """End a lease without a valid result; `counted`: what the worker did is counted as redundant already.
 
         R3: when the last lease of a wanted job ends, the job goes back into the queue.
         """

@@ -120,7 +120,9 @@ class Member:
     @property
     def departure(self) -> str:
         """How it went, for the log."""
-        return "is gone without a word" if self.is_lost else f"left ({self.farewell})" if self.farewell else "left"
+        if self.is_lost:
+            return "is lost: it was killed, or its connection was cut"
+        return f"left ({self.farewell})" if self.farewell else "left"
 
     @property
     def is_reachable(self) -> bool:

@@ -16,7 +16,7 @@ from dreamfleet.coordinator.jobs.work import Work
 MAX_FAILED = 64  # failed attempts of a job that are remembered
 MAX_HOLDERS = 2  # workers that a job is leased to at a time
 SUSPECT_LOSSES = 2  # workers that ended while they held a job: it may be what ended them
-WORKER_ENDED = f"{HOST_PREFIX}its worker ended without a word"
+WORKER_ENDED = f"{HOST_PREFIX}its worker was lost"
 
 
 class JobState(Enum):
@@ -77,7 +77,7 @@ class PendingJob:
     @property
     def failure(self) -> JobFailure:
         """Its failures so far."""
-        return JobFailure(self.work, tuple(self.attempts))
+        return JobFailure(self.work, tuple(self.attempts), self.retry_at)
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ def find_refusal(
         )
     if request.packages != packages:
         named, own = (truncate(", ".join(each), LONGEST) for each in (request.packages, packages))
-        return f"its fingerprint names {named}, this run's {own}", "say hello again about those"
+        return f"its fingerprint names {named}, this run's {own}", "start the worker again"
     host_class = effective_class(request.host_class, request.fingerprint, admitted)
     if admitted is None or host_class in ("", admitted):
         return None
@@ -51,9 +51,9 @@ def find_refusal(
 def class_mismatch(run: str | None, host_class: str, fingerprint: str) -> tuple[str, str]:
     """Why a strict run refuses a worker of another class, and the remedy."""
     own, other, host = (truncate(each or "", LONGEST) for each in (run, host_class, fingerprint))
-    return f"classes differ: the run is strict, of class {own}, and this host is of {other} [{host}]", (
+    return f"classes differ: the run is --strict with class {own}, and this host has class {other} [{host}]", (
         "install the same dreamfleet and package versions on a host of the same CPU features; or continue the run with "
-        "--no-strict, which takes results of any host, though its bits then hang on which host scored what"
+        "--no-strict, which takes results of any host, but makes the run not repeatable bit by bit"
     )
 
 

@@ -25,6 +25,7 @@ from dreamfleet.common.cli import model_commands
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.cli.model_commands import options
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
+from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.host.processes import (
     VerbProcess,
     parent_death_command,
@@ -36,13 +37,14 @@ from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import never_stop
 from dreamfleet.common.monitoring.client import Client
 from dreamfleet.common.monitoring.status_panel import RunPanel
-from dreamfleet.common.printable import plural
+from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.runs.records import best_evaluation
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.common.runs.run_paths import CONTROLLER
+from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL, resume_command
 from dreamfleet.common.runs.standard_error import format_with_error, standard_error
 from dreamfleet.common.worlds.profile import DemoPlan
+from dreamfleet.common.worlds.score_words import score_word
 from dreamfleet.coordinator.experiments.demo_plans import PLANS, find_plan, plan_defaults
 from dreamfleet.coordinator.experiments.local_run import START_SECONDS, LocalRun, has_begun
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE
@@ -50,10 +52,6 @@ from dreamfleet.coordinator.settings.config import NO_SUBSPACE
 REFRESH = 0.5
 PAGE_PACKAGES = ("plotly", "starlette", "uvicorn")
 PLOT, VIDEO, SCHEDULE = "fitness.png", "drive.mp4", "stages.toml"
-DREAM_EVALUATIONS, REAL_EVALUATIONS = (
-    (2, 8, 16),
-    (3, 16, 64),
-)  # generations between evaluations, tracks of each, of a confirmation
 SUBSPACE_SIGMA0, FULL_SIGMA0 = 0.3, 0.1  # first step sizes from zero: in a subspace, and of all parameters
 SUBSPACE_SIGMA0_AFTER_DREAM, FULL_SIGMA0_AFTER_DREAM = 0.15, 0.06  # the same after a dream
 LATE_SIGMA0 = 0.06  # step size in a subspace once a mean is able
@@ -90,7 +88,7 @@ class DemoConfig:
         None, "the few features that both searches keep to; none: all parameters (default the bundle's, if one ships)"
     )
     seed: int = option(1, "makes the runs")
-    tracks: int = option(16, "unseen tracks, or seeds of the world, that the outcome is judged on")
+    tracks: int | None = _option_of_plan("tracks", "unseen tracks or games that the outcome is judged on")
     workers: int = option(0, "worker processes; 0: one a core")
     port: int = option(7447, "port of the embedded router")
     page: bool = option(
@@ -99,7 +97,7 @@ class DemoConfig:
 
     def __post_init__(self) -> None:
         plan = self.plan
-        if min(plan.minutes, plan.dream_minutes) < 0 or self.tracks < 1 or self.workers < 0:
+        if min(plan.minutes, plan.dream_minutes) < 0 or plan.tracks < 1 or self.workers < 0:
             raise UsageError("--minutes and --workers must not be negative, --tracks at least 1")
         if not plan.minutes and not plan.dream_minutes:
             raise UsageError("--minutes and --dream-minutes cannot both be 0: nothing would evolve")
@@ -126,7 +124,7 @@ class Demo:
     """One demonstration run in `runs_dir`."""
 
     def __init__(self, config: DemoConfig, name: str, runs_dir: Path) -> None:
-        self._config, self._plan = config, config.plan
+        self._config, self._plan, self._word = config, config.plan, score_word(config.world)
         self._runs_dir = runs_dir
         self._demo_runs = plan_runs(config, name, runs_dir)
         self._endpoint = f"tcp/127.0.0.1:{config.port}"
@@ -145,7 +143,7 @@ class Demo:
         folder = self._runs_dir / best.run
         controller = folder / CONTROLLER
         self._print(
-            f"judging run {best.run}'s controller on unseen {self._plan.word}s, whole episodes, in {self._plan.judge}"
+            f"judging run {best.run}'s controller on unseen {self._word}s, whole episodes, in {self._plan.judge}"
         )
         drives = self._judge(controller)
         self._console.print(self._table(best, drives))
@@ -153,13 +151,22 @@ class Demo:
             self._plot(demo_run)
         if self._plan.random_score is not None:
             times = fmean(drives.values()) / self._plan.random_score
-            self._print(f"random play has {self._plan.random_score:.0f}: this is {times:.1f} times as much")
+            self._print(f"random play has {format_number(self._plan.random_score)}: this is {times:.1f} times as much")
         seed, score = median_drive(drives)
-        what = f"{score:.0f} on {self._plan.word} {seed}"
+        what = f"{format_number(score)} on {self._word} {seed}"
         self._print(f"recording the median of these drives ({what}), and what the model dreams")
         steps = self._plan.video_steps
         run_verb_to_end("record", "--controller", controller, "--out", folder / VIDEO, "--steps", steps, "--seed", seed)
         self._print_next_steps(folder)
+
+    @property
+    def stopped_text(self) -> str:
+        """What is kept of a demonstration that was stopped, and the command that continues it."""
+        kept = [each.run for each in self._demo_runs if path_exists(self._runs_dir / each.run / JOURNAL)]
+        ended = "stopped: all its processes have ended"
+        if not kept:
+            return f"{ended}, and no run had begun"
+        return f"{ended}; run {kept[-1]} is kept: continue it with: {resume_command(self._runs_dir / kept[-1])}"
 
     def _show_page(self, stack: ExitStack) -> None:
         """Serve a page about the runs until `stack` closes; none without its packages or a free port."""
@@ -180,12 +187,12 @@ class Demo:
 
     def _judge(self, controller: Path) -> dict[int, float]:
         """Score by track, on tracks that no part of the demonstration has seen."""
-        report = run_verb_for_json(*model_commands.evaluate(controller, self._config.tracks, "--json"))
+        report = run_verb_for_json(*model_commands.evaluate(controller, self._plan.tracks, "--json"))
         return dict(zip(report["seeds"], report["scores"], strict=True))
 
     def _table(self, chosen: DemoRun, drives: Mapping[int, float]) -> Table:
         """Each run's best evaluation and confirmed score, and the chosen one's score on unseen tracks."""
-        words = f"{self._plan.word}s"
+        words = f"{self._word}s"
         table = Table("run", "its best evaluation", f"confirmed on fresh {words}", f"on unseen {words}", box=None)
         for demo_run in self._demo_runs:
             with open_run(self._runs_dir, demo_run.run) as run:
@@ -219,6 +226,8 @@ class Demo:
                     self._show(live, client, demo_run.run)
 
                 run.wait(never_stop, look, REFRESH)
+            if not self._console.is_terminal:
+                self._console.print()  # the panel's last line has no end there
 
     def _show(self, live: Live, client: Client, run: str) -> None:
         with suppress(ConnectionFailedError):  # the coordinator is starting, or has just ended
@@ -254,12 +263,12 @@ def median_drive(drives: Mapping[int, float]) -> tuple[int, float]:
 
 
 def _format_score(mean: float, error: float | None, episodes: int) -> str:
-    return f"{format_with_error(mean, error, 0)} ({episodes})"
+    return f"{format_with_error(mean, error)} ({episodes})"
 
 
 def _format_drives(scores: Sequence[float]) -> str:
     score = _format_score(fmean(scores), standard_error(scores), len(scores))
-    return f"{score}, {min(scores):.0f} to {max(scores):.0f}"
+    return f"{score}, {format_number(min(scores))} to {format_number(max(scores))}"
 
 
 def _evaluation_flags(every: int, tracks: int, confirming: int) -> dict[str, object]:
@@ -278,15 +287,15 @@ def plan_runs(config: DemoConfig, name: str, runs_dir: Path) -> tuple[DemoRun, .
     reality: dict[str, object] = {
         **search, "population": plan.population, "horizon": plan.horizon,
         "patience": plan.patience, "sigma0": sigma0, "seed": config.seed, "minutes": plan.minutes,
-        "variant": plan.variant or None, **_evaluation_flags(*REAL_EVALUATIONS),
+        "variant": plan.variant or None, **_evaluation_flags(*plan.real_evaluations),
     }  # fmt: skip
     if plan.dream_minutes:
         dream = check_run_name(f"{name}-dream")
         flags = {
             **search, "preset": plan.preset, "temperature": plan.temperature, "sigma0": sigma0, "seed": config.seed,
-            "minutes": plan.dream_minutes, **_evaluation_flags(*DREAM_EVALUATIONS),
+            "minutes": plan.dream_minutes, **_evaluation_flags(*plan.dream_evaluations),
         }  # fmt: skip
-        found.append(DemoRun(dream, f"evolving in the dream for {plan.dream_minutes:g} minutes", flags))
+        found.append(DemoRun(dream, f"evolving in the dream for {plural(plan.dream_minutes, 'minute')}", flags))
         reality |= {
             "init": runs_dir / dream / CONTROLLER,
             "sigma0": SUBSPACE_SIGMA0_AFTER_DREAM if few else FULL_SIGMA0_AFTER_DREAM,
@@ -296,5 +305,5 @@ def plan_runs(config: DemoConfig, name: str, runs_dir: Path) -> tuple[DemoRun, .
             f"[[stage]]\nscore = {plan.able_score}\nsteps = {plan.quick_steps}\nepisodes = 1\n\n"
             f"[[stage]]\nepisodes = {plan.episodes}\n" + (f"sigma0 = {LATE_SIGMA0}\n" if few else "")
         )
-        found.append(DemoRun(name, f"evolving in reality for {plan.minutes:g} minutes", reality, schedule))
+        found.append(DemoRun(name, f"evolving in reality for {plural(plan.minutes, 'minute')}", reality, schedule))
     return tuple(found)

@@ -14,8 +14,8 @@ PLANS: dict[str, DemoPlan] = {name: world.demo for name, world in WORLDS.items()
 def find_plan(world: str) -> DemoPlan:
     """The plan of this world's demonstration; `UsageError` lists the worlds that have one.
 
-    >>> find_plan("car-racing").word
-    'track'
+    >>> find_plan("car-racing").bundle
+    'tiny'
     """
     if world not in PLANS:
         raise UsageError(f"--world must be one of {', '.join(PLANS)}, not {world!r}")

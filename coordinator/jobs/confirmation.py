@@ -88,7 +88,7 @@ class Confirmation:
             return f"confirming: generation {self._remaining[0].generation}'s mean on {fresh}, for its score"
         names = ", ".join(str(each.generation) for each in self._remaining)
         more = plural(seeds, "more seed")
-        return f"confirming: the means of generations {names} on {more} each; the better half goes on"
+        return f"confirming: the means of generations {names} on {more} each; the better half continues"
 
     @property
     def in_progress(self) -> bool:

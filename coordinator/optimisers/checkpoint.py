@@ -69,7 +69,7 @@ class Checkpoint:
 def _version_01_head(arrays: State) -> Head:
     """Move the head of a version 0.1 state, which is always of pycma, out of the arrays."""
     if "cma" not in arrays:
-        raise JournalError("the journal's last state is damaged: it does not say which optimiser wrote it")
+        raise JournalError("the journal's last state is damaged: it does not name the optimiser that wrote it")
     sigma = untag(json.loads(str(arrays["about"]))["sigma"])
     return Head("cma", f"cma=={arrays.pop('cma')}", arrays["mean"].astype(np.float64), float(sigma))
 

@@ -122,7 +122,7 @@ class Evolution:
         """`UsageError` if the optimiser cannot draw single candidates anew."""
         if not callable(getattr(self._optimiser, "redraw", None)):
             raise UsageError(
-                f"optimiser {self._config.optimiser!r} cannot draw single candidates anew: say --on-failure worst"
+                f"optimiser {self._config.optimiser!r} cannot redraw single candidates: pass --on-failure worst"
             )
 
     def _check(self, drawn: object, count: int) -> NDArray[np.float64]:
@@ -137,14 +137,14 @@ class Evolution:
         if not travels:
             raise DreamfleetError(
                 f"optimiser {self._config.optimiser!r} asked for what no single-precision number can hold, at "
-                f"step size {self.sigma:g}: it cannot go on; fork the run with another --sigma0 or --optimiser"
+                f"step size {self.sigma:g}: it cannot continue; start one --from it with other --sigma0 or --optimiser"
             )
         return asked
 
     def tell(self, fitness: NDArray[np.float64]) -> None:
         """Update the distribution; `fitness` `(population,)`, larger is better, in the order of `ask`."""
         if fitness.shape != (self._config.population,) or not np.isfinite(fitness).all():
-            raise ValueError(f"tell needs {self._config.population} finite numbers")  # pycma accepts NaN silently
+            raise ValueError(f"an update needs {self._config.population} finite numbers")  # pycma accepts NaN silently
         self._optimiser.tell(fitness)
         self._is_open = False
 
@@ -154,7 +154,7 @@ class Evolution:
 
     def state(self) -> Checkpoint:
         """Everything that the next `ask` depends on."""
-        assert not self._is_open, "a state is taken between tell and ask"
+        assert not self._is_open, "a state is taken after an update and before ask"
         state = self._optimiser.state()
         unfit = [name for name, array in state.items() if name.startswith(PREFIX) or array.dtype.hasobject]
         if unfit:

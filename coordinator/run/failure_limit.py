@@ -43,6 +43,6 @@ class FailureLimit:
             where = f"generation {last}" if first == last else f"generations {first} to {last}"
             return (
                 f"{failed} of {plural(total, 'candidate')} failed in {where}; `dreamfleet resume` tries them again and "
-                "goes on, however many fail in this generation"
+                "continues, however many fail in this generation"
             )
         return None

@@ -161,7 +161,7 @@ class Generations:
             self.redrawn.update(indices)
             self._journal.redraw(number, indices, [vector_bytes(x) for x in self._strategy.redraw(indices)])
             names = f"candidate {indices[0]}" if len(indices) == 1 else f"candidates {', '.join(map(str, indices))}"
-            found = f"{names} of generation {number} failed and {'is' if len(indices) == 1 else 'are'} drawn anew"
+            found = f"{names} of generation {number} failed and {'is' if len(indices) == 1 else 'are'} redrawn"
         else:
             return None
         return found

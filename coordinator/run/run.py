@@ -181,7 +181,7 @@ class Run:
             return False
         if self.stalled is not None:
             self.stalled, self.fleet.paused = None, self.paused is not None
-            goes_on = "the run goes on" if self.paused is None else f"the run stays paused: {self.paused}"
+            goes_on = "the run continues" if self.paused is None else f"the run stays paused: {self.paused}"
             self.fleet.notes.append(f"the journal can be written again: {goes_on}")
         return True
 
@@ -197,8 +197,8 @@ class Run:
     def wait_until_writable(self, error: NotWritableNowError) -> None:
         """Give out no jobs until what could not be written is written."""
         if self.stalled is None:
-            self.fleet.notes.append(f"paused: {error}, and the run goes on by itself")
-        self.stalled, self.fleet.paused = f"{error}, and the run goes on by itself", True
+            self.fleet.notes.append(f"paused: {error}, and the run then continues by itself")
+        self.stalled, self.fleet.paused = f"{error}, and the run then continues by itself", True
         self._retry_at = self._now + WRITE_RETRY
 
     def leave(self) -> None:
@@ -252,14 +252,14 @@ class Run:
                 self._record_failure(lasting)
         if self.paused is not None:
             if self._lacks_host and judge.has_hope:
-                self.fleet.notes.append("a host is here that may score: the run goes on")
+                self.fleet.notes.append("a host has joined that may be able to score: the run continues")
                 self._go_on()
             return
         if is_judged and (failure := judge.find_broken_fleet(at_once=self.failure_limit.share < 1)) is not None:
             proof = self.generations.find_scored(self.generation)
             if proof is None or judge.has_failed_proof or not self.fleet.jobs.offer_proof(proof):
                 self.pause(
-                    f"no host that is here has ever scored, and every job that it tried failed, such as {failure}; "
+                    f"no present host has ever scored a job, and all its jobs failed, such as {failure}; "
                     f"another host, or `dreamfleet resume`, tries them again{OTHER_SEEDS if proof is None else ''}"
                 )
                 self._lacks_host = not judge.has_hope

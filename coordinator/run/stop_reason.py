@@ -1,8 +1,8 @@
-"""Why a run ends: its limits, or a search that has come to one point."""
+"""Why a run ends: its limits, or a population that has collapsed to one point."""
 
 from __future__ import annotations
 
-from dreamfleet.common.printable import plural
+from dreamfleet.common.printable import format_number, plural
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.run.background_jobs import BackgroundJobs
@@ -14,7 +14,8 @@ def find_stop_reason(
 ) -> str | None:
     """Why the run ends before `generation` is scored, in words; `None` if it continues."""
     if generation.is_one_point:
-        return f"converged: generation {generation.number} is one point; fork the run with a larger --sigma0"
+        collapsed = f"the population of generation {generation.number} collapsed to one point"
+        return f"{collapsed}; start another --from it with a larger --sigma0"
     return _find_reached_limit(limits, history, jobs)
 
 
@@ -25,10 +26,10 @@ def _find_reached_limit(limits: LimitsConfig, history: History, jobs: Background
     if limits.steps and history.steps >= limits.steps:
         return f"{history.steps} environment steps"
     if limits.minutes and history.seconds >= 60 * limits.minutes:
-        return f"{plural(limits.minutes, 'minute')} in which it could work"
+        return f"{plural(limits.minutes, 'minute')} of work"
     best = jobs.evaluations.best
     if limits.target is not None and best is not None and best.mean >= limits.target and best.is_sound:
-        return f"the mean of generation {best.generation} reached {best.mean:.1f}"
+        return f"the mean of generation {best.generation} reached {format_number(best.mean)}"
     if best is not None and limits.parted and jobs.have_fallen_behind(limits.parted):
         return f"the evaluated mean fell behind generation {best.generation}'s"
     return None

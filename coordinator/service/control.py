@@ -51,14 +51,14 @@ class Control:
         self._now, verb = now, query_key.rsplit("/", 1)[-1]
         why, again = "", ""
         if query_key != keys.control(self._name, verb):
-            why = f"one run is steered at a time, by its own key: ask {keys.control(self._name, 'VERB')}"
+            why = f"one run is controlled at a time, by its own key: query {keys.control(self._name, 'VERB')}"
         elif verb not in self._verbs:
             known = ", ".join(self._verbs)
-            why = f"{truncate(verb, LONGEST_VERB)!r} is no control verb of this version; it knows: {known}"
+            why = f"{truncate(verb, LONGEST_VERB)!r} is not a control verb of this version; known are {known}"
         else:
             self._verbs[verb]()
             if verb == "resume" and self._run.stalled is not None:
-                why = f"it cannot go on now: {self._run.stalled}; say `resume` again then"
+                why = f"it cannot continue now: {self._run.stalled}; repeat `resume` then"
             if verb in LEAVING_VERBS and len(resume_command) <= MAX_TEXT and resume_command.isprintable():
                 again = resume_command
         return ControlReply(v=keys.PROTOCOL_VERSION, run=self._name, accepted=not why, why=why, again=again)

@@ -25,6 +25,7 @@ from dreamfleet.common.runs.run_paths import ARCHIVE, BUNDLE, JOURNAL, resume_co
 from dreamfleet.common.security.certificate_ledger import RevocationWatcher
 from dreamfleet.common.security.credentials import Credentials
 from dreamfleet.common.transport.session import Network
+from dreamfleet.common.worlds.score_words import score_word
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.service.service import Service
 from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, LimitsConfig, NetworkConfig, RunConfig
@@ -86,19 +87,19 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
         file_watch = stack.enter_context(
             closing(FileWatch(journal, served, request.with_absolute_paths.resume_command))
         )
-        service = _service(request, file_watch, served)
+        service = _service(request, file_watch, served, _score_word(settings, bundle))
         on_stoppable(service.stop)
         try:
             return service.serve(lambda: Run(journal, settings, request.limits, request.network, monotonic()))
         except JournalError as error:
             if not isinstance(error.__cause__, (OSError, sqlite3.OperationalError)) or not journal.is_whole:
                 raise
-            raise JournalError(f"{error}; it goes on with: {request.resume_command()}") from error
+            raise JournalError(f"{error}; continue it with: {request.resume_command()}") from error
         except ConnectionFailedError as error:
             if request.config is None:
                 raise
             raise ConnectionFailedError(
-                f"{error}; the run is made, and begins with: {request.resume_command()}"
+                f"{error}; the run was created; start it with: {request.resume_command()}"
             ) from error
 
 
@@ -111,12 +112,17 @@ def _check_file_system(folder: Path) -> None:
                     folder, kind)  # fmt: skip
 
 
-def _service(request: RunRequest, file_watch: FileWatch, bundle: ServedBundle | None) -> Service:
+def _score_word(settings: RunSettings, bundle: Bundle | None) -> str:
+    task = settings.task.task
+    return score_word(task) if bundle is None else score_word(bundle.manifest.task, bundle.manifest.world)
+
+
+def _service(request: RunRequest, file_watch: FileWatch, bundle: ServedBundle | None, word: str) -> Service:
     network = request.network
     intervals = Intervals(network.beat, network.beat)
     revocations = RevocationWatcher(request.access_dir, request.credentials)
     reached = Network(network.listen, network.connect, request.credentials, revocations.revoked_seats)
-    return Service(request.name, reached, intervals, file_watch, bundle, network.metrics_port, revocations)
+    return Service(request.name, reached, intervals, file_watch, bundle, network.metrics_port, revocations, word)
 
 
 def _open_journal(request: RunRequest, folder: Path, settings: RunSettings, bundle: Bundle | None) -> Journal:

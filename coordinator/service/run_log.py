@@ -15,6 +15,7 @@ from typing import Any
 
 from dreamfleet.common.monitoring.eta import estimate_eta, summarise_status
 from dreamfleet.common.monitoring.status import Status
+from dreamfleet.common.printable import format_number
 from dreamfleet.common.protocol.tasks import is_unregistered
 from dreamfleet.common.runs.records import StoredGeneration, count_episodes, format_mean, with_error
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, Credentials, describe_time_left
@@ -52,14 +53,15 @@ class RunLog:
         if listen:
             log.info("listening on %s", ", ".join(listen))
             if self._network.credentials is None and not all(is_loopback(each) for each in listen):
-                log.warning("this is neither encrypted nor authenticated: anyone who reaches the port owns the run "
+                log.warning("this is neither encrypted nor authenticated: anyone who reaches the port controls the run "
                             "(docs/how-to/security.md)", extra={"facts": {"event": "insecure"}})  # fmt: skip
 
     def report_closed(self, generations: Iterable[StoredGeneration]) -> None:
         """Log these closed generations, and the evaluations that have finished since the last call."""
         for closed in generations:
             failed = f", {closed.failed} failed" if closed.failed else ""
-            log.info("generation %d: mean %.1f, best %.1f%s", closed.number, closed.mean, closed.best, failed,
+            log.info("generation %d: mean %s, best %s%s", closed.number, format_number(closed.mean),
+                     format_number(closed.best), failed,
                      extra={"facts": {"event": "generation", **asdict(closed)}})  # fmt: skip
         evaluations = self._run.background_jobs.evaluations
         if len(evaluations) > self._evaluations_logged:

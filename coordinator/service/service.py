@@ -61,7 +61,7 @@ class Service:
 
     def __init__(
         self, name: str, network: Network, intervals: Intervals, file_watch: FileWatch, bundle: ServedBundle | None,
-        metrics_port: str, revocations: RevocationWatcher,
+        metrics_port: str, revocations: RevocationWatcher, score_word: str,
     ) -> None:  # fmt: skip
         self._name = name
         self._file_watch = file_watch
@@ -69,6 +69,7 @@ class Service:
         self._network = network
         self._secured = network.credentials is not None
         self._revocations = revocations
+        self._score_word = score_word
         self._metrics_port = metrics_port
         self._intervals = intervals
         self._nonce = secrets.token_hex(8)
@@ -260,7 +261,7 @@ class Service:
     def _find_refusal(self, request: HelloRequest, worker: str) -> tuple[str, str] | None:
         """Why the service admits nobody of this name, and what to do about it; `worker` is named by the hello's key."""
         if self._secured and request.worker != worker:
-            return "it says hello in another's name", "update dreamfleet on the worker's host"
+            return "it uses another worker's name", "update dreamfleet on the worker's host"
         if self._secured and self._is_revoked(request.worker):
             self._run.admission.refused_workers.add(request.worker, "its join file is revoked")
             return "its join file is revoked", "have another issued"
@@ -310,4 +311,4 @@ class Service:
         dropped = self._inbox.dropped + self._run.dropped + self._events.dropped + self._error_counter.counts
         credentials = self._network.credentials
         expires = None if credentials is None else credentials.expires.timestamp()
-        return take_snapshot(self._run, self._name, dropped, now - self._started, now, expires)
+        return take_snapshot(self._run, self._name, dropped, now - self._started, now, expires, self._score_word)

@@ -66,17 +66,19 @@ class Snapshot:
 
 
 def take_snapshot(
-    run: Run, name: str, dropped: Mapping[str, int], uptime: float, now: float, expires: float | None = None
-) -> Snapshot:
+    run: Run, name: str, dropped: Mapping[str, int], uptime: float, now: float, expires: float | None = None,
+    score_word: str = "seed",
+) -> Snapshot:  # fmt: skip
     """The run at `now`, seconds of the monotonic clock.
 
     `dropped` counts what the service dropped by reason, `uptime` is in seconds, `expires` in seconds since 1970.
+    `score_word` is what the world calls a scored seed.
     """
     background_jobs, candidate_scores = run.background_jobs, run.generation.candidate_scores()
     members = list(run.fleet.members.values())
     departed = [member for worker, member in run.fleet.departed.items() if worker not in run.fleet.members]
     return Snapshot(
-        status=_status(run, name, candidate_scores, members, departed, dropped, uptime, expires),
+        status=_status(run, name, candidate_scores, members, departed, dropped, uptime, now, expires, score_word),
         workers=tuple(_worker(member, now) for member in (*members, *departed)),
         history=run.history.view(),
         evaluations=background_jobs.evaluations.rows,
@@ -90,7 +92,7 @@ def take_snapshot(
 
 def _status(
     run: Run, name: str, candidate_scores: CandidateScores, members: Sequence[Member], departed: Sequence[Member],
-    dropped: Mapping[str, int], uptime: float, expires: float | None,
+    dropped: Mapping[str, int], uptime: float, now: float, expires: float | None, score_word: str,
 ) -> Status:  # fmt: skip
     present = [member for member in members if member.is_reachable]
     lost = sum(member.is_lost for member in departed)
@@ -124,7 +126,7 @@ def _status(
         throughput=_throughput(run, present),
         waste=_waste(run.fleet.counts),
         failing=len(failures),
-        failures=tuple(_failure(each) for each in failures[:MOST_FAILURES]),
+        failures=tuple(_failure(each, now) for each in failures[:MOST_FAILURES]),
         dropped=dict(dropped),
         refused=_refused(run),
         confirmed=run.confirmed,
@@ -136,6 +138,7 @@ def _status(
         strict=run.admission.strict,
         classes=run.classes,
         expires=expires,
+        score_word=score_word,
     )
 
 
@@ -214,7 +217,7 @@ def _waste(counts: Mapping[str, int]) -> Waste:
     )
 
 
-def _failure(failure: JobFailure) -> FailureStatus:
+def _failure(failure: JobFailure, now: float) -> FailureStatus:
     job, names = failure.work.job, list(failure.errors)[:MOST_NAMED]
     return FailureStatus(
         candidate=f"{job.generation}/{job.candidate}",
@@ -222,6 +225,7 @@ def _failure(failure: JobFailure) -> FailureStatus:
         seeds=job.seeds,
         errors={name: shorten(failure.errors[name], LONGEST) for name in names},
         attempts={name: failure.attempts[name] for name in names},
+        retry_in=round(failure.retry_at - now, 1) if failure.retry_at > now else None,
     )
 
 

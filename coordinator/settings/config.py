@@ -167,9 +167,8 @@ class RunConfig:
     confirm_episodes: ConfirmationEpisodes | None = frozen_option(
         RunSettings,
         None,
-        "confirm what is reported as the run ends, after its limits: the best evaluated means drive about twice as "
-        "many seeds in rounds, then the remaining one drives so many fresh ones, which give its score (default as many "
-        "as of an evaluation, 2 at least); 0: never",
+        "fresh seeds that confirm what is reported, once a limit is reached (default as many as of an evaluation, 2 "
+        "at least); 0: never. Before, the best evaluated means drive about twice as many seeds in rounds",
     )
     collect_every: Interval = frozen_option(
         RunSettings, 0, "keep rollouts of the mean for training, every so many generations; 0: never"
@@ -196,13 +195,13 @@ class RunConfig:
         elif self.bundle == NO_BUNDLE:
             raise UsageError(f"--bundle {NO_BUNDLE}: name what candidates are scored in with --task")
         if self.racing and self.episodes < 2:
-            raise UsageError("--racing needs at least 2 episodes: there is no second half of one")
+            raise UsageError("--racing needs at least 2 episodes, as one has no second half")
         if not 0 < self.sigma0 <= LARGEST_STEP:
             raise UsageError(f"--sigma0 must be a positive number of at most {LARGEST_STEP:g}, not {self.sigma0}")
         for name, nothing in {"recorded": "0", "driven": "0", "end": "''"}.items():
             if getattr(self, name) and self.task != DREAM:
                 other = self.task or (default_world() if self.bundle is None else "the world that it dreams of")
-                raise UsageError(f"--{name} is of task {DREAM}, not of {other}: leave it out, or say {nothing}")
+                raise UsageError(f"--{name} needs task {DREAM}, not {other}: leave it out, or pass {nothing}")
         if self.end:
             EndRule.parse(self.end)
         if 0 < self.driven < 1:
@@ -218,7 +217,7 @@ class RunConfig:
         if self.racing:
             raise UsageError(
                 "--racing compares all candidates by the first half of their episodes, and of a mixture that would be "
-                "the driven ones: leave it out, or say --driven 0 or 1"
+                "the driven ones: leave it out, or pass --driven 0 or 1"
             )
 
     @property
@@ -321,8 +320,8 @@ class RunConfig:
         costs = [each for each in driving.option_texts if each not in driving.without_costs.option_texts]
         if costs and self.task == DREAM:
             raise UsageError(
-                f"{costs[0].partition('=')[0]} is of candidates that drive: a dream knows of no lap and no road; name "
-                "--variant without it"
+                f"{costs[0].partition('=')[0]} needs candidates that drive in the world: a dream has no lap and no "
+                "road; leave it out of --variant"
             )
         return driving
 
@@ -404,13 +403,13 @@ def _check_subspace(subspace: Subspace, spec: TaskSpec, shape: ControllerShape) 
     if subspace.bundle != spec.bundle:
         own = f"world model {spec.bundle[:12]}" if spec.bundle else "a task without a world model"
         raise UsageError(
-            f"--subspace (given, or the preset's) is of world model {subspace.bundle[:12]}, and the run is on {own}: "
+            f"--subspace (given, or the preset's) belongs to world model {subspace.bundle[:12]}, the run uses {own}: "
             f"give its own --bundle, or --subspace {NO_SUBSPACE}"
         )
     if (inputs := subspace.weights.shape[1]) != shape.features:
         raise UsageError(
-            f"--subspace is of controllers that see {inputs} numbers, latent and hidden state alone, and this run's "
-            f"see {shape.features}: leave --features and feedback=last out, or say --subspace {NO_SUBSPACE}"
+            f"--subspace fits controllers that see {inputs} numbers, latent and hidden state alone, and this run's "
+            f"see {shape.features}: leave --features and feedback=last out, or pass --subspace {NO_SUBSPACE}"
         )
 
 

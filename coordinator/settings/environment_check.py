@@ -33,5 +33,5 @@ def check_environment(config: RunConfig, bundle: Bundle | None, *, strict: bool)
     if found.varies and strict:
         raise UsageError(f"{task} is not deterministic, so --strict cannot hold: {found.varies}; or leave --strict out")
     if found.varies:
-        log.warning("%s is not deterministic, so no fitness can be recomputed to the bit: %s", task, found.varies)
+        log.warning("%s is not deterministic, so a recomputed fitness differs: %s", task, found.varies)
     return replace(config, description=found.description)

@@ -57,11 +57,11 @@ class Rerun:
     def expected_difference(self) -> str:
         """Why it is known beforehand that the bits may be others; empty: nothing speaks against equal ones."""
         if self.receipt.mixed or (self.receipt.classes is not None and self.receipt.classes.mixed):
-            return "the first run took hosts of several classes: expect another controller"
+            return "hosts of several classes scored the first run: expect another controller"
         if self.receipt.classes is not None and self.receipt.classes.varying:
             return "the first run's environment is not deterministic: expect another controller"
         if self.receipt.fingerprint is None:
-            return "the receipt names no hosts of the first run: whether the bits will be equal is not known"
+            return "the receipt does not name the first run's hosts: the controller may differ in its last bits"
         return ""
 
     @property
@@ -77,7 +77,7 @@ class Rerun:
             kept, wanted = self.receipt.subspace, self.settings.subspace
             found = Subspace.from_text(kept) if kept is not None else None
             if (found.sha256 if found else "") != wanted:
-                raise ValueError("it is another one than the settings name, or none")
+                raise ValueError("it is not the one that the settings name")
             return found
         except ValueError as error:
             raise ControllerError(f"the subspace in the controller's receipt is damaged: {error}") from error
@@ -93,11 +93,11 @@ class Rerun:
         with open_run(folder.parent, folder.name) as stored:
             if stored.uid and stored.uid == self.controller.provenance.get("run_uid"):
                 raise UsageError(
-                    f"run {folder.name} is the one that the controller came from, and would be compared with itself: "
+                    f"run {folder.name} is the one that the controller came from, compared with itself: "
                     "choose another --run"
                 )
             if stored.settings != self.settings or stored.fact(START_MEAN) != start:
-                raise UsageError(f"run {folder.name} exists and is another one: choose another --run")
+                raise UsageError(f"run {folder.name} exists and is another run: choose another --run")
             return None, stored_network(stored)
 
     def compare(self, folder: Path) -> RerunComparison:
@@ -107,7 +107,7 @@ class Rerun:
             why, hosts = self._describe_difference(stored), self._describe_hosts(stored)
         if again.sha256 == self.controller.sha256:
             return RerunComparison(
-                True, f"the same controller as the first time, to the bit ({again.sha256[:12]}){hosts}"
+                True, f"the same controller as the first time, bit-identical ({again.sha256[:12]}){hosts}"
             )
         names = f"({again.sha256[:12]} instead of {self.controller.sha256[:12]})"
         return RerunComparison(False, f"NOT the same controller as the first time {names}: {why}", why)
@@ -142,17 +142,17 @@ class Rerun:
         """What is known to differ between the first time and now."""
         first, here = self.receipt, versions()
         if first.mixed:
-            return "the first run took hosts of several classes, so that its last bits are its own"
+            return "hosts of several classes scored the first run, so no other run is bit-identical"
         if stored.classes.varying:
-            return "the environment is not deterministic, so that no run of it has the same bits again"
+            return "the environment is not deterministic, so no two runs are bit-identical"
         if stored.classes.mixed:
             return f"this time hosts of several classes scored ({stored.classes.description}): --strict keeps to one"
         if (classes := self._both_classes(stored)) and classes[0] != classes[1]:
-            return f"its hosts were of class {classes[0]}, these are of {classes[1]}: their bits differ"
+            return f"its hosts were of class {classes[0]}, and these are of class {classes[1]}: their bits differ"
         if first.fingerprint is None:
-            return "the receipt names no fingerprint, and only equal hosts give equal bits"
+            return "the receipt does not name the first run's hosts, and only equal hosts give equal bits"
         if not classes and first.fingerprint != stored.fingerprint:
-            return f"its hosts were of another fingerprint: [{first.fingerprint}], now [{stored.fingerprint}]"
+            return f"its hosts had another fingerprint: [{first.fingerprint}], now [{stored.fingerprint}]"
         others = [f"{name} {each}, now {here.get(name)}" for name, each in (first.versions or {}).items()
                   if here.get(name) != each]  # fmt: skip
         return f"the coordinator's versions differ: {'; '.join(others)}" if others else "hosts and versions are equal"

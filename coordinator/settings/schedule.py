@@ -50,7 +50,7 @@ def split_first_stage(stages: tuple[StageSettings, ...]) -> tuple[dict[str, Any]
         return {}, ()
     first = stages[0]
     if first.whole:
-        raise UsageError("stage 1: whole is of a later stage, which leaves the subspace; without --subspace all are")
+        raise UsageError("stage 1: whole is for a later stage, which leaves the subspace; leave --subspace out instead")
     return first.overrides, (first.end, *stages[1:]) if first.has_end or len(stages) > 1 else ()
 
 

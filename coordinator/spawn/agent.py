@@ -184,7 +184,7 @@ class HostFolder:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 return
             if not said:
-                self.channel.send("say", "another command is at work there: waiting for it")
+                self.channel.send("say", "another command works there: waiting for it")
             said = True
             self.channel.wait_for_request()
 
@@ -330,8 +330,8 @@ def _call(host_folder: HostFolder, *command: str, inside: Path | None = None) ->
         raise OSError(errno.ENOSPC, "no space left")
     why = next((each for each in said if "ERROR: " in each), said[-1] if said else f"exit code {done.returncode}")
     raise FailedError(
-        f"the worker cannot be installed ({why.removeprefix('ERROR: ')}): where it reaches no package index, or one "
-        "without what it needs, give --wheelhouse, or --remote-python where it is installed"
+        f"the worker cannot be installed ({why.removeprefix('ERROR: ')}): if it reaches no package index that has "
+        "all it needs, give --wheelhouse; if dreamfleet is installed there, give --remote-python"
     )
 
 

@@ -74,7 +74,7 @@ class Host:
 
     def __post_init__(self) -> None:
         if self.address.startswith("-") or not _ADDRESS.fullmatch(self.address):
-            raise UsageError(f"{self.address!r} is no host: write it as user@host, host, or ssh://user@host:port")
+            raise UsageError(f"{self.address!r} is not a host: write it as user@host, host, or ssh://user@host:port")
         check_worker_name(self.name)
 
     @property

@@ -41,8 +41,8 @@ NO_PYTHON = "dreamfleet-no-python"  # printed by the remote shell before the ver
 _SSH_ERRORS = (
     (r"Could not resolve hostname", "no such host: look at its address, or at HostName in ~/.ssh/config"),
     (r"REMOTE HOST IDENTIFICATION HAS CHANGED|Host key for .* has changed",
-     "its host key is not the one that is known: if it was set up anew, remove the old one with `ssh-keygen -R HOST`, "
-     "and connect once by hand; else somebody stands between"),
+     "its host key is not the one that is known: if it was reinstalled, remove the old one with `ssh-keygen -R HOST`, "
+     "and connect once by hand. Otherwise the connection may be intercepted"),
     (r"Host key verification failed|host key is known",
      "its host key is not known here: connect once by hand, compare what is shown, and accept it"),
     (r"Permission denied \(", "it refuses this user and key: try `ssh {address}` by hand; no password is asked for "
@@ -191,7 +191,7 @@ class Connection:
             self._stray += len(line)
             if self._stray >= MAX_LINE:
                 self._end(
-                    f"it prints more than {MAX_LINE >> 20} MiB that is no answer: `ssh {self._address} true` must "
+                    f"it prints more than {MAX_LINE >> 20} MiB that are not an answer: `ssh {self._address} true` must "
                     "print nothing, so look at its shell's startup files, such as .bashrc"
                 )
         raise self._failure()

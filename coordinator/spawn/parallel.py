@@ -43,7 +43,7 @@ def bring_up(
         rows = _run_in_threads(remote_hosts, RemoteHost.bring_up, stop, RemoteHost.close)
         if stop():
             raise StoppedError(
-                "interrupted: some workers may run; the same command goes on, `dreamfleet down` ends them"
+                "interrupted: some workers may run; the same command continues, and `dreamfleet down` ends them"
             )
         on_statuses(rows)
         up = [remote_host for remote_host, row in zip(remote_hosts, rows, strict=True) if row.state != FAILED]
@@ -66,7 +66,7 @@ def _follow_until_ended(remote_host: RemoteHost) -> HostStatus:
     """Follow a worker until it ends or the command stops, which ends a worker that uses our tunnel."""
     row = remote_host.follow()
     if row is None and not remote_host.forwards:
-        return HostStatus(remote_host.host.name, "running", "goes on without this command; `dreamfleet down` ends it")
+        return HostStatus(remote_host.host.name, "running", "continues without this command; `dreamfleet down` ends it")
     ended = remote_host.end(all_workers=False, now=False, keep=True) if remote_host.forwards else None
     return row or ended or HostStatus(remote_host.host.name, "ended", "")
 
@@ -79,7 +79,7 @@ def _run_on_all(
             _open_remote_hosts(hosts, fleet_address, stack, _ignore_line), do, stop, RemoteHost.close
         )
         if stop():
-            raise StoppedError("interrupted: the same command goes on")
+            raise StoppedError("interrupted: the same command continues")
         return rows
 
 

@@ -53,7 +53,7 @@ def _backup_lock(target: Path) -> Iterator[None]:
     while True:
         with open_lock(path) as lock:
             if not try_lock(lock):
-                raise UsageError(f"another backup into {target} is at work: wait for it")
+                raise UsageError(f"another backup into {target} is running: wait for it")
             if not path.exists() or not os.path.samestat(os.fstat(lock.fileno()), path.stat()):
                 continue  # who held it has removed it
             try:
@@ -78,7 +78,7 @@ def _check_target(source: RunFolder, target: Path) -> None:
         raise UsageError(f"{target} is the run itself: name another folder with --to")
     if not (target / JOURNAL).exists():
         if target.exists():
-            raise UsageError(f"{target} exists and is no run: name another folder with --to")
+            raise UsageError(f"{target} exists and is not a run: name another folder with --to")
         return
     with open_run(target.parent, target.name) as other:
         if other.uid != source.uid:

@@ -83,7 +83,7 @@ class FileWatch:
         folder = self._find_folder()
         if not cut and folder is not None and folder != self._folder and self._has_own_files(folder):
             raise JournalError(
-                f"the run's folder was moved to {folder} while it was served: nothing is lost; go on with: "
+                f"the run's folder was moved to {folder} while it was served: nothing is lost; continue with: "
                 f"{self._resume_command(folder)}"
             )
         raise JournalError(self._rescue(folder))
@@ -132,13 +132,13 @@ class FileWatch:
             left = " ".join(str(each) for each in sqlite_side_files(target) if each.exists())
             clear = f"rm {left} && " if left else ""
             return (
-                f"{target} was replaced while it was served: what lies there now is left as it is, what the run had "
-                f"written is in {copy}; go on with: {clear}mv {copy} {target} && {self._resume_command(folder)}"
+                f"{target} was replaced while it was served: what is there now is left as it is, and what the run "
+                f"wrote is in {copy}. Continue with: {clear}mv {copy} {target} && {self._resume_command(folder)}"
             )
         copy.replace(target)
         return (
             f"{target} or its write-ahead log was removed, overwritten or truncated while it was served: rescued to "
-            f"the last result as {target}; go on with: {self._resume_command(folder)}"
+            f"the last result as {target}; continue with: {self._resume_command(folder)}"
         )
 
     def _rescue_beside(self, parent: Path) -> str:
@@ -153,8 +153,8 @@ class FileWatch:
         if self._bundle is not None:
             self._bundle.restore_into(folder)
         return (
-            f"{self._folder} was removed while it was served: rescued to the last result as {folder / JOURNAL}; go on "
-            f"with: {self._resume_command(folder)}"
+            f"{self._folder} was removed while it was served: rescued to the last result as {folder / JOURNAL}; "
+            f"continue with: {self._resume_command(folder)}"
         )
 
     def _restore_bundle(self) -> None:

@@ -110,7 +110,7 @@ class Journal(JournalConnection):
         if found != self._incarnation:
             raise JournalError(
                 f"another coordinator serves {self.path} too (incarnation {found}, this one is {self._incarnation}): "
-                "this one leaves; what it committed is whole, and the other one goes on with it"
+                "this one leaves; what it committed is whole, and the other one continues it"
             )
 
     def fingerprint(self) -> str | None:
@@ -315,7 +315,7 @@ class Journal(JournalConnection):
             rounds.setdefault(each, []).append(candidate)
         try:
             if not all(each in range(len(vectors)) for candidates in rounds.values() for each in candidates):
-                raise ValueError(f"generation {number} has no such candidate as one that was drawn anew")
+                raise ValueError(f"generation {number} lacks a candidate that was redrawn")
             return StoredOpenGeneration(
                 number, row[0], tuple(json.loads(row[1])), tuple(vector for (vector,) in vectors),
                 tuple(map(tuple, rounds.values())), to_finite(row[2] or 0.0),

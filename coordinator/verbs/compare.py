@@ -111,7 +111,7 @@ def _compare_runs(args: argparse.Namespace, names: Sequence[str]) -> int:
     print()
     _print_settings(sides, settings)
     if len(worlds) > 1:
-        print(f"their evaluations are of the worlds {', '.join(sorted(worlds))}: scores are not compared")
+        print(f"their evaluations are in different worlds ({', '.join(sorted(worlds))}): scores are not compared")
     for each in equal:
         print(_format_budget(sides, each))
     if found:
@@ -126,7 +126,7 @@ def _run_row(side: ComparedRun) -> dict[str, object]:
     return {
         "run": side.name,
         "task": side.settings.task.task,
-        "spent": side.total.description,
+        "spent": side.spent,
         "last evaluation": None if last is None else format_with_error(last.score, last.error),
         "confirmed": None if confirmed is None else f"{format_mean(confirmed)} on {count_episodes(confirmed, word)}",
     }  # fmt: skip
@@ -158,7 +158,7 @@ def _format_budget(sides: Sequence[ComparedRun], equal: EqualBudget) -> str:
 
 def _format_evaluation(look: EvaluatedMean | None) -> str:
     if look is None:
-        return "had nothing evaluated"
+        return "without an evaluation"
     return f"{format_with_error(look.point.score, look.point.error)} (generation {look.generation})"
 
 
@@ -184,7 +184,9 @@ def _run_differences(sides: Sequence[ComparedRun], equal: Sequence[EqualBudget])
 def _run_facts(side: ComparedRun) -> dict[str, Any]:
     confirmed = side.confirmed and with_error(side.confirmed)
     effort = {**asdict(side.total), "core_hours": side.total.core_hours}
-    return {"run": side.name, "world": side.world, "effort": effort, "confirmed": confirmed}
+    inherited = {**asdict(side.inherited), "core_hours": side.inherited.core_hours}
+    facts = {"run": side.name, "world": side.world, "effort": effort, "inherited": inherited}
+    return {**facts, "confirmed": confirmed}
 
 
 def _budget_facts(sides: Sequence[ComparedRun], equal: EqualBudget) -> dict[str, Any]:

@@ -75,7 +75,7 @@ def _run_trials(trials: Trials, contrast: Contrast) -> list[TrialResult]:
                 outcomes.append(trials.do(trial, shown.update))
                 console.print(f"{trial.name} is finished", markup=False)
     except StoppedError as error:
-        raise StoppedError(f"{error}; what is finished is kept, and the same command goes on") from error
+        raise StoppedError(f"{error}; finished parts are kept, and the same command continues") from error
     return outcomes
 
 

@@ -215,7 +215,7 @@ def _report(
         text = f"left run {request.name} open{score}; continue it with: {again}"
     else:
         where = f"; controller: {controller}" if controller else "; it has no controller yet"
-        more = f"; it goes on with wider limits, such as: {again} --generations 0 --minutes 30" if nothing_new else ""
+        more = f"; to continue it, widen its limits: {again} --generations 0 --minutes 30" if nothing_new else ""
         lasted = elapsed_seconds(run.created, datetime.now(UTC).isoformat())
         ago = "" if lasted is None else f" (begun {format_duration(lasted)} ago)"
         text = f"run {request.name} ended after {run.ended}{ago}{score}{where}{outcome.text or more}"

@@ -8,6 +8,7 @@ from datetime import datetime
 
 from dreamfleet.common.cli.config import add_flags, load
 from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.errors import StoppedError
 from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.stop_signals import interrupted_by_signals
 from dreamfleet.common.protocol.keys import check_run_name
@@ -31,5 +32,9 @@ def run(args: argparse.Namespace) -> int:
     check_modules(("av", "gymnasium", "matplotlib", "onnxruntime", *config.plan.packages))
     os.environ["DREAMFLEET_JOIN"] = ""  # the demo stays on this host, even if its user is in a fleet
     name = check_run_name(args.run_name or f"demo-{datetime.now():%m%d-%H%M%S}")
-    Demo(config, name, args.runs_dir).play()
+    demo = Demo(config, name, args.runs_dir)
+    try:
+        demo.play()
+    except KeyboardInterrupt:
+        raise StoppedError(demo.stopped_text) from None
     return 0

@@ -14,6 +14,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import is_file
 from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_signals
+from dreamfleet.common.printable import plural
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
 from dreamfleet.coordinator.settings.config import (
@@ -104,7 +105,7 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
         else begun.with_settings(config, settings, layout.root)
     )
     if config.local == 0 and not args.listen:
-        raise UsageError("nothing would score: give --local slots here, or --listen for workers of other hosts")
+        raise UsageError("no worker would score: give --local slots here, or --listen for workers of other hosts")
     Network(args.listen, credentials=load_credentials(args, ("coordinator",))).check_open(insecure=_insecure(args))
     iteration = Iteration(
         layout, config, ledger, lambda: _local_fleet(args, config, more, task), stop, _network_flags(args)
@@ -190,7 +191,7 @@ def _run_phases(iteration: Iteration, layout: IterationFolder) -> None:
 
     console = Console(stderr=True, highlight=False)
     if finished := iteration.ledger.finished:
-        console.print(f"{len(finished)} phases are finished, the last is {finished[-1]}", markup=False)
+        console.print(f"finished: {plural(len(finished), 'phase')}, the last is {finished[-1]}", markup=False)
     with console.status("") as shown:
         doing = ""
 

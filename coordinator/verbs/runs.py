@@ -6,6 +6,7 @@ import argparse
 import json
 import shutil
 import sys
+from collections.abc import Collection
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.files.regular_files import is_folder, path_exists
 from dreamfleet.common.monitoring.eta import format_duration
-from dreamfleet.common.printable import format_setting
+from dreamfleet.common.printable import format_number, format_setting, plural
 from dreamfleet.common.runs.records import (
     RunSettings,
     StoredGeneration,
@@ -35,6 +36,7 @@ from dreamfleet.common.transport.network import SECURED_PREFIX
 from dreamfleet.common.worlds.score_words import score_word_of_run
 
 DROP_ORDER = ("created", "classes", "task", "mean", "evaluated")  # columns that a narrow terminal leaves out first
+SCORES = ("mean", "evaluated", "confirmed")  # columns of `runs list`
 LAST_GENERATIONS = 20
 
 
@@ -55,7 +57,7 @@ def configure_list(parser: argparse.ArgumentParser) -> None:
 def list_runs(args: argparse.Namespace) -> int:
     """Print one row per run; a run whose journal is damaged has the error as its state."""
     if not is_folder(args.runs_dir) and ("runs_dir" in args.given or path_exists(args.runs_dir)):
-        raise UsageError(f"--runs-dir {args.runs_dir} is no folder: name the one that holds runs")
+        raise UsageError(f"--runs-dir {args.runs_dir} is not a folder: name the one that holds runs")
     runs_dir = args.runs_dir / ARCHIVE_FOLDER if args.archived else args.runs_dir
     rows = [_run_row(path) for path in run_paths(runs_dir)]
     if args.json:
@@ -64,11 +66,13 @@ def list_runs(args: argparse.Namespace) -> int:
     if not rows:
         print(f"no runs in {runs_dir}; start one with: dreamfleet coordinator --run NAME", file=sys.stderr)
         return 0
-    print_rows(rows, right=("generations", "mean", "evaluated", "confirmed", "classes"), drop_order=DROP_ORDER)
+    for row in rows:
+        row |= {name: format_number(row[name]) for name in SCORES}
+    print_rows(rows, right=("generations", *SCORES, "classes"), drop_order=DROP_ORDER)
     return 0
 
 
-def _run_row(path: Path) -> dict[str, object]:
+def _run_row(path: Path) -> dict[str, Any]:
     try:
         with RunFolder(path) as run:
             history, evaluations, confirmed = run.history(), run.evaluations(), run.confirmation()
@@ -77,9 +81,9 @@ def _run_row(path: Path) -> dict[str, object]:
                 "created": run.created,
                 "task": run.spec.task,
                 "generations": len(history),
-                "mean": round(history[-1].mean, 1) if history else None,
-                "evaluated": round(evaluations[-1].mean, 1) if evaluations else None,
-                "confirmed": round(confirmed.mean, 1) if confirmed else None,
+                "mean": history[-1].mean if history and history[-1].number not in run.unscored_generations() else None,
+                "evaluated": evaluations[-1].mean if evaluations else None,
+                "confirmed": confirmed.mean if confirmed else None,
                 "classes": run.classes.total,
                 "state": run.state,
             }
@@ -103,10 +107,11 @@ def show_run(args: argparse.Namespace) -> int:
             "fingerprint": stored.fingerprint,
             "failed_candidates": count_failed(history),
         }
+        unscored = stored.unscored_generations()
         classes, word = stored.classes, score_word_of_run(stored.spec, stored.bundle_path)
     begun = begun_stages(settings, history, evaluations) if settings.stages else ()
     if args.json:
-        rows: dict[str, Any] = {"history": [asdict(each) for each in history]}
+        rows: dict[str, Any] = {"history": [_generation_facts(each, unscored) for each in history]}
         rows["evaluations"] = [with_error(each) for each in evaluations]
         rows["stages"] = [{"number": each.stage.number, "since": each.since, "after": each.why} for each in begun]
         reported = None if confirmed is None else with_error(confirmed)
@@ -126,7 +131,7 @@ def show_run(args: argparse.Namespace) -> int:
     print()
     shown = history[-LAST_GENERATIONS:] if sys.stdout.isatty() else history
     judged = {each.generation: each.mean for each in evaluations}
-    lines = [_generation_row(each, judged.get(each.number)) for each in shown]
+    lines = [_generation_row(each, judged.get(each.number), scored=each.number not in unscored) for each in shown]
     if len(shown) < len(history):
         print(f"the last {LAST_GENERATIONS} of {len(history)} generations; --json has all")
     least = ("seconds", "worst", "steps", "std", "sigma") + (
@@ -140,7 +145,7 @@ def _flatten_settings(settings: RunSettings) -> dict[str, object]:
     """Settings by name, with those of task and controller, without stages; heat only of older runs that have it."""
     flat: dict[str, object] = {}
     plain = asdict(settings)
-    del plain["stages"]
+    del plain["stages"], plain["task"]["controller"]  # the same as the run's own
     if settings.heat == 1.0:
         del plain["heat"]
     for name, value in plain.items():
@@ -152,11 +157,18 @@ def _prefix_names(name: str, parts: dict[str, object]) -> dict[str, object]:
     return {part if part == name else f"{name}.{part}": value for part, value in parts.items() if value is not None}
 
 
-def _generation_row(each: StoredGeneration, evaluated: float | None) -> dict[str, object]:
+def _generation_facts(each: StoredGeneration, unscored: Collection[int]) -> dict[str, Any]:
+    missing = dict.fromkeys(("mean", "std", "best", "worst")) if each.number in unscored else {}
+    return {**asdict(each), **missing}
+
+
+def _generation_row(each: StoredGeneration, evaluated: float | None, *, scored: bool) -> dict[str, object]:
+    fitness = {"mean": each.mean, "std": each.std, "best": each.best, "worst": each.worst}
+    shown = {name: format_number(value if scored else None) for name, value in fitness.items()}
     return {
-        "generation": each.number, "mean": f"{each.mean:.1f}", "std": f"{each.std:.1f}", "best": f"{each.best:.1f}",
-        "worst": f"{each.worst:.1f}", "sigma": f"{each.sigma:.4f}", "failed": each.failed or "", "steps": each.steps,
-        "seconds": f"{each.seconds:.1f}", "evaluated": "" if evaluated is None else f"{evaluated:.1f}",
+        "generation": each.number, **shown,
+        "sigma": format_number(each.sigma), "failed": each.failed or "", "steps": each.steps,
+        "seconds": f"{each.seconds:.1f}", "evaluated": "" if evaluated is None else format_number(evaluated),
     }  # fmt: skip
 
 
@@ -194,8 +206,8 @@ def back_up_run(args: argparse.Namespace) -> int:
     secured = any(each.startswith(SECURED_PREFIX) for each in (*network.get("listen", ()), *network.get("connect", ())))
     join = args.global_config.join or ("FILE" if secured else None)
     text = (
-        f"copied to {target}: {generations} closed generations, {results} results; should the run's own folder be "
-        f"lost, go on with: {resume_command(target, join)}"
+        f"copied to {target}: {plural(generations, 'closed generation')}, {plural(results, 'result')}; should its own "
+        f"folder be lost, continue with: {resume_command(target, join)}"
     )
     print_answer(args, text, run=args.run_name, copy=target, generations=generations, results=results)
     return 0
@@ -213,8 +225,8 @@ def delete_run(args: argparse.Namespace) -> int:
         generations = len(stored.history())
     if not args.yes:
         if not sys.stdin.isatty():
-            raise UsageError("nobody is there to confirm: give --yes")
-        answer = input(f"delete run {args.run_name} with its {generations} generations? [y/N] ")
+            raise UsageError("cannot ask for confirmation: no terminal; give --yes")
+        answer = input(f"delete run {args.run_name} with its {plural(generations, 'generation')}? [y/N] ")
         if answer.strip().lower() not in ("y", "yes"):
             print_answer(args, "kept", run=args.run_name, deleted=None)
             return 1
@@ -247,7 +259,7 @@ def export_run(args: argparse.Namespace) -> int:
         raise UsageError(f"{args.run_name} is a file's name: --{args.kind} takes none, so write {command}")
     folder = args.out or Path(f"{args.run_name}-{args.kind}")
     if folder.exists() and not folder.is_dir():
-        raise UsageError(f"--out {folder} is no folder: name one")
+        raise UsageError(f"--out {folder} is not a folder: name one")
     with open_run(args.runs_dir, args.run_name) as stored, stored.read_transaction():
         written = kinds[args.kind](stored, folder)
     text = "\n".join(map(str, written)) if written else f"run {args.run_name} has no row yet: nothing was written"
@@ -257,14 +269,14 @@ def export_run(args: argparse.Namespace) -> int:
 
 LIST = SimpleVerb("list the runs on this disk", configure_list, list_runs)
 SHOW = SimpleVerb("show one run from its journal: settings, history, evaluations", add_run_arguments, show_run)
-ARCHIVE = SimpleVerb("move a run that nobody serves into the archive", add_run_arguments, archive_run)
+ARCHIVE = SimpleVerb("move a run that is not served into the archive", add_run_arguments, archive_run)
 BACKUP = SimpleVerb(
     "copy a run, served or not, into another folder of runs, from which it can be resumed",
     configure_backup,
     back_up_run,
 )
 DELETE = SimpleVerb(
-    "delete a run that nobody serves, with its journal, controller and videos", configure_delete, delete_run
+    "delete a run that is not served, with its journal, controller and videos", configure_delete, delete_run
 )
 EXPORT = SimpleVerb(
     "write a run's generations, candidates, evaluations and confirmed score as CSV, Parquet or TensorBoard events",

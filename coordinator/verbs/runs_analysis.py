@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from dreamfleet.common.cli.command_line import SimpleVerb
@@ -15,7 +16,7 @@ from dreamfleet.common.files.atomic_write import check_output_path, open_output
 from dreamfleet.common.printable import printable_lines
 from dreamfleet.common.runs.run_folder import open_run
 
-LEARNING, FITNESS = "learning.png", "fitness.png"
+MOST_IN_NAME = 3  # runs that name a picture
 
 
 def _add_place_flags(parser: argparse.ArgumentParser) -> None:
@@ -27,7 +28,11 @@ def configure_plot(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `runs plot`."""
     parser.add_argument("run_names", metavar="RUN", nargs="+", help="names of runs")
     parser.add_argument("--fitness", action="store_true", help="draw one run's fitness, even if it has evaluations")
-    parser.add_argument("--out", type=Path, help=f"a PNG or SVG to write (default {LEARNING}, or {FITNESS})")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        help="a PNG or SVG to write (default RUN-learning.png or RUN-fitness.png, with the names of the runs)",
+    )
     _add_place_flags(parser)
 
 
@@ -36,13 +41,20 @@ def plot_runs(args: argparse.Namespace) -> int:
     from dreamfleet.coordinator.analysis.plot import KINDS
 
     fitness = args.fitness or _has_no_evaluation(args)
-    out = args.out or Path(FITNESS if fitness else LEARNING)
+    out = args.out or _picture_name(args.run_names, "fitness" if fitness else "learning")
     if out.suffix not in KINDS:
         raise UsageError(f"--out {out}: give a name that ends in {' or '.join(KINDS)}")
     check_output_path(out)
     (_draw_fitness if fitness else _draw_learning)(args, out)
     print_answer(args, str(out), picture=out, runs=args.run_names)
     return 0
+
+
+def _picture_name(runs: Sequence[str], what: str) -> Path:
+    """A picture's name by its runs, so that one replaces no other's: a-learning.png, a-b-c-and-2-learning.png."""
+    names = list(dict.fromkeys(runs))
+    more = [f"and-{len(names) - MOST_IN_NAME}"] if len(names) > MOST_IN_NAME else []
+    return Path("-".join((*names[:MOST_IN_NAME], *more, f"{what}.png")))
 
 
 def _has_no_evaluation(args: argparse.Namespace) -> bool:
@@ -57,7 +69,7 @@ def _draw_fitness(args: argparse.Namespace, out: Path) -> None:
     from dreamfleet.coordinator.analysis.plot import plot_fitness
 
     if len(args.run_names) > 1:
-        raise UsageError("--fitness is of one run: name one")
+        raise UsageError("--fitness draws one run: name one")
     with open_run(args.runs_dir, args.run_names[0]) as stored:
         plot_fitness(stored, out)
 
@@ -73,7 +85,7 @@ def _draw_learning(args: argparse.Namespace, out: Path) -> None:
     worlds = sorted({each.world for each in curves})
     if len(worlds) > 1:
         names = ", ".join(worlds)
-        print(f"note: these runs are of the worlds {names}: their scores do not compare", file=sys.stderr)
+        print(f"note: these runs are in different worlds ({names}): their scores do not compare", file=sys.stderr)
     plot_learning(curves, published_scores(curves), out)
 
 

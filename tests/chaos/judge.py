@@ -4,7 +4,7 @@ python -m tests.chaos.judge --runs 20 --out build/judge.jsonl
 
 Short dream runs on the shipped world model, each with a fixed number of generations and one slot, so that every figure
 follows from the seed. A reported mean should lie within two standard errors of the difference, both errors counted.
-Each finished run is a line of the file; the same command goes on where it was interrupted.
+Each finished run is a line of the file; the same command continues where it was interrupted.
 """
 
 import argparse

@@ -42,7 +42,7 @@ def measure(folder):
         fleet.coordinator.wait_for("generation 3: mean")
         for _ in range(ROUNDS):
             fleet.workers[0].popen.kill()
-            figures["killed_worker"].append(until_said(fleet, "is gone without a word:"))
+            figures["killed_worker"].append(until_said(fleet, "is lost: it was killed, or its connection was cut:"))
             fleet.workers[0] = fleet.new_worker(0)
             fleet.coordinator.wait_for("generation", times=100)
             os.kill(fleet.workers[1].popen.pid, signal.SIGSTOP)

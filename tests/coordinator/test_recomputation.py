@@ -92,7 +92,7 @@ class Recomputed:
         return found, number
 
     def fitness(self, generation):
-        """Each candidate's mean over its own episodes; NaN for one that failed. In a race the better half goes on."""
+        """Each candidate's mean over its own episodes; NaN for one that failed. In a race the better half continues."""
         stage, _ = self.stage(generation)
         places = [("score", generation, number) for number in range(stage["population"])]
         if any(place in self.failed for place in places):

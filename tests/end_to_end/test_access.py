@@ -148,7 +148,7 @@ def test_a_plain_port_and_a_closed_port_give_different_errors_for_a_join_file(ac
     with served, pytest.raises(HandshakeRejectedError, match="started without --join"):
         open_session(access.network("viewer", f"tls/{plain}"), timeout=1)
     linked = Network((f"tls/{plain}",), (f"tls/{nobody}",), read_join_file(access.path("coordinator")))
-    with pytest.raises(ConnectionFailedError, match=f"nobody answers at tls/{nobody}"):
+    with pytest.raises(ConnectionFailedError, match=f"no one answers at tls/{nobody}"):
         open_session(linked, timeout=1)
 
 

@@ -67,7 +67,7 @@ def test_what_cannot_be_a_copy_is_left_alone(processes, finished, tmp_path):
     other = tmp_path / "other"
     for wrong, why in (
         (processes.runs, "is the run itself"),
-        (tmp_path / "taken", "is no run"),
+        (tmp_path / "taken", "is not a run"),
         (other, "another run of this name"),
     ):
         if wrong.name == "taken":
@@ -133,7 +133,7 @@ def test_two_at_once_leave_a_whole_copy(processes, finished, tmp_path, monkeypat
     monkeypatch.setattr(backup, "_hold_target", meanwhile)
     with open_run(processes.runs, "test") as source:
         backup.back_up(source, safe / "test")
-    assert [(code, "is at work" in err) for code, _, err in said] == [(2, True)]
+    assert [(code, "is running" in err) for code, _, err in said] == [(2, True)]
     assert [path.name for path in safe.iterdir()] == ["test"]
     with open_run(safe, "test") as copy:
         assert len(copy.history()) == 2

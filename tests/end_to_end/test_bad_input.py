@@ -32,7 +32,7 @@ def complains(processes, *arguments, says):
         (("--sigma0", "nan"), "--sigma0 must be a positive number"),
         (("--horizon", "0"), "--horizon must be from 1 to"),
         (("--population", "many"), "invalid int value: 'many'"),
-        (("--listen", "localhost"), "write it as tcp/HOST:PORT"),
+        (("--listen", "localhost"), "write tcp/HOST:PORT"),
         (("--config", "absent.toml"), "no configuration file at absent.toml"),
         (("--resume", "never"), "no run 'never'"),
         (("--target", "900", "--evaluate-every", "0"), "--target is reached by an evaluated mean"),
@@ -152,11 +152,11 @@ def test_a_controller_of_another_shape(processes, tmp_path):
 
 @pytest.mark.slow
 def test_a_worker_or_viewer_without_a_coordinator(processes):
-    complains(processes, "status", "--connect", processes.endpoint, says="nobody answers at")
-    complains(processes, "worker", "--connect", "nowhere", says="write it as tcp/HOST:PORT")
+    complains(processes, "status", "--connect", processes.endpoint, says="no one answers at")
+    complains(processes, "worker", "--connect", "nowhere", says="write tcp/HOST:PORT")
     complains(processes, "worker", "--connect", processes.endpoint, "--run", "No", says="cannot name a run")
     complains(processes, "worker", "--connect", processes.endpoint, "--slots", "-1", says="--slots must be from 0")
-    complains(processes, "worker", "--any", "--exit-when-done", says="--any goes on to the next run")
+    complains(processes, "worker", "--any", "--exit-when-done", says="--any takes the next run")
 
 
 def test_runs_that_do_not_exist(processes):

@@ -84,7 +84,7 @@ def test_a_strangers_hello_keeps_nobody_out_of_a_strict_run(processes, settings)
 @pytest.mark.slow
 def test_hosts_that_compute_the_same_are_of_one_class_whatever_they_say_of_themselves(processes, settings, stranger):
     classes = one_after_the_other(processes, (*settings, "--strict"), stranger, lambda: own(processes))
-    assert classes.description == "one class: to the bit"
+    assert classes.description == "one class: all results are bit-identical"
     assert len(classes.largest[0].fingerprints) == 2
     assert OTHER in classes.largest[0].fingerprints
 
@@ -105,7 +105,7 @@ def test_a_strict_run_refuses_another_class_and_stays_strict_when_resumed(proces
     own(processes, inside=ODD)
     assert coordinator.finish()[0] == 0
     with open_run(processes.runs, "test") as run:
-        assert run.classes.description == "mixed: 2 classes, 50.0%, 50.0% of results"
+        assert run.classes.description == "mixed: 2 classes with 50.0%, 50.0% of the results"
         assert json.loads(run.fact("network"))["strict"] is False
 
 
@@ -143,7 +143,7 @@ def test_another_kernel_of_openblas_is_another_class_whose_results_are_replayed_
     settings = ("--task", "gym:BipedalWalker-v3", "--population", 4, "--episodes", 2, "--horizon", 100, "--sigma0", 1.0,
                 "--evaluate-every", 0)  # fmt: skip
     classes = one_after_the_other(processes, settings, lambda: processes.worker(inside=OTHER_KERNEL), processes.worker)
-    assert classes.description == "mixed: 2 classes, 50.0%, 50.0% of results"
+    assert classes.description == "mixed: 2 classes with 50.0%, 50.0% of the results"
 
     def replayed(candidate, where=(), *more):
         replay = processes.start(

@@ -130,7 +130,7 @@ def test_drives_of_the_real_car_are_episodes_that_a_data_set_takes_in_once(proce
             "collect", "--data", data, "--from-run", "test", "--runs-dir", processes.runs
         )  # fmt: skip
         assert code == 0, err
-        assert f"{new} episodes, {30 * new} frames new, of 2" in out
+        assert f"{new} new episodes with {30 * new} frames, of 2" in out
     with open_run(processes.runs, "test") as run:
         assert [path.read_bytes() for path in run.rollouts()] == [path.read_bytes() for path in episode_paths(data)]
     for path in episode_paths(data):

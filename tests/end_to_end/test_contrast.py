@@ -32,7 +32,7 @@ def test_a_stopped_contrast_continues_and_compares_the_kinds(processes, data, tm
     first.popen.send_signal(signal.SIGTERM)
     code, _ = first.finish()
     assert code == 130, first.lines
-    assert "the same command goes on" in first.lines[-1]
+    assert "the same command continues" in first.lines[-1]
 
     code, out, err = processes.call(*words, "--json")
     assert code == 0, err

@@ -138,4 +138,4 @@ def test_a_worker_a_mean_and_an_earlier_generations_are_chosen_and_what_is_gone_
         run.popen.kill()
         say(page, "lost", "state")
         page.select_option(WHOM, "best=")
-        say(page, "nobody answers")
+        say(page, "no one answers")

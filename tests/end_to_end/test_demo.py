@@ -11,6 +11,7 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import JOURNAL
+from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.coordinator.experiments.demo import Demo, DemoConfig, median_drive, plan_runs
 
 
@@ -56,7 +57,7 @@ def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle):
         assert Controller.load(real.controller_path).bundle == random_bundle.sha256
         best = max((real, dream), key=lambda run: run.confirmation().mean).name
         found = [run.confirmation() for run in (real, dream)]
-        confirmed = [f"{each.mean:.0f} ± {each.error:.0f} ({each.episodes})" for each in found]
+        confirmed = [f"{format_with_error(each.mean, each.error)} ({each.episodes})" for each in found]
         provenance = Controller.load((real if best == "demo" else dream).controller_path).provenance
     assert provenance["confirmed"]
     assert f"run {best}'s" in out.replace("\n", " ")
@@ -65,6 +66,13 @@ def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle):
         assert (processes.runs / made).stat().st_size > 1000
     assert "evolving in the dream" in out
     assert "the dashboard is at http://127.0.0.1:" in out
+
+
+def test_each_world_is_judged_on_as_many_episodes_as_its_scores_vary():
+    cars, game = DemoConfig(), DemoConfig(world="takecover")
+    assert (cars.plan.tracks, game.plan.tracks, DemoConfig(tracks=3).plan.tracks) == (16, 100, 3)
+    looks = [each.flags["evaluation-episodes"] for each in plan_runs(game, "demo", Path("runs"))]
+    assert looks == [50, 50]
 
 
 @pytest.mark.parametrize("name", ["shown-dream", "shown"])
@@ -115,8 +123,10 @@ def test_without_the_page_none_is_begun(processes, random_bundle):
         assert demo.popen.poll() is None
     started = Path(f"/proc/{demo.popen.pid}/task/{demo.popen.pid}/children").read_text().split()
     words = [Path(f"/proc/{each}/cmdline").read_bytes().split(b"\0") for each in started]
-    demo.popen.send_signal(signal.SIGINT)
+    demo.popen.send_signal(signal.SIGTERM)
     assert demo.finish()[0] == 130
+    assert "stopped: all its processes have ended; run demo-dream is kept: continue it with" in demo.last_line()
+    assert not any(_runs(each) for each in started)
     assert not any(b"dashboard" in each for each in words)
 
 

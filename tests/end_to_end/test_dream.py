@@ -94,7 +94,7 @@ def test_a_world_model_without_a_dream_is_refused_by_its_worker(processes, rando
     worker = processes.worker("--run", "old")
     code, _ = worker.finish()
     assert code == 1
-    assert any("from before dreams" in line for line in worker.lines)
+    assert any("is too old to dream" in line for line in worker.lines)
 
 
 STAGES = """
@@ -127,7 +127,7 @@ def test_a_run_that_dreams_then_mixes_then_drives_gives_the_same_bits_through_ki
     coordinator.wait_for("generation 0 is in stage 1 of 3")
     worker = processes.worker("--run", "calm", "--slots", 2)
     coordinator.wait_for("stage 2 of 3 (60 steps, 8 x 4 episodes, 50% of them driven, a new search with step size 0.2)")
-    coordinator.wait_for("stage 3 of 3 (60 steps, 8 x 2 episodes, all driven, the search goes on)")
+    coordinator.wait_for("stage 3 of 3 (60 steps, 8 x 2 episodes, all driven, the search continues)")
     assert coordinator.finish()[0] == 0
     worker.end()
     coordinator = staged(processes, random_bundle, "night")

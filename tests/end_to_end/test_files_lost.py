@@ -47,7 +47,7 @@ def closed(coordinator):
 def goes_on(processes, coordinator, said, name="test"):
     """The command that the error names continues the run, with its worker and every generation that was reported."""
     generations = closed(coordinator)
-    command = said.split("go on with: ")[1].strip()
+    command = said.split("ontinue with: ")[1].strip()
     with subprocess.Popen(
         f"{command} --generations {generations + 1} --listen {processes.endpoint}", shell=True, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True, env=environment(processes.cache),

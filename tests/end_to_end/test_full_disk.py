@@ -45,10 +45,10 @@ def test_a_run_on_a_full_disk_waits_and_goes_on_by_itself_to_the_same_bits(proce
     status = processes.status()
     assert status["state"] == "paused"
     assert "full" in status["why"]
-    assert "goes on" in status["why"]
+    assert "continues" in status["why"]
     assert 0 < status["generations"] < 40
     resize(small_disk, 200 << 20)
-    full.wait_for("the run goes on")
+    full.wait_for("continues")
     assert full.finish()[0] == 0
 
     processes.runs = small_disk.parent / "roomy"
@@ -67,9 +67,9 @@ def test_a_run_whose_journal_is_locked_waits_and_goes_on(processes, random_bundl
     locked.wait_for("generation 0: mean")
     with closing(sqlite3.connect(processes.runs / "test" / "journal.sqlite", timeout=60)) as other:
         other.execute("BEGIN IMMEDIATE")
-        locked.wait_for("locked; end the program that keeps it locked, and the run goes on")
+        locked.wait_for("locked; end the program that keeps it locked, and the run then continues")
         code, _, err = processes.call("resume", "test", "--connect", processes.endpoint)
-        assert (code, "it cannot go on now" in err) == (1, True), err
+        assert (code, "it cannot continue now" in err) == (1, True), err
         time.sleep(15 * FILE_CHECK)  # meanwhile the coordinator looks whether its files are still there
         assert locked.popen.poll() is None, "".join(locked.lines)
         other.rollback()
@@ -133,7 +133,7 @@ def test_a_run_on_a_disk_without_inodes_waits_and_goes_on_by_itself(processes, r
     subprocess.run(["mount", "-o", f"remount,nr_inodes={used}", small_disk], check=True)
     full.wait_for("No space left on device")
     subprocess.run(["mount", "-o", "remount,nr_inodes=1000", small_disk], check=True)
-    full.wait_for("the run goes on")
+    full.wait_for("continues")
     assert full.finish()[0] == 0
     with open_run(small_disk, "small") as run:
         assert len(run.history()) == 12

@@ -134,7 +134,7 @@ def test_no_hello_and_no_control_verb_is_too_long_to_be_answered(processes, rand
             assert "classes differ" in reply.why
         reply = decode_json(ControlReply, say(session, keys.control("test", "z" * 3000)))
         assert not reply.accepted
-        assert "no control verb" in reply.why
+        assert "not a control verb" in reply.why
     assert coordinator.finish()[0] == 0
 
 

@@ -220,7 +220,7 @@ def test_what_is_finished_is_not_done_again_and_other_settings_are_refused(undis
     before = layout.ledger.read_bytes()
     code, out, err = processes.call("iterate", "--data", layout.root)
     assert code == 0, err
-    assert "14 phases are finished" in err
+    assert "finished: 14 phases" in err
     assert out.splitlines()[0].split("\t")[:3] == ["round", "drives", "frames"]
     assert f"world model: {answer['model']}" in out
     assert layout.ledger.read_bytes() == before
@@ -341,7 +341,7 @@ def test_what_cannot_be_gone_on_from_is_refused_before_anything_is_driven(proces
             ("--vae-flags", "--error-factor 4", "--mdnrnn-flags", "--z-factor 0"),
             "--mdnrnn-flags: z_factor must be from",
         ),
-        (("--local", 0), "nothing would score"),
+        (("--local", 0), "no worker would score"),
         (("--go-on", "--run-flags", "--generations 1 --variant feedback=last"), "--go-on fits a controller"),
         (("--subspace",), "give --go-on too"),
         (("--views", 8), "--views are beside the features of --subspace"),

@@ -172,7 +172,7 @@ def test_what_cannot_be_shown_is_said_in_one_line(processes, tmp_path):
         (("--fps", 0), "--fps must be 1 to 50"),
         (("--controller", "nothing", "--out", tmp_path / "a"), "no controller 'nothing'"),
         (("--controller", "gone", "--generation", 3, "--out", tmp_path / "a"), "no run 'gone'"),
-        (("--connect", "tcp/127.0.0.1:9", "--out", tmp_path / "a"), "nobody answers"),
+        (("--connect", "tcp/127.0.0.1:9", "--out", tmp_path / "a"), "no one answers"),
     ):
         code, _, err = processes.call("live", "--runs-dir", processes.runs, *flags)
         assert (code != 0, said in err.splitlines()[-1], "Traceback" in err) == (True, True, False), err

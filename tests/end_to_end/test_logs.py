@@ -26,7 +26,9 @@ def test_a_json_log_is_json_and_says_how_to_start_a_worker(processes, random_bun
     closed = json.loads(coordinator.wait_for("generation 0: mean"))
     assert (closed["event"], closed["number"], closed["level"]) == ("generation", 0, "info")
     coordinator.popen.kill()
-    assert "this worker waits for that run alone" in worker.wait_for("the coordinator of run test is out of sight")
+    assert "this worker waits for this run only" in worker.wait_for(
+        "the coordinator of run test left or cannot be reached"
+    )
     worker.popen.terminate()
     assert worker.finish()[0] == 0
 
@@ -44,7 +46,7 @@ def test_an_orderly_end_is_not_logged_as_a_loss(processes, random_bundle):
     drained.wait_for("joined run test")
     coordinator.wait_for("generation 0: mean")
     drained.popen.terminate()
-    assert "left (drained after a signal): " in coordinator.wait_for("worker drained/")
+    assert "left (drained after a stop signal): " in coordinator.wait_for("worker drained/")
     code, out, err = processes.call("status", "test", "--connect", processes.endpoint)
     assert (code, "╭─ test · running" in out) == (0, True), err
     for verb, said in (("pause", "paused: by hand"), ("resume", "resumed"), ("stop", "")):
@@ -63,7 +65,7 @@ def test_the_events_of_a_killed_workers_jobs_are_printed_while_the_run_lives(pro
     worker = processes.worker("--task", tasks.SLOW_TOY, "--name", "host-a")
     coordinator.wait_for("generation 0: mean")
     worker.popen.kill()
-    assert "host-a" in coordinator.wait_for("is gone without a word: ")
+    assert "host-a" in coordinator.wait_for("is lost: it was killed, or its connection was cut: ")
 
     def story(*words):
         code, out, err = processes.call("story", "test", "--connect", processes.endpoint, *words, "--json")
@@ -91,6 +93,6 @@ def test_a_coordinator_from_before_stories_is_said_to_be_old_and_not_absent(proc
         session.declare_queryable(key, lambda query: query.reply(key, status))
         for run in ((), ("night",)):
             code, _, err = processes.call("story", *run, "--connect", processes.endpoint)
-            assert (code, "run night sends no events: a worker's join file has no right" in err) == (1, True), err
+            assert (code, "run night sends no events: a worker's join file may not read" in err) == (1, True), err
     code, _, err = processes.call("story", "night", "--connect", processes.endpoint)
-    assert (code, "nobody answers" in err) == (1, True), err
+    assert (code, "no one answers" in err) == (1, True), err

@@ -31,11 +31,11 @@ def test_a_cut_link_costs_neither_the_worker_nor_its_results(processes, random_b
     coordinator.wait_for("generation 0: mean")
     relay.hold()
     relay.cut()
-    worker.wait_for("out of sight")
+    worker.wait_for("left or cannot be reached")
     time.sleep(OUTAGE)
     assert worker.popen.poll() is None
     relay.release()
-    worker.wait_for("in sight again")
+    worker.wait_for("is back; this worker continues")
     assert coordinator.finish()[0] == 0
     assert worker.finish()[0] == 0
     assert "the run has ended" in "".join(worker.lines)
@@ -47,7 +47,7 @@ def test_a_coordinator_that_comes_back_finds_its_worker(processes, random_bundle
     worker = processes.worker("--task", tasks.SLOW_TOY, "--exit-when-done")
     coordinator.wait_for("generation 0: mean")
     coordinator.end()
-    worker.wait_for("out of sight")
+    worker.wait_for("left or cannot be reached")
     time.sleep(OUTAGE)
     assert worker.popen.poll() is None
     resumed = processes.start(
@@ -63,7 +63,7 @@ def test_a_coordinator_that_is_gone_for_good_fails_its_worker(processes, random_
     coordinator.wait_for("generation 0: mean")
     coordinator.end()
     assert worker.finish()[0] == 1
-    assert "was out of sight for 1 s" in worker.lines[-1]
+    assert "was reachable for 1 s" in worker.lines[-1]
 
 
 def test_a_run_says_why_its_worker_left_and_the_worker_in_one_line(processes):

@@ -75,7 +75,7 @@ def test_a_limit_that_has_passed_ends_at_once_and_names_no_controller_that_is_no
     assert code == 0
     path = processes.runs / "test" / "controller.npz"
     assert ("controller: " in out) == path.exists()
-    assert "it goes on with wider limits" in out
+    assert "to continue it, widen its limits" in out
 
 
 @pytest.mark.slow

@@ -102,7 +102,7 @@ def test_status_is_json_that_zenoh_cli_reads_too(processes, settings):
 
 
 @pytest.mark.parametrize(
-    ("on_failure", "why"), [("worst", "no host that is here has ever scored"), ("pause", "failed on two workers")]
+    ("on_failure", "why"), [("worst", "no present host has ever scored"), ("pause", "failed on two workers")]
 )
 def test_failures_on_all_workers_pause_the_run_and_say_why(processes, settings, on_failure, why):
     flags = "--task", tasks.RAISING, "--generations", 2, "--on-failure", on_failure
@@ -156,7 +156,7 @@ def test_pause_resume_and_drain_from_the_command_line(processes, settings):
 
     assert json.loads(say("pause", "--json")) == {"run": "test", "asked": "pause", "accepted": True}
     assert processes.status()["state"] == "paused"
-    assert "goes on" in say("resume", "test")
+    assert "continues" in say("resume", "test")
     coordinator.wait_for("generation", times=2)
     drained = json.loads(say("drain", "test", "--json"))
     code, _ = coordinator.finish()

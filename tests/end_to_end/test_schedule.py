@@ -67,7 +67,9 @@ def resume(processes, name, *flags):
 def test_a_run_of_three_stages_gives_the_same_bits_however_often_it_is_killed(processes, begin):
     coordinator = begin("calm")
     worker = processes.worker("--task", tasks.TOY, "--run", "calm")
-    coordinator.wait_for("stage 3 of 3 (10 steps, 7 x 4 episodes, racing, the search goes on) begins with generation 6")
+    coordinator.wait_for(
+        "stage 3 of 3 (10 steps, 7 x 4 episodes, racing, the search continues) begins with generation 6"
+    )
     assert coordinator.finish()[0] == 0
     worker.end()
     coordinator = begin("night")

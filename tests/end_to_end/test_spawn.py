@@ -127,7 +127,7 @@ def test_a_log_is_followed_until_the_worker_ends_or_somebody_has_seen_enough(pro
     command.popen.send_signal(signal.SIGINT)
     code, out = command.finish()
     assert code == 0
-    assert "goes on without this command" in out
+    assert "continues without this command" in out
     assert runs(state(a)["pid"])
 
     command = processes.start("spawn", "a", *words(hosts, *flags, *own))
@@ -196,7 +196,7 @@ def test_ctrl_c_while_hosts_are_brought_up_ends_the_command_and_not_what_others_
     await_that(asked.exists, "the host was never asked")
     command.popen.send_signal(signal.SIGINT)
     assert command.finish()[0] == 130
-    assert "the same command goes on" in command.lines[-1]
+    assert "the same command continues" in command.lines[-1]
 
 
 def test_a_full_disk_and_a_folder_that_cannot_be_written_are_said(processes, hosts, tmp_path):

@@ -36,7 +36,7 @@ def test_training_keeps_all_updates(processes, tmp_path, number):
     said = stopped(training, number, lambda: curve.exists() and curve.read_text().count("update") >= 2)
     update = load_progress(tmp_path / "vae.safetensors")["update"]
     assert update >= 40
-    assert f"after update {update} of 100000: {tmp_path}/vae.safetensors keeps them; the same command goes on" in said
+    assert f"after update {update} of 100000: {tmp_path}/vae.safetensors keeps them; the same command continues" in said
 
 
 @pytest.mark.slow
@@ -74,7 +74,7 @@ def test_a_collection_keeps_its_episodes_and_counts_them(processes, tmp_path, nu
     collecting = processes.start("collect", "--data", tmp_path, *flags)
     said = stopped(collecting, number, lambda: len(existing_episodes(tmp_path)) >= 2)
     kept = len(existing_episodes(tmp_path))
-    assert f"stopped: {tmp_path} keeps {kept} new episodes, {kept} of 1000 in all; the same command goes on" in said
+    assert f"stopped: {tmp_path} keeps {kept} new episodes, {kept} of 1000 in all; the same command continues" in said
     assert [path.name for path in (tmp_path / "episodes").iterdir() if path not in existing_episodes(tmp_path)] == []
 
 

@@ -36,7 +36,7 @@ def load_episode(folder: Path, number: int, picture: int) -> Episode:
         episode = Episode(arrays["picture"], arrays["choice"], arrays["reward"], bool(arrays["terminal"]))
         _check(episode, picture)
     except (OSError, ValueError, TypeError) as error:
-        raise DatasetError(f"{path} is missing or damaged ({error}): give --new to begin anew") from error
+        raise DatasetError(f"{path} is missing or damaged ({error}): give --new to start over") from error
     return episode
 
 

@@ -32,7 +32,7 @@ def export_agent(folder: Path) -> TrainedAgent:
     progress = parse_progress(path, load_checkpoint(path, networks, None))
     weights = {name: tensor.numpy() for name, tensor in networks.online.state_dict().items()}
     if not all(np.isfinite(each).all() for each in weights.values()):
-        raise DatasetError(f"{path} holds NaN or infinity: give --new to train anew, with a lower --rate")
+        raise DatasetError(f"{path} holds NaN or infinity: give --new to start over with a lower --rate")
     driven = progress.episodes
     provenance = {
         "episodes": len(driven), "steps": sum(each.steps for each in driven),

@@ -29,8 +29,8 @@ class Learner:
         loss.backward()  # type: ignore[no-untyped-call]
         if not math.isfinite(value := loss.item()):
             raise DatasetError(
-                f"the loss of update {self.updates + 1} is {value}: the rate is too high; the checkpoint of the last "
-                "whole episode is kept, and the same command with a lower --rate goes on from it"
+                f"the loss of update {self.updates + 1} is {value}: the rate is too high. The checkpoint of the last "
+                "whole episode is kept, and the same command with a lower --rate continues from it"
             )
         if self._config.clip:
             torch.nn.utils.clip_grad_norm_(self._networks.online.parameters(), self._config.clip)

@@ -9,6 +9,7 @@ from statistics import fmean
 from typing import Annotated, Any
 
 from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.printable import format_number
 from dreamfleet.common.serialization.optional_fields import OPTIONAL
 from dreamfleet.common.serialization.validation import Count, Length, MalformedError, from_plain
 
@@ -41,7 +42,7 @@ def parse_progress(path: Path, plain: Any) -> TrainingProgress:
         if found.oldest > len(found.episodes):
             raise MalformedError("fewer episodes than it dropped")
     except MalformedError as error:
-        raise DatasetError(f"checkpoint {path} is damaged ({error}); delete it or give --new to begin anew") from error
+        raise DatasetError(f"checkpoint {path} is damaged ({error}); delete it or give --new to start over") from error
     return found
 
 
@@ -57,7 +58,8 @@ class TrainingReport:
 
     def __str__(self) -> str:
         loss = "nothing learnt yet" if self.loss is None else f"loss {self.loss:.4g}"
-        return f"episode {self.episode}: mean {self.mean:.1f}, best {self.most:.1f}, epsilon {self.epsilon:.2f}, {loss}"
+        mean, best = format_number(self.mean), format_number(self.most)
+        return f"episode {self.episode}: mean {mean}, best {best}, epsilon {self.epsilon:.2f}, {loss}"
 
 
 def make_reports(records: Sequence[EpisodeRecord], every: int) -> list[TrainingReport]:

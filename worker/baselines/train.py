@@ -186,7 +186,7 @@ class AgentTraining:
     def _raise_stopped(self) -> None:
         raise StoppedError(
             f"stopped in episode {self.episodes + 1} of {self._config.episodes}: {self._path} keeps those before it; "
-            f"{resume_command(self._new)} drives it again and goes on from there"
+            f"{resume_command(self._new)} drives it again and continues from there"
         )
 
 

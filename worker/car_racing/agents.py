@@ -73,7 +73,7 @@ class NetworkAgent(PictureAgent):
             )
         for each in manifest.choices:
             if len(each) != actions.actions or (np.clip(each, actions.low, actions.high) != each).any():
-                raise ControllerError(f"the agent's choice {each} is no steering, gas and brake: export it again")
+                raise ControllerError(f"the agent's choice {each} is not steering, gas and brake: export it again")
         NetworkPolicy(self.trained).act(np.zeros(PREPROCESSINGS[manifest.preprocessing].shape, np.uint8))
 
     @property

@@ -45,7 +45,7 @@ class DreamWorld:
         """
         check_temperature(temperature)
         if DREAM_GRAPH not in bundle.manifest.parts:
-            raise BundleError(f"{bundle.path.name} is from before dreams: build it again with `dreamfleet bundle`")
+            raise BundleError(f"{bundle.path.name} is too old to dream: build it again with `dreamfleet bundle`")
         model: dict[str, Any] = bundle.manifest.models.get("mdnrnn", {})
         self._reward_kind = str(model.get("reward", "none"))
         self._reward_scale = float(model.get("reward_scale", 1.0))  # of a value: what its labels were divided by
@@ -110,7 +110,7 @@ def _reward_of(bundle: Bundle, world: World | WorldFacts, kind: str) -> RewardFa
             found = RewardFacts(terms.source, terms.gain, terms.cost)
     survives = found is not None and found.source == "survival"
     if kind == "none" and not survives:
-        raise BundleError(f"{bundle.path.name} predicts no reward: nothing can be scored in its dream")
+        raise BundleError(f"{bundle.path.name} predicts no reward: its dreams cannot be scored")
     if found is None:
         raise BundleError(f"task {bundle.manifest.task} defines no reward for a dreamt step of {bundle.path.name}")
     if not survives and (found.source == "value") != (kind == "value"):

@@ -43,7 +43,7 @@ def make_scene(task: str, steps: int) -> Scene:
     """The scene of a task's world; `UsageError` if nobody drives in it by hand."""
     found = find_task(task)
     if not isinstance(found, TaskWithScene):
-        raise UsageError(f"nobody drives by hand in {task}")
+        raise UsageError(f"task {task} has no driving by hand")
     return found.make_scene(steps)
 
 

@@ -55,8 +55,8 @@ def make_environment(name: str, arguments: Mapping[str, Any], render_mode: str |
             raise
         close_environment(_make(name, arguments))  # without pictures it is sound
         raise UsageError(
-            f"this environment ({name}) draws no pictures: it must take `render_mode`, and its `render` must "
-            f"return an array (height, width, 3) in the render mode {render_mode}"
+            f"{name} draws no pictures: it must take `render_mode`, and in the render mode {render_mode} its `render` "
+            "must return an array (height, width, 3)"
         ) from error
 
 

@@ -84,7 +84,7 @@ class PixelOptions:
             return from_plain(cls, plain)
         except (ValueError, RecursionError) as error:
             known = ", ".join(cls.__dataclass_fields__)
-            raise UsageError(f"{text!r:.200} are no options of pictures ({error}); known are {known}") from error
+            raise UsageError(f"{text!r:.200} are not options of pictures ({error}); known are {known}") from error
 
     @property
     def text(self) -> str:

@@ -190,7 +190,7 @@ def _fitness_section(subject: InspectionSubject) -> Iterator[Section]:
 
 def _dream_sections(bundle: Bundle, driven: EncodedRollout, vae_view: VAEView) -> Iterator[Section]:
     if not can_dream(bundle):
-        text = "This bundle is from before dreams; build it again with `dreamfleet bundle` to see one."
+        text = "This bundle is too old to dream; build it again with `dreamfleet bundle` to see one."
         yield Section("dream", "A dream beside the drive", text)
         return
     yield mdnrnn_sections.dream_section(bundle, driven, vae_view)

@@ -110,12 +110,12 @@ class Survival:
 
 def measure_survival(
     bundle: Bundle, controller: Controller | None, config: SurvivalConfig,
-    on_policy: Callable[[int], None] = lambda _count: None,
+    on_episode: Callable[[int], None] = lambda _count: None,
 ) -> Survival:  # fmt: skip
     """Compare how long each fixed policy, and the controller if there is one, lives in reality and in dreams.
 
-    `UsageError` for a world model that predicts no ends, or for a controller of another one. `on_policy` gets the
-    number of policies so far that were driven, and then of those that were dreamt too.
+    `UsageError` for a world model that predicts no ends, or for a controller of another one. `on_episode` gets the
+    number of episodes so far, first of those in the world and then of dreams.
     """
     if not bundle.manifest.models.get("mdnrnn", {}).get("done"):
         raise UsageError(f"{bundle.path.name} predicts no ends: train its MDN-RNN with --set done=true")
@@ -130,15 +130,14 @@ def measure_survival(
     reality = _Reality(task, assignment, controller)
     try:
         for name, make in drivers.items():
-            reality.drive(name, make, config.seeds)
-            on_policy(len(reality.lengths))
+            reality.drive(name, make, config.seeds, on_episode)
     finally:
         reality.close()
     found = []
     for name, make in drivers.items():
         dreamt = _dream_lengths(world, make, controller, config.seeds, reality.limit)
         found.append(PolicySurvival.of(name, np.array(reality.lengths[name]), dreamt, reality.limit))
-        on_policy(len(drivers) + len(found))
+        on_episode((len(drivers) + len(found)) * len(config.seeds))
     return Survival.of(reality.limit, rule, tuple(found))
 
 
@@ -178,14 +177,18 @@ class _Reality:
         self._controller, self._policy = controller, task.make_policy(assignment)
         self._environment = task.make_environment(assignment)
 
-    def drive(self, name: str, make: DriverMaker | None, seeds: Sequence[int]) -> None:
-        """Add the lengths of a driver's episodes, or of the controller's."""
+    def drive(
+        self, name: str, make: DriverMaker | None, seeds: Sequence[int], on_episode: Callable[[int], None]
+    ) -> None:
+        """Add the lengths of a driver's episodes, or of the controller's; `on_episode` gets the number of all."""
+        before = sum(map(len, self.lengths.values()))
         self.lengths[name] = []
         for seed in seeds:
             policy = self._policy if make is None else DriverPolicy(make(np.random.default_rng(seed)))
             policy.begin(NO_PARAMETERS if self._controller is None else self._controller.parameters)
             *_, last = run_episode(self._environment, policy, EpisodeConfig(seed, self.limit))
             self.lengths[name].append(last.step)
+            on_episode(before + len(self.lengths[name]))
             if last.ended and not last.terminal:
                 self.limit = last.step
 

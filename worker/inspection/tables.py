@@ -83,15 +83,15 @@ def survival_text(found: Survival, episodes: int, temperature: float) -> str:
 
 
 LIKENESS = (
-    "shares of steps ± standard errors over drives at which a quantity is larger than at nine of ten real steps, by "
-    "the truth, and by a linear probe on [z, h]; dreams begin behind each drive's opening and last as long"
+    "shares of steps ± standard errors over drives: at these a quantity is larger than at nine of ten real steps. "
+    "Measured by the truth, and by a linear probe on [z, h]. Dreams begin after each drive's opening and last as long"
 )
 
 
 def loss_text(drives: int, dreams: int, lasting: int) -> str:
     """Describe the rows of `loss_rows`."""
     return (
-        f"means ± standard errors over n beginnings in {drives} drives, {dreams} dreams of each; the road is lost "
+        f"means ± standard errors over n beginnings in {drives} drives, {dreams} dreams of each. The road is lost "
         f"after {lasting} steps in a row off it, and the end is as long"
     )
 

@@ -130,7 +130,7 @@ def read_points(path: Path) -> Points:
         if not points or any("update" not in point or len(point) < 2 for point in points):
             raise ValueError("a point lacks its update or a loss")
         if not all(type(each) in (int, float) and abs(each) < MOST for point in points for each in point.values()):
-            raise ValueError("a point is no finite number")
+            raise ValueError("a point is not a finite number")
     except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise DatasetError(f"{path} holds no loss curve ({error}); move it away, or choose another --data") from error
     return points

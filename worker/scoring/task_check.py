@@ -26,7 +26,7 @@ from dreamfleet.common.protocol.tasks import Description, describe_task
 if TYPE_CHECKING:
     from dreamfleet.worker.tasks.api import Task
 
-MEND = "mend the environment, or wrap it"
+MEND = "fix the environment, or wrap it"
 SLOW_RESET = 2.0  # seconds; gymnasium's checker resets a dozen times, so it is left out where resets are slower
 PICTURE_DIMENSIONS = 2
 ADVICE = re.compile(r"infinity|we recommend")  # warnings of gymnasium's checker that are about style

@@ -36,7 +36,7 @@ class WorkerConfig:
         if self.any and self.run is not None:
             raise UsageError("--any and --run exclude each other")
         if self.any and self.exit_when_done:
-            raise UsageError("--any goes on to the next run, --exit-when-done leaves after one: give one of them")
+            raise UsageError("--any takes the next run, and --exit-when-done leaves after one: give one of them")
         if not 0 <= self.slots <= MAX_LEASES:
             raise UsageError(f"--slots must be from 0 to {MAX_LEASES}, not {self.slots}")
         for name in ("drain_timeout", "lifetime", "slot_memory", "coordinator_timeout"):

@@ -111,10 +111,15 @@ class Membership:
     def plan_without_coordinator(self) -> str:
         """What it does while its coordinator is out of sight, in words."""
         if self._conditions.serves_any:
-            return f"goes on to the next run after {NEXT_RUN_AFTER:g} s, or {NEXT_RUN_PATIENCE:g} s with results"
+            return f"takes the next run after {NEXT_RUN_AFTER:g} s, with results after {NEXT_RUN_PATIENCE:g} s"
         if self._conditions.leaves_with_run:
-            return f"leaves too if it is not back within {self._conditions.coordinator_timeout:g} s"
-        return "waits for that run alone, whatever its name (--any: the next one)"
+            return f"leaves unless it is back within {self._conditions.coordinator_timeout:g} s"
+        return "waits for this run only, even under another name (--any takes the next run)"
+
+    @property
+    def run_is_over(self) -> bool:
+        """Whether the joined run is over and its workers leave."""
+        return bool(self._run_is_over)
 
     @property
     def draining(self) -> bool:
@@ -144,12 +149,12 @@ class Membership:
         if self._drain_until is not None:
             if busy and now <= self._drain_until:
                 return ""
-            why = "drained after a signal" if self._stop_requests else "drained at the end of its lifetime"
-            return f"{why}, with jobs or results left when the time for that was up" if busy else why
+            why = "drained after a stop signal" if self._stop_requests else "drained at the end of its lifetime"
+            return f"{why}, but jobs or results were left when --drain-timeout was over" if busy else why
         if self.gives_up(now):
-            return f"its coordinator was out of sight for {self._conditions.coordinator_timeout:g} s"
+            return f"no coordinator was reachable for {self._conditions.coordinator_timeout:g} s"
         if self._conditions.serves_any and self._is_alone(now, NEXT_RUN_PATIENCE if busy else NEXT_RUN_AFTER):
-            return "it goes on to another run"
+            return "it takes another run"
         return ""
 
     def gives_up(self, now: float) -> bool:

@@ -134,8 +134,8 @@ class RunSession:
         self._send_heartbeat(monotonic(), capacity=0, reason=why)
         for each in self._declared:
             each.undeclare()
-        log.info("leaving run %s (%s): %d jobs, %d environment steps%s", self._admission.run, why, self._finished,
-                 self._steps_finished, self._lost_results())  # fmt: skip
+        log.info("leaving run %s (%s): %s, %s%s", self._admission.run, why, plural(self._finished, "job"),
+                 plural(self._steps_finished, "environment step"), self._lost_results())  # fmt: skip
 
     def _lost_results(self) -> str:
         """Which finished results go with this worker, in words."""
@@ -178,11 +178,13 @@ class RunSession:
         nonce = str(event.key_expr).rsplit("/", 1)[-1]
         if event.kind == zenoh.SampleKind.DELETE:
             self._membership.remove_coordinator(nonce, monotonic())
-            log.info("the coordinator of run %s is out of sight: it left, or the connection was cut; this worker %s",
+            if self._membership.run_is_over:
+                return  # it ended the run and left, as it said
+            log.info("the coordinator of run %s left or cannot be reached; this worker %s",
                      self._admission.run, self._membership.plan_without_coordinator,
                      extra={"facts": {"event": "coordinator gone", "run": self._admission.run}})  # fmt: skip
         elif self._membership.add_coordinator(nonce):  # joining another life is logged by `_rejoin`
-            log.info("the coordinator of run %s is in sight again; this worker goes on", self._admission.run,
+            log.info("the coordinator of run %s is back; this worker continues", self._admission.run,
                      extra={"facts": {"event": "coordinator back", "run": self._admission.run}})  # fmt: skip
 
     def _handle_batch(self, payload: bytes) -> None:
@@ -208,7 +210,7 @@ class RunSession:
             return
         self._membership.note_activity(monotonic())
         if batch.leave or batch.ended:
-            self._membership.end_run("the run has ended" if batch.ended else "the run is over for its workers")
+            self._membership.end_run("the run has ended" if batch.ended else "the run dismissed its workers")
         for digest in batch.cancels:
             self._slots.abandon(digest)
         for job, why in self._backlog.add_batch(batch, self._slots.wanted_digests):
@@ -320,7 +322,7 @@ class RunSession:
             return
         if admission is None or (admission.run_uid, admission.spec) != (joined.run_uid, joined.spec):
             return
-        log.info("run %s goes on under the name %s", joined.run, admission.run)
+        log.info("run %s continues under the name %s", joined.run, admission.run)
         for each in self._declared:
             each.undeclare()
         self._slots.show(False)

@@ -115,8 +115,8 @@ class FramePainter:
             found = self._environment.render()
         if np.ndim(found) != 3:
             raise UsageError(
-                f"this environment ({type(self._environment.unwrapped).__name__}) draws no pictures: its `render` must "
-                "return an array (height, width, 3) in the render mode rgb_array"
+                f"{type(self._environment.unwrapped).__name__} draws no pictures: in the render mode rgb_array its "
+                "`render` must return an array (height, width, 3)"
             )
         return np.asarray(found)
 

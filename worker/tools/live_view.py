@@ -106,7 +106,7 @@ class LiveCanvas(Board):
     def _draw_strip(self, dream: DecodedDream) -> None:
         pitch = (SIZE[0] - 2 * EDGE - SMALL) // (len(AHEAD) - 1)
         if not dream.dreamt:
-            self._text("no dream goes on from here", (EDGE, STRIP), self._small, FAINT)
+            self._text("no dream continues from here", (EDGE, STRIP), self._small, FAINT)
         for column, (ahead, picture) in enumerate(dream.dreamt):
             words = f"dreamt {ahead} steps on" if column == 0 else f"{ahead} steps on"
             self._draw_fitted(words, picture, (EDGE + column * pitch, STRIP), (SMALL, SMALL))

@@ -5,12 +5,17 @@ from __future__ import annotations
 import argparse
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.files.atomic_write import check_output_path
 from dreamfleet.common.host.stop_signals import stop_on_signals
+from dreamfleet.common.printable import format_number
 from dreamfleet.common.runs.seeds import TEST
+
+if TYPE_CHECKING:
+    from dreamfleet.worker.tasks.api import World
 
 
 def add_video_flags(parser: argparse.ArgumentParser) -> None:
@@ -38,22 +43,24 @@ def video_paths(args: argparse.Namespace) -> dict[int, Path]:
     return videos
 
 
-def record_videos(args: argparse.Namespace, videos: dict[int, Path], film: partial[float], word: str) -> int:
+def record_videos(args: argparse.Namespace, videos: dict[int, Path], film: partial[float], world: World) -> int:
     """Record one video after another and print each score; Ctrl-C ends the current video and the verb.
 
-    `film` is as in `record_in_process`; `word` is what the world calls a seed.
+    `film` is as in `record_in_process`.
     """
     from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.worker.tools.recording import record_in_process
 
+    word, most = world.score_word, min(args.steps, world.horizon)
     with stop_on_signals() as stop:
         for seed, video in videos.items():
-            with progress_bar("record", args.steps, "steps") as bar:
+            with progress_bar("record", most, "steps") as bar:
                 score, driven = record_in_process(film, seed, video, bar.update, stop)
             if stop():
                 raise StoppedError(
-                    f"stopped: {video} shows the first {driven} steps on {word} {seed}, with a score of {score:.1f}; "
-                    "the same command records whole drives"
+                    f"stopped: {video} shows the first {driven} steps on {word} {seed}, with a score of "
+                    f"{format_number(score)}; the same command records whole episodes"
                 )
-            print_answer(args, f"{video}: score {score:.1f} on {word} {seed}", video=video, score=score, seed=seed)
+            text = f"{video}: score {format_number(score)} on {word} {seed}"
+            print_answer(args, text, video=video, score=score, seed=seed)
     return 0

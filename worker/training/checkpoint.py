@@ -86,8 +86,8 @@ def _remedy(path: Path) -> str:
     """What to do about a checkpoint that cannot be used: only one that is surely ours may be deleted."""
     with suppress(OSError, SafetensorError), safe_open(path, "np") as file:
         if "progress" in (file.metadata() or {}):
-            return "delete it, or give --new, to train anew"
-    return "if another program wrote it, choose another --data; else move it away and train anew"
+            return "delete it, or give --new to start over"
+    return "if another program wrote it, choose another --data; else move it away and train again"
 
 
 def _read_metadata(path: Path) -> Mapping[str, str]:
@@ -134,8 +134,8 @@ def check_config(path: Path, config: Any, extensible: frozenset[str] = frozenset
                  if stored[name] != value and not (name in extensible and value)]  # fmt: skip
     if differing:
         raise DatasetError(
-            f"checkpoint {path} is of another model: {'; '.join(differing)}; give it the same flags, or --new to begin "
-            "anew"
+            f"checkpoint {path} belongs to another model: {'; '.join(differing)}; give it the same flags, or --new to "
+            "start over"
         )
 
 

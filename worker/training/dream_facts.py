@@ -83,8 +83,8 @@ def warn_of_unsure_ends(rule: EndRule, quality: Mapping[str, float]) -> None:
     """Warn where dreams end above a bar that a model which can hardly foretell ends may never reach."""
     if rule.kind != DRAWN and (area := quality.get("done_auc", 1.0)) < SURE:
         log.warning(
-            "this model hardly separates ends from other steps (area under the curve %.2f, 0.5 is chance): dreams that "
-            "end above %g may go on for ever; `bundle --end drawn` ends them as often as they end in the world",
+            "this model hardly separates ends from other steps (area under the curve %.2f, 0.5 is chance). Dreams that "
+            "end above %g may never end; `bundle --end drawn` ends them as often as they end in the world",
             area, rule.at,
         )  # fmt: skip
 

@@ -86,7 +86,7 @@ def latents_encoder_hash(folder: Path) -> str:
     vae = encoder_hash(folder)
     for path in episode_paths(folder, ENCODED):
         if str(load_arrays(path, "vae")["vae"]) != vae:
-            raise DatasetError(f"{path} is of another VAE: run `dreamfleet encode --data {folder}` again")
+            raise DatasetError(f"{path} belongs to another VAE: run `dreamfleet encode --data {folder}` again")
     return vae
 
 

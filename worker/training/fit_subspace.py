@@ -130,9 +130,9 @@ def find_subspace(
     counted = [0 if each is None else each.steps for each in (fit, held_out)]
     if fit is None or held_out is None or sum(counted) < LEAST_STEPS or not all(counted):
         raise UsageError(
-            f"{len(paths)} drives of {sum(counted)} steps that count are too few: it takes {HELD_OUT_EVERY} drives and "
-            f"{LEAST_STEPS} steps; the first {FIRST_START} of a drive, its last {ACTION_WINDOWS[-1][1]} and those "
-            "off the road do not count: `dreamfleet collect` drives more"
+            f"{len(paths)} drives of {sum(counted)} counted steps are too few: it takes {HELD_OUT_EVERY} drives and "
+            f"{LEAST_STEPS} steps; `dreamfleet collect` drives more. Not counted are the first {FIRST_START} steps of "
+            f"a drive, its last {ACTION_WINDOWS[-1][1]} and those off the road"
         )
     r_squared = held_out.r_squared(fit.solve(RIDGE))
     predictable = [index for index, each in enumerate(r_squared) if each >= MIN_R_SQUARED]

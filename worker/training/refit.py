@@ -83,7 +83,7 @@ def refit(
         on_progress(first + len(drives))
     fit, held_out = split.fit, split.held_out
     if fit is None or not fit.steps:
-        raise UsageError(f"none of the {len(paths)} drives keeps to its road: there is nothing to fit a controller to")
+        raise UsageError(f"none of the {len(paths)} drives stays on its road: there is nothing to fit a controller to")
     r_squared = held_out.r_squared(fit.solve(RIDGE)) if held_out and held_out.steps else np.full(len(biases), np.nan)
     whole = fit + held_out if held_out else fit
     solved = whole.solve(RIDGE)

@@ -52,7 +52,7 @@ def train_mdnrnn(
     model = MDNRNN(layers).to(device)
     schedule = TrainingState(folder / CHECKPOINT, model, config, len(train), continue_from, new, ADDABLE_HEADS)
     if schedule.progress.setdefault("vae", vae) != vae:
-        raise DatasetError(f"{folder / CHECKPOINT} was trained on latents of another VAE; --new begins anew")
+        raise DatasetError(f"{folder / CHECKPOINT} was trained on latents of another VAE; --new starts over")
     report(schedule.update, "")
     with open_loss_curve(folder / CURVE, events, schedule.update) as point:
         while schedule.should_continue(stop):

@@ -30,7 +30,7 @@ class EarlyStop:
     def __str__(self) -> str:
         return (
             f"ended early after update {self.given_up_at}, as --patience says: the checkpoint is that of update "
-            f"{self.update}, the best on held-out drives with a loss of {self.held_out_loss:.4g}; --patience 0 goes on"
+            f"{self.update}, the best on held-out drives (loss {self.held_out_loss:.4g}); --patience 0 continues"
         )
 
 
@@ -52,7 +52,7 @@ def explain_interrupt(path: Path, new: bool) -> Iterator[None]:
             raise
         raise StoppedError(
             f"interrupted: {path} keeps what was made up to update {load_progress(path)['update']}; "
-            f"{resume_command(new)} goes on from there"
+            f"{resume_command(new)} continues from there"
         ) from error
 
 

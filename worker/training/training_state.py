@@ -74,7 +74,7 @@ class TrainingState:
             self.save()
             raise StoppedError(
                 f"stopped after update {self.update} of {self._config.updates}: {self._path} keeps them; "
-                f"{resume_command(self._new)} goes on from there"
+                f"{resume_command(self._new)} continues from there"
             )
         return True
 
@@ -150,8 +150,8 @@ def _check_seed(path: Path, own: Any, given: int) -> None:
     """`UsageError` if a training would resume with another seed."""
     if own != given:
         raise UsageError(
-            f"{path} was begun with --seed {own}, and this is --seed {given}: give --seed {own} to go on with it; "
-            "another training is one in another --data, or begins anew with --new"
+            f"{path} was begun with --seed {own}, and this is --seed {given}: give --seed {own} to continue it. "
+            "For another training choose another --data, or start over with --new"
         )
 
 

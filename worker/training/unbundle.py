@@ -35,7 +35,7 @@ def unbundle(bundle: Bundle, folder: Path) -> tuple[Path, Path]:
     paths = folder / train_vae.CHECKPOINT, folder / train_mdnrnn.CHECKPOINT
     for path in paths:
         if path_exists(path):
-            raise UsageError(f"{path} is there already: choose another --data")
+            raise UsageError(f"{path} exists: choose another --data")
     try:
         vae, rnn = _rebuild_models(bundle)
     except (BundleError, MalformedError, UsageError, RuntimeError, ValueError, TypeError, SafetensorError) as error:

@@ -14,6 +14,7 @@ from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.cli.world_flags import add_world_flags, world_arguments
 from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.host.resource_limits import usable_cores
+from dreamfleet.common.printable import plural
 
 if TYPE_CHECKING:
     from dreamfleet.worker.scoring.rollout import DataWorld
@@ -82,10 +83,12 @@ def run(args: argparse.Namespace) -> int:
     there = len(existing_episodes(args.data))  # with those that were written while the others stopped
     if there < total:
         raise StoppedError(
-            f"stopped: {args.data} keeps {there - before} new episodes, {there} of {total} in all; the same command "
-            "goes on"
+            f"stopped: {args.data} keeps {plural(there - before, 'new episode')}, {there} of {total} in all; the same "
+            "command continues"
         )
-    text = f"{args.data}: {done} episodes, {frames} frames new; {there} episodes in all"
+    text = (
+        f"{args.data}: {plural(done, 'new episode')} with {plural(frames, 'frame')}; {plural(there, 'episode')} in all"
+    )
     print_answer(args, text, data=args.data, new_episodes=done, new_frames=frames, episodes=there)
     return 0
 
@@ -128,7 +131,8 @@ def _import_run(args: argparse.Namespace) -> int:
         if not drives:
             raise UsageError(f"run {args.from_run} has collected nothing: start a run with --collect-every")
     new = list(import_rollouts(args.data, drives))
-    text = f"{args.data}: {len(new)} episodes, {sum(new)} frames new, of {len(drives)} that {args.from_run} collected"
+    added = f"{plural(len(new), 'new episode')} with {plural(sum(new), 'frame')}"
+    text = f"{args.data}: {added}, of {len(drives)} that {args.from_run} collected"
     print_answer(args, text, data=args.data, new_episodes=len(new), new_frames=sum(new), collected=len(drives),
            episodes=len(existing_episodes(args.data)))  # fmt: skip
     return 0

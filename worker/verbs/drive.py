@@ -28,9 +28,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Drive, and print each episode's score."""
     if not args.dream and (args.bundle is not None or args.temperature is not None):
-        raise UsageError("--bundle and --temperature are of a dream: add --dream")
+        raise UsageError("--bundle and --temperature need a dream: add --dream")
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.common.artifacts.driving import FIRST_WORLD
+    from dreamfleet.common.printable import format_number
     from dreamfleet.worker.driving.loop import DrivingConfig, drive, random_seed
     from dreamfleet.worker.driving.scene import DreamScene, Scene, make_scene
 
@@ -42,6 +43,6 @@ def run(args: argparse.Namespace) -> int:
     else:
         scene = make_scene(FIRST_WORLD, config.steps)
     for driven in drive(scene, config):
-        text = f"score {driven.score:.1f} in {driven.steps} steps, seed {config.seed}"
+        text = f"score {format_number(driven.score)} in {driven.steps} steps, seed {config.seed}"
         print_answer(args, text, score=driven.score, steps=driven.steps, seed=config.seed)
     return 0

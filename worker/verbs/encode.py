@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from dreamfleet.common.cli.output import add_json_flag, print_answer
+from dreamfleet.common.printable import plural
 
 SUMMARY = "encode a data set's pictures with its trained VAE"
 EXTRAS = ("train",)
@@ -32,6 +33,7 @@ def run(args: argparse.Namespace) -> int:
         for done, count in enumerate(encode(args.data), start=1):
             frames += count
             bar.update(done)
+        bar.update(total)  # with those that were encoded before
     also = ", each also mirrored" if encodes_mirrored(args.data) else ""
-    print_answer(args, f"{args.data}: {frames} frames encoded{also}", data=args.data, new_frames=frames)
+    print_answer(args, f"{args.data}: {plural(frames, 'frame')} encoded{also}", data=args.data, new_frames=frames)
     return 0

@@ -87,12 +87,12 @@ def run(args: argparse.Namespace) -> int:
     """Write the page and print its path, or measure and print figures."""
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     if args.end and not args.survival:
-        raise UsageError("--end is of the dreams of --survival: give that too")
+        raise UsageError("--end needs the dreams of --survival: give that too")
     if args.probe or args.losses or args.likeness or args.survival:
         if args.picture:
-            raise UsageError("--picture is of the page: leave --probe, --losses, --likeness and --survival out")
+            raise UsageError("--picture belongs to the page: leave --probe, --losses, --likeness and --survival out")
         if args.action:
-            raise UsageError("--action is of the page: leave --probe, --losses, --likeness and --survival out")
+            raise UsageError("--action belongs to the page: leave --probe, --losses, --likeness and --survival out")
         return _measure(args)
     if args.driver:
         raise UsageError("--driver drives for figures: give --probe too")
@@ -105,7 +105,7 @@ def _draw_page(args: argparse.Namespace) -> int:
     if args.steps < 2 or args.seed < 0:
         raise UsageError("--steps must be at least 2 and --seed at least 0")
     if args.action and args.controller:
-        raise UsageError("one drives: give --controller or --action")
+        raise UsageError("only one can drive: give --controller or --action")
     from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.worker.inspection.encoded_rollout import DriveConfig
     from dreamfleet.worker.inspection.page_builder import write_page
@@ -183,7 +183,7 @@ def _measure_survival(
     episodes = LIVES if args.episodes is None else args.episodes
     wanted = SurvivalConfig(episodes, args.seed, temperature, args.end)
     policies = len(fixed_drivers(task_of(bundle), world_of(bundle))) + (driving.controller is not None)
-    with progress_bar("survival", 2 * policies, "policies") as bar:
+    with progress_bar("survival", 2 * policies * episodes, "episodes") as bar:
         found = measure_survival(bundle, driving.controller, wanted, bar.update)
     if not args.json:
         rows = survival_rows(found)
@@ -252,7 +252,7 @@ def _check_figure_flags(args: argparse.Namespace) -> None:
     if args.driver and args.survival:
         raise UsageError("--survival measures all drivers: leave --driver out")
     if args.controller and args.driver:
-        raise UsageError("one drives: give --controller or --driver")
+        raise UsageError("only one can drive: give --controller or --driver")
 
 
 def _open_measured_subject(args: argparse.Namespace, held: ExitStack) -> InspectionSubject:
@@ -292,5 +292,5 @@ def _choose_driver(args: argparse.Namespace, subject: InspectionSubject) -> tupl
     if args.driver:
         return bundle, DriverChoice(driver=args.driver)
     if controller is None and (args.probe or args.losses or args.likeness or not args.survival):
-        raise UsageError("nobody drives: give --controller, or for --probe a --driver")
+        raise UsageError("name who drives: --controller, or for --probe a --driver")
     return bundle, DriverChoice(controller, own)

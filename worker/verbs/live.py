@@ -92,7 +92,7 @@ def _check(args: argparse.Namespace) -> None:
     if args.controller and args.run_name:
         raise UsageError("give either a live run to watch, or --controller, which needs none")
     if args.generation is not None and not args.controller:
-        raise UsageError("--generation is of a run on this disk: name it with --controller")
+        raise UsageError("--generation needs a run on this disk: name it with --controller")
 
 
 def _writes_files(args: argparse.Namespace) -> bool:

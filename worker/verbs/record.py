@@ -33,4 +33,4 @@ def run(args: argparse.Namespace) -> int:
 
     agent = find_driver(args.controller, args.runs_dir, args.bundle)
     film = partial(record, agent, steps=args.steps, dreaming=ParallelDreamConfig(args.temperature))
-    return record_videos(args, videos, film, agent.world.score_word)
+    return record_videos(args, videos, film, agent.world)

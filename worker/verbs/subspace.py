@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
         subspace.save(args.out, {"drives": found.drives, "steps": found.steps, "r_squared": r_squared})
     width = max(map(len, subspace.names))
     rows = [f"{name:<{width}}  {each:.2f}" for name, each in zip(subspace.names, r_squared, strict=True)]
-    heading = "what is foretold, in which steps from now, and its R² on held-out drives:"
+    heading = "what is predicted, how many steps ahead, and its R² on held-out drives:"
     last = f"{args.out}: {len(rows)} features, by {found.steps} steps of {found.drives} drives"
     text = "\n".join([heading, *rows, last])
     print_answer(args, text, subspace=args.out, sha256=subspace.sha256, bundle=bundle.sha256, features=subspace.names,

@@ -11,6 +11,7 @@ from dreamfleet.common.cli.model_commands import MODELS
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.printable import plural
 
 if TYPE_CHECKING:
     from torch import nn
@@ -115,7 +116,7 @@ def _train_mdnrnn(args: argparse.Namespace) -> int:
         return training.train_mdnrnn(args.data, config, report, layers, device, other, stop, args.new, args.tensorboard)
 
     if waiting := count_unencoded(args.data):
-        note = f"note: {waiting} drives are not encoded, and not learnt from: `dreamfleet encode --data {args.data}`"
+        note = f"note: not encoded or learnt from: {plural(waiting, 'drive')}; `dreamfleet encode --data {args.data}`"
         print(note, file=sys.stderr)
     return run_training(args, "MDN-RNN", config.updates, args.data / training.CHECKPOINT, train)
 

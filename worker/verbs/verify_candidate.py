@@ -60,14 +60,14 @@ def run(args: argparse.Namespace) -> int:
         for each in episodes:
             print(f"episode {each.episode}  seed {each.seed}  {_describe(each, args.tolerance)}")
     if varying := sum(not each.deterministic for each in episodes):
-        print(f"{varying} of {len(episodes)} episodes were driven in an environment that is not deterministic: their "
-              "bits are not the same again anywhere; --tolerance N compares them", file=sys.stderr)  # fmt: skip
+        print(f"{varying} of {len(episodes)} episodes were driven in an environment that is not deterministic, so "
+              "replays are never bit-identical; --tolerance N compares them", file=sys.stderr)  # fmt: skip
     elif blocked := sum(not each.attempted for each in episodes):
         print(f"{blocked} of {len(episodes)} episodes crashed or hung their process and were not driven again",
               file=sys.stderr)  # fmt: skip
     elif unchecked:
-        print(f"{unchecked} of {len(episodes)} episodes were scored by hosts of another class: whether they are right "
-              "cannot be checked here to the bit; --tolerance N compares them", file=sys.stderr)  # fmt: skip
+        print(f"{unchecked} of {len(episodes)} episodes were scored by hosts of another class, which "
+              "this host cannot check bit by bit; --tolerance N compares them", file=sys.stderr)  # fmt: skip
     return 0 if False not in agree and True in agree else 1
 
 

@@ -96,7 +96,7 @@ class PolicyStep:
             check_sizes(bundle, POLICY, session, expected)
             sizes = {each.name: each.shape for each in session.get_inputs()}
             if "state" not in sizes:
-                raise BundleError(f"{bundle.path.name} is from before models by configuration: build it again")
+                raise BundleError(f"{bundle.path.name} was built by a version that is too old: build it again")
             self.state_size = int(sizes["state"][1])
             self._run = session.run
         else:

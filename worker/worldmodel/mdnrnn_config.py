@@ -67,7 +67,7 @@ class MDNRNNConfig:
         if self.reward_factor != 1 and self.reward == "none":
             raise UsageError("reward_factor is the weight of a reward head's loss: give another reward than none")
         if (self.done_factor, self.done_weight) != (1, 1) and not self.done:
-            raise UsageError("done_factor and done_weight are of a done head's loss: give done=true")
+            raise UsageError("done_factor and done_weight weight a done head's loss: give done=true")
         if self.reward_scale not in (0, 1):
             check_factors(self, "reward_scale")
             if self.reward != "value":

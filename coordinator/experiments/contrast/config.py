@@ -47,7 +47,7 @@ class Contrast:
             raise UsageError("give --kind NAME FLAGS twice or more: each is compared with the first")
         for name in names:
             if not _NAME.fullmatch(name):
-                raise UsageError(f"--kind {name!r}: a name is of a-z, 0-9 and '-', and begins with a letter")
+                raise UsageError(f"--kind {name!r}: a name has only a-z, 0-9 and '-', and begins with a letter")
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise UsageError(f"--kind {twice[0]} is given twice")
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):

@@ -97,7 +97,7 @@ def describe_difference(kind: str, first: str, figure: str, found: PairedDiffere
 def _reality(found: TrialResult) -> str:
     if found.score is None:
         return "not evaluated"
-    score = format_with_error(found.score, found.error, 0)
+    score = format_with_error(found.score, found.error)
     return f"{score} on {found.tracks}{'' if found.confirmed else ', provisional'}"
 
 

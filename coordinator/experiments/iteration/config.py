@@ -62,7 +62,7 @@ class IterateConfig:
     noise: float = option(0.3, "on the actions of these drives, in halves of an action's range")
     spells: float = option(0.0, "chance of each of their steps that an action which rests, as a brake, is tried")
     drive_steps: int | None = option(None, "steps of a drive at most (default the preset's)")
-    vae: Literal["decoder", "whole", "keep"] = option("decoder", "what of the VAE learns on in later rounds")
+    vae: Literal["decoder", "whole", "keep"] = option("decoder", "the part of the VAE that learns on in later rounds")
     vae_updates: int | None = option(
         None, "updates of the VAE in each later round (default what --vae-flags say, else 1800)"
     )
@@ -110,7 +110,7 @@ class IterateConfig:
         if self.gate_drives == 1 or 0 < self.gate_losses < 4:
             raise UsageError("--gate-drives must be 0 or at least 2, --gate-losses 0 or at least 4")
         if self.subspace and not self.go_on:
-            raise UsageError("--subspace changes a controller that is there: give --go-on too")
+            raise UsageError("--subspace changes an existing controller: give --go-on too")
         if self.views and not self.subspace:
             raise UsageError("--views are beside the features of --subspace: give that too")
         if self.seed > MOST_SEED:

@@ -256,7 +256,7 @@ def find_init(name: str, runs_dir: Path) -> tuple[Controller, Bundle]:
             f"{error}".replace("name it with --bundle FILE", f"put it beside {name}, as {RUN_BUNDLE}")
         ) from error
     if bundle is None:
-        raise UsageError(f"controller {name} sees no world model, and an iteration goes on with one")
+        raise UsageError(f"controller {name} sees no world model, and an iteration needs one")
     return controller, bundle
 
 

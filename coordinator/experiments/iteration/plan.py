@@ -34,7 +34,7 @@ class Phase(NamedTuple):
         known = (INIT,) if number == "0" else ALL
         if not (number.isascii() and number.isdigit() and len(number) < 10 and name in known):
             raise UsageError(
-                f"{text!r} is no phase: write ROUND/PHASE, such as 2/mdnrnn; phases are {', '.join(ALL)}, and 0/init"
+                f"{text!r} is not a phase: write ROUND/PHASE, such as 2/mdnrnn; phases are {', '.join(ALL)}, and 0/init"
             )
         return cls(int(number), name)
 

@@ -49,7 +49,7 @@ def format_score(score: Mapping[str, Any] | None) -> str:
     provisional = "" if score["confirmed"] else ", provisional"
     error = score["error"] if score["episodes"] > 1 else None  # older ledgers have 0 for one track
     episodes = plural(score["episodes"], score.get("word", "track"))
-    return f"{format_with_error(score['mean'], error, 0)} on {episodes}{provisional}"
+    return f"{format_with_error(score['mean'], error)} on {episodes}{provisional}"
 
 
 def describe_rounds(layout: IterationFolder, ledger: IterationLedger) -> list[dict[str, Any]]:

@@ -98,7 +98,7 @@ def test_what_cannot_be_is_refused(bundle, tmp_path):
         write_bundle(tmp_path / "a.zip", replace(bundle.manifest, actions=2), parts)
     for wrong in (None, "x", float("nan"), True):
         manifest = replace(bundle.manifest, models={"mdnrnn": {"reward_scale": wrong}})
-        with pytest.raises(BundleError, match="reward_scale is no finite number"):
+        with pytest.raises(BundleError, match="reward_scale is not a finite number"):
             write_bundle(tmp_path / "a.zip", manifest, parts)
     del parts[DREAM_GRAPH]
     with pytest.raises(BundleError, match=f"no member {DREAM_GRAPH}|not a whole bundle"):

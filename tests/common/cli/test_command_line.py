@@ -143,7 +143,7 @@ def test_a_missing_folder_of_runs_is_an_error_where_it_was_named(tmp_path, monke
     assert command_line.main(["runs", "list"]) == 0
     for place in (tmp_path / "missing", Path("/dev/null")):
         assert command_line.main(["runs", "list", "--runs-dir", str(place)]) == UsageError.exit_code
-        assert f"--runs-dir {place} is no folder" in capsys.readouterr().err
+        assert f"--runs-dir {place} is not a folder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["x" * 5000, "\udcff\udc80", "a\nb\x1b[2J", "a\0b"])

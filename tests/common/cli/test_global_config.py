@@ -74,7 +74,7 @@ def test_quiet_logs_only_warnings():
     [
         ({"DREAMFLEET_CONECT": "tcp/a:1"}, "unknown environment variable DREAMFLEET_CONECT: did you mean DREAMFLEET_C"),
         ({"DREAMFLEET_RUN_DIR": "x", "DREAMFLEET_RUNSDIR": "x"}, "did you mean DREAMFLEET_RUNS_DIR"),
-        ({"DREAMFLEET_CONNECT": "nowhere"}, "write it as tcp/HOST:PORT"),
+        ({"DREAMFLEET_CONNECT": "nowhere"}, "write tcp/HOST:PORT"),
         ({"DREAMFLEET_LOG_LEVEL": "loud"}, "must be one of debug, info, warning, error"),
         ({"DREAMFLEET_CONFIG": "absent.toml"}, "no configuration file at absent.toml"),
     ],

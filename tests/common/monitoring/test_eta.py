@@ -5,7 +5,13 @@ import dataclasses
 import pytest
 
 from dreamfleet.common.monitoring.eta import describe_state, estimate_eta, format_duration
-from dreamfleet.common.monitoring.status import EpisodeProgress, GenerationStatus, Throughput, WorkerCount
+from dreamfleet.common.monitoring.status import (
+    EpisodeProgress,
+    FailureStatus,
+    GenerationStatus,
+    Throughput,
+    WorkerCount,
+)
 from tests.support.samples import BEST, CLOSED, STATUS
 
 WORKER = STATUS.worker_list[0]
@@ -34,6 +40,13 @@ def test_a_paused_generation_does_not_change_the_pace():
 def test_the_open_generations_elapsed_time_counts():
     assert estimate_eta(status({"generations": 9}, gone=1.6)).seconds == pytest.approx(3.0 + 4.6)
     assert estimate_eta(status({"generations": 8}, gone=99.0)).seconds == 0
+
+
+def test_a_failed_job_that_waits_for_its_next_attempt_counts():
+    failure = FailureStatus("7/1", "score", (1,), {"a": "no memory"}, {"a": 3}, retry_in=64.0)
+    evaluation = dataclasses.replace(failure, kind="evaluate")
+    assert estimate_eta(status({"generations": 8}, failures=(failure,))).seconds == pytest.approx(64.0)
+    assert estimate_eta(status({"generations": 8}, failures=(evaluation,))).seconds == pytest.approx(4.6)
 
 
 def test_steps_are_estimated_from_the_rate_of_closed_generations():
@@ -96,7 +109,7 @@ def test_after_losing_workers_the_remaining_speed_counts():
 def test_a_target_score_has_no_estimate():
     eta = estimate_eta(status({"target": 900.0, "parted": 3}, best=BEST))
     assert eta.description == (
-        "until an evaluation reaches 900 (best 120), until 3 evaluations in a row fall behind, 4.6 s a generation"
+        "until an evaluation reaches 900 (best 120.5), until 3 evaluations in a row fall behind, 4.6 s a generation"
     )
     assert eta.seconds is None
 
@@ -134,7 +147,7 @@ def test_unknown_limits_are_ignored(strange):
             {"state": "evaluating", "confirming": EpisodeProgress(3, 1600)},
             "confirming its result: 3 of 1,600 episodes",
         ),
-        ({"state": "waiting for workers"}, "waiting for workers: none of 1 is present"),
+        ({"state": "waiting for workers"}, "waiting for workers: none is present"),
         (
             {"state": "waiting for workers", "workers": WorkerCount(0, 0), "steps": 0},
             "waiting for workers: none has joined yet",
@@ -145,7 +158,7 @@ def test_unknown_limits_are_ignored(strange):
                 "state": "waiting for workers",
                 "worker_list": (dataclasses.replace(WORKER, state="left", reason="no memory"),),
             },
-            f"waiting for workers: none of 1 is present; {WORKER.worker} left 0.3 s ago: no memory",
+            f"waiting for workers: none is present; {WORKER.worker} left 0.3 s ago: no memory",
         ),
         (
             {"state": "waiting for workers", "refused": {"old-host": "no AVX2"}},

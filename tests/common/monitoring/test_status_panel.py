@@ -37,7 +37,9 @@ def test_a_workers_name_is_never_truncated(width):
 def test_the_least_important_lines_are_left_out_first():
     status = dataclasses.replace(STATUS, worker_list=(WORKER,))
     narrow, wide = drawn(status, 80), drawn(status, 160)
-    assert all(column in wide for column in ("slots", "leases", "finished", "load", "picture", "round trip", "resent"))
+    assert all(
+        column in wide for column in ("slots", "assigned", "finished", "load", "picture", "round trip", "resent")
+    )
     assert "state" in narrow
     assert "picture" not in narrow
 
@@ -74,7 +76,7 @@ def test_80_columns_and_24_lines_show_every_part():
     rows = [line for line in lines if line.startswith("a-host")]
     assert len(rows) >= 3
     assert {line.split()[0] for line in rows} <= {each.worker for each in FLEET}
-    assert f"and {40 - len(rows)} more" in lines[-1]
+    assert f"and {40 - len(rows)} more workers" in lines[-1]
 
 
 def test_lost_and_slow_workers_are_shown_first():
@@ -84,7 +86,7 @@ def test_lost_and_slow_workers_are_shown_first():
     assert [line.split("  ")[0] for line in lines[1:4]] == [fleet[number].worker for number in (0, 17, 31)]
     assert "slowest" in lines[3]
     assert "4.6 s" in lines[3]
-    assert lines[4] == "and 38 more"
+    assert lines[4] == "and 38 more workers"
     assert find_slowest(FLEET) is None
 
 
@@ -126,12 +128,22 @@ def test_candidates_are_cells_and_the_best_is_highlighted():
     assert [len(each) for each in candidate_grid(many, 76, 2)] == [76, 74]
 
 
+def test_a_failed_job_says_when_it_is_tried_again():
+    failure = FailureStatus("7/1", "score", (1,), {LONG: "no memory"}, {LONG: 3}, retry_in=64.0)
+    for failed, says in (
+        (failure, "tried again in 1 min"),
+        (dataclasses.replace(failure, retry_in=None), "tried again"),
+    ):
+        text = " ".join(drawn(dataclasses.replace(STATUS, failures=(failed,)), 200).split())
+        assert f"no memory; it is {says} " in text
+
+
 def test_a_failed_candidate_is_no_waiting_one():
     some = Population(7, 0, 4, (2, 0, 0, 1), (2, 0, 2, 2), (1.0, None, None, 2.0))
     (line,) = candidate_grid(some, 80, 1)
     assert line.plain == "█x·▄"
     assert line.spans[1].style == "red"
-    assert "generation 7     3/8 episodes, 1 failed (x), so far 1 to 2" in drawn(
+    assert "generation 7     3/8 episodes, 1 failed (x), so far 1.0 to 2.0" in drawn(
         dataclasses.replace(STATUS, population=some), 100
     )
     none = Population(7, 0, 3, (0, 0, 0), (0, 0, 0), (None, None, None))
@@ -170,7 +182,7 @@ def test_a_curve_has_the_given_height():
 def test_an_ended_run_shows_its_last_generations_candidates():
     text = drawn(dataclasses.replace(STATUS, state="ended", why="7 generations"), 100)
     assert "ended: 7 generations" in text
-    assert "generation 6     8/8 episodes, so far -12 to 140" in text
+    assert "generation 6     8/8 episodes, so far -12.5 to 140.0" in text
 
 
 @pytest.mark.parametrize("width", [30, 80, 200])

@@ -143,10 +143,7 @@ def test_a_difference_under_two_standard_errors_is_not_significant():
     assert PairedDifference(30, 1.0, 0.6).description.endswith("not significant, as it is under two standard errors")
     bounds = [round(PairedDifference(seeds, 0, 1).critical_value, 2) for seeds in (2, 3, 4, 8, 16)]
     assert bounds == [13.97, 4.53, 3.28, 2.43, 2.18]  # t itself: 13.97, 4.53, 3.31, 2.43, 2.18
-    assert (
-        PairedDifference.between(*[JUDGEMENT.results] * 2).description
-        == "the same scores, to the bit, on 3 equal seeds"
-    )
+    assert PairedDifference.between(*[JUDGEMENT.results] * 2).description == "bit-identical scores on 3 equal seeds"
     with pytest.raises(UsageError, match="1 seeds are in both"):
         PairedDifference.between(scored(1, 2).results, scored(1, 2, first=10_001).results)
 
@@ -159,7 +156,7 @@ def test_the_verb_compares_each_report_with_the_first(tmp_path, capsys):
     said = capsys.readouterr().out.splitlines()
     assert len(said) == 5
     assert said[2].endswith("better")
-    assert "to the bit" in said[4]
+    assert "bit-identical" in said[4]
     assert command_line.main(["compare", *map(str, paths), "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["differences"]
     assert [(each["mean"], each["clear"]) for each in rows] == [(10.0, True), (0.0, False)]
@@ -187,7 +184,8 @@ def test_other_differences_than_the_controllers_are_noted(tmp_path, capsys):
     for name, changes in {"a": {}, "b": {"task": "car-racing"}, "c": {"fingerprint": "arm"}}.items():
         (tmp_path / f"{name}.json").write_text(scored(1, 2, **changes).to_json())
     assert command_line.main(["compare", *(str(tmp_path / f"{name}.json") for name in "abc")]) == 0
-    notes = capsys.readouterr().err.splitlines()
+    what, *notes = capsys.readouterr().err.splitlines()
+    assert what == "comparing reports of `evaluate`"
     assert len(notes) == 1, "a dream's controllers are driven in reality too"
     assert "of different fingerprints" in notes[0]
 
@@ -199,7 +197,7 @@ def test_episodes_that_failed_when_they_were_recorded_are_named_and_not_driven_a
     recorded = replace(scored(100, 500), failed=(FailedEpisode(10002, "ValueError: sick"),))
     found = Reproduction(recorded, scored(100, 500))
     assert found.is_reproduced
-    assert found.description.endswith("; 1 episode that failed then not driven again")
+    assert found.description.endswith("; 1 episode that had failed: not driven again")
 
 
 def test_a_single_differing_seed_is_not_reproduced():
@@ -218,12 +216,12 @@ def test_seeds_out_of_range_are_refused_before_the_episodes(verb, words, capsys)
 @pytest.mark.parametrize(
     ("scores", "changes", "holds", "says"),
     [
-        ((100, 500, 900), {}, True, "reproduced: the same 3 scores to the bit"),
-        ((100, 500, 900), ELSEWHERE, True, "though this host is of another fingerprint"),
+        ((100, 500, 900), {}, True, "reproduced: 3 bit-identical scores"),
+        ((100, 500, 900), ELSEWHERE, True, "although this host has another fingerprint"),
         ((100, 500, 900.0001), {}, False, "NOT reproduced: 1 of 3 drives differ (seeds 10002)"),
         ((110, 480, 900), ELSEWHERE, True, "reproduced: mean 496.7"),
         ((110, 511, 909), ELSEWHERE, False, "NOT reproduced: mean 510.0"),
-        ((100, 500), {}, True, "the same 2 scores"),
+        ((100, 500), {}, True, "2 bit-identical scores"),
     ],
 )
 def test_reproduction_is_to_the_bit_on_equal_hosts_and_within_two_standard_errors_elsewhere(

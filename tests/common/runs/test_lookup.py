@@ -35,5 +35,5 @@ def test_a_subspace_is_a_shipped_one_or_a_file(subspace, tmp_path, monkeypatch):
     subspace.save(tmp_path / "few.npz", {})
     assert find_subspace("few.npz").sha256 == subspace.sha256
     (tmp_path / "broken.npz").write_text("rubbish")
-    with pytest.raises(UsageError, match=r"broken\.npz is no subspace"):
+    with pytest.raises(UsageError, match=r"broken\.npz is not a subspace"):
         find_subspace("broken.npz")

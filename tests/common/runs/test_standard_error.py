@@ -46,10 +46,10 @@ def test_a_mean_without_an_error_is_printed_without_one():
     [
         (-3.5, None, "-3.5"),
         (0.1234, 0.0031, "0.123 ± 0.003"),
-        (0.00042, None, "0.0004"),
-        (500.0, 0.0, "500.0 ± 0.0"),
+        (0.00042, None, "0.00042"),
+        (500.0, 0.0, "500.0 ± 0"),
         (-0.01, 2.0, "0.0 ± 2.0"),
-        (-1e-12, None, "0.000000"),
+        (-0.0, None, "0.0"),
     ],
 )
 def test_a_small_score_has_enough_digits_and_a_zero_no_sign(mean, error, text):

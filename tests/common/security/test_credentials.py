@@ -57,7 +57,7 @@ def test_a_join_file_identifies_its_holder_and_repr_hides_secrets(join):
 @pytest.mark.parametrize(
     ("damage", "says"),
     [
-        (lambda text: "", "no join file of this version"),
+        (lambda text: "", "not a join file of this version"),
         (lambda text: "not = [toml", "not TOML"),
         (lambda text: text + "#" * MAX_BYTES, "larger than"),
         (lambda text: text.replace("version = 1", "version = 2"), "of this version"),

@@ -3,8 +3,8 @@ import time
 
 import pytest
 
-from dreamfleet.common.errors import ConnectionFailedError, UsageError
-from dreamfleet.common.transport.session import Network, check_endpoint, open_session
+from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
+from dreamfleet.common.transport.session import Network, check_clock, check_endpoint, open_session
 from tests.support.processes import DEADLINE, free_port
 
 
@@ -15,7 +15,7 @@ def test_good_endpoints(endpoint):
 
 @pytest.mark.parametrize("endpoint", ["", "127.0.0.1:7447", "tcp/host", "tcp/host:99999", "tcp/ host:1", "ftp/host:21"])
 def test_bad_endpoints_are_refused(endpoint):
-    with pytest.raises(UsageError, match="write it as tcp/HOST:PORT"):
+    with pytest.raises(UsageError, match="write tcp/HOST:PORT"):
         Network(listen=(endpoint,))
 
 
@@ -26,7 +26,7 @@ def test_a_port_in_use_is_an_error():
 
 
 def test_no_listener_is_an_error():
-    with pytest.raises(ConnectionFailedError, match="nobody answers at"):
+    with pytest.raises(ConnectionFailedError, match="no one answers at"):
         open_session(Network(connect=(f"tcp/127.0.0.1:{free_port()}",)), timeout=0.2)
 
 
@@ -65,3 +65,10 @@ def test_an_address_that_drops_packets_does_not_block_the_others():
         open_session(Network(connect=(f"tcp/127.0.0.1:{mute.getsockname()[1]}", endpoint))) as session,
     ):
         await_answer(session, endpoint)
+
+
+@pytest.mark.parametrize("seconds", [-1.0, 2.0**32])
+def test_a_clock_that_zenoh_cannot_write_is_an_error_that_says_so(seconds):
+    with pytest.raises(DreamfleetError, match="set the clock"):
+        check_clock(seconds)
+    check_clock(2.0**32 - 1)

@@ -23,7 +23,7 @@ def test_a_profile_agrees_with_its_task(profile):
     assert is_shipped(profile.task)
     assert world.preset == profile.default_training == default_training_preset(profile.task)
     assert PRESETS[profile.default_training].task == profile.task
-    assert profile.demo.word == world.score_word
+    assert profile.score_word == world.score_word
     assert profile.demo.preset in profile.run_presets
 
 

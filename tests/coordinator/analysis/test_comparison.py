@@ -6,6 +6,7 @@ from contextlib import closing
 
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.runs.comparison import ComparedRun, at_equal_budget, difference, differing_settings
+from dreamfleet.common.runs.effort import START_EFFORT
 from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.common.runs.records import StoredConfirmation
 from dreamfleet.common.runs.run_folder import CONFIRMED, RunFolder, open_run
@@ -111,3 +112,13 @@ def test_a_run_is_read_in_one_transaction_while_an_evaluation_closes(runs, monke
         (before,) = sides(runs, "dream")
         (after,) = sides(runs, "dream")
     assert len(after.evaluated_means) == len(before.evaluated_means) + 1
+
+
+def test_what_a_fork_inherited_is_named(runs):
+    with closing(sqlite3.connect(runs / "reality" / "journal.sqlite")) as journal:
+        journal.execute("INSERT INTO run VALUES (?, ?)", (START_EFFORT, '{"driven": 5000, "microseconds": 9000000}'))
+        journal.commit()
+    plain, fork = sides(runs, "dream", "reality")
+    assert fork.spent.endswith("(5k steps in reality, 9 core-seconds of it inherited)")
+    assert fork.total.steps > fork.inherited.steps == 5000
+    assert "inherited" not in plain.spent

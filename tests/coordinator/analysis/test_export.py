@@ -185,3 +185,17 @@ def test_events_onto_a_full_disk_end_with_one_line_and_leave_nothing(runs, tmp_p
         disk.free()
         assert not list(out.iterdir())
         assert command_line.main(words) == 0
+
+
+def test_a_generation_without_a_mean_is_shown_as_a_dash(runs, capsys):
+    with closing(sqlite3.connect(runs / "reality" / "journal.sqlite")) as journal:
+        journal.execute("UPDATE generation SET mean = NULL, std = NULL, best = NULL, worst = NULL WHERE number = 1")
+        journal.commit()
+    words = ["runs", "show", "reality", "--runs-dir", str(runs)]
+    assert command_line.main(words) == 0
+    rows = [line.split("\t") for line in capsys.readouterr().out.splitlines()]
+    shown = {row[0]: row[1:5] for row in rows if len(row) > 5}
+    assert shown["1"] == ["-"] * 4
+    assert "-" not in shown["0"]
+    assert command_line.main([*words, "--json"]) == 0
+    assert [each["mean"] is None for each in json.loads(capsys.readouterr().out)["history"]][:2] == [False, True]

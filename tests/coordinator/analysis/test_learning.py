@@ -3,6 +3,7 @@
 import html
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 
 import pytest
 
@@ -63,8 +64,8 @@ def test_one_run_without_evaluations_is_drawn_by_its_fitness_and_the_file_is_nam
 ):
     monkeypatch.chdir(tmp_path)
     assert command_line.main(["runs", "plot", "hidden", "--runs-dir", str(runs)]) == 0
-    assert capsys.readouterr().out == "fitness.png\n"
-    assert (tmp_path / "fitness.png").read_bytes().startswith(b"\x89PNG")
+    assert capsys.readouterr().out == "hidden-fitness.png\n"
+    assert (tmp_path / "hidden-fitness.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_runs_of_several_worlds_are_drawn_with_a_note_and_short_ones_without_marks(runs, tmp_path, capsys):
@@ -75,8 +76,8 @@ def test_runs_of_several_worlds_are_drawn_with_a_note_and_short_ones_without_mar
     with closing(sqlite3.connect(runs / "reality" / "journal.sqlite")) as journal, journal:
         journal.execute("UPDATE run SET value = replace(value, 'car-racing', 'gym:Other-v0')")
     assert command_line.main(words) == 0
-    assert "note: these runs are of the worlds car-racing, gym:Other-v0" in capsys.readouterr().err
-    assert "car-racing, gym:Other-v0: score of the mean" in html.unescape(out.read_text())
+    assert "note: these runs are in different worlds (car-racing, gym:Other-v0)" in capsys.readouterr().err
+    assert "reality in gym:Other-v0: " in html.unescape(out.read_text())
 
 
 def test_of_several_runs_one_without_evaluations_is_refused(runs, capsys):
@@ -113,7 +114,7 @@ def test_the_verb_draws(runs, tmp_path, capsys, words):
     ("words", "says"),
     [
         (("reality", "--out", "a.gif"), "ends in .png or .svg"),
-        (("reality", "dream", "--fitness"), "--fitness is of one run"),
+        (("reality", "dream", "--fitness"), "--fitness draws one run"),
         (("nowhere",), "no run 'nowhere'"),
     ],
 )
@@ -121,3 +122,18 @@ def test_what_cannot_be_drawn_says_why(runs, capsys, monkeypatch, tmp_path, word
     monkeypatch.chdir(tmp_path)
     assert command_line.main(["runs", "plot", *words, "--runs-dir", str(runs)]) != 0
     assert says in capsys.readouterr().err
+
+
+def test_an_axis_is_logarithmic_only_over_a_decade_and_says_so(tmp_path):
+    for factor, says in ((20, True), (3, False)):
+        points = [Point(Effort(driven=times * 1000, microseconds=10**6), 500.0, 9.0) for times in (1, factor)]
+        curve = replace(CURVE, points=tuple(points), confirmed=None, reported=None)
+        plot_learning([curve], None, tmp_path / "a.svg")
+        text = html.unescape((tmp_path / "a.svg").read_text())
+        assert ("evaluations included (log scale)" in text) == says
+
+
+def test_a_picture_is_named_after_its_runs(runs, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert command_line.main(["runs", "plot", "reality", "dream", "--runs-dir", str(runs)]) == 0
+    assert capsys.readouterr().out == "reality-dream-learning.png\n"

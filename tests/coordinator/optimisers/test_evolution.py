@@ -157,7 +157,7 @@ def test_tell_refuses_what_pycma_would_swallow(fitness):
 def test_a_state_is_not_taken_while_a_population_is_open():
     evolution = Evolution(config())
     evolution.ask()
-    with pytest.raises(AssertionError, match="between tell and ask"):
+    with pytest.raises(AssertionError, match="after an update and before ask"):
         evolution.state()
 
 

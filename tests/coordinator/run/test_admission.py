@@ -173,7 +173,7 @@ def test_a_run_that_is_not_strict_accepts_all_classes_and_records_each_results_c
         counted[A] or class_from_fingerprint("here"),
         counted[B] or class_from_fingerprint("elsewhere"),
     }
-    assert bench.run.classes.description == "mixed: 2 classes, 50.0%, 50.0% of results"
+    assert bench.run.classes.description == "mixed: 2 classes with 50.0%, 50.0% of the results"
     bench.journal.close()
     with RunFolder(bench.path) as folder:
         assert folder.classes == bench.run.classes
@@ -192,7 +192,7 @@ def test_a_journal_without_classes_continues_with_fingerprints(bench):
     before.close()
     with RunFolder(bench.path) as folder:
         assert bench.stored() == {class_from_fingerprint("here")}
-        assert folder.classes.description == "one class, by its fingerprint: to the bit"
+        assert folder.classes.description == "one class (by fingerprint): all results are bit-identical"
     bench.journal = Journal(bench.path / "journal.sqlite")
     bench.begin()
     assert bench.run.admission.host_class == class_from_fingerprint("here")

@@ -357,7 +357,7 @@ def test_a_host_that_was_never_ready_keeps_no_job_from_being_tried_again(tmp_pat
 def test_a_new_host_that_fails_the_proof_pauses_the_run(left):
     left.fails = lambda job: True
     replace_host(left)
-    assert "no host that is here has ever scored" in left.run.paused
+    assert "no present host has ever scored" in left.run.paused
     assert left.run.generation.failed == []
 
 
@@ -388,7 +388,7 @@ def test_a_run_that_nobody_can_score_pauses_before_every_job_was_tried(tmp_path,
             tmp_path / str(tried) / "night", random_bundle.path, settings, fails=lambda job: True, limit=limit
         )
         bench.serve()
-        assert "no host that is here has ever scored" in bench.run.paused
+        assert "no present host has ever scored" in bench.run.paused
         assert (len(bench.run.fleet.jobs.failures) < 80) == (tried < 80)
         assert sum("it is tried again" in each for each in bench.run.take_notes()) == 1
         bench.journal.close()
@@ -509,7 +509,7 @@ def test_an_episode_that_ends_its_worker_counts_as_failed_and_its_company_does_n
     with RunFolder(bench.path) as folder:
         facts = folder.failures()
     assert {each.candidate for each in facts} == {3}
-    assert all("its worker ended without a word" in each.error for each in facts)
+    assert all("its worker was lost" in each.error for each in facts)
     bench.journal.close()
 
 
@@ -526,7 +526,7 @@ def test_a_run_whose_every_episode_ends_its_worker_pauses(tmp_path, random_bundl
     bench = Lethal(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: True)
     bench.new_names = True
     bench.serve(turns=3000)
-    assert "no host that is here has ever scored" in bench.run.paused
+    assert "no present host has ever scored" in bench.run.paused
     bench.journal.close()
 
 

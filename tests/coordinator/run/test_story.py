@@ -34,12 +34,12 @@ def test_comings_failures_pauses_and_lives_are_kept_in_order(bench):
     bench.now += 1
     bench.run.tick(bench.now)
     found = texts(bench)
-    assert "killed" not in "".join(text for _, text in found)
+    assert "was killed, crashed" not in "".join(text for _, text in found)
     expected = [
         (1, "incarnation 1 begins"), (1, "joined"), (1, "paused: by hand"), (1, "resumed"),
         (1, "the coordinator leaves"),
         (2, "incarnation 2 begins"), (2, "candidate 0/1, seed"), (2, "counts as failed"), (2, "ended: 3 generations"),
-        (2, f"worker {A} is gone without a word"),
+        (2, f"worker {A} is lost: it was killed, or its connection was cut"),
     ]  # fmt: skip
     places = [next(i for i, (life, text) in enumerate(found) if life == number and part in text)
               for number, part in expected]  # fmt: skip

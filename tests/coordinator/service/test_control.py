@@ -50,7 +50,7 @@ def test_a_pause_by_hand_does_not_hide_why_the_run_was_paused(bench):
 def test_an_unknown_verb_and_one_for_several_runs_change_nothing(bench):
     unknown, wild = bench.obey("halt"), bench.control.obey(keys.control("*", "stop"), AGAIN, bench.now)
     assert not unknown.accepted
-    assert "'halt' is no control verb of this version; it knows: pause, resume" in unknown.why
+    assert "'halt' is not a control verb of this version; known are pause, resume" in unknown.why
     assert (wild.accepted, wild.again, bench.stopped) == (False, "", False)
     assert "by its own key" in wild.why
 

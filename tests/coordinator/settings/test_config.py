@@ -132,7 +132,7 @@ def test_a_variant_that_says_nothing_leaves_the_words_of_the_first_version(rando
         ({"variant": ("pedals",)}, "--variant 'pedals': write KEY=VALUE, such as pedals=one"),
         ({"variant": ("pedals=one", "pedals=one")}, "a KEY stands there twice"),
         ({"variant": ("time_cost=1",), "task": "dream"}, "time_cost is of candidates that drive"),
-        ({"variant": ("offroad_cost=2",), "task": "dream"}, "a dream knows of no lap and no road"),
+        ({"variant": ("offroad_cost=2",), "task": "dream"}, "a dream has no lap and no road"),
         ({"variant": ("pedals=one",), "task": "tests.support.tasks:Toy"}, "has no variants: car-racing has"),
         ({"task_options": '{"pedals": "one"}'}, "--task-options are of tasks without a world model"),
     ],

@@ -93,7 +93,7 @@ def test_it_is_frozen_by_its_hash_and_a_later_stage_leaves_it(settings):
 @pytest.mark.parametrize(
     ("stages", "why"),
     [
-        ((StageSettings(whole=True),), "stage 1: whole is of a later stage"),
+        ((StageSettings(whole=True),), "stage 1: whole is for a later stage"),
         ((StageSettings(generations=2), StageSettings(whole=True)), "stage 2 leaves the subspace"),
         (
             (StageSettings(generations=2), StageSettings(whole=True, sigma0=0.1, generations=2),

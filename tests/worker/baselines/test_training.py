@@ -122,7 +122,7 @@ def test_flags_change_what_a_preset_says(tmp_path, capsys):
     assert "episode 1: mean" in printed.err
     found = load_config(tmp_path / CHECKPOINT, AgentConfig)
     assert found == replace(LAYERS, picture=96, choices="notebook", heads="softmax")
-    with pytest.raises(DatasetError, match=r"is of another model: picture 96, not 64; choices notebook.*or --new"):
+    with pytest.raises(DatasetError, match=r"belongs to another model: picture 96, not 64; choices notebook.*or --new"):
         call("drqn", "--data", tmp_path, *FLAGS, "--episodes", 3)
     with pytest.raises(
         UsageError, match="random-discrete learns nothing: `dreamfleet evaluate --controller random-discrete`"

@@ -84,7 +84,7 @@ def test_an_action_is_a_vector_that_the_simulator_gets_as_its_own(kind, outputs,
         (f"{pixel_fakes.MODULE}:InTwo-v0", {}, "choose one with --observation: map, screen, render"),
         (f"{pixel_fakes.MODULE}:InTwo-v0", {"observation": "radar"}, "'radar' is no picture"),
         (f"{pixel_fakes.MODULE}:Grey-v0", {"observation": "screen"}, "'screen' is no picture"),
-        (f"{pixel_fakes.MODULE}:Grey-v0", {"crop": "0:49,0:40"}, "0:49,0:40 is no part of a picture of 48 rows"),
+        (f"{pixel_fakes.MODULE}:Grey-v0", {"crop": "0:49,0:40"}, "0:49,0:40 is not within a picture of 48 rows"),
         (f"{pixel_fakes.MODULE}:Grey-v0", {"crop": "0:1,0:1"}, "with at least 8 of each"),
         (f"{pixel_fakes.MODULE}:Grey-v0", {"environment": {"render_mode": "human"}}, "opens a window.*leave it out"),
         ("CartPole-v1", {"observation": "render", "environment": {"wings": 2}}, "takes no such arguments"),
@@ -100,15 +100,15 @@ def test_an_environment_without_such_pictures_is_refused_with_the_reason(name, o
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("{", "are no options of pictures"),
-        ("[]", "are no options of pictures"),
+        ("{", "are not options of pictures"),
+        ("[]", "are not options of pictures"),
         ('{"zoom": 2}', "there is no zoom.*known are environment, observation, crop, size, skip, difference"),
         ('{"size": 32}', "64 or 96 pixels wide, not 32"),
         ('{"skip": 0}', "out of range"),
         ('{"skip": true}', "wrong type"),
         ('{"crop": "1:2"}', "a crop is top:bottom,left:right"),
         ('{"environment": 5}', "wrong type"),
-        ("[" * 100_000, "are no options of pictures"),
+        ("[" * 100_000, "are not options of pictures"),
     ],
 )
 def test_unknown_and_wrong_options_are_refused(text, says):

@@ -102,7 +102,7 @@ def test_what_a_bundle_cannot_do_is_left_out_or_explained(attentive, tmp_path):
     awake = write_bundle(tmp_path / "awake.zip", attentive.manifest, parts)
     page = write_page(InspectionSubject(awake), tmp_path / "awake", SHORT)
     assert Links(page.read_text()).sections == [*LOOKS, "dream"]
-    assert "from before dreams" in page.read_text()
+    assert "is too old to dream" in page.read_text()
 
 
 def test_the_table_has_sizes_and_quality(tmp_path, attentive):

@@ -81,4 +81,4 @@ def test_an_environment_that_is_not_deterministic_has_a_class_of_its_own(fault):
     options = f'{{"environment": {{"fault": "{fault}"}}}}'
     found = Scorer(TaskSpec(ODD, "", 20, 0, ControllerShape(2, 2), options=options)).host_class
     assert found == NON_DETERMINISTIC
-    assert HostClasses.of({(found, "x"): 3}).description.startswith("not deterministic: 100.0% of results")
+    assert HostClasses.of({(found, "x"): 3}).description.startswith("not deterministic: 100.0% of the results")

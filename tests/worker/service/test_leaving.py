@@ -64,7 +64,7 @@ def test_it_says_to_its_coordinator_why_it_leaves(stage, cached):
     made, served = stage.worker()
     hand.ready()
     made.stop()
-    assert hand.beat(lambda beat: beat.reason).reason == "drained after a signal"
+    assert hand.beat(lambda beat: beat.reason).reason == "drained after a stop signal"
     assert served.result(DEADLINE) is None
 
 

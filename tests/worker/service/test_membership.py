@@ -58,6 +58,13 @@ def test_silence_of_a_coordinator_that_owes_an_answer_makes_it_say_hello(hands, 
     assert member.must_rejoin(after + 0.1, hands)
 
 
+def test_a_run_that_its_coordinator_ended_is_over():
+    member = joined()
+    assert not member.run_is_over
+    member.end_run("the run has ended")
+    assert (member.run_is_over, member.find_end(0.0, busy=True)) == (True, "the run has ended")
+
+
 def test_silence_while_jobs_run_means_nothing():
     assert not joined().must_rejoin(1e6, BUSY)
 
@@ -142,7 +149,7 @@ def test_a_worker_that_leaves_with_its_run_gives_up_a_coordinator_only_after_lon
         assert not member.find_end(since + TIMEOUT, busy=True)
         assert not member.find_end(since + TIMEOUT, busy=False), "it waits for a restart although it has nothing"
         assert not member.gives_up(since + TIMEOUT)
-    assert "out of sight" in leaves.find_end(since + TIMEOUT + 0.1, busy=True)
+    assert "no coordinator was reachable" in leaves.find_end(since + TIMEOUT + 0.1, busy=True)
     assert leaves.gives_up(since + TIMEOUT + 0.1)
     assert not stays.find_end(math.inf, busy=False)
     leaves.add_coordinator("second")
@@ -165,7 +172,7 @@ def test_a_drained_worker_names_why():
     for member in (stopped, expired):
         assert member.start_draining_if_due(1.0)
     assert "signal" in stopped.find_end(2.0, busy=False)
-    assert "left when the time" in stopped.find_end(32.0, busy=True)
+    assert "left when --drain-timeout" in stopped.find_end(32.0, busy=True)
     assert "lifetime" in expired.find_end(2.0, busy=False)
 
 

@@ -84,10 +84,10 @@ def save_controller(monkeypatch, name, path):
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("Dark", "this environment (Dark) draws no pictures"),
-        ("Blank", "this environment (Blank) draws no pictures"),
+        ("Dark", "Dark draws no pictures"),
+        ("Blank", "Blank draws no pictures"),
         ("Raising", "the episode of seed 10000 failed: ZeroDivisionError: no light"),
-        ("Plain", "this environment (tests.support.dark_environments:Plain-v0) draws no pictures"),
+        ("Plain", "tests.support.dark_environments:Plain-v0 draws no pictures"),
     ],
 )
 def test_an_environment_that_cannot_be_filmed_ends_with_one_line(processes, tmp_path, monkeypatch, name, says):

@@ -61,10 +61,10 @@ def test_what_ships_and_what_is_no_model_have_no_wrong_weights():
         (npy(np.zeros((0, 2, 32), np.float32)), "with N at least 1"),
         (npy(np.zeros((4, 2, 16), np.float32)), r"\(N, 2, 32\)"),
         (npy(np.full((4, 2, 32), np.nan, np.float32)), "NaN or infinity"),
-        (npy(np.array([object()])), "no array of latents"),
-        (npy(np.zeros(3, np.int64)), "no array of latents"),
-        (b"", "no array of latents"),
-        (npy(np.zeros((4, 2, 32), np.float32))[:-9], "no array of latents"),
+        (npy(np.array([object()])), "not an array of latents"),
+        (npy(np.zeros(3, np.int64)), "not an array of latents"),
+        (b"", "not an array of latents"),
+        (npy(np.zeros((4, 2, 32), np.float32))[:-9], "not an array of latents"),
     ],
 )
 def test_a_dream_begins_at_real_latents(random_bundle, tmp_path, initial, said):
@@ -83,10 +83,10 @@ def test_a_dream_begins_at_real_latents(random_bundle, tmp_path, initial, said):
         (npy(np.zeros((4, 2, 576), np.float16)), r"not \(4, 2, 576\)"),
         (npy(np.full((4, 576), np.nan, np.float16)), "NaN or infinity"),
         (npy(np.full((4, 576), np.inf, np.float16)), "NaN or infinity"),
-        (npy(np.array([object()])), "no array of states"),
-        (npy(np.zeros(576, np.int64)), "no array of states"),
-        (b"", "no array of states"),
-        (npy(np.zeros((4, 576), np.float16))[:-1], "no array of states"),
+        (npy(np.array([object()])), "not an array of states"),
+        (npy(np.zeros(576, np.int64)), "not an array of states"),
+        (b"", "not an array of states"),
+        (npy(np.zeros((4, 576), np.float16))[:-1], "not an array of states"),
     ],
 )
 def test_damaged_recorded_states_are_one_clear_line(random_bundle, tmp_path, recorded, said):

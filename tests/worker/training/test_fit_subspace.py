@@ -115,7 +115,7 @@ def test_views_are_directions_that_predict_the_models_later_state(bundle, drives
 
 
 def test_unpredictable_drives_are_refused(bundle, drives, tmp_path):
-    with pytest.raises(UsageError, match="5 drives of 0 steps that count are too few"):
+    with pytest.raises(UsageError, match="5 drives of 0 counted steps are too few"):
         find_subspace(bundle, [write_drive(tmp_path / "short", number, steps=30) for number in range(5)], ignore)
     always = [write_drive(tmp_path / "always", number, steps=150) for number in range(10)]
     for path in always:
@@ -124,7 +124,7 @@ def test_unpredictable_drives_are_refused(bundle, drives, tmp_path):
         np.savez(path, **{**arrays, "action": np.ones((150, 3), np.float32), "reward": np.ones(150, np.float32)})
     with pytest.raises(UsageError, match="predicts nothing of these 10 drives"):
         find_subspace(bundle, always, ignore)
-    with pytest.raises(UsageError, match=r"4 drives of .* steps that count are too few"):
+    with pytest.raises(UsageError, match=r"4 drives of .* counted steps are too few"):
         find_subspace(bundle, drives[:4], ignore)
     with pytest.raises(DatasetError, match="holds pictures"):
         find_subspace(bundle, [write_drive(tmp_path / "wide", 0, picture=96)], ignore)

@@ -174,7 +174,7 @@ def test_signals_wait_until_a_checkpoint_is_written(data, monkeypatch):
     assert made(data) == ["vae.jsonl", "vae.safetensors"]
 
 
-@pytest.mark.parametrize(("new", "command"), [(False, "the same command goes on"), (True, "command without --new")])
+@pytest.mark.parametrize(("new", "command"), [(False, "the same command continues"), (True, "command without --new")])
 def test_a_second_signal_says_what_is_kept(data, new, command):
     def twice(done, _note):
         if done == 3:
@@ -278,6 +278,6 @@ def test_new_begins_from_a_kept_checkpoint_and_never_from_what_it_replaces(data)
 
 def test_a_stop_of_a_new_training_says_how_to_go_on(data):
     train(data)
-    with pytest.raises(StoppedError, match="the same command without --new goes on"):
+    with pytest.raises(StoppedError, match="the same command without --new continues"):
         train(data, new=True, stop=lambda: True)
     assert load_progress(data / train_vae.CHECKPOINT)["update"] == 0

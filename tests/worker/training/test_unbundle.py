@@ -84,7 +84,7 @@ def test_training_goes_on_from_it_also_with_a_head_more(tmp_path):
     for name, values in load_weights(rnn).items():
         np.testing.assert_allclose(values[: len(before[name])], before[name], atol=1e-6)
     assert load_config(rnn, MDNRNNConfig) == ending
-    with pytest.raises(DatasetError, match="of another model: done True, not False"):
+    with pytest.raises(DatasetError, match="belongs to another model: done True, not False"):
         train_mdnrnn.train_mdnrnn(tmp_path, replace(few, updates=2), lambda *_: None, MEMORY)
 
 
@@ -160,6 +160,6 @@ def test_models_that_are_there_stay(tmp_path, capsys):
     printed = json.loads(capsys.readouterr().out)
     assert printed["bundle"] == Bundle.open(tmp_path / "a.zip").sha256
     before = (tmp_path / "data" / "vae.safetensors").read_bytes()
-    with pytest.raises(UsageError, match="is there already"):
+    with pytest.raises(UsageError, match="exists: choose another"):
         unbundle(Bundle.open(tmp_path / "a.zip"), tmp_path / "data")
     assert (tmp_path / "data" / "vae.safetensors").read_bytes() == before

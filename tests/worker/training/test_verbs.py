@@ -34,7 +34,7 @@ def test_a_flag_says_how_large_pictures_are(tmp_path, capsys):
     call(train, "vae", "--data", str(tmp_path), "--updates", "1", "--set", "picture=96", "channels=2,2,4,4")
     assert load_config(tmp_path / "vae.safetensors", VAEConfig).picture == 96
     assert call(collect, "--data", str(tmp_path), "--episodes", "3", "--picture", "96") == 0
-    assert "0 episodes, 0 frames new; 3 episodes in all" in capsys.readouterr().out
+    assert "0 new episodes with 0 frames; 3 episodes in all" in capsys.readouterr().out
     with pytest.raises(DatasetError, match="or --picture"):
         call(collect, "--data", str(tmp_path), "--episodes", "4")
 
@@ -45,7 +45,7 @@ def test_a_set_that_has_more_than_is_asked_for_is_counted_whole(tmp_path, capsys
     flags = ("--episodes", "4", "--jobs", "1", "--preset", "tiny")
     assert call(collect, "--data", str(tmp_path), *flags) == 0
     printed = capsys.readouterr()
-    assert ": 1 episodes, " in printed.out
+    assert ": 1 new episode with " in printed.out
     assert "5 episodes in all" in printed.out
     assert "5/5" in printed.err
 

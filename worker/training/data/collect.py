@@ -221,7 +221,7 @@ def _check_one_kind(folder: Path, drives: Sequence[Path]) -> None:
     pictures = {name: path for path, (_, name) in kinds.items()}
     if len(pictures) > 1:
         found = " and ".join(f"{name!r} ({path})" for name, path in pictures.items())
-        raise DatasetError(f"a data set's pictures are of one kind, and these are {found}; {REMEDY}")
+        raise DatasetError(f"a data set's pictures must be of one kind, and these are {found}; {REMEDY}")
 
 
 def _check_drive(path: Path) -> int:

@@ -55,7 +55,7 @@ def check_seed(folder: Path, seed: int) -> None:
     own = load_begun(folder).get("seed", seed)
     if own != seed:
         raise UsageError(
-            f"{folder} was begun with --seed {own}, and this is --seed {seed}: give --seed {own} to go on with it, or "
+            f"{folder} was begun with --seed {own}, and this is --seed {seed}: give --seed {own} to continue it, or "
             "another --data"
         )
 
@@ -116,5 +116,5 @@ def explain_write_errors(path: Path) -> Iterator[None]:
         raise DatasetError(
             f"cannot write {path}: {error.strerror}; nothing that was saved before is lost: "
             f"{'make it writable' if error.errno in FORBIDDEN else 'make room there'}, and the same command (without "
-            "--new, where it had that) goes on"
+            "--new, where it had that) continues"
         ) from error

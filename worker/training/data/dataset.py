@@ -233,7 +233,7 @@ def load_steps(path: Path, *latents: str) -> Arrays:
     if not (steps and fits and all(each.shape == () and each.dtype.kind in "bu" for each in flags)):
         raise _damaged(path, DatasetError("its arrays are not of one drive"))
     if not all(arrays[name].dtype.kind == "f" for name in ranks):
-        raise _damaged(path, DatasetError("its actions, rewards or latents are no floats"))
+        raise _damaged(path, DatasetError("its actions, rewards or latents are not floats"))
     steps_of = {name: arrays[name].astype(np.float32, copy=False) for name in ranks}
     if not all(np.isfinite(each).all() for each in steps_of.values()):
         raise _damaged(path, DatasetError("its actions, rewards or latents hold NaN or infinity"))

@@ -26,7 +26,7 @@ class Pilot:
         """`ControllerError` unless its task is the data set's world and its pictures have this preprocessing."""
         if self.controller.bundle != self.bundle.sha256:
             raise ControllerError(
-                f"the controller is of the world model {self.controller.bundle[:12]}..., not of {self.bundle.path}"
+                f"the controller belongs to the world model {self.controller.bundle[:12]}..., not to {self.bundle.path}"
             )
         own, seen = DataWorld.of(self.bundle), self.bundle.manifest.preprocessing
         if (own, seen) != (world, preprocessing):

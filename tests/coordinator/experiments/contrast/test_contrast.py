@@ -39,7 +39,7 @@ def test_kinds_take_turns_and_own_flags_come_last():
     [
         ({"kinds": (("alone", ""),)}, "twice or more"),
         ({"kinds": (("one", ""), ("one", "--hidden 8"))}, "--kind one is given twice"),
-        ({"kinds": (("../up", ""), ("one", ""))}, "a name is of a-z"),
+        ({"kinds": (("../up", ""), ("one", ""))}, "a name has only a-z"),
         ({"kinds": (("one", "--seed 3"), ("two", ""))}, "leave out --seed, which lab contrast sets itself"),
         ({"kinds": (("one", "--hid 'x"), ("two", ""))}, "No closing quotation"),
         ({"mdnrnn_flags": "--data elsewhere"}, "leave out --data"),
@@ -83,7 +83,7 @@ def test_kinds_are_compared_seed_by_seed():
     )
     (plain,) = [each for each in means(outcomes) if (each.kind, each.figure) == ("plain", "score")]
     assert plain.text == "600.0 ± 100.0"
-    assert rows(outcomes)[0]["reality"] == "700 ± 5 on 16"
+    assert rows(outcomes)[0]["reality"] == "700.0 ± 5.0 on 16"
 
 
 def test_one_seed_has_no_error_and_no_difference_and_what_was_not_evaluated_no_score():
@@ -96,4 +96,4 @@ def test_one_seed_has_no_error_and_no_difference_and_what_was_not_evaluated_no_s
 
 def test_a_score_of_one_track_has_no_standard_error():
     (row,) = rows([TrialResult("plain", 1, 10, {}, -80.0, None, 1)])
-    assert row["reality"] == "-80 on 1, provisional"
+    assert row["reality"] == "-80.0 on 1, provisional"

@@ -59,7 +59,7 @@ def test_a_round_whose_evolution_is_finished_gets_no_gate_behind_it():
 
 @pytest.mark.parametrize("text", ["0/vae", "1/init", "0", "-1/init", "x/init"])
 def test_only_what_it_goes_on_from_is_of_round_0(text):
-    with pytest.raises(UsageError, match="is no phase"):
+    with pytest.raises(UsageError, match="is not a phase"):
         Phase.of(text)
 
 
@@ -74,7 +74,7 @@ def test_a_phase_done_again_takes_all_behind_it_along_and_what_was_begun():
 
 @pytest.mark.parametrize("text", ["", "vae", "0/vae", "2/", "2/sleep", "-1/vae", "two/vae", "²/vae"])
 def test_what_is_no_phase_is_refused_with_those_that_there_are(text):
-    with pytest.raises(UsageError, match=r"no phase: write ROUND/PHASE, such as 2/mdnrnn; phases are collect, "):
+    with pytest.raises(UsageError, match=r"not a phase: write ROUND/PHASE, such as 2/mdnrnn; phases are collect, "):
         Phase.of(text)
 
 

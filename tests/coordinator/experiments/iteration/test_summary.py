@@ -32,7 +32,7 @@ SECOND = (
 
 def test_a_row_per_round_has_drives_model_gate_and_score():
     one, two = summary.table_rows(describe_rounds(*FIRST, *SECOND))
-    assert list(one.values()) == [1, 620, 153_000, 0.96, 0.93, None, None, "kept", "812 ± 15 on 32 tracks"]
+    assert list(one.values()) == [1, 620, 153_000, 0.96, 0.93, None, None, "kept", "812.4 ± 15.2 on 32 tracks"]
     assert list(two.values()) == [2, 700, 170_000, 0.96, 0.93, "0.80 ± 0.01", None, "refused", None]
 
 
@@ -40,12 +40,12 @@ def test_a_round_says_whose_model_it_evolved_in():
     rounds = describe_rounds(*FIRST, *SECOND, entry(2, "evolve", score={**SCORE, "mean": 900.0, "confirmed": False}))
     assert [each["evolved_in"] for each in rounds] == [1, 1]
     assert summary.best_round(rounds)["round"] == 2
-    assert summary.format_score(rounds[1]["score"]) == "900 ± 15 on 32 tracks, provisional"
+    assert summary.format_score(rounds[1]["score"]) == "900.0 ± 15.2 on 32 tracks, provisional"
 
 
 def test_a_score_of_one_track_has_no_standard_error():
     single = {**SCORE, "mean": -80.0, "error": 0.0, "episodes": 1, "confirmed": False}
-    assert summary.format_score(single) == "-80 on 1 track, provisional"
+    assert summary.format_score(single) == "-80.0 on 1 track, provisional"
 
 
 def test_a_round_in_its_midst_has_no_model_that_was_kept():
