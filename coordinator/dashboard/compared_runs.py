@@ -55,7 +55,7 @@ def _side(run: RunFolder) -> tuple[ComparedRun, str]:
     try:
         return ComparedRun.of(run), ""
     except BundleError as error:
-        return ComparedRun(run.name, run.settings, None, Effort(), (), None, {}), printable(str(error))
+        return ComparedRun(run.name, run.settings, None, Effort(), Effort(), (), None, {}), printable(str(error))
 
 
 def _pairs(sides: Sides, equal: Sequence[EqualBudget]) -> Iterator[tuple[str, Scores, Scores]]:
@@ -77,7 +77,7 @@ def _difference(of: str, sides: Sides, found: PairedDifference | str, word: str)
         "mean": found.mean,
         "error": found.error,
         "half": found.critical_value * found.error,  # a significant difference is larger
-        "size": format_with_error(found.mean, found.error, sign="+,"),
+        "size": format_with_error(found.mean, found.error, sign="+,") if found.error else f"{found.mean:+g}",
         "on": plural(found.seeds, f"common {word}"),
         "clear": found.is_significant,
         "verdict": _verdict(sides, found),
