@@ -55,7 +55,7 @@ def _side(run: RunFolder) -> tuple[ComparedRun, str]:
     try:
         return ComparedRun.of(run), ""
     except BundleError as error:
-        return ComparedRun(run.name, run.settings, None, Effort(), (), None, {}), printable(str(error))
+        return ComparedRun(run.name, run.settings, None, Effort(), Effort(), (), None, {}), printable(str(error))
 
 
 def _pairs(sides: Sides, equal: Sequence[EqualBudget]) -> Iterator[tuple[str, Scores, Scores]]:
