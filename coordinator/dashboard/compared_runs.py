@@ -77,7 +77,7 @@ def _difference(of: str, sides: Sides, found: PairedDifference | str, word: str)
         "mean": found.mean,
         "error": found.error,
         "half": found.critical_value * found.error,  # a significant difference is larger
-        "size": format_with_error(found.mean, found.error, sign="+,") if found.error else f"{found.mean:+g}",
+        "size": format_with_error(found.mean, found.error, sign="+,"),
         "on": plural(found.seeds, f"common {word}"),
         "clear": found.is_significant,
         "verdict": _verdict(sides, found),
