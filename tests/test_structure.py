@@ -1,9 +1,10 @@
 """The structure that architecture.md describes: what must not grow again."""
 
-from deploy.structure import SIDES, WORLDS, class_names, floors, names_outside_rooms, room_arrows, sources
+from deploy.structure import SIDES, WORLDS, class_names, floors, names_outside_rooms, room_arrows, sources, surface
 from dreamfleet.common.worlds import shipped
 
 MOST_FILES = 20  # in a folder
+MOST_VERBS, MOST_FLAGS = 50, 175  # of the command line; other settings are keys of `--set` and of files
 # Files that name a world outside its rooms. This list may only shrink.
 NAMING_WORLDS = {
     "common/worlds/shipped.py": "the one list of the worlds that ship",
@@ -35,6 +36,12 @@ def test_a_folder_is_read_at_a_glance():
     for path in sources(*SIDES):
         counts[str(path.parent)] = counts.get(str(path.parent), 0) + (path.name != "__init__.py")
     assert max(counts.values()) <= MOST_FILES, counts
+
+
+def test_the_command_line_does_not_grow_again():
+    found = surface()
+    assert found["verbs"] <= MOST_VERBS
+    assert found["distinct_flags"] <= MOST_FLAGS
 
 
 def test_no_world_is_named_outside_its_room():

@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict
+from importlib.metadata import metadata
 from typing import Any
 
 from dreamfleet.common.artifacts.bundle import Bundle
@@ -33,6 +34,8 @@ from dreamfleet.common.runs.times import parse_time
 from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.common.worlds.score_words import score_word_of_run
 
+AUTHORS = "The dreamfleet authors"
+
 
 def citation_facts(run: RunFolder) -> dict[str, Any]:
     """The run and its provenance as JSON values; `ControllerError` before the run has a controller."""
@@ -47,11 +50,20 @@ def citation_facts(run: RunFolder) -> dict[str, Any]:
         "failed_candidates": count_failed(run.history()), "on_failure": settings.on_failure,
         "spent": {**asdict(spent), "core_hours": spent.core_hours},
         "settings": to_dict(settings), "receipt": to_dict(receipt), "commands": _commands(run),
+        "software": software_facts(receipt),
     }  # fmt: skip
 
 
+def software_facts(receipt: RunProvenance) -> dict[str, str]:
+    """The software as a paper cites it: of the version that served the run; `url` where the distribution names one."""
+    about = metadata("dreamfleet")
+    facts = {"title": about["Name"], "authors": AUTHORS, "version": (receipt.versions or {}).get("dreamfleet", "")}
+    pages = [each.partition(", ")[2] for each in about.get_all("Project-URL") or ()]
+    return facts | ({"url": pages[0]} if pages else {})
+
+
 def format_markdown(run: RunFolder) -> str:
-    """The same as Markdown: a list, the commands, and a BibTeX entry."""
+    """The same as Markdown: a list, the commands, and BibTeX entries of the run and the software."""
     controller = Controller.load(run.controller_path)
     receipt, settings = read_run_provenance(controller), read_run_settings(controller)
     lines = [
@@ -162,4 +174,13 @@ def _bibtex(run: RunFolder, controller: Controller, receipt: RunProvenance) -> l
         *([] if begun is None else [f"  year = {{{begun.year}}},"]),
         f"  note = {{run {run.uid}, controller SHA-256 {controller.sha256}, {receipt.generations} generations}}",
         "}",
+        "@misc{dreamfleet,",
+        ",\n".join(f"  {name} = {{{text}}}" for name, text in _software_fields(receipt) if text),
+        "}",
     ]
+
+
+def _software_fields(receipt: RunProvenance) -> Iterator[tuple[str, str]]:
+    """The software's BibTeX fields. Without braces of its own, `authors` would be the authors' family name."""
+    for name, text in software_facts(receipt).items():
+        yield ("author", f"{{{text}}}") if name == "authors" else (name, text)

@@ -1,4 +1,4 @@
-"""Two stored runs compared for the page, by the functions of `dreamfleet runs compare`."""
+"""Two stored runs compared for the page, by the functions of `dreamfleet compare`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from dreamfleet.common.errors import BundleError
 from dreamfleet.common.printable import format_setting, plural, printable
 from dreamfleet.common.runs.comparison import (
     ComparedRun,
@@ -15,8 +16,9 @@ from dreamfleet.common.runs.comparison import (
     difference,
     differing_settings,
 )
+from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.paired_difference import PairedDifference
-from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.score_words import score_word_of_run
 
@@ -26,15 +28,19 @@ Sides = tuple[ComparedRun, ComparedRun]
 def compare_runs(runs_dir: Path, one: str, other: str) -> dict[str, Any]:
     """The settings that differ, and the paired differences `other - one`; none if they are of several worlds.
 
+    `problem` says why a run's scores are unknown, such as a world model that is gone.
+
     `JournalError` or `UsageError` if a run is missing or unreadable.
     """
     with open_run(runs_dir, one) as first, open_run(runs_dir, other) as second:
-        sides = ComparedRun.of(first), ComparedRun.of(second)
+        (base, problem), (other_side, other_problem) = _side(first), _side(second)
+        sides = base, other_side
         word = score_word_of_run(second.spec, second.bundle_path)
     worlds = {each.world for each in sides if each.world is not None}
     equal = at_equal_budget(sides) if len(worlds) == 1 else []
     pairs = _pairs(sides, equal) if len(worlds) == 1 else ()
     return {
+        "problem": problem or other_problem,
         "worlds": sorted(map(printable, worlds)),
         "differences": [_difference(of, sides, difference(*scores), word) for of, *scores in pairs],
         "settings": [
@@ -42,6 +48,14 @@ def compare_runs(runs_dir: Path, one: str, other: str) -> dict[str, Any]:
             for name, values in differing_settings(sides).items()
         ],
     }
+
+
+def _side(run: RunFolder) -> tuple[ComparedRun, str]:
+    """A run, and why its scores are unknown; empty if they are not."""
+    try:
+        return ComparedRun.of(run), ""
+    except BundleError as error:
+        return ComparedRun(run.name, run.settings, None, Effort(), Effort(), (), None, {}), printable(str(error))
 
 
 def _pairs(sides: Sides, equal: Sequence[EqualBudget]) -> Iterator[tuple[str, Scores, Scores]]:

@@ -184,7 +184,7 @@ def _about(run: RunFolder, settings: RunSettings) -> Facts:
         ("task", task),
         *([("world", world)] if world != task else []),
         ("begun", format_time(run.created)),
-        ("ended", format_time(run.ended_at or "") or NONE),
+        *([("ended", format_time(run.ended_at))] if run.ended_at else []),
         ("population", f"{plural(settings.population, 'candidate')}, {plural(settings.episodes, 'episode')} each"),
         ("horizon", f"{settings.task.horizon:,} steps"),
         ("optimiser", describe_optimiser(settings)),

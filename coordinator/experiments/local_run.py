@@ -7,9 +7,10 @@ import re
 import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from random import SystemRandom
 from typing import Any
 
 from dreamfleet.common.cli import model_commands
@@ -25,6 +26,7 @@ from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.coordinator.settings.config import LimitsConfig, RunConfig
 
 START_SECONDS = 180.0  # a coordinator that ends earlier is seen at once; a busy host takes its time
+PORTS = range(20_000, 32_000)
 ANY_ADDRESS = re.compile(r"/(0\.0\.0\.0|\[::\]):")  # an endpoint that listens on all of this host's addresses
 # Flags of `coordinator` that each run of an experiment has its own of, by the names of their values.
 RESERVED = {"run_name": "--run", "source": "--from"} | {
@@ -193,6 +195,9 @@ def parse_run_flags(flags: Sequence[str], sources: Mapping[str, Any], verb: str)
 
 
 def _free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return int(found.getsockname()[1])
+    """A port that is free, below those that connections get: one of them could take it before the coordinator does."""
+    for port in SystemRandom().sample(PORTS, 100):
+        with socket.socket() as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
+    raise DreamfleetError("no port of this host is free: name one with listen")

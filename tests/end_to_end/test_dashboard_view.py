@@ -77,7 +77,7 @@ def test_pictures_come_with_their_facts_while_somebody_sees_them(browser, proces
         assert page.get_attribute(PICTURE, "src").startswith("data:image/jpeg;base64,/9j/")
         assert "the busiest worker" in page.get_attribute(PICTURE, "alt")
         assert facts(page)["worker"].startswith("alpha/")
-        assert {"generation", "seed", "step", "score so far"} <= facts(page).keys()
+        assert {"generation", "step", "score so far"} <= facts(page).keys()
         before = page.get_attribute(PICTURE, "src")
         page.wait_for_function("src => document.querySelector('[data-part=view-picture]').src !== src", arg=before)
         other.goto(started.address)

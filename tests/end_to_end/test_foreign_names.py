@@ -206,7 +206,7 @@ def test_no_verb_imports_what_a_file_names(folder, mark, capfd):
                 assert code == 2, words
                 refused.add(" ".join(words[: 2 if words[0] in ("lab", "verify") else 1]))
     assert refused >= {
-        "coordinator", "drive", "evaluate", "inspect", "lab bench", "lab subspace", "live", "record",
+        "coordinator", "drive", "evaluate", "inspect", "lab bench", "live", "record",
         "verify candidate", "verify report", "verify run",
     }  # fmt: skip
 

@@ -60,9 +60,8 @@ def to_pixels(picture: NDArray[Any]) -> Pixels:
     if picture.dtype != np.uint8:
         levels = np.rint(picture * 255)
         if not ((levels >= 0) & (levels <= 255)).all():  # also NaN
-            raise ValueError(
-                f"a picture of {picture.dtype} has values from 0 to 1, not {picture.min()} to {picture.max()}"
-            )
+            found = "NaN" if np.isnan(picture).any() else f"{picture.min()} to {picture.max()}"
+            raise ValueError(f"a picture of {picture.dtype} has values from 0 to 1, not {found}")
         picture = levels.astype(np.uint8)
     pixels = picture
     pixels = pixels[..., None] if pixels.ndim == 2 else pixels

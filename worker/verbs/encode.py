@@ -33,6 +33,7 @@ def run(args: argparse.Namespace) -> int:
         for done, count in enumerate(encode(args.data), start=1):
             frames += count
             bar.update(done)
+        bar.update(total)  # with those that were encoded before
     also = ", each also mirrored" if encodes_mirrored(args.data) else ""
     print_answer(args, f"{args.data}: {plural(frames, 'frame')} encoded{also}", data=args.data, new_frames=frames)
     return 0

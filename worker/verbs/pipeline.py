@@ -55,7 +55,8 @@ def run(args: argparse.Namespace) -> int:
     flags = (world_flags(vars(args)), args.collect_flags, args.vae_flags, args.mdnrnn_flags, args.bundle_flags)
     source = Pipeline(preset, args.data, args.scale, args.seed, *flags)
     check_modules(("gymnasium", "onnx", "onnxruntime", "safetensors", "torch"))
-    file = ("--config", str(args.config)) if args.config else ()
+    config = getattr(args, "config", None)  # its tables [vae] and [mdnrnn] hold for the stages
+    file = ("--config", str(config)) if config else ()
     stages = source.stages(max(1, args.jobs), args.device, args.out)
     runner = InProcessRunner({name: (*words, *file) for name, words in stages.items()})  # wrong flags end it here
     check_output_path(args.out or source.bundle)

@@ -260,15 +260,16 @@ export const differences = (element, rows, title) =>
   }));
 
 // What hosts did over the run's time, stacked: the largest ones in colours of their own.
-export const stacked = (element, since, width, series, title) =>
+export const stacked = (element, since, width, series, title, { whole = false } = {}) =>
   draw(element, () => {
     const moments = series[0].values.map((_, at) => new Date(1000 * (since + width * (at + 0.5))));
+    const most = Math.max(1, ...moments.map((_, at) => series.reduce((sum, { values }) => sum + values[at], 0)));
     return {
       traces: series.map(({ name, ink, values }) => ({
         type: "scatter", mode: "lines", x: moments, y: values, name, stackgroup: "hosts", line: { width: 0.5, color: colour(ink), shape: "hvh" },
         fillcolor: rgba(ink, 0.65), hovertemplate: "%{y:.3~s}",
       })),
       keys: series.map(({ name, ink }) => ({ kind: "area", ink, name })),
-      shape: { xaxis: axis({ type: "date" }), yaxis: axis({ rangemode: "tozero" }), annotations: [heading(title)] },
+      shape: { xaxis: axis({ type: "date" }), yaxis: axis({ rangemode: "tozero", ...(whole && { dtick: Math.ceil(most / 6) }) }), annotations: [heading(title)] },
     };
   });

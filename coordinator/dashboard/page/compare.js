@@ -8,7 +8,7 @@ export const show = guarded(async (current, one, other) => {
   const address = (name) => encodeURIComponent(name);
   const [runs, compared, listed] = await Promise.all([
     Promise.all([one, other].map((name) => ask(`runs/${address(name)}`))),
-    ask(`compare/${address(one)}/${address(other)}`).catch((error) => ({ worlds: [], differences: [], settings: null, error: error.message })),
+    ask(`compare/${address(one)}/${address(other)}`),
     ask("runs"),
   ]);
   if (!current()) return;
@@ -26,10 +26,10 @@ export const show = guarded(async (current, one, other) => {
   fillSides(page, runs, compared);
 });
 
-const fillDifferences = (page, runs, { worlds, differences, error }) => {
+const fillDifferences = (page, runs, { worlds, differences, problem }) => {
   const [first, second] = runs.map((each) => each.run);
   const known = differences.filter((each) => each.mean !== undefined);
-  const why = error ? `The two cannot be paired: ${error}` : worlds.length > 1
+  const why = problem ? `The two cannot be paired: ${problem}.` : worlds.length > 1
     ? `The evaluations are of the worlds ${worlds.join(" and ")}, so no difference is taken.`
     : "A difference is taken once both runs have evaluated means.";
   page["paired-table"].hidden = !differences.length;
@@ -93,10 +93,9 @@ const fillSides = (page, runs, { settings }) => {
   const tables = runs.map((each) => new Map([...each.facts, ...each.outcome]));
   const rows = [...new Set(tables.flatMap((each) => [...each.keys()]))];
   page.sides.replaceChildren(...rows.map((name) => sideRow(name, tables.map((each) => each.get(name) ?? "-"))));
-  page.differ.replaceChildren(...(settings ?? []).map(([name, ...values]) => sideRow(name, values)));
-  page["differ-table"].hidden = !settings?.length;
-  page.same.hidden = settings?.length > 0;
-  say(page.same, settings ? "None: these two have the same settings." : "They cannot be told apart here.");
+  page.differ.replaceChildren(...settings.map(([name, ...values]) => sideRow(name, values)));
+  page["differ-table"].hidden = !settings.length;
+  page.same.hidden = settings.length > 0;
 };
 
 const sideRow = (name, values) => {

@@ -12,8 +12,12 @@ export const open = (name) => {
   return parts(root);
 };
 
+// The text node is kept where there is one: thousands of figures change each second.
 export const say = (element, text) => {
-  if (element.textContent !== text) element.textContent = text;
+  const node = element.firstChild;
+  if (node?.nodeType === Node.TEXT_NODE && node === element.lastChild) {
+    if (node.data !== text) node.data = text;
+  } else if (element.textContent !== text) element.textContent = text;
 };
 
 export const make = (tag, text = "", attributes = {}) => {

@@ -52,12 +52,12 @@ const fillPage = (page, found) => {
   charts.stacked(page.rate, since, width, series("rate"), "steps/s by host");
   const there = found.events.length > 0;
   charts.placeholder(page.workers, there ? "" : "This journal names no arrivals: an older version wrote it.");
-  if (there) charts.stacked(page.workers, since, width, series("workers"), "workers present, by host");
+  if (there) charts.stacked(page.workers, since, width, series("workers"), "workers present, by host", { whole: true });
   page.rate.setAttribute("aria-label", `Steps a second of ${count(hosts.length, "host")}; the table below has the sums`);
   page.workers.setAttribute("aria-label", `Workers present of ${count(hosts.length, "host")}; the table below has their stays`);
   say(page.method, `Each point is ${short(width)} s. The journal keeps no moment of a result, so it counts evenly over the time that its generation took. It keeps no number of slots: "slots at work" is the slot time of accepted results in the time that the host was there.`);
   fillTable(page, found);
-  page["no-events"].hidden = found.events.length > 0;
+  page.came.hidden = !there;
   fill(page.events, found.events, () => {
     const each = make("li");
     each.append(make("time"), make("span"));

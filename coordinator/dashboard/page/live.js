@@ -12,10 +12,13 @@ const COLUMNS = [
   ["state", "state"], ["slots", "slots"], ["rate", "steps/s"], ["leases", "leases"], ["finished", "finished"],
   ["load", "load"], ["heard", "last seen"], ["picture", "picture"],
 ];
+const MANY = 100; // workers from which on those out of sight are filled anew only every fifth time, which saves half the work
 const LEFT = new Set(["state", "picture"]);
 
 let page = null; // the parts, once they stand
 let curves = null;
+let sight = null; // an observer of rows: which are seen
+let turns = 0; // frames that filled the table of workers
 let absent = null; // the run that was asked for, or "" for any, while none is live
 
 export const show = () => {
@@ -23,6 +26,10 @@ export const show = () => {
   page.body.hidden = page.tiles.hidden = true;
   view.show(page);
   curves = absent = null;
+  sight?.disconnect();
+  sight = new IntersectionObserver((seen) => {
+    for (const each of seen) each.target.inSight = each.isIntersecting;
+  });
   say(page.run, "dreamfleet");
   say(page.sentence, "Asking the coordinator…");
   page.state.hidden = true;
@@ -192,13 +199,27 @@ const fillWorkers = (frame) => {
   page["no-workers"].hidden = count > 0;
   say(page["worker-command"], `dreamfleet worker --run ${frame.run} --connect tcp/COORDINATOR:7447`);
   const fleet = page.workers;
-  while (fleet.children.length > count) fleet.lastElementChild.remove();
+  while (fleet.children.length > count) {
+    sight.unobserve(fleet.lastElementChild);
+    fleet.lastElementChild.remove();
+  }
+  const all = count < MANY || turns % 5 === 0;
+  turns += 1;
   let before = "";
   const inks = laneInks(); // read once: between changes of the page each reading would cost a layout of it
   for (let index = 0; index < count; index += 1) {
-    if (!fleet.children[index]) fleet.append(workerRow());
+    if (!fleet.children[index]) {
+      fleet.append(workerRow());
+      sight.observe(fleet.lastElementChild);
+    }
     const row = fleet.children[index];
     const [host, life] = split(workers.worker[index]);
+    const who = `${workers.worker[index]} ${workers.state[index]}`;
+    if (!all && !row.inSight && row.who === who) {
+      before = host;
+      continue;
+    }
+    row.who = who;
     row.dataset.state = workers.state[index];
     row.classList.toggle("same", host === before);
     before = host;
@@ -269,5 +290,6 @@ export const redraw = () => {
 
 export const leave = () => {
   view.leave();
+  sight?.disconnect();
   page = null;
 };

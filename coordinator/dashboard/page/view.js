@@ -162,7 +162,7 @@ const draw = ({ facts: named, jpeg }) => {
 
 const rows = ({ worker, kind, generation, candidate, seed, step, score }) => {
   const found = [["worker", worker], ["drive of", worker ? (KINDS[kind] ?? kind) : "a mean, here"],
-    ["generation", generation], ["candidate", kind === "score" ? candidate : null], [word, seed], ["step", step],
+    ["generation", generation], ["candidate", kind === "score" ? candidate : null], [kind === "score" ? "seed" : word, seed], ["step", step],
     ["score so far", score?.toFixed(1)], ["speed", speed(worker, step)]];
   return found.filter(([, value]) => value !== null && value !== undefined).map(([name, value]) => [name, String(value)]);
 };

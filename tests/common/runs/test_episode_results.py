@@ -184,7 +184,8 @@ def test_other_differences_than_the_controllers_are_noted(tmp_path, capsys):
     for name, changes in {"a": {}, "b": {"task": "car-racing"}, "c": {"fingerprint": "arm"}}.items():
         (tmp_path / f"{name}.json").write_text(scored(1, 2, **changes).to_json())
     assert command_line.main(["compare", *(str(tmp_path / f"{name}.json") for name in "abc")]) == 0
-    notes = capsys.readouterr().err.splitlines()
+    what, *notes = capsys.readouterr().err.splitlines()
+    assert what == "comparing reports of `evaluate`"
     assert len(notes) == 1, "a dream's controllers are driven in reality too"
     assert "of different fingerprints" in notes[0]
 

@@ -9,9 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC
-from dreamfleet.common.runs.run_paths import JOURNAL
+from dreamfleet.common.runs.effort import Effort
+from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL
+from dreamfleet.common.runs.run_provenance import RECEIPT, RunProvenance
+from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.coordinator.storage.journal import Journal
 
 RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
@@ -65,6 +69,17 @@ def test_receipt_and_comparison_count_the_same_effort(change, printed, tmp_path)
     spent = json.loads(printed("receipt", "reality", "--json"))["spent"]
     assert spent == json.loads(printed("compare", "reality", "other", "--json"))["runs"][0]["effort"]
     assert "with the results of the open generation" in printed("receipt", "reality")
+
+
+def test_it_cites_the_software_in_the_version_that_served_the_run(change, printed, tmp_path):
+    run = tmp_path / "runs" / "reality"
+    found = Controller.load(run / CONTROLLER)
+    found.provenance[RECEIPT] = to_dict(RunProvenance(3, Effort(), versions={"dreamfleet": "0.0.7"}))
+    found.save(run / CONTROLLER)
+    said, facts = printed("receipt", "reality"), json.loads(printed("receipt", "reality", "--json"))
+    assert facts["software"] == {"title": "dreamfleet", "authors": "The dreamfleet authors", "version": "0.0.7"}
+    entry = ["@misc{dreamfleet,", "  title = {dreamfleet},", "  author = {{The dreamfleet authors}},"]
+    assert "\n".join([*entry, "  version = {0.0.7}", "}"]) in said
 
 
 @pytest.mark.slow

@@ -134,11 +134,13 @@ def test_two_runs_are_compared_as_by_the_verb(runs):
     found = client.get("/compare/reality/again").json()
     assert found["settings"] == []
     assert [each["of"] for each in found["differences"]] == ["at equal steps in reality", "at equal core-hours"]
-    assert {(each["size"], each["verdict"]) for each in found["differences"]} == {
-        ("+0.0 ± 0.0", "bit-identical scores")
-    }
+    assert {(each["size"], each["verdict"]) for each in found["differences"]} == {("+0.0 ± 0", "bit-identical scores")}
     assert found["differences"][0]["on"].endswith("common tracks")
     assert client.get("/compare/reality/nothing").status_code == 404
+    lacking = client.get("/compare/reality/dream").json()
+    assert "no bundle" in lacking["problem"], "its world is unknown"
+    assert lacking["differences"] == []
+    assert ["seed", "11", "12"] in lacking["settings"]
 
 
 def test_hosts_are_those_of_the_journal(runs):

@@ -1,0 +1,42 @@
+"""The commands of pages name verbs and flags that are there, by the reference that is written from the parsers."""
+
+import re
+import shlex
+
+import pytest
+
+from tests.support.processes import ROOT
+
+PARTS = ("README.md", "CONTRIBUTING.md", "docs/tutorials/*.md", "docs/how-to/*.md", "docs/explanation/*.md")
+PAGES = sorted(path for part in PARTS for path in ROOT.glob(part))
+GROUPS = ("access", "baseline", "lab", "runs", "verify")
+VERBS, SETTINGS = ((ROOT / "docs" / "reference" / name).read_text() for name in ("verbs.md", "settings.md"))
+EVERY, *_ = VERBS.partition("\n## ")  # flags of every verb
+FLAGS = dict(re.findall(r"^### (.+?)\n(.*?)(?=^##|\Z)", VERBS, re.MULTILINE | re.DOTALL))
+
+
+def commands(page):
+    """The words of each `dreamfleet` line in a page's shell blocks, but for the program and `&`."""
+    for block in re.findall(r"^ *```sh\n(.*?)^ *```", page.read_text(), re.MULTILINE | re.DOTALL):
+        for line in block.replace("\\\n", " ").splitlines():
+            if line.lstrip().startswith("dreamfleet "):
+                yield [word for word in shlex.split(line, comments=True)[1:] if word != "&"]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_a_pages_commands_are_there(page):
+    wrong = []
+    for words in commands(page):
+        verb = " ".join(words[: 2 if words[0] in GROUPS else 1])
+        known = f"{EVERY}{FLAGS.get(verb, '')}"
+        # a text of several flags, as for `--run-flags "--a 1"`, is another verb's
+        flags = [
+            word.partition("=")[0] for word in words if word.startswith("--") and " " not in word.partition("=")[0]
+        ]
+        wrong += [verb] * (verb not in FLAGS and verb != "VERB")
+        wrong += [
+            f"{verb} {flag}"
+            for flag in flags
+            if not re.search(rf"{re.escape(flag)}\b", known) and f"`{flag[2:].replace('-', '_')}`" not in SETTINGS
+        ]
+    assert wrong == [], "docs/reference/verbs.md has the verbs and their flags"
