@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from dreamfleet.common.transport.network import Network
 
 T = TypeVar("T")
-SUMMARY = "show a run's status: generation, population, best, workers, throughput, waste"
+SUMMARY = "show a run's status: generation, population, best, workers, throughput, redundant work"
 EXTRAS = ()
 REFRESH = 0.5  # seconds
 
