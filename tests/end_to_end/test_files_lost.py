@@ -11,6 +11,7 @@ from contextlib import closing
 import pytest
 
 from dreamfleet.common.errors import write_error
+from dreamfleet.common.printable import format_number
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
 from tests.support.processes import DEADLINE, environment, free_port
@@ -55,7 +56,7 @@ def goes_on(processes, coordinator, said, name="test"):
         _, err = again.communicate(timeout=DEADLINE)
         assert again.returncode == 0, err
     with open_run(processes.runs, name) as run:
-        history = [(each.number, f"{each.mean:.1f}") for each in run.history()]
+        history = [(each.number, format_number(each.mean)) for each in run.history()]
     lines = [line for line in coordinator.lines if ": mean" in line]
     for line, (number, mean) in zip(lines, history, strict=False):
         assert f"generation {number}: mean {mean}," in line

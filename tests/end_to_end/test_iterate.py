@@ -195,7 +195,7 @@ def test_a_driver_that_cannot_be_fitted_leaves_losses_unmeasured(tmp_path):
     figures = gate(layout, ignorant.path, drives=lost_drives, gate_drives=0, gate_losses=4)
     assert figures["kept"]
     assert figures["why"] == "kept: nothing was measured of both"
-    assert "none of the 2 drives keeps to its road" in layout.gate_file(2).read_text()
+    assert "none of the 2 drives stays on its road" in layout.gate_file(2).read_text()
     assert not layout.refitted(2).exists()
 
 
@@ -292,7 +292,7 @@ def test_until_it_has_what_it_goes_on_from_flags_may_be_mended(processes, pilot)
     root = processes.folder / "data"
     wrong = ("--mdnrnn-flags", "--latent 4 --hidden 5", "--vae-flags", "--latent 4 --channels 2 2 2 2")
     code, _, err = processes.call("iterate", "--data", root, "--init", pilot, *wrong)
-    assert (code, "of another model: hidden 4, not 5" in err) == (1, True), err
+    assert (code, "to another model: hidden 4, not 5" in err) == (1, True), err
     code, _, err = processes.call("iterate", "--data", root, "--mdnrnn-flags", "--latent 4 --hidden 4 --nonsense 3")
     assert "begun with" not in err
     assert "nonsense" in err
@@ -317,8 +317,8 @@ def test_a_controller_that_cannot_be_fitted_is_refused_at_once(processes, pilot)
     [
         (("--init", "absent.npz"), "no controller 'absent.npz'"),
         (("--init", "tiny", "--go-on", "--run-flags", "--generations 1 --features z"), "has 867 parameters"),
-        (("--init", "tiny", "--mdnrnn-flags", "--hidden 8"), "0/init: .*of another model: hidden 256, not 8"),
-        (("--init", "tiny", "--preset", "article", "--vae", "whole"), "0/init: .*of another model: channels"),
+        (("--init", "tiny", "--mdnrnn-flags", "--hidden 8"), "0/init: .*to another model: hidden 256, not 8"),
+        (("--init", "tiny", "--preset", "article", "--vae", "whole"), "0/init: .*to another model: channels"),
     ],
 )
 def test_what_cannot_be_gone_on_from_is_refused_before_anything_is_driven(processes, flags, said):

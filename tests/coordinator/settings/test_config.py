@@ -81,8 +81,8 @@ def test_a_share_of_recorded_states_is_frozen_with_a_dream_and_can_be_configured
     [
         ({"task": "dream", "recorded": -0.1}, "--recorded must be from 0 to 1, not -0.1"),
         ({"task": "dream", "recorded": 1.5}, "--recorded must be from 0 to 1, not 1.5"),
-        ({"recorded": 0.5}, "--recorded is of task dream, not of car-racing: leave it out, or say 0"),
-        ({"task": "gym:CartPole-v1", "recorded": 0.5}, "--recorded is of task dream, not of gym:CartPole-v1"),
+        ({"recorded": 0.5}, "--recorded needs task dream, not car-racing: leave it out, or pass 0"),
+        ({"task": "gym:CartPole-v1", "recorded": 0.5}, "--recorded needs task dream, not gym:CartPole-v1"),
         ({"task": "dream", "recorded": 0.5}, "holds no recorded states that dreams could begin at: build it again"),
     ],
 )
@@ -131,7 +131,7 @@ def test_a_variant_that_says_nothing_leaves_the_words_of_the_first_version(rando
         ({"variant": ("pedals=three",)}, "pedals must be two, half or one, not 'three'"),
         ({"variant": ("pedals",)}, "--variant 'pedals': write KEY=VALUE, such as pedals=one"),
         ({"variant": ("pedals=one", "pedals=one")}, "a KEY stands there twice"),
-        ({"variant": ("time_cost=1",), "task": "dream"}, "time_cost is of candidates that drive"),
+        ({"variant": ("time_cost=1",), "task": "dream"}, "time_cost needs candidates that drive"),
         ({"variant": ("offroad_cost=2",), "task": "dream"}, "a dream has no lap and no road"),
         ({"variant": ("pedals=one",), "task": "tests.support.tasks:Toy"}, "has no variants: car-racing has"),
         ({"task_options": '{"pedals": "one"}'}, "--task-options are of tasks without a world model"),

@@ -173,7 +173,7 @@ def test_a_share_that_is_driven_stays_a_share_whatever_the_episodes(settings):
 @pytest.mark.parametrize(
     ("flags", "says"),
     [
-        ({"driven": 0.5}, "--driven is of task dream, not of car-racing"),
+        ({"driven": 0.5}, "--driven needs task dream, not car-racing"),
         ({"task": "dream", "driven": 1.5}, "--driven must be from 0 to 1, not 1.5"),
         ({"task": "dream", "driven": float("nan")}, "--driven must be from 0 to 1, not nan"),
         ({"task": "dream", "driven": 0.1, "episodes": 4}, "--driven 0.1 of 4 episodes is none of them, or all"),

@@ -153,7 +153,7 @@ def test_the_status_says_which_stage_it_is_and_what_counts_there(staged):
     shown = console.file.getvalue()
     assert "4 of 4, since generation 10" in shown
     assert "600 steps" in shown
-    assert "8 x 2" in shown
+    assert "8 candidates x 2 episodes" in shown
 
 
 def test_a_search_that_begins_anew_begins_at_the_mean_and_draws_other_numbers(staged):

@@ -105,7 +105,7 @@ def test_a_gymnasium_environment_is_scored_with_a_world_model_of_its_own(tmp_pat
         ({"variant": ("decide_every=0",)}, "decide_every must be a whole number from 1 to 50"),
         ({"task": "dream", "end": "soon"}, "a dream ends at a probability from 0 to 1, or 'drawn', not 'soon'"),
         ({"task": "dream", "end": "1.5"}, "a dream ends at a probability from 0 to 1"),
-        ({"end": "drawn"}, "--end is of task dream, not of the world that it dreams of: leave it out, or say ''"),
+        ({"end": "drawn"}, "--end needs task dream, not the world that it dreams of: leave it out, or pass ''"),
     ],
 )
 def test_what_the_world_does_not_have_is_refused(bundle, flags, says):

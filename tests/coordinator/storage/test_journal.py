@@ -56,7 +56,7 @@ def test_a_candidate_that_was_drawn_anew_and_does_not_exist_is_damage(journal, f
     with sqlite3.connect(folder / "journal.sqlite") as other:
         other.execute("INSERT INTO redraw VALUES (1, 0, ?, x'00')", (candidate,))
     other.close()
-    with pytest.raises(JournalError, match=r"is damaged: .* drawn anew; restore it from a copy"):
+    with pytest.raises(JournalError, match=r"is damaged: .* redrawn; restore it from a copy"):
         journal.last_generation()
 
 

@@ -118,7 +118,7 @@ def test_it_follows_its_run_to_another_name_with_its_results(stage, said, cached
     hand.leave()
     again = stage.also(hand, tasks.SLOW_TOY, run="test-rescued")
     again.nonce, again.incarnation = SECOND, 2
-    wait_for(said, "run test goes on under the name test-rescued")
+    wait_for(said, "run test continues under the name test-rescued")
     again.hello()
     assert again.results(done, running) == {done.digest, running.digest}
     again.next(Heartbeat)  # it listens under this name

@@ -106,4 +106,4 @@ def test_a_bar_that_uncertain_ends_may_never_reach_is_warned_of(caplog):
         warn_of_unsure_ends(rule, quality)
     assert not caplog.records
     warn_of_unsure_ends(EndRule(), {"done_auc": 0.708})
-    assert "(area under the curve 0.71, 0.5 is chance): dreams that end above 0.5 may go on for ever" in caplog.text
+    assert "(area under the curve 0.71, 0.5 is chance). Dreams that end above 0.5 may never end" in caplog.text

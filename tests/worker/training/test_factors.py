@@ -121,7 +121,7 @@ def test_at_one_nothing_is_written_and_files_from_before_factors_open(trained, t
 
 
 def test_a_training_goes_on_under_its_own_factors_only(trained):
-    with pytest.raises(DatasetError, match=r"of another model: error_factor 1\.0, not 4\.0; .*same flags"):
+    with pytest.raises(DatasetError, match=r"to another model: error_factor 1\.0, not 4\.0; .*same flags"):
         train_vae.train_vae(trained, SHORT, ignore, replace(LAYERS, error_factor=4.0))
     with pytest.raises(DatasetError, match=r"z_factor 1\.0, not 2\.0"):
         train_mdnrnn.train_mdnrnn(trained, SHORT, ignore, replace(RNN, z_factor=2.0))

@@ -110,7 +110,7 @@ def test_a_decoder_alone_needs_an_encoder(encoded, tmp_path):
 
 def test_a_checkpoint_keeps_its_layers_and_refuses_others(encoded):
     assert load_config(encoded / train_vae.CHECKPOINT, VAEConfig) == LAYERS
-    with pytest.raises(DatasetError, match=r"of another model: latent 4, not 5; .*same flags"):
+    with pytest.raises(DatasetError, match=r"to another model: latent 4, not 5; .*same flags"):
         train_vae.train_vae(encoded, SHORT, ignore, replace(LAYERS, latent=5))
 
 
@@ -136,10 +136,10 @@ def test_a_done_head_can_be_added_to_a_trained_mdnrnn(encoded, tmp_path):
     assert all(state["exp_avg"].shape == shapes[index] for index, state in moments.items())
     ending = replace(SMALL, done=True, lost=3)
     train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, ending, continue_from=before)
-    with pytest.raises(DatasetError, match="of another model: lost 3, not 5"):
+    with pytest.raises(DatasetError, match="to another model: lost 3, not 5"):
         load_checkpoint(checkpoint, MDNRNN(replace(ending, lost=5)), None, ADDABLE_HEADS)
     other = checkpoint.rename(tmp_path / "ending.safetensors")
-    with pytest.raises(DatasetError, match="of another model: done True, not False; lost 3, not 0"):
+    with pytest.raises(DatasetError, match="to another model: done True, not False; lost 3, not 0"):
         train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, SMALL, continue_from=other)
 
 

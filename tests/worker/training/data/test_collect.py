@@ -181,7 +181,7 @@ def test_controllers_drive_in_turn_under_noise_as_a_function_of_seed_and_number(
 
 
 def test_a_controller_of_another_model_or_other_pictures_drives_for_no_data_set(pilot, random_bundle, tmp_path):
-    with pytest.raises(ControllerError, match=r"belongs to the world model .*, not of .*random\.zip"):
+    with pytest.raises(ControllerError, match=r"belongs to the world model .*, not to .*random\.zip"):
         list(collect(tmp_path, TINY, 1, (Pilot(pilot.controller, random_bundle),)))
     with pytest.raises(ControllerError, match=r"sees 'box-64' .* holds 'raw-96' .*: choose another --picture"):
         list(collect(tmp_path, replace(TINY, picture=96), 1, (pilot,)))
