@@ -17,7 +17,7 @@ SHARES = {
 @pytest.mark.timeout(WHOLE + 60)
 def test_its_commands_work_as_they_stand(tmp_path):
     printed = run_tutorial("own-environment.md", "my_drone.py", SHARES, tmp_path)
-    for made in ("runs/drone/controller.npz", "runs/hidden/controller.npz", "learning.png", "drive.mp4"):
+    for made in ("runs/drone/controller.npz", "runs/hidden/controller.npz", "drone-learning.png", "drive.mp4"):
         assert (tmp_path / made).exists()
     assert "6 observations, 2 outputs" in printed
     assert "equal seeds\tgive equal episodes" in printed

@@ -16,6 +16,7 @@ SETTINGS = {
     "channels": 2, "kernels": 8, "strides": 8, "hidden": 4, "steps": 60, "random_episodes": 2, "batch": 2,
     "learn_every": 2, "report_every": 1, "replay": 100, "episodes": EPISODES,
 }  # fmt: skip
+FLAGS = ("steps", "episodes")
 
 
 def finish(folder):
@@ -33,8 +34,9 @@ def state(folder):
 
 @pytest.mark.slow
 def test_a_training_that_was_interrupted_and_killed_goes_on_to_the_same_bits(processes, tmp_path):
-    flags = (word for name, value in SETTINGS.items() for word in ("--" + name.replace("_", "-"), value))
-    words = ("baseline", "train", "drqn", "--data", tmp_path / "broken", *flags)
+    settings = (f"{name}={value}" for name, value in SETTINGS.items() if name not in FLAGS)
+    flags = (word for name in FLAGS for word in (f"--{name}", SETTINGS[name]))
+    words = ("baseline", "train", "drqn", "--data", tmp_path / "broken", *flags, "--set", *settings)
     first = processes.start(*words)
     first.wait_for("episode 3:")
     os.killpg(first.popen.pid, signal.SIGINT)

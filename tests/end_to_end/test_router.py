@@ -73,7 +73,7 @@ def test_two_linked_routers_one_of_which_is_killed_cost_no_bit(processes, recipe
     assert coordinator.finish()[0] == 0
     linked.popen.send_signal(signal.SIGTERM)
     assert linked.finish()[0] == 0
-    assert "1 routers" in linked.lines[-1]
+    assert "1 router" in linked.lines[-1]
     assert fitness(processes, "far") == alone
 
 
