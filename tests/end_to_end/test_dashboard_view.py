@@ -63,6 +63,14 @@ def choose(page, kind):
     page.select_option(WHOM, option.get_attribute("value"))
 
 
+def look(page):
+    """Keep the view in sight, while charts above it take their places, until it shows a picture."""
+    page.wait_for_function(
+        "picture => { document.querySelector('[data-part=view]').scrollIntoView({block: 'nearest'}); "
+        "return document.querySelector(picture) }", arg=PICTURE, timeout=PATIENCE,
+    )  # fmt: skip
+
+
 def facts(page):
     names, values = (page.locator(f"[data-part=view-facts] {each}").all_text_contents() for each in ("dt", "dd"))
     return dict(zip(names, values, strict=False))
@@ -124,7 +132,7 @@ def test_a_worker_a_mean_and_an_earlier_generations_are_chosen_and_what_is_gone_
         assert not children(started)
         choose(page, "worker")
         page.locator("[data-part=view-pause]").click()
-        page.wait_for_selector(PICTURE)
+        look(page)
         assert page.evaluate("document.documentElement.scrollWidth") == 390
         with tab(browser) as other:
             other.goto(started.address)
