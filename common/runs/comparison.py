@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.runs.effort import START_EFFORT, Effort, parse_start_effort
-from dreamfleet.common.runs.learning import LearningCurve, Point, total_effort
+from dreamfleet.common.runs.effort import Effort
+from dreamfleet.common.runs.learning import LearningCurve, Point
 from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, expand_task_options
 from dreamfleet.common.runs.run_folder import RunFolder
@@ -59,9 +59,9 @@ class ComparedRun:
         )
         scores = {} if confirmed is None else run.scores(confirmed.generation, confirming=True)
         world = None if curve is None else curve.world
-        inherited = parse_start_effort(run.fact(START_EFFORT)) or Effort()
-        total = total_effort(run)
-        return cls(run.name, run.settings, world, total, inherited, evaluated_means, confirmed, scores)
+        return cls(
+            run.name, run.settings, world, run.total_effort(), run.start_effort(), evaluated_means, confirmed, scores
+        )
 
     @property
     def spent(self) -> str:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.tasks import DREAM
-from dreamfleet.common.runs.effort import START_EFFORT, Effort, parse_start_effort
+from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.records import StoredConfirmation, StoredEvaluation
 from dreamfleet.common.runs.run_folder import RunFolder
 
@@ -42,7 +42,7 @@ class LearningCurve:
     @classmethod
     def of(cls, run: RunFolder) -> LearningCurve:
         """Read a run's journal; `UsageError` before the first evaluation."""
-        points, confirmed, total = tuple(_points(run)), run.confirmation(), total_effort(run)
+        points, confirmed, total = tuple(_points(run)), run.confirmation(), run.total_effort()
         if not points:
             raise UsageError(
                 f"run {run.name} has no evaluated mean, so there is nothing to draw: wait for the first, or begin runs "
@@ -54,14 +54,9 @@ class LearningCurve:
         return cls(run.name, _world(run), points, judged, next(found, None), total)
 
 
-def total_effort(stored: RunFolder) -> Effort:
-    """What a run took so far, and what had been spent on its start."""
-    return sum((each.effort for each in stored.efforts()), parse_start_effort(stored.fact(START_EFFORT)) or Effort())
-
-
 def _points(run: RunFolder) -> Iterator[Point]:
     """Each evaluation, with the effort spent up to its generation."""
-    spent = parse_start_effort(run.fact(START_EFFORT)) or Effort()
+    spent = run.start_effort()
     efforts = deque(each for each in run.efforts() if not each.confirming)
     for evaluation in run.evaluations():
         while efforts and efforts[0].generation <= evaluation.generation:

@@ -20,7 +20,7 @@ from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite
 from dreamfleet.common.runs import schema
-from dreamfleet.common.runs.effort import Effort, GenerationEffort
+from dreamfleet.common.runs.effort import START_EFFORT, Effort, GenerationEffort, parse_start_effort
 from dreamfleet.common.runs.journal_reader import (
     CANDIDATES_QUERY,
     WORK_QUERY,
@@ -46,8 +46,8 @@ from dreamfleet.common.runs.run_lock import is_run_locked
 from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, rollout_path, run_paths
 from dreamfleet.common.runs.seeds import CHOOSING_OFFSET, CONFIRMING_OFFSET, VALIDATION
 from dreamfleet.common.runs.stages import begun_stages
-from dreamfleet.common.runs.times import elapsed_seconds
 from dreamfleet.common.serialization.display import Displayed
+from dreamfleet.common.serialization.times import elapsed_seconds
 
 MAX_LISTED_RUNS = 8  # in the error for an unknown run name
 # Names of facts in the journal.
@@ -307,6 +307,14 @@ class RunFolder(Displayed):
         return [GenerationEffort(generation, bool(confirming), Effort.of(settings.task.task, kind, *made,
                                                                          driven=bool(driven)))
                 for kind, generation, confirming, driven, *made in rows]  # fmt: skip
+
+    def start_effort(self) -> Effort:
+        """What had been spent before the run began: by the run that it forked, or on its first controller."""
+        return parse_start_effort(self.fact(START_EFFORT)) or Effort()
+
+    def total_effort(self) -> Effort:
+        """What the run took so far, and what had been spent on its start."""
+        return sum((each.effort for each in self.efforts()), self.start_effort())
 
     def work_by_worker(self) -> list[StoredWork]:
         """What each worker did for each generation."""

@@ -15,7 +15,6 @@ from dreamfleet.common.errors import BundleError
 from dreamfleet.common.monitoring.eta import format_duration
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.tasks import module_of
-from dreamfleet.common.runs.learning import total_effort
 from dreamfleet.common.runs.records import (
     RunSettings,
     StoredConfirmation,
@@ -30,8 +29,8 @@ from dreamfleet.common.runs.run_paths import trust_flag
 from dreamfleet.common.runs.run_provenance import RunProvenance, read_run_provenance, read_run_settings
 from dreamfleet.common.runs.seeds import TRAINING_FIRST
 from dreamfleet.common.runs.stages import begun_stages, describe_stages
-from dreamfleet.common.runs.times import parse_time
 from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.common.serialization.times import parse_time
 from dreamfleet.common.worlds.score_words import score_word_of_run
 
 AUTHORS = "The dreamfleet authors"
@@ -41,7 +40,7 @@ def citation_facts(run: RunFolder) -> dict[str, Any]:
     """The run and its provenance as JSON values; `ControllerError` before the run has a controller."""
     controller = Controller.load(run.controller_path)
     receipt, settings = read_run_provenance(controller), read_run_settings(controller)
-    score, spent = _reported(run), total_effort(run)
+    score, spent = _reported(run), run.total_effort()
     return {
         "run": run.name, "run_uid": run.uid, "created": run.created, "ended": run.ended,
         "ended_at": run.ended_at, "lasted_seconds": run.duration_seconds,
@@ -105,7 +104,7 @@ def _rows(
         yield "search", f"{settings.optimiser}, {settings.covariance}, {size}, {generations}"
     yield "failed candidates", describe_failed(settings, run.history())
     so_far = "" if run.ended else "; so far, with the results of the open generation"
-    yield "spent", f"{total_effort(run).description}{so_far}"
+    yield "spent", f"{run.total_effort().description}{so_far}"
     yield "seed", f"{settings.seed}; training seeds follow from it, from {TRAINING_FIRST} up"
     for what, (first, count) in (receipt.seeds or {}).items():
         yield f"seeds of the {what}", f"{first} to {first + count - 1}"

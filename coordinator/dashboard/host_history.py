@@ -71,7 +71,7 @@ def host_history(
 
 
 class _Spans:
-    """When work was done, as far as the journal tells: from and until."""
+    """When work was done, as far as the journal says: from and until."""
 
     def __init__(self, work: Sequence[StoredWork], times: Times, end: float) -> None:
         self._times, self._end = times, end

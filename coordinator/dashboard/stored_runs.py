@@ -14,7 +14,7 @@ from dreamfleet.common.errors import DreamfleetError, JournalError
 from dreamfleet.common.monitoring.eta import format_duration
 from dreamfleet.common.printable import format_setting, plural, printable
 from dreamfleet.common.protocol.tasks import DREAM
-from dreamfleet.common.runs.effort import START_EFFORT, Effort, format_steps, parse_start_effort
+from dreamfleet.common.runs.effort import Effort, format_steps
 from dreamfleet.common.runs.records import (
     RunSettings,
     StoredGeneration,
@@ -25,7 +25,7 @@ from dreamfleet.common.runs.records import (
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import resume_command, run_paths
 from dreamfleet.common.runs.stages import stages_of
-from dreamfleet.common.runs.times import format_time, parse_time
+from dreamfleet.common.serialization.times import format_time, parse_time
 from dreamfleet.common.worlds.score_words import score_word_of_run
 from dreamfleet.coordinator.dashboard.curves import Quartiles, RunData, cumulative_effort, curves, downsample
 from dreamfleet.coordinator.dashboard.host_history import host_history
@@ -58,7 +58,7 @@ def describe_run(runs_dir: Path, name: str) -> dict[str, Any]:
         if [each.number for each in history] != list(range(len(history))):
             raise JournalError(f"the journal of run {name} is damaged: generations are missing; restore it from a copy")
         data = RunData(settings, history, run.evaluations(), run.confirmation())
-        start = parse_start_effort(run.fact(START_EFFORT)) or Effort()
+        start = run.start_effort()
         efforts = run.efforts()
         spent = cumulative_effort(start, efforts, len(history))
         total = sum((each.effort for each in efforts), start)

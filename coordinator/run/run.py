@@ -20,7 +20,7 @@ from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, Stor
 from dreamfleet.common.runs.run_folder import ENDING
 from dreamfleet.common.runs.scoring_params import ScheduleState
 from dreamfleet.common.runs.stages import longest_horizon
-from dreamfleet.common.runs.times import elapsed_seconds
+from dreamfleet.common.serialization.times import elapsed_seconds
 from dreamfleet.coordinator.dispatch.failures import JobFailure, host_of, shorten
 from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.jobs.generation import Generation

@@ -18,7 +18,6 @@ from dreamfleet.common.errors import ControllerError, DreamfleetError, JournalEr
 from dreamfleet.common.files.regular_files import is_file, path_exists
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.effort import START_EFFORT, Effort
-from dreamfleet.common.runs.learning import total_effort
 from dreamfleet.common.runs.lookup import find_controller
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
@@ -122,7 +121,7 @@ def find_start(name: str, runs_dir: Path) -> StartPoint:
 def start_from_run(stored: RunFolder) -> StartPoint:
     """The mean of a run's latest generation."""
     mean, _ = latest_mean_and_sigma(stored)
-    return StartPoint(mean, stored.spec.bundle, f"run {stored.name}", stored.spec.options, total_effort(stored))
+    return StartPoint(mean, stored.spec.bundle, f"run {stored.name}", stored.spec.options, stored.total_effort())
 
 
 def latest_mean_and_sigma(stored: RunFolder) -> tuple[NDArray[np.float64], float]:

@@ -192,7 +192,7 @@ def _report(
     from dreamfleet.common.runs.records import describe_score, with_error
     from dreamfleet.common.runs.run_folder import open_run
     from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER
-    from dreamfleet.common.runs.times import elapsed_seconds
+    from dreamfleet.common.serialization.times import elapsed_seconds
     from dreamfleet.common.worlds.score_words import score_word_of_run
 
     again = request.resume_command()

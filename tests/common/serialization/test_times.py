@@ -9,7 +9,7 @@ import pytest
 
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.common.runs.times import elapsed_seconds, format_time
+from dreamfleet.common.serialization.times import elapsed_seconds, format_time
 
 RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
 ENDED = "2026-01-01T00:00:00+00:00"

@@ -1,4 +1,4 @@
-"""Times of a run, as the clocks of its hosts gave them: a clock may be set back or forward, a time be missing."""
+"""Times as text: the clocks of hosts gave them, so one may be set back or forward, and one may be missing."""
 
 from __future__ import annotations
 
