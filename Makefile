@@ -6,6 +6,9 @@ SUPPLY := .venv-supply
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 SOURCES := pyproject.toml constraints.txt $(wildcard worker/car_racing/native/*)
 
+# Every process of every test would compile our modules again where an environment forbids the cache.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test test-doom test-newest slow setup check wheel long box2d-py simulate chaos weekend fuzz sanitize bundle worker-size \
   stranger reproduce reproduce-evolution lock audit sbom structure words site reference clean
 
@@ -13,7 +16,7 @@ demo: $(VENV)/.demo $(if $(filter takecover,$(WORLD)),$(VENV)/.demo-doom)  ## ev
 	$(BIN)/dreamfleet demo $(if $(WORLD),--world $(WORLD)) $(ARGS)
 
 test: $(VENV)/.dev  ## every test that ends within seconds: under ten minutes
-	$(BIN)/pytest -m "not slow and not long" --numprocesses 2 --dist worksteal $(ARGS)
+	$(BIN)/pytest -m "not slow and not long" --numprocesses 3 --dist worksteal $(ARGS)
 
 slow: $(VENV)/.dev  ## those that take longer, each under two minutes; what lands has passed both
 	$(BIN)/pytest -m "slow and not long" --numprocesses 2 --dist worksteal $(ARGS)
@@ -30,7 +33,9 @@ test-newest:  ## a short part of the tests on the newest Python that is here, in
 	@if [ -z "$(NEWEST)" ]; then echo "neither Python 3.13 nor 3.12 is here: nothing was run"; \
 	else $(MAKE) test VENV=.venv-newest PYTHON=$(NEWEST) ARGS="$(or $(ARGS),$(SHORT))"; fi
 # What another version of Python breaks first: syntax, dataclasses, threads and processes, pickles, warnings, one run.
-SHORT := tests/common tests/coordinator tests/worker/service tests/worker/scoring tests/test_structure.py
+SHORT := tests/common/files tests/common/host tests/common/protocol tests/common/serialization tests/common/cli/test_config.py \
+  tests/coordinator/settings tests/coordinator/storage tests/coordinator/run tests/coordinator/experiments/test_minimise.py \
+  tests/worker/service tests/worker/scoring tests/test_structure.py
 
 setup: $(VENV)/.dev  ## everything that development needs
 

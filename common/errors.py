@@ -21,7 +21,15 @@ class DreamfleetError(Exception):
 
 
 class UsageError(DreamfleetError):
-    """A flag, a configuration key, a name or a preset is invalid."""
+    """A flag, a configuration key, a name or a preset is invalid.
+
+    >>> import dreamfleet
+    >>> try:
+    ...     dreamfleet.start_run(generation=5)
+    ... except dreamfleet.UsageError as error:
+    ...     print(error)
+    unknown setting 'generation': did you mean 'generations'?
+    """
 
     exit_code = 2
 

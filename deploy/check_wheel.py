@@ -18,6 +18,8 @@ EXPECTED = (
     "dreamfleet/py.typed",
     "dreamfleet/common/pretrained/tiny.zip",
     "dreamfleet/coordinator/dashboard/page/index.html",
+    "dreamfleet/docs/index.md",
+    "dreamfleet/docs/tutorials/own-environment.md",
     "dreamfleet/coordinator/dashboard/page/main.js",
     "dreamfleet/coordinator/service/service.py",
     "dreamfleet/worker/service/worker.py",

@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from dreamfleet.common.cli.command_line import GROUP, build_parser, load_verb
 from dreamfleet.common.cli.global_config import GlobalConfig
 from dreamfleet.common.verbs.router import RouterConfig
+from dreamfleet.coordinator.bridge.config import BridgeConfig
 from dreamfleet.coordinator.dashboard.config import DashboardConfig
 from dreamfleet.coordinator.experiments.demo import DemoConfig
 from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
@@ -47,6 +48,7 @@ SECTIONS: Mapping[str, tuple[type | tuple[type, ...], str]] = {
     "network": (NetworkConfig, "Where the coordinator is reached, and how it treats its workers. Kept with the run."),
     "worker": (WorkerConfig, "A worker process."),
     "dashboard": (DashboardConfig, "The web page."),
+    "serve": (BridgeConfig, "`dreamfleet serve`: batches over HTTP."),
     "router": (RouterConfig, "A router of its own."),
     "spawn": (SpawnConfig, "Workers on other hosts. A `[[host]]` table overrides these."),
     "demo": (DemoConfig, "`dreamfleet demo`."),
@@ -65,7 +67,7 @@ SECTIONS: Mapping[str, tuple[type | tuple[type, ...], str]] = {
     ),
 }
 ALL_VERBS = ("config", "log_level", "log_format", "trust", "help", "help_all")  # names of flags that each verb has
-OF_ONE_VERB = ("dashboard", "demo", "iterate", "router")  # tables that only the verb of that name reads
+OF_ONE_VERB = ("dashboard", "serve", "demo", "iterate", "router")  # tables that only the verb of that name reads
 LARGE = 1e9  # a bound from here on only guards the wire
 JSON = "print the answer as JSON"
 UNITS = {
@@ -169,7 +171,10 @@ def _verb(name: str, summary: str, parser: argparse.ArgumentParser) -> Iterator[
 def _part_of(parser: argparse.ArgumentParser, tables: Sequence[str]) -> str:
     """Of which keys, where a verb takes a part of these tables: the flags by name."""
     taken = {each.dest for each in parser._actions}
-    partial = [each for each in tables if {one.name for one in _settings(SECTIONS[each][0])} - taken]
+    flagged = {
+        each: {one.name for one in _settings(SECTIONS[each][0]) if one.metadata.get("flag", True)} for each in tables
+    }
+    partial = [each for each in tables if flagged[each] - taken]
     names = [one.name for each in partial for one in _settings(SECTIONS[each][0]) if one.name in taken - {*ALL_VERBS}]
     flags = ", ".join(f"`--{name.replace('_', '-')}`" for name in dict.fromkeys(names))
     return (

@@ -19,13 +19,15 @@ if TYPE_CHECKING:
     from dreamfleet.common.artifacts.bundle import Bundle
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.common.artifacts.controller import Controller, ControllerShape
-    from dreamfleet.common.errors import DreamfleetError
+    from dreamfleet.common.errors import DreamfleetError, UsageError
     from dreamfleet.common.monitoring.client import Client
+    from dreamfleet.common.monitoring.remote_scorer import RemoteBatch, RemoteScorer
     from dreamfleet.common.protocol.messages import TaskSpec
     from dreamfleet.common.protocol.tasks import Description
     from dreamfleet.common.runs.episode_results import EpisodeResults
     from dreamfleet.coordinator.analysis.stored_run import StoredRun as Run
     from dreamfleet.coordinator.analysis.stored_run import open_run
+    from dreamfleet.coordinator.experiments.minimise import maximise, minimise
     from dreamfleet.coordinator.experiments.started_run import evolve, start_run
     from dreamfleet.worker.scoring.scorer import Scorer
     from dreamfleet.worker.tasks.api import Task, World
@@ -47,10 +49,13 @@ _HOMES = {
     "Discrete": "common.artifacts.actions",
     "DreamfleetError": "common.errors",
     "EpisodeResults": "common.runs.episode_results",
+    "RemoteBatch": "common.monitoring.remote_scorer",
+    "RemoteScorer": "common.monitoring.remote_scorer",
     "Run": "coordinator.analysis.stored_run:StoredRun",
     "Scorer": "worker.scoring.scorer",
     "Task": "worker.tasks.api",
     "TaskSpec": "common.protocol.messages",
+    "UsageError": "common.errors",
     "World": "worker.tasks.api",
     "evaluate": "worker.tools.public_api",
     "evolve": "coordinator.experiments.started_run",
@@ -59,6 +64,8 @@ _HOMES = {
     "find_controller": "worker.tools.public_api",
     "make_environment": "worker.tools.public_api",
     "make_policy": "worker.tools.public_api",
+    "maximise": "coordinator.experiments.minimise",
+    "minimise": "coordinator.experiments.minimise",
     "open_run": "coordinator.analysis.stored_run",
     "start_run": "coordinator.experiments.started_run",
 }
@@ -72,10 +79,13 @@ __all__ = [
     "Discrete",
     "DreamfleetError",
     "EpisodeResults",
+    "RemoteBatch",
+    "RemoteScorer",
     "Run",
     "Scorer",
     "Task",
     "TaskSpec",
+    "UsageError",
     "World",
     "evaluate",
     "evolve",
@@ -84,6 +94,8 @@ __all__ = [
     "find_controller",
     "make_environment",
     "make_policy",
+    "maximise",
+    "minimise",
     "open_run",
     "start_run",
 ]
@@ -91,7 +103,11 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from difflib import get_close_matches
+
+        near = get_close_matches(name, _HOMES, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
     from importlib import import_module
 
     module, _, original = _HOMES[name].partition(":")

@@ -77,4 +77,5 @@ def processes(tmp_path):
 def private_folders(tmp_path, monkeypatch):
     monkeypatch.setenv("DREAMFLEET_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("DREAMFLEET_RUNS_DIR", str(tmp_path / "runs"))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     monkeypatch.setenv("DREAMFLEET_TRUST", "tests.support")  # again: a test may have trusted more

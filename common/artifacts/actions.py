@@ -20,7 +20,8 @@ class Continuous:
 
     Action `i` reads output `i`, or `output_indices[i]` where these are given; several actions may share an output.
     `choices` are a fixed set of actions with one output each: the action is the choice with the largest output (the
-    first of equal ones), and no output is squashed.
+    first of equal ones), and no output is squashed. Without `squashed` an action is the outputs themselves: the
+    environment limits what it does with them to `low` to `high`, and a world model sees them as they are.
 
     >>> import numpy as np
     >>> from dreamfleet import Continuous
@@ -35,6 +36,7 @@ class Continuous:
     high: tuple[float, ...]
     output_indices: tuple[int, ...] = ()
     choices: tuple[tuple[float, ...], ...] = ()
+    squashed: bool = True
 
     @classmethod
     def between(cls, low: Any, high: Any) -> Continuous:
@@ -61,6 +63,8 @@ class Continuous:
         if self.choices:
             chosen: Floats = self._choice_table[np.argmax(logits, axis=-1)]
             return chosen
+        if not self.squashed:
+            return logits.astype(np.float32)
         scale, shift, low, high = self._ranges
         outputs = np.tanh(logits)
         selected = outputs[..., self.output_indices] if self.output_indices else outputs
@@ -161,6 +165,8 @@ def one_hot(count: int) -> Continuous:
 STEERING_GAS_BRAKE = Continuous(scale=(1, 0.5, 1), shift=(0, 0.5, 0), low=(-1, 0, 0), high=(1, 1, 1))
 # AppliedDataSciencePartners/WorldModels, controller/arch.py, and the notebook after it: gas and brake (tanh + 1) / 2.
 STEERING_AND_HALVES = Continuous.between(low=(-1, 0, 0), high=(1, 1, 1))
+# ctallec/world-models, models/controller.py: no tanh; the car limits its controls.
+STEERING_GAS_BRAKE_AS_THEY_ARE = replace(Continuous.between(low=(-1, 0, 0), high=(1, 1, 1)), squashed=False)
 # gymnasium's CarRacing-v3 with continuous=False: nothing, right, left, gas, brake.
 FIVE_CHOICES = replace(
     STEERING_GAS_BRAKE, choices=((0, 0, 0), (0.6, 0, 0), (-0.6, 0, 0), (0, 0.2, 0), (0, 0, 0.8))

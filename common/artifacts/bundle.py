@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.controller import Controller, ControllerShape
+from dreamfleet.common.artifacts.controller import Controller, ControllerShape, import_hint
 from dreamfleet.common.artifacts.driving import Driving, Variant, parse_driving
 from dreamfleet.common.artifacts.onnx_checks import (
     UnsafeModelError,
@@ -29,12 +29,13 @@ from dreamfleet.common.artifacts.world_facts import WorldFacts
 from dreamfleet.common.errors import BundleError, ControllerError, UsageError
 from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive, write_archive
 from dreamfleet.common.files.atomic_write import atomic_write
-from dreamfleet.common.files.regular_files import open_regular, read_regular
+from dreamfleet.common.files.regular_files import is_folder, open_regular, read_regular
 from dreamfleet.common.serialization.display import Displayed
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
 from dreamfleet.common.serialization.validation import Between, MalformedError, Word, from_plain
 
 FORMAT = 1
+TO_BUNDLE = "--out world.zip"  # of `import`, for another program's world model
 MANIFEST = "manifest.json"
 ENCODER, DECODER, POLICY, INITIAL_LATENTS_PART = "encoder.onnx", "decoder.onnx", "policy.onnx", "initial_latents.npy"
 DREAM_GRAPH = "dream.onnx"  # one step of the dream; older bundles have none
@@ -42,6 +43,7 @@ RECORDED_STATES = "recorded_states.npy"  # states of recorded drives; only in bu
 # Graphs for controllers of any size; their input holds a controller in each row.
 LINEAR_CONTROLLER, LAYERED_CONTROLLER = "controller-linear.onnx", "controller-hidden.onnx"
 WEIGHTS = "weights.safetensors"  # only in bundles from which training can continue
+SINGLE_PRECISION = "single_precision"  # in the provenance of a bundle of eight bits: SHA-256 of what was rounded
 REQUIRED = (ENCODER, DECODER, POLICY, INITIAL_LATENTS_PART)  # of a bundle that does not describe its world
 REQUIRED_WITH_WORLD = (ENCODER, DECODER, DREAM_GRAPH, INITIAL_LATENTS_PART)
 MAX_BUNDLE = 256 << 20  # bytes, of the file and of its members together; the largest known bundle has 16 MB
@@ -123,7 +125,8 @@ class Bundle(Displayed):
         except FileNotFoundError:
             raise BundleError(f"no bundle at {path}") from None
         except OSError as error:
-            raise BundleError(f"{path} is not a whole bundle ({error.strerror}); fetch or build it again") from error
+            remedy = import_hint(path, TO_BUNDLE) if is_folder(path) else "fetch or build it again"
+            raise BundleError(f"{path} is not a whole bundle ({error.strerror}); {remedy}") from error
         return cls.from_bytes(path, data, sha256)
 
     @classmethod
@@ -141,7 +144,10 @@ class Bundle(Displayed):
                 for name in {*manifest.required_parts, *manifest.parts}:
                     _check_part(path, manifest, name, _read_part(archive, path, manifest, name))
         except DamagedArchiveError as error:
-            raise BundleError(f"{path} is not a whole bundle ({error}); fetch or build it again") from error
+            if path.suffix in ("", ".zip"):
+                raise BundleError(f"{path} is not a whole bundle ({error}); fetch or build it again") from error
+            folder = path.parent.parent if path.suffix == ".tar" else path.parent
+            raise BundleError(f"{path} is not a bundle; {import_hint(folder, TO_BUNDLE)}") from error
         return cls(path, found, manifest)
 
     @property
@@ -214,15 +220,22 @@ class Bundle(Displayed):
     def for_controller(self, controller: Controller) -> Bundle:
         """This bundle for one controller, which drives as its options say; errors as in `with_options`.
 
-        `ControllerError` also for a controller that was evolved on another world model.
+        `ControllerError` also for a controller that was evolved on another world model. One that was rounded to eight
+        bits is the same.
         """
         found = self.with_options(controller.shape, controller.options)
-        if self.sha256 != controller.bundle:
+        if controller.bundle not in self.same_models:
             raise ControllerError(
                 f"the controller belongs to {describe_bundle(controller.bundle)}, not to {self.path.name} "
-                f"({self.sha256[:12]}...): leave --bundle out, or fit it to this one by `dreamfleet lab refit`"
+                f"({self.sha256[:12]}...): omit --bundle, or fit it to this one by `dreamfleet lab refit`"
             )
         return found
+
+    @property
+    def same_models(self) -> tuple[str, ...]:
+        """SHA-256 of the bundles whose controllers drive by this one: itself, and the one that was rounded to it."""
+        rounded = self.manifest.provenance.get(SINGLE_PRECISION)
+        return (self.sha256,) if rounded is None else (self.sha256, str(rounded))
 
     @property
     def recorded_count(self) -> int:
@@ -234,7 +247,7 @@ class Bundle(Displayed):
         if RECORDED_STATES not in self.manifest.parts:
             raise BundleError(
                 f"{self.path.name} holds no recorded states that dreams could begin at: build it again with "
-                "`dreamfleet bundle --recorded N`, or leave --recorded out"
+                "`dreamfleet bundle --recorded N`, or omit --recorded"
             )
 
     def read_recorded(self) -> NDArray[np.float32]:

@@ -11,13 +11,19 @@ from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
 from typing import Any, Literal
 
-from dreamfleet.common.artifacts.actions import FIVE_CHOICES, STEERING_AND_HALVES, STEERING_GAS_BRAKE, Continuous
+from dreamfleet.common.artifacts.actions import (
+    FIVE_CHOICES,
+    STEERING_AND_HALVES,
+    STEERING_GAS_BRAKE,
+    STEERING_GAS_BRAKE_AS_THEY_ARE,
+    Continuous,
+)
 from dreamfleet.common.artifacts.task_options import check_options, read_options, write_options
 from dreamfleet.common.errors import UsageError
 
 CAR_RACING = "car-racing"  # the task; its dream has the same options
 OPTION_HELP = {
-    "actions": "continuous, or discrete with pedals=two",
+    "actions": "continuous, or linear or discrete with pedals=two",
     "pedals": "two, half or one",
     "pedal_shift": "a number from -1 to 1, and 0 unless pedals=one",
     "decide_every": "a whole number from 1 to 50",
@@ -31,7 +37,8 @@ OPTION_HELP = {
 class Variant:
     """How a controller drives, and the penalties of its candidates; `UsageError` for a value out of range."""
 
-    actions: Literal["continuous", "discrete"] = "continuous"  # discrete: one of gymnasium's five
+    # linear: the outputs are the action, without tanh; discrete: one of gymnasium's five
+    actions: Literal["continuous", "linear", "discrete"] = "continuous"
     pedals: Literal["two", "half", "one"] = "two"  # half: output 0 presses both halfway; one: > 0 is gas, < 0 brake
     pedal_shift: float = 0.0  # added to the one pedal
     decide_every: int = 1  # steps for which an action is repeated
@@ -41,7 +48,8 @@ class Variant:
 
     def __post_init__(self) -> None:
         valid = {
-            "actions": self.actions == "continuous" or (self.actions == "discrete" and self.pedals == "two"),
+            "actions": self.actions == "continuous"
+            or (self.actions in ("linear", "discrete") and self.pedals == "two"),
             "pedals": self.pedals in ("two", "half", "one"),
             "pedal_shift": _within(self.pedal_shift, -1, 1) and (self.pedals == "one" or not self.pedal_shift),
             "decide_every": type(self.decide_every) is int and 1 <= self.decide_every <= 50,
@@ -99,6 +107,8 @@ class Variant:
         """The conversion of outputs to steering, gas and brake."""
         if self.actions == "discrete":
             return FIVE_CHOICES
+        if self.actions == "linear":
+            return STEERING_GAS_BRAKE_AS_THEY_ARE
         if self.pedals == "two":
             return STEERING_GAS_BRAKE
         if self.pedals == "half":

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shlex
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from dreamfleet.common.artifacts.bundle import Bundle
 
 FORMAT = 1
+IMPORTED = "imported"  # in the provenance: the name of another program's file
 PREDICTORS = "dreamfleet.predictors"  # entry points: what makes a `Predictor` of a controller, on hosts that score
 _LIMITS = ArchiveLimits(64 << 20, members=8)  # 16 million parameters, more than any search has
 _TASK_DEFAULTS: dict[str, Any] = {"options": "", "version": 1}  # written only where a task's values differ
@@ -197,12 +199,12 @@ class Controller(Displayed):
     def _task_details(self) -> dict[str, Any]:
         return {"options": self.options, "version": self.version}
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         """Write an `.npz` that `load` reads, atomically."""
         about = {"format": FORMAT, "shape": to_dict(self.shape), "task": self.task, "bundle": self.bundle}
         about |= {name: value for name, value in self._task_details.items() if value != _TASK_DEFAULTS[name]}
         text = json.dumps({**about, "provenance": self.provenance}, sort_keys=True)
-        with atomic_write(path) as file:
+        with atomic_write(Path(path)) as file:
             np.savez(file, parameters=self.parameters, about=np.array(text))
 
     @classmethod
@@ -214,11 +216,12 @@ class Controller(Displayed):
         except FileNotFoundError:
             raise ControllerError(f"no controller at {path}") from None
         except OSError as error:
-            raise ControllerError(f"{path} is not a controller file: {error.strerror}") from error
+            raise ControllerError(f"{path} is not a controller file: {error.strerror}; {import_hint(path)}") from error
         except ControllerError as error:
             raise ControllerError(f"{path}: {error}") from error
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise ControllerError(f"{path} is not a controller file: {error}") from error
+            reason = f": {error}" if path.suffix.lower() in ("", ".npz") else ""
+            raise ControllerError(f"{path} is not a controller file{reason}; {import_hint(path)}") from error
 
     @classmethod
     def _parse(cls, parameters: NDArray[Any], about: dict[str, Any]) -> Controller:
@@ -235,6 +238,11 @@ class Controller(Displayed):
         if details["options"] and not isinstance(json.loads(details["options"]), dict):
             raise ValueError("its task's options are not a JSON object")
         return cls(shape, parameters, about["task"], about["bundle"], dict(about["provenance"]), **details)
+
+
+def import_hint(source: Path, to: str = "--bundle WORLD_MODEL --out controller.npz") -> str:
+    """The command that makes something of what another program wrote; by default a controller."""
+    return f"`dreamfleet import {shlex.quote(str(source))} {to}` reads what another program wrote"
 
 
 def _load_predictor(controller: Controller, bundle: Bundle | None) -> Predictor:

@@ -142,7 +142,12 @@ class WorldFacts:
 
     @classmethod
     def of(cls, actions: Continuous, **facts: Any) -> WorldFacts:
-        """The facts of a world with these actions; `facts` are the other fields."""
+        """The facts of a world with these actions; `facts` are the other fields.
+
+        `UsageError` for outputs that are not squashed, which only a variant of CarRacing has.
+        """
+        if not actions.squashed:
+            raise UsageError("a world's outputs are squashed by tanh: give `squashed` its default")
         for name in ("scale", "shift", "low", "high"):
             facts[name] = tuple(map(float, getattr(actions, name)))
         choices = tuple(tuple(map(float, choice)) for choice in actions.choices)

@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points, version
+from importlib.resources import files
 from pathlib import Path
 from typing import NoReturn, Protocol
 
@@ -118,6 +119,7 @@ def run_verb(points: Mapping[str, EntryPoint], words: Sequence[str]) -> int:
     from dreamfleet.common.cli.global_config import complete_arguments
 
     complete_arguments(args)
+    args.typed = tuple(words)
     try:
         with interrupts.on_ctrl_c():
             return verb.run(args)
@@ -190,7 +192,9 @@ class _Overview(argparse.ArgumentParser):
     def format_help(self) -> str:
         from dreamfleet.common.cli.overview import overview
 
-        return overview(DESCRIPTION, EXIT_CODES, self._points, lambda name: _summary(self._points[name]))
+        text = overview(DESCRIPTION, EXIT_CODES, self._points, lambda name: _summary(self._points[name]))
+        page = Path(str(files("dreamfleet"))) / "docs" / "index.md"
+        return f"{text}\nDocuments\n  {page}\n" if page.exists() else text
 
 
 def _help_parser(prog: str, names: Iterable[str], points: Mapping[str, EntryPoint]) -> argparse.ArgumentParser:

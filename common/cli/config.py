@@ -38,9 +38,9 @@ METAVARS = {
 KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", Path: "a path"}
 
 
-def option(default: Any, text: str) -> Any:
-    """A dataclass field with its default and the text that `--help` shows."""
-    return field(default=default, metadata={"help": text})
+def option(default: Any, text: str, *, flag: bool = True) -> Any:
+    """A dataclass field with its default and the text that `--help` shows; without `flag` only a key and a variable."""
+    return field(default=default, metadata={"help": text, "flag": flag})
 
 
 def add_flags(
@@ -58,7 +58,7 @@ def add_flags(
         group = _group(parser, section.__name__.removesuffix("Config").lower())
         hints = get_type_hints(section)
         for each in configurable_fields(section):
-            if wanted is None or each.name in wanted:
+            if each.metadata.get("flag", True) if wanted is None else each.name in wanted:
                 text = (texts or {}).get(each.name) or each.metadata["help"] + _default_text(each)
                 group.add_argument(_flag(each), **_flag_options(each, hints[each.name], text))
 

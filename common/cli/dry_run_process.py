@@ -30,9 +30,13 @@ class DryRunError(Exception):
 
 
 class DryRunProcess:
-    """A module that reads its request from stdin, writes lines to stdout, and prints to stderr. Use it in a `with`."""
+    """A module that reads its request from stdin, writes lines to stdout, and prints to stderr. Use it in a `with`.
+
+    Its arguments are a file descriptor, which is closed by `begin`: until then it only loads what it needs.
+    """
 
     def __init__(self, module: str, request: str) -> None:
+        waits, self._go = os.pipe()
         self._descendants = Descendants()
         self._lines: list[bytes] = []  # unread, the next one last
         self._begun = bytearray()  # a line without its end
@@ -42,9 +46,10 @@ class DryRunProcess:
             stdin.write(request.encode())
             stdin.seek(0)
             self._child = subprocess.Popen(  # noqa: S603 - our own interpreter and module
-                [*parent_death_command(), sys.executable, "-P", "-m", module],
+                [*parent_death_command(), sys.executable, "-P", "-m", module, str(waits)], pass_fds=(waits,),
                 stdin=stdin, stdout=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=0, start_new_session=True,
             )  # fmt: skip
+        os.close(waits)
         self._selector = selectors.DefaultSelector()
 
     def __enter__(self) -> DryRunProcess:
@@ -56,10 +61,17 @@ class DryRunProcess:
 
     def __exit__(self, *_error: object) -> None:
         self._kill()
+        self.begin()
         self._descendants.forget()
         self._selector.close()
         for pipe in self._pipes():
             pipe.close()
+
+    def begin(self) -> None:
+        """Let it begin its dry run."""
+        if self._go >= 0:
+            os.close(self._go)
+            self._go = -1
 
     def read_line(self, seconds: float) -> bytes | None:
         """The next line of stdout, or `None` if the child ended; `DryRunError` after `seconds` or too much output."""

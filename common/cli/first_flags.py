@@ -19,12 +19,14 @@ FIRST_FLAGS: Mapping[str, tuple[str, ...]] = {
         "--join", "--json",
     ),
     "dashboard": ("--connect", "--join", "--port", "--host", "--runs-dir", "--run"),
+    "serve": ("--connect", "--join", "--port", "--host", "--token-file"),
     "demo": (
         "--world", "--run", "--dream-minutes", "--minutes", "--population", "--episodes", "--tracks", "--seed",
         "--workers", "--page",
     ),
     "evaluate": (
-        "--controller", "--run", "--connect", "--episodes", "--first-seed", "--bundle", "--jobs", "--out", "--json",
+        "--controller", "--run", "--task", "--connect", "--episodes", "--first-seed", "--bundle", "--jobs", "--out",
+        "--json",
     ),
     "inspect": (
         "--out", "--data", "--picture", "--controller", "--seed", "--steps", "--probe", "--losses", "--likeness",
@@ -48,12 +50,17 @@ FIRST_FLAGS: Mapping[str, tuple[str, ...]] = {
         "--remote-python", "--json",
     ),
     "story": ("--journal", "--worker", "--job", "--what", "--last", "--connect", "--json"),
+    "sweep": (
+        "--run", "--vary", "--resume", "--parallel", "--workers", "--listen", "--connect", "--json", "--runs-dir",
+        "--task", "--bundle", "--preset", "--population", "--episodes", "--generations", "--minutes",
+    ),
     "train": (
         "--preset", "--device", "--continue-from", "--new", "--summary", "--updates", "--batch", "--rate", "--seed",
         "--set", "--tensorboard", "--json",
     ),
     "verify.run": ("--run", "--bundle", "--optimiser", "--listen", "--connect", "--runs-dir", "--json"),
     "worker": (
-        "--connect", "--join", "--run", "--any", "--slots", "--name", "--task", "--exit-when-done", "--lifetime",
+        "--connect", "--join", "--run", "--any", "--runs", "--slots", "--name", "--task", "--exit-when-done",
+        "--lifetime",
     ),
 }  # fmt: skip

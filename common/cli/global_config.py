@@ -18,7 +18,7 @@ from typing import Any, Literal
 from dreamfleet.common.cli.config import add_flags, load, option, read_toml
 from dreamfleet.common.errors import AccessError, UsageError
 from dreamfleet.common.host.logs import set_log_format
-from dreamfleet.common.host.trusted_modules import trust
+from dreamfleet.common.host.trusted_modules import PLACES, trust
 from dreamfleet.common.protocol.tasks import module_of
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, Credentials, describe_time_left, read_join_file
 from dreamfleet.common.transport.network import DEFAULT_ENDPOINT, Network, check_endpoint
@@ -26,9 +26,9 @@ from dreamfleet.common.transport.network import DEFAULT_ENDPOINT, Network, check
 log = logging.getLogger(__name__)
 ARRAYS = ("stage", "host")  # arrays of tables
 # The tables of every verb: all verbs may share one file.
-TABLES = ("run", "limits", "network", "worker", "dashboard", "demo", "iterate", "router", "spawn", "vae", "mdnrnn",
-          "baseline")  # fmt: skip
-OTHER_VARIABLES = ("DREAMFLEET_CACHE", "DREAMFLEET_CONFIG")
+TABLES = ("run", "limits", "network", "worker", "dashboard", "serve", "demo", "iterate", "router", "spawn", "vae",
+          "mdnrnn", "baseline")  # fmt: skip
+OTHER_VARIABLES = ("DREAMFLEET_CACHE", "DREAMFLEET_CONFIG", PLACES)
 PREFIX = "DREAMFLEET_"
 SIMILARITY_CUTOFF = 0.75  # similarity to a known name from which an unknown variable counts as a typing error
 

@@ -11,8 +11,7 @@ from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 
-from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.artifacts.bundle_store import default_cache, shipped_bundles
+from dreamfleet.common.artifacts.bundle_store import default_cache, find_bundle, shipped_names
 from dreamfleet.common.cli.task_check import try_task
 from dreamfleet.common.errors import AccessError, DreamfleetError
 from dreamfleet.common.files.file_system import file_system_type, is_network, lock_problem
@@ -98,14 +97,14 @@ def _check_box2d() -> Finding:
 
 
 def _check_bundles() -> Iterator[Finding]:
-    paths = shipped_bundles()
-    for name, path in paths.items():
+    names = shipped_names()
+    for name in names:
         try:
-            found, ok = Bundle.open(path).sha256[:12], True
+            found, ok = find_bundle(name).sha256[:12], True
         except DreamfleetError as error:
             found, ok = str(error), False
         yield Finding(f"bundle {name}", ok, True, found, "everything", "reinstall dreamfleet")
-    if not paths:
+    if not names:
         yield Finding("bundle", False, True, "none shipped", "everything", "reinstall dreamfleet")
 
 

@@ -72,7 +72,7 @@ def train(
     'train vae --data d --seed 1 --json --updates 9 --set channels=8,16 --set batch_norm=true'
     """
     given = options(preset=preset, device=device, seed=seed)
-    return command("train", model, "--data", data, *given, "--json", *_with_settings(command(*more)))
+    return command("train", model, "--data", data, *given, "--json", *with_settings(command(*more)))
 
 
 def encode(data: Path) -> Words:
@@ -122,11 +122,11 @@ def split_flags(flag: str, text: str, owner: str = "", reserved: Sequence[str] =
         raise UsageError(f"{flag} {text!r}: {error}") from error
     given = {word.partition("=")[0] for word in words if word.startswith("--")}
     if taken := [each for each in reserved if any(each.startswith(word) for word in given)]:  # argparse takes prefixes
-        raise UsageError(f"{flag}: leave out {', '.join(taken)}, which {owner} sets itself")
+        raise UsageError(f"{flag}: omit {', '.join(taken)}, which {owner} sets itself")
     return words
 
 
-def _with_settings(words: Words) -> Words:
+def with_settings(words: Words) -> Words:
     """The same flags of a training, where those that are settings now stand as `--set KEY=VALUE`."""
     found: list[str] = []
     rest = list(words)

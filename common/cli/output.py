@@ -1,4 +1,4 @@
-"""Output of verbs on stdout: tables in a terminal, tab-separated lines in a pipe, JSON with `--json`."""
+"""Output of verbs on stdout: aligned tables, or JSON with `--json`."""
 
 from __future__ import annotations
 
@@ -33,16 +33,34 @@ def print_rows(
 ) -> None:
     """Print rows that have the same keys, under a heading of the keys. No cell is truncated.
 
-    In a terminal, a table with the columns in `right` right-aligned. If it is too wide, columns are left out in
-    `drop_order`, with a note below; then the last column wraps. In a pipe, tab-separated lines.
+    The columns in `right` are right-aligned. If a terminal is too narrow, columns are left out in `drop_order`, with a
+    note below; then the last column wraps. In a pipe, lines have any width.
+
+    >>> print_rows([{"run": "night", "mean": 8.5}, {"run": "day", "mean": 12.25}], right=["mean"])
+    run     mean
+    night    8.5
+    day    12.25
     """
     if not rows:
         return
     if sys.stdout.isatty():
         _print_table(rows, right, drop_order)
         return
-    for line in (list(rows[0]), *(row.values() for row in rows)):
-        print("\t".join(_format_cell(value) for value in line))  # noqa: T201
+    _print_aligned([list(rows[0]), *([_format_cell(value) for value in row.values()] for row in rows)], right)
+
+
+def _print_aligned(lines: Sequence[Sequence[str]], right: Collection[str]) -> None:
+    """Print lines of cells, the first one being the heading, with two spaces between columns."""
+    from rich.cells import cell_len
+
+    widths = [max(map(cell_len, column)) for column in zip(*lines, strict=True)]
+    is_right = [name in right for name in lines[0]]
+    for line in lines:
+        gaps = [" " * (width - cell_len(cell)) for cell, width in zip(line, widths, strict=True)]
+        cells = [
+            gap + cell if at_right else cell + gap for cell, gap, at_right in zip(line, gaps, is_right, strict=True)
+        ]
+        print("  ".join(cells).rstrip())  # noqa: T201
 
 
 def _format_cell(value: object) -> str:

@@ -22,11 +22,14 @@ GROUPS: Mapping[str, Mapping[tuple[str, ...], str]] = {
     "A run": {
         ("coordinator",): "start, continue or fork a run: CMA-ES asks",
         ("worker",): "score candidates for a run, on any host",
+        ("sweep",): "evolve with several seeds and settings, and compare",
         ("status",): "show a live run: generation, best, workers, time left",
         ("dashboard",): "serve a read-only web page about runs",
+        ("serve",): "let a search in any language score batches over HTTP",
         ("story",): "list what happened to a run, its workers and jobs",
         ("pause", "resume"): "hold a run, and go on",
         ("drain", "stop"): "end its coordinator after the open jobs, or now",
+        ("bar",): "keep out a host that scores wrongly",
     },
     "Hosts": {
         ("spawn", "down"): "start workers on other hosts over ssh, and end them",
@@ -38,6 +41,7 @@ GROUPS: Mapping[str, Mapping[tuple[str, ...], str]] = {
         ("runs.list", "runs.show"): "list runs; show one: settings, generations, scores",
         ("runs.plot",): "draw what runs learnt",
         ("runs.export",): "write a run as CSV, Parquet or TensorBoard events",
+        ("card",): "write a controller as a folder to publish",
         ("runs.receipt",): "print what a paper cites of a run",
         ("runs.backup", "runs.archive"): "copy a run to another disk; put it away",
         ("runs.delete",): "delete a run",
@@ -54,6 +58,7 @@ GROUPS: Mapping[str, Mapping[tuple[str, ...], str]] = {
         ("train",): "train the VAE; once drives are encoded, the MDN-RNN",
         ("encode",): "encode the drives with the trained VAE",
         ("bundle",): "freeze a trained model into one file, and back",
+        ("import",): "read what another project made",
         ("inspect",): "show what a world model sees, keeps and dreams",
     },
     "Study": {

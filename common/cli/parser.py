@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 
 from dreamfleet.common.cli.first_flags import FIRST_FLAGS, FLAGS_OF_ALL
 from dreamfleet.common.cli.key_values import as_setting
-from dreamfleet.common.cli.removed import REMOVED_FLAGS
+from dreamfleet.common.cli.removed import FLAGS_ELSEWHERE, REMOVED_FLAGS
 from dreamfleet.common.errors import UsageError
 
 MIN_LIKENESS = 0.65  # of an unknown flag and the one that is suggested
@@ -42,10 +42,28 @@ class Parser(argparse.ArgumentParser):
 
     def parse_all(self, words: Sequence[str]) -> argparse.Namespace:
         """Parse `words`; exits with an error on an unknown one."""
-        args, unknown = self.parse_known_args(words)
+        try:
+            args, unknown = self.parse_known_args(words)
+        except UsageError as error:
+            if "are required:" in str(error):  # perhaps because one is misspelt
+                self._refuse_misspelt(words)
+            raise
         if unknown:
             self._refuse(unknown, words)
         return args
+
+    def _refuse_misspelt(self, words: Sequence[str]) -> None:
+        """An error that suggests the nearest flag, if one of `words` is an unknown flag like a known one."""
+        for word in words:
+            flag = word.split("=")[0]
+            known = any(each.startswith(flag) for each in self._option_string_actions)
+            if (
+                flag.startswith("--")
+                and flag != "--"
+                and not known
+                and _nearest_flag(flag, self._option_string_actions)
+            ):
+                self._refuse([word], words)
 
     def format_help(self) -> str:
         """The help text with the first flags; where some are left out it says how to see them."""
@@ -117,6 +135,8 @@ class Parser(argparse.ArgumentParser):
         flag, equals, value = word.partition("=")
         if new := REMOVED_FLAGS.get((self._verb, flag)):
             return f"{flag} is gone: {new}"
+        if other := FLAGS_ELSEWHERE.get((self._verb, flag)):
+            return f"{self.prog} has no {flag}: {other}"
         keys = {key for texts in self.keys.values() for key in texts}
         setting = as_setting(flag, (value,) if equals else tuple(takewhile(_is_value, following)))
         return f"{flag} is a setting now: give --set {setting}" if setting.partition("=")[0] in keys else None

@@ -10,6 +10,7 @@ from typing import Literal
 
 from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.worlds.profile import WorldProfile
 from dreamfleet.common.worlds.shipped import WORLDS
 
 Kind = Literal["run", "training", "baseline"]
@@ -36,6 +37,15 @@ def default_training_preset(task: str) -> str:
     return world.default_training if world else "pixels"
 
 
+def default_run_preset(task: str) -> str:
+    """The preset of a run in the dream of a task's world model; an empty text is the first world.
+
+    >>> default_run_preset(""), default_run_preset("takecover"), default_run_preset("gym:ALE/Pong-v5")
+    ('dream', 'takecover', 'pixels')
+    """
+    return (WORLDS.get(task or FIRST_WORLD) or WorldProfile(task=task)).dream_preset
+
+
 def check_preset(kind: Kind, name: str) -> str:
     """Return `name` if a preset of this kind has it, else raise `UsageError`, with a hint if another kind has it."""
     if name in NAMES[kind]:
@@ -47,6 +57,6 @@ def check_preset(kind: Kind, name: str) -> str:
 
 def preset_help_text(kind: Kind) -> str:
     """The `--help` text for the presets of one kind."""
-    text = f"{kind} preset to begin with: {', '.join(NAMES[kind])}"
+    text = f"{kind} preset, whose settings flags may change: {', '.join(NAMES[kind])}"
     note = "; a data set stores its preset, and each verb must name that one unless it is tiny"
     return f"{text} (default tiny{note})" if kind == "training" else text

@@ -26,7 +26,7 @@ from dreamfleet.common.host.foreign_code import answer_kept
 UNLIMITED_WIDTH = 10_000  # columns: a console on which nothing is truncated
 LARGEST_TOTAL = 10**15  # items: of more, rich cannot estimate the remaining time
 SPEED_PERIOD = 600.0  # seconds of the past that the remaining time is estimated from: steps may take a minute
-LOG_INTERVAL = 60.0  # seconds between two lines where no bar can be drawn, such as in a log
+LOG_INTERVAL = 30.0  # seconds between two lines where no bar can be drawn, such as in a log
 BAR_WIDTH, MIN_BAR_WIDTH = 40, 8  # columns of a bar: preferred, and the least before other columns are left out
 
 
@@ -39,13 +39,17 @@ class Bar:
         self._last_logged = time.monotonic()
 
     def update(self, done: int, note: str = "") -> None:
-        """Set the number of finished items and the note after the bar; where no bar is drawn, log once a minute."""
+        """Set the number of finished items and the note after the bar; where no bar is drawn, log twice a minute."""
         self._progress.update(self._task, completed=done, note=note)
         console = self._progress.console
         drawn = console.is_terminal and not console.is_dumb_terminal
         if not drawn and time.monotonic() - self._last_logged >= LOG_INTERVAL:
             self._last_logged = time.monotonic()
             console.print(self._progress.get_renderable())
+
+    def end(self, done: int, note: str = "") -> None:
+        """Fill the bar of what ended after `done` items, as a drive that may be shorter than planned."""
+        self._progress.update(self._task, total=done, completed=done, note=note)
 
 
 class FittedProgress(Progress):

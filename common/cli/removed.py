@@ -26,6 +26,15 @@ REMOVED_VERBS = {
 REMOVED_FLAGS = {
     ("evaluate", "--data"): "name the training's folder as --controller FOLDER",
     ("record", "--data"): "name the training's folder as --controller FOLDER",
+    ("runs.plot", "--fitness"): "give --kind fitness, which is the default of one run",
+}
+
+# Flags that people look for in a verb, and where they are.
+FLAGS_ELSEWHERE = {
+    ("coordinator", "--workers"): "workers are programs of their own: `dreamfleet worker --run NAME --slots N`",
+    ("coordinator", "--slots"): "slots are a worker's: `dreamfleet worker --run NAME --slots N`",
+    ("coordinator", "--log-to"): "give DREAMFLEET_NETWORK_LOG_TO=tensorboard, or `log_to` in a file's [network]",
+    ("worker", "--workers"): "give --slots N, the number of processes",
 }
 
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from time import monotonic
 from typing import Any
 
 from dreamfleet.common.cli.dry_run_process import DryRunError, DryRunProcess
+from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.printable import one_line
-from dreamfleet.common.protocol.tasks import Description
+from dreamfleet.common.protocol.tasks import Description, is_function_task
 from dreamfleet.common.serialization.optional_fields import OPTIONAL
 from dreamfleet.common.serialization.validation import from_plain
 
@@ -21,6 +23,10 @@ STEP_LIMIT = 120.0  # seconds of one step of a dry run, such as a reset; as long
 SECOND_RUN_LIMIT = 20.0  # seconds of the first dry run's episode from which on there is no second dry run
 DRY_RUN_LIMIT = 3600.0  # seconds of a whole dry run, which may normalise observations in 20 episodes
 MAX_ANSWERS = 200  # of one dry run; a sound one gives about a dozen
+VARYING_FUNCTION = (
+    "two calls of the function with equal arguments give different values: let it take a second parameter `seed`, and "
+    "draw all randomness from that"
+)
 REMEDY = "draw all randomness from self.np_random, which reset(seed=...) seeds, and keep nothing from earlier episodes"
 
 
@@ -56,23 +62,37 @@ class TaskReport:
     varies: str = ""  # what differs between them; empty: nothing was found
 
 
-def try_task(name: str, options: Mapping[str, Any], limit: float = STEP_LIMIT) -> TaskReport:
+def try_task(
+    name: str, options: Mapping[str, Any], limit: float = STEP_LIMIT, measures: Sequence[str] = ()
+) -> TaskReport:  # fmt: skip
     """Make the task's environment, drive its probe episode in two processes, and compare.
 
-    No step may take longer than `limit` seconds. `options` are those that the task describes itself by.
+    No step may take longer than `limit` seconds. `options` are those that the task describes itself by. An
+    unknown one of `measures` is a fault.
     """
-    first = _dry_run({"task": name, "options": options, "thorough": True}, limit)
-    if first.fault:
-        return TaskReport(fault=first.fault)
-    warnings, varies, compared = list(first.warnings), "", False
-    if not first.episode or first.seconds > SECOND_RUN_LIMIT:
-        why = "its first steps take too long" if first.episode else "the task has no probe episode"
-        warnings.append(f"whether equal seeds give equal episodes was not checked: {why}")
-    else:
-        second = _dry_run({"task": name, "options": options, "thorough": False}, limit)
-        if second.fault:
-            warnings.append(f"a second dry run failed: {second.fault}")
-        compared, varies = True, _find_difference(first, second)
+    request = {"task": name, "options": options, "measures": list(measures), "path": sys.path}
+
+    def start(*, thorough: bool) -> DryRunProcess:
+        return DryRunProcess(CHILD, json.dumps({**request, "thorough": thorough}))
+
+    with ExitStack() as stack:
+        with start(thorough=True) as child:
+            # Where a core is free, the second process loads beside the first dry run, and begins its own after it.
+            another = stack.enter_context(start(thorough=False)) if usable_cores() > 1 else None
+            first = _dry_run(child, name, limit)
+        if first.fault:
+            return TaskReport(fault=first.fault)
+        warnings, varies, compared = list(first.warnings), "", False
+        if not first.episode or first.seconds > SECOND_RUN_LIMIT:
+            why = "its first steps take too long" if first.episode else "the task has no probe episode"
+            warnings.append(f"whether equal seeds give equal episodes was not checked: {why}")
+        else:
+            second = _dry_run(another or stack.enter_context(start(thorough=False)), name, limit)
+            if second.fault:
+                warnings.append(f"a second dry run failed: {second.fault}")
+            compared, varies = True, _find_difference(first, second)
+            if varies and is_function_task(name):
+                varies = VARYING_FUNCTION
     return TaskReport(first.description, "", tuple(warnings), compared, varies)
 
 
@@ -86,27 +106,27 @@ def _find_difference(first: DryRunReport, second: DryRunReport) -> str:
     return ""
 
 
-def _dry_run(request: Mapping[str, Any], limit: float) -> DryRunReport:
-    """Run one child and return its last report; without one the fault says what it was doing as it hung or crashed."""
-    name, step, failure = request["task"], "loading it", ""
+def _dry_run(child: DryRunProcess, name: str, limit: float) -> DryRunReport:
+    """Let a child begin and return its last report; without one the fault says what it did as it hung or crashed."""
+    step, failure = "loading it", ""
     report: DryRunReport | None = None
     until = monotonic() + DRY_RUN_LIMIT
-    with DryRunProcess(CHILD, json.dumps({**request, "path": sys.path})) as child:
-        try:
-            for _ in range(MAX_ANSWERS):
-                left = until - monotonic()
-                line = child.read_line(min(limit, left) if step else left)
-                if line is None:
-                    break
-                answer = _parse(line)
-                report = answer.report or report
-                step = step if answer.step is None else answer.step
-            else:
-                raise DryRunError("wrote to the pipe of this check")
-            is_through = report is not None and (bool(report.fault) or step == LAST_STEP)
-            failure = "" if is_through and child.exit_code == 0 else child.describe_failure()
-        except DryRunError as error:
-            failure = str(error)
+    child.begin()
+    try:
+        for _ in range(MAX_ANSWERS):
+            left = until - monotonic()
+            line = child.read_line(min(limit, left) if step else left)
+            if line is None:
+                break
+            answer = _parse(line)
+            report = answer.report or report
+            step = step if answer.step is None else answer.step
+        else:
+            raise DryRunError("wrote to the pipe of this check")
+        is_through = report is not None and (bool(report.fault) or step == LAST_STEP)
+        failure = "" if is_through and child.exit_code == 0 else child.describe_failure()
+    except DryRunError as error:
+        failure = str(error)
     failure = failure and f"{one_line(step) or 'normalising'} {failure}"
     if report is None or (report.description is None and not report.fault):
         return DryRunReport(fault=f"{name} cannot be scored: {failure or 'it does not describe itself'}")

@@ -26,6 +26,7 @@ from dreamfleet.common.files.regular_files import open_regular
 Arrays = dict[str, NDArray[Any]]
 NPY = ".npy"
 _END, _END_64, _END_BYTES = b"PK\5\6", b"PK\6\7", 22  # end-of-archive record: mark, its zip64 locator's mark, length
+_RECORD_64, _LOCATOR_BYTES, _RECORD_BYTES = b"PK\6\6", 20, 56  # the zip64 record before its locator
 _DIRECTORY_BYTES = 512  # maximum average length of a directory entry
 _ENCRYPTED = 1  # bit of a member's flags
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest date of a zip
@@ -46,10 +47,11 @@ class DamagedArchiveError(ValueError):
 
 @dataclass(frozen=True)
 class ArchiveLimits:
-    """The maximum number of members of an archive, and of their unpacked bytes together."""
+    """The most members of an archive, and the most unpacked bytes of them; `zip64` lets that form pass."""
 
     size: int
     members: int = 64
+    zip64: bool = False
 
 
 class Archive:
@@ -168,18 +170,24 @@ def _open_source(source: Path | bytes, limits: ArchiveLimits) -> Iterator[Binary
 
 
 def _check_end(file: BinaryIO, limits: ArchiveLimits) -> None:
-    """Bound the directory before `zipfile` reads it whole. Only archives without comment and zip64 pass."""
+    """Bound the directory before `zipfile` reads it whole. Only archives without comment pass."""
     size = file.seek(0, io.SEEK_END)
-    file.seek(max(0, size - _END_BYTES - 20))
-    tail = file.read(_END_BYTES + 20)
+    file.seek(max(0, size - _END_BYTES - _LOCATOR_BYTES))
+    tail = file.read(_END_BYTES + _LOCATOR_BYTES)
     end = tail[-_END_BYTES:]
     if size < _END_BYTES or end[:4] != _END or end[-2:] != b"\0\0":
         raise DamagedArchiveError("it does not end as an archive does")
-    if tail[:4] == _END_64 and size > len(end):
-        raise DamagedArchiveError(
-            "it is in the form zip64, which only archives beyond 4 GiB need: write it again without"
-        )
     (directory,) = struct.unpack_from("<I", end, 12)
+    if tail[:4] == _END_64 and size > len(end):
+        if not limits.zip64:
+            raise DamagedArchiveError(
+                "it is in the form zip64, which only archives beyond 4 GiB need: write it again without"
+            )
+        file.seek(max(0, size - len(tail) - _RECORD_BYTES))
+        record = file.read(_RECORD_BYTES)
+        if record[:4] != _RECORD_64:
+            raise DamagedArchiveError("it does not end as an archive does")
+        (directory,) = struct.unpack_from("<Q", record, 40)
     if directory > limits.members * _DIRECTORY_BYTES:
         raise DamagedArchiveError("its directory is too long")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from tensorboardX.event_file_writer import EventsWriter
 
 FILE_VERSION = "brain.Event:2"
+EVENTS = "events.out.tfevents.*"  # names of the files
 EXTRA = "pip install 'dreamfleet[export]'"
 
 
@@ -35,12 +37,13 @@ class EventFileWriter:
         self._write(Event(step=step, session_log=SessionLog(status=SessionLog.START)))
 
     def add(self, step: int, **values: float) -> None:
-        """Add scalars of one step by name; `__` in a name becomes TensorBoard's `/`."""
+        """Add scalars of one step by name, in one record; `__` in a name becomes TensorBoard's `/`."""
         from tensorboardX.proto.event_pb2 import Event
+        from tensorboardX.proto.summary_pb2 import Summary
         from tensorboardX.summary import scalar
 
-        for name, value in values.items():
-            self._write(Event(step=step, summary=scalar(name.replace("__", "/"), value)))
+        each = (scalar(name.replace("__", "/"), value).value for name, value in values.items())
+        self._write(Event(step=step, summary=Summary(value=chain.from_iterable(each))))
         self._writer.flush()  # visible while the training runs
 
     def add_text(self, name: str, text: str) -> None:
@@ -78,3 +81,30 @@ def open_event_file(folder: Path, since: int | None = None) -> Iterator[EventFil
         finally:
             with suppress(OSError):  # the write error was reported already
                 writer.close()
+
+
+def read_scalars(folder: Path) -> dict[str, dict[int, float]]:
+    """The values of each scalar by its steps, from all event files in `folder`, as TensorBoard shows them.
+
+    A last record that a killed process left incomplete is skipped.
+    """
+    from tensorboardX.proto.event_pb2 import Event, SessionLog
+
+    found: dict[str, dict[int, float]] = {}
+    for path in sorted(folder.glob(EVENTS)):
+        for record in _records(path.read_bytes()):
+            event = Event.FromString(record)
+            if event.session_log.status == SessionLog.START:
+                found = {name: {at: each for at, each in one.items() if at < event.step} for name, one in found.items()}
+            for value in event.summary.value:
+                if value.HasField("simple_value"):
+                    found.setdefault(value.tag, {})[event.step] = value.simple_value
+    return found
+
+
+def _records(data: bytes) -> Iterator[bytes]:
+    """The whole records of TensorFlow's format: a length, its checksum, the bytes, their checksum."""
+    start = 0
+    while (end := start + 16 + int.from_bytes(data[start : start + 8], "little")) <= len(data):
+        yield data[start + 12 : end - 4]
+        start = end

@@ -1,6 +1,7 @@
 """Logging on stderr, one line an event: as text or as JSON.
 
-A record may carry named values (`extra={"facts": {...}}`): JSON includes them, text does not.
+Text is short: the time of day, with the date in a day's first line, the level unless it is INFO, and who speaks. A
+record may carry named values (`extra={"facts": {...}}`): JSON includes them, text does not.
 """
 
 from __future__ import annotations
@@ -11,7 +12,30 @@ import sys
 from datetime import UTC, datetime
 from typing import Literal
 
-from dreamfleet.common.printable import PrintableFormatter, one_line, shorten_words
+from dreamfleet.common.printable import PrintableFormatter, one_line, printable, shorten_words
+
+PROCESSES = ("coordinator", "worker")  # loggers whose lines are their process's
+
+
+class TextFormatter(PrintableFormatter):
+    """A record as one line. `label` names this process among others in the same log: `run night`, `worker core-0`."""
+
+    label = ""
+
+    def __init__(self) -> None:
+        super().__init__("%(message)s")
+        self._day = ""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Format one record, printable."""
+        day, time = (datetime.fromtimestamp(record.created).strftime(part) for part in ("%Y-%m-%d", "%H:%M:%S"))
+        level = "" if record.levelno == logging.INFO else record.levelname
+        package, _, rest = record.name.partition(".")
+        speaker = rest.partition(".")[0] if package == "dreamfleet" and rest else record.name
+        speaker = self.label if self.label and speaker in PROCESSES else speaker
+        words = ["" if day == self._day else day, time, level, f"{printable(speaker)}: {super().format(record)}"]
+        self._day = day
+        return " ".join(filter(None, words))
 
 
 class JsonFormatter(logging.Formatter):
@@ -29,15 +53,20 @@ class JsonFormatter(logging.Formatter):
 def configure_logging() -> None:
     """Log warnings on stderr as text, until the settings are read."""
     handler = logging.StreamHandler()
-    handler.setFormatter(PrintableFormatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    handler.setFormatter(TextFormatter())
     logging.basicConfig(handlers=[handler], level=logging.WARNING)
+
+
+def label_logs(label: str) -> None:
+    """Name this process in its lines from now on, such as `worker core-0`."""
+    TextFormatter.label = label
 
 
 def set_log_format(log_format: Literal["text", "json", "auto"]) -> None:
     """Log as text or JSON from now on; `auto` is text in a terminal, else JSON."""
     if log_format == "json" or (log_format == "auto" and not sys.stderr.isatty()):
         for handler in logging.getLogger().handlers:
-            if isinstance(handler.formatter, PrintableFormatter):  # not a handler of somebody else
+            if isinstance(handler.formatter, TextFormatter):  # not a handler of somebody else
                 handler.setFormatter(JsonFormatter())
 
 

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from importlib.metadata import PackageNotFoundError, version
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from importlib.abc import MetaPathFinder
+from importlib.metadata import PackageNotFoundError, distributions, packages_distributions, version
 from importlib.util import find_spec
+from threading import get_ident
 
 # distribution -> (module, extra); the empty extra is required by every role
 PACKAGES = {
@@ -20,13 +26,15 @@ PACKAGES = {
     "av": ("av", "views"),
     "matplotlib": ("matplotlib", "views"),
     "torch": ("torch", "train"),
-    "onnx": ("onnx", "train"),
     "safetensors": ("safetensors", "train"),
     "plotly": ("plotly", "dashboard"),
     "starlette": ("starlette", "dashboard"),
     "uvicorn": ("uvicorn", "dashboard"),
+    "ribs": ("ribs", "qd"),
+    "numba": ("numba", "qd"),
     "pyarrow": ("pyarrow", "export"),
     "tensorboardX": ("tensorboardX", "export"),
+    "onnx": ("onnx", "export"),  # and training
 }
 
 
@@ -60,3 +68,45 @@ def package_version(name: str) -> str | None:
         return version(name)
     except PackageNotFoundError:
         return None
+
+
+@cache
+def find_distributions(module: str) -> tuple[str, ...]:
+    """The installed distributions that have a module; empty for a module of no distribution."""
+    top = module.partition(".")[0]
+    if not any(_may_have(top, each.read_text) for each in distributions()):
+        return ()  # a user's own module, as most: the full answer reads every installed file's name
+    return tuple(packages_distributions().get(top, ()))
+
+
+def _may_have(top: str, read: Callable[[str], str | None]) -> bool:
+    """Whether a distribution whose metadata `read` reads may have a top-level module."""
+    if declared := read("top_level.txt"):
+        return top in declared.split()
+    if files := read("RECORD"):
+        lines = f"\n{files}"
+        return f"\n{top}/" in lines or f"\n{top}." in lines
+    return any(top in (read(name) or "") for name in ("installed-files.txt", "SOURCES.txt"))
+
+
+@contextmanager
+def hidden(*modules: str) -> Iterator[None]:
+    """Let this thread's optional imports of these modules fail, which saves seconds; loaded ones stay visible."""
+    finder = _Hiding(frozenset(modules), get_ident())
+    sys.meta_path.insert(0, finder)
+    try:
+        yield
+    finally:
+        sys.meta_path.remove(finder)
+
+
+@dataclass(frozen=True)
+class _Hiding(MetaPathFinder):
+    """Finds nothing, and says that these modules are missing."""
+
+    modules: frozenset[str]
+    thread: int
+
+    def find_spec(self, fullname: str, _path: object, _target: object = None) -> None:
+        if fullname in self.modules and get_ident() == self.thread:
+            raise ModuleNotFoundError(f"No module named {fullname!r}", name=fullname)

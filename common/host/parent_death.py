@@ -11,7 +11,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing import resource_tracker
+from runpy import run_module
 
 _PR_SET_PDEATHSIG = 1
 
@@ -19,6 +19,8 @@ _PR_SET_PDEATHSIG = 1
 @contextmanager
 def signals_blocked() -> Iterator[None]:
     """Block SIGINT and SIGTERM; children started inside inherit this, so Ctrl-C cannot end them during imports."""
+    from multiprocessing import resource_tracker
+
     resource_tracker.ensure_running()  # its start would unblock the signals
     before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
     try:
@@ -45,9 +47,14 @@ def exit_with_parent(parent: int) -> None:
 
 
 def main() -> None:
-    """Replace this process by the command."""
+    """Run the command in this process: a module in this interpreter, anything else in its place."""
     exit_with_parent(int(sys.argv[1]))
-    os.execv(sys.argv[2], sys.argv[2:])  # noqa: S606 - dreamfleet's interpreter and verb
+    command = sys.argv[2:]
+    if command[:3] == [sys.executable, "-P", "-m"]:  # a second interpreter would start for nothing
+        sys.argv[:] = command[3:]
+        run_module(command[3], run_name="__main__", alter_sys=True)
+    else:
+        os.execv(command[0], command)  # noqa: S606 - a program of dreamfleet's choice
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 from time import monotonic
 
 STALL_SECONDS = 30.0  # without a step, after which an episode is given up
+FUNCTION_STALL_SECONDS = 600.0  # of one call of a function that is a task
 START_LIMIT = 120.0  # seconds that a process may take to load task and world model
 
 

@@ -7,18 +7,36 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
 
 from dreamfleet.common.errors import UsageError
 
 VARIABLE = "DREAMFLEET_TRUST"
+PLACES = "DREAMFLEET_PATH"  # folders of users' modules, for this process and those that it starts
+INSTALLED = ("site-packages", "dist-packages")  # folders of installed packages
 
 
 def trust(modules: Iterable[str]) -> None:
     """Trust these modules, and the modules in those of them that are packages."""
     os.environ[VARIABLE] = ",".join(dict.fromkeys((*_trusted_modules(), *filter(None, modules))))
+
+
+@contextmanager
+def trust_meanwhile() -> Iterator[None]:
+    """What is trusted inside is trusted no more afterwards, but for modules that this program has imported by then."""
+    before = os.environ.get(VARIABLE)
+    try:
+        yield
+    finally:
+        if before is None:
+            os.environ.pop(VARIABLE, None)
+        else:
+            os.environ[VARIABLE] = before
 
 
 def is_trusted(module: str) -> bool:
@@ -33,7 +51,7 @@ def check_trusted(module: str, chooser: str) -> None:
     if not is_trusted(module):
         raise UsageError(
             f"{chooser} is code in the module {module!r}, which is not trusted here: if you trust that module, pass "
-            f"--trust {module}, or {VARIABLE}={module} in the environment"
+            f"--trust {module}, or {VARIABLE}={module} in the environment{_place_hint(module)}"
         )
 
 
@@ -45,5 +63,65 @@ def import_trusted(module: str, chooser: str) -> ModuleType:
     return found
 
 
+def module_folder(module: str) -> Path | None:
+    """The folder to search for a module that this process finds; `None` for an unknown or installed one."""
+    top = module.partition(".")[0]
+    found = sys.modules.get(top)
+    try:
+        spec = found.__spec__ if found is not None else find_spec(top)  # of a top module nothing is imported
+    except (ImportError, ValueError):
+        return None
+    places = list(getattr(spec, "submodule_search_locations", None) or ())  # of a package
+    file = places[0] if places else getattr(spec, "origin", None) or getattr(found, "__file__", None)
+    if file in (None, "built-in", "frozen"):
+        return None
+    folder = Path(file).resolve().parent
+    return None if folder.name in INSTALLED else folder
+
+
+def search_in(folder: str) -> None:
+    """Find modules in this folder too, also in processes that this one starts."""
+    if folder:
+        os.environ[PLACES] = join_places(folder)
+        _extend_path()
+
+
+def join_places(*folders: str) -> str:
+    """The value of `PLACES` with these folders before those that it has."""
+    known = os.environ.get(PLACES, "").split(os.pathsep)
+    return os.pathsep.join(dict.fromkeys(filter(None, (*folders, *known))))
+
+
+def check_module_name(module: str) -> None:
+    """`UsageError` for a user's module that is called like one of Python's own, which other processes import instead.
+
+    In `PYTHONPATH` it would replace Python's own one in each process, and end most of them.
+    """
+    top, folder = module.partition(".")[0], module_folder(module)
+    if top in sys.stdlib_module_names and folder and not folder.is_relative_to(Path(os.__file__).resolve().parent):
+        raise UsageError(
+            f"the module {top!r} in {folder} is called like one of Python's own, which other processes would import "
+            "instead: give it another name"
+        )
+
+
+def _extend_path() -> None:
+    """Search the folders of `PLACES`: behind Python's own modules, and before installed packages."""
+    place = next((at for at, each in enumerate(sys.path) if Path(each).name in INSTALLED), len(sys.path))
+    new = [each for each in os.environ.get(PLACES, "").split(os.pathsep) if each and each not in sys.path]
+    sys.path[place:place] = new
+
+
+def _place_hint(module: str) -> str:
+    """What else it needs, if no module of this name is found; nothing is imported."""
+    with suppress(ImportError, ValueError):
+        if find_spec(module.partition(".")[0]) is not None:
+            return ""
+    return "; it is not found here either: name its folder in PYTHONPATH, as the current folder is not searched"
+
+
 def _trusted_modules() -> tuple[str, ...]:
     return tuple(filter(None, os.environ.get(VARIABLE, "").split(",")))
+
+
+_extend_path()  # as this is imported: whatever names a user's module, then finds it

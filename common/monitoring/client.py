@@ -23,6 +23,7 @@ from dreamfleet.common.monitoring.status import (
     read_document,
     read_status,
 )
+from dreamfleet.common.monitoring.status_card import show_live
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import decode_json
 from dreamfleet.common.protocol.messages import ControlReply
@@ -80,8 +81,15 @@ class Client(Displayed):
         return read_status(self.document(run))
 
     def statuses(self, timeout: float = QUERY_TIMEOUT) -> list[dict[str, Any]]:
-        """The raw statuses of all live runs that answer within `timeout` seconds, unordered."""
-        return [read_document(payload) for payload in query_all(self.session, [keys.status("*")], timeout)]
+        """The raw statuses of all live runs that answer within `timeout` seconds, unordered.
+
+        Answers that are no status are left out: one run must not hide the others.
+        """
+        found = []
+        for payload in query_all(self.session, [keys.status("*")], timeout):
+            with suppress(MalformedError):
+                found.append(read_document(payload))
+        return found
 
     def document(self, run: str | None = None, part: str = "", parameters: str = "") -> dict[str, Any]:
         """The raw status of `run`, or of the only live run; `part` is one of `status.PARTS`."""
@@ -101,6 +109,13 @@ class Client(Displayed):
         Use a longer patience to wait for a coordinator that is being started.
         """
         return map(read_status, self.watch_documents(run, pause, patience))
+
+    def show(self, run: str, pause: float = 1.0, patience: float = PATIENCE) -> None:
+        """Show the status of `run` in a notebook's cell, in place, until its coordinator leaves; errors as in `watch`.
+
+        Interrupting the cell ends the showing and not the run. Outside of a notebook, a line of each status is printed.
+        """
+        show_live(self.watch(run, pause, patience))
 
     def watch_documents(self, run: str, pause: float, patience: float = PATIENCE) -> Iterator[dict[str, Any]]:
         """Like `watch`, but yields raw statuses."""
@@ -200,12 +215,14 @@ class Client(Displayed):
             if offset >= document["total"] or not document[part]:
                 return
 
-    def control(self, run: str, verb: str) -> str:
-        """Ask the coordinator to `pause`, `resume`, `drain` or `stop`; `RefusedError` with its reason if it refuses.
+    def control(self, run: str, verb: str, host: str = "") -> str:
+        """Ask the coordinator to `pause`, `resume`, `drain` or `stop`, or to `bar` or `unbar` a host.
 
-        Returns the command that resumes the run on the coordinator's host, if it leaves and sends one; else empty.
+        `RefusedError` with its reason if it refuses. Returns the command that resumes the run on the coordinator's
+        host, if it leaves and sends one; else empty.
         """
-        for reply in self.session.get(keys.control(keys.check_run_name(run), verb), timeout=QUERY_TIMEOUT):
+        about = f"?host={keys.check_worker_name(host)}" if host else ""
+        for reply in self.session.get(keys.control(keys.check_run_name(run), verb) + about, timeout=QUERY_TIMEOUT):
             if reply.ok is not None:
                 try:
                     answer = decode_json(ControlReply, reply.ok.payload.to_bytes())

@@ -10,8 +10,10 @@ from typing import Any
 
 from dreamfleet.common.monitoring.status import EpisodeProgress, Status, WorkerCount
 from dreamfleet.common.printable import format_number, plural
+from dreamfleet.common.protocol.function_values import value_of
+from dreamfleet.common.protocol.tasks import step_unit
 from dreamfleet.common.runs.effort import format_steps
-from dreamfleet.common.runs.records import describe_score, format_mean
+from dreamfleet.common.runs.records import describe_score, format_mean, in_values
 
 PACE_WINDOW = 10  # closed generations whose median is the pace; the median ignores one that was paused for hours
 ACTIVE_STATES = ("running", "evaluating")
@@ -85,15 +87,15 @@ def summarise_status(status: Status) -> str:
     """Summarise a status in one line, for a log; without the run's name."""
     if status.is_over:
         return describe_state(status)
-    opened, best = status.generation, status.confirmed or status.best
+    opened, best = status.generation, in_values(status.confirmed or status.best, status.settings.task)
     score = "nothing evaluated yet" if best is None else f"best mean {format_mean(best)}"
     workers, slots = plural(status.workers.present, "worker"), plural(status.slots, "slot")
-    lost = describe_departed(status.workers)
+    lost, unit = describe_departed(status.workers), step_unit(status.settings.task.task)
     failed = status.failed + opened.failed
     failures = f", {plural(failed, 'failed candidate')}" if failed else ""
     return (
         f"{_summarise_progress(status)}{failures}, {score}, "
-        f"{status.throughput.steps_per_second:,.0f} steps/s, {workers} with {slots}{f' ({lost})' if lost else ''}, "
+        f"{status.throughput.steps_per_second:,.0f} {unit}/s, {workers} with {slots}{f' ({lost})' if lost else ''}, "
         f"{estimate_eta(status).description}"
     )
 
@@ -169,7 +171,8 @@ def _counted_limits(status: Status, pace: float | None, next_seconds: float | No
         seconds = None
         if rate and open_seconds is not None:
             seconds = max((steps - done) / rate, open_seconds) if done < steps else open_seconds
-        yield LimitProgress("steps", done, steps, seconds, f"{format_steps(done)} of {format_steps(int(steps))} steps")
+        text = f"{format_steps(done)} of {format_steps(int(steps))} {step_unit(status.settings.task.task)}"
+        yield LimitProgress("steps", done, steps, seconds, text)
     if (minutes := _limit(limits, "minutes")) and spent.seconds is not None:
         elapsed += spent.seconds
         text = f"{_format_minutes(elapsed / 60)} of {_format_minutes(minutes)} minute{'' if minutes == 1 else 's'}"
@@ -195,8 +198,10 @@ def _uncounted_limits(status: Status) -> Iterator[str]:
     """Describe the limits that depend on the results of evaluations."""
     target, parted = status.limits.get("target"), status.limits.get("parted")
     if isinstance(target, (int, float)):
-        best = "" if status.best is None else f" (best {format_number(status.best.mean)})"
-        yield f"until an evaluation reaches {target:g}{best}"
+        task = status.settings.task
+        found = in_values(status.best, task)
+        best = "" if found is None else f" (best {format_number(found.mean)})"
+        yield f"until an evaluation reaches {value_of(target, task):g}{best}"
     if isinstance(parted, int) and parted:
         yield f"until {parted} evaluations in a row fall behind"
 
@@ -219,6 +224,8 @@ def _summarise_progress(status: Status) -> str:
     if _is_limit_reached(status):
         return status.state
     opened = status.generation
+    if status.settings.is_external and not opened.episodes:
+        return status.state
     episodes = f"{opened.episodes_done}/{opened.episodes} episodes" if opened.episodes else "all candidates failed"
     return f"{status.state}, generation {opened.number} ({episodes})"
 
@@ -260,7 +267,8 @@ def _describe_paused(status: Status) -> str:
 
 
 def _describe_ended(status: Status) -> str:
-    return f"ended: {status.why or 'stopped'}; {describe_score(status.confirmed or status.best, status.score_word)}"
+    score = describe_score(in_values(status.confirmed or status.best, status.settings.task), status.score_word)
+    return f"ended: {status.why or 'stopped'}; {score}"
 
 
 def _describe_left(status: Status) -> str:

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
-from dreamfleet.common.protocol.tasks import DREAM
+from dreamfleet.common.printable import plural
+from dreamfleet.common.protocol.function_values import is_minimised, spans_decades, value_of
+from dreamfleet.common.protocol.tasks import DREAM, is_function_task
+from dreamfleet.common.runs.records import in_values
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.common.runs.stages import begun_stages
+from dreamfleet.common.runs.stages import BegunStage, begun_stages
+from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.score_words import score_word_of_run
 
 
@@ -22,46 +28,91 @@ class ScoreWithError(Protocol):
         """The standard error."""
 
 
-# Of a confirmed score: its error bar, which may be short, shows within the marker.
-HOLLOW_STAR: dict[str, Any] = {"markersize": 13, "markerfacecolor": "none", "markeredgewidth": 1.5, "capsize": 4}
+# Of a confirmed score: a white edge sets it apart from lines and error bars behind it, and no edge of a panel cuts it.
+STAR: dict[str, Any] = {
+    "markersize": 14, "markeredgecolor": "white", "markeredgewidth": 1, "capsize": 4, "zorder": 5, "clip_on": False
+}  # fmt: skip
 PLOT_COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:olive")
+FEW_EPISODES = 4  # of a candidate, up to which luck with a generation's seeds is visible in its mean
+WINDOW = 9  # generations of a running median; a run of twice as many has one
+ASIDE = 0.012  # of the x axis: how far a confirmed score stands beside the same mean's evaluation
 
 
-def draw_fitness(axes: Any, run: RunFolder) -> list[Any]:
+def has_score_panel(run: RunFolder) -> bool:
+    """Whether evaluated means need a panel of their own: candidates only dream, and a dream's fitness is no score."""
+    evaluations = run.evaluations()
+    dreams = run.settings.task.task == DREAM
+    return bool(evaluations) and dreams and not any(each.stage.driven for each in _stages(run))
+
+
+def draw_fitness(panels: Sequence[Any], run: RunFolder) -> list[Any]:
     """Draw each generation's mean, spread and best fitness, the evaluations and the confirmed score.
 
-    Evaluations have a second axis if candidates only dream: dreamed fitness and real score are not comparable. Returns
-    the handles for a legend.
+    `panels` are one pair of axes, or two, above each other, if the run `has_score_panel`. Returns the handles for a
+    legend.
     """
-    history, evaluations, settings = run.history(), run.evaluations(), run.settings
-    number, mean, std, best = np.array([(each.number, each.mean, each.std, each.best) for each in history]).T
-    spread = "± 1 standard deviation of the candidates"
-    axes.fill_between(number, mean - std, mean + std, alpha=0.2, color="tab:blue", label=spread)
-    axes.plot(number, mean, color="tab:blue", label="mean of the population")
-    axes.plot(number, best, color="tab:orange", linewidth=1, label="best candidate")
-    stages = begun_stages(settings, history, evaluations)
-    for count, each in enumerate(stages[1:]):
-        label = None if count else "a stage begins"
-        axes.axvline(each.since - 0.5, color="tab:gray", linestyle="--", linewidth=1, label=label)
-    axes.set_xlabel("generation")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.grid(alpha=0.3)
-    dreamt = settings.task.task == DREAM
-    dreams_only = dreamt and not any(each.stage.driven for each in stages)
-    real = axes.twinx() if dreams_only and evaluations else axes
+    task, evaluations, stages = run.spec, run.evaluations(), _stages(run)
+    history = [in_values(each, task) for each in run.history()]
+    number, mean, std, best, worst = np.array(
+        [(each.number, each.mean, each.std, each.best, each.worst) for each in history]
+    ).T
+    axes, scores = panels[0], panels[-1]
+    marker = "o" if len(history) == 1 else ""
+    smooth = running_median(mean, [each.since for each in stages])
+    thin = {} if smooth is None else {"linewidth": 0.8, "alpha": 0.6}
+    axes.plot(number, mean, color="tab:blue", marker=marker, label="mean of the candidates", **thin)
+    if smooth is not None:
+        label = f"its running median over {WINDOW} generations"
+        axes.plot(number, smooth, color="tab:blue", linewidth=2.2, label=label)
+    spread = "± 1 standard deviation (cut at worst and best)"
+    ends = np.minimum(best, worst), np.maximum(best, worst)
+    low, high = np.fmax(mean - std, ends[0]), np.fmin(mean + std, ends[1])
+    axes.fill_between(number, low, high, alpha=0.2, color="tab:blue", linewidth=0, label=spread)
+    axes.plot(number, best, color="tab:orange", linewidth=1, marker=marker, label="best candidate")
+    for panel in panels:
+        for count, each in enumerate(stages[1:]):
+            named = {} if count or panel is not axes else {"label": "a stage begins"}
+            panel.axvline(each.since - 0.5, color="tab:gray", linestyle="--", linewidth=1, **named)
+        panel.margins(x=0.03)
+        panel.xaxis.set_major_locator(MaxNLocator(9, integer=True, steps=(1, 2, 5, 10)))
+        panel.grid(alpha=0.3)
+    scores.set_xlabel("generation")
     if evaluations:
-        word = score_word_of_run(run.spec, run.bundle_path)
-        episodes = f"{settings.evaluation_episodes} {word}s, whole episodes"
-        real.errorbar(
-            [each.generation for each in evaluations], [each.mean for each in evaluations],
-            error_bars(evaluations), fmt="o-" if dreamt else "o", color="tab:green", capsize=3,
-            label=f"evaluated mean{' in reality' if dreamt else ''}, {episodes} (± standard error)",
-        )  # fmt: skip
-        _draw_confirmed(real, run)
-    if real is not axes:
-        real.set_ylabel(f"score in reality, {episodes}", color="tab:green")
-    drawn = (axes,) if real is axes else (axes, real)
-    return [handle for each in drawn for handle in each.get_legend_handles_labels()[0]]
+        _draw_evaluations(scores, run)
+    if is_minimised(task) and spans_decades([*best, *worst, *(value_of(each.mean, task) for each in evaluations)]):
+        axes.set_yscale("log")
+    return [handle for each in dict.fromkeys(panels) for handle in each.get_legend_handles_labels()[0]]
+
+
+def seeds_note(run: RunFolder) -> str:
+    """What a reader must know of a candidate's few episodes; empty if it has many."""
+    episodes = sorted({each.stage.episodes for each in _stages(run)})
+    if (
+        run.settings.is_external
+        or is_function_task(run.spec.task)
+        or episodes[0] > FEW_EPISODES
+        or len(run.history()) < 2
+    ):
+        return ""
+    counted = plural(episodes[0], "episode") if len(episodes) == 1 else f"{episodes[0]} to {episodes[-1]} episodes"
+    return f"{counted} a candidate: seeds differ from one generation to the next, and some are harder"
+
+
+def running_median(values: NDArray[np.float64], begins: Sequence[int] = (0,)) -> NDArray[np.float64] | None:
+    """The median of `WINDOW` values around each of `values` `(n,)`, of fewer at the ends; `None` for a short run.
+
+    Values before and after an index in `begins` never mix: a stage may change what a fitness means.
+
+    >>> running_median(np.array([0.0, 9.0] * 9))[:6].tolist()
+    [0.0, 4.5, 0.0, 4.5, 0.0, 9.0]
+    """
+    if len(values) < 2 * WINDOW:
+        return None
+    half, smooth = WINDOW // 2, np.empty_like(values)
+    for first, last in pairwise((*begins, len(values))):
+        for place in range(first, last):
+            smooth[place] = np.median(values[max(first, place - half) : min(last, place + half + 1)])
+    return smooth
 
 
 def error_bars(found: Iterable[ScoreWithError]) -> list[float]:
@@ -69,11 +120,26 @@ def error_bars(found: Iterable[ScoreWithError]) -> list[float]:
     return [np.nan if each.error is None else each.error for each in found]
 
 
-def _draw_confirmed(axes: Any, run: RunFolder) -> None:
-    """Draw the run's confirmed score; it is often below the best evaluation, which is partly luck."""
-    if (confirmed := run.confirmation()) is not None:
-        word = score_word_of_run(run.spec, run.bundle_path)
+def _stages(run: RunFolder) -> Sequence[BegunStage]:
+    history = run.history()
+    return [each for each in begun_stages(run.settings, history, run.evaluations()) if each.since < len(history)]
+
+
+def _draw_evaluations(axes: Any, run: RunFolder) -> None:
+    """Draw the evaluated means and the confirmed score, which is often below the best of them, as that is luck too."""
+    evaluations = [in_values(each, run.spec) for each in run.evaluations()]
+    confirmed = in_values(run.confirmation(), run.spec)
+    word, episodes = score_word_of_run(run.spec, run.bundle_path), run.settings.evaluation_episodes
+    seeds = "" if episodes == 1 else f" ± standard error, {episodes} {word}s"
+    axes.errorbar(
+        [each.generation for each in evaluations], [each.mean for each in evaluations], error_bars(evaluations),
+        fmt="o-", color="tab:green", capsize=3, linewidth=1, zorder=3,
+        label=f"evaluated mean{seeds}",
+    )  # fmt: skip
+    if confirmed is not None:
+        score = format_with_error(confirmed.mean, confirmed.error)
         axes.errorbar(
-            confirmed.generation, confirmed.mean, error_bars([confirmed]), fmt="*", color="tab:red", **HOLLOW_STAR,
-            label=f"reported: confirmed on {confirmed.episodes} fresh {word}s (± standard error)",
+            confirmed.generation + ASIDE * max(1, len(run.history()) - 1), confirmed.mean, error_bars([confirmed]),
+            fmt="*", color="tab:red", **STAR,
+            label=f"reported: {score} on {confirmed.episodes} fresh {word}s",
         )  # fmt: skip

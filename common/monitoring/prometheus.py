@@ -13,13 +13,14 @@ from typing import Literal
 from dreamfleet.common.monitoring.eta import estimate_eta
 from dreamfleet.common.monitoring.status import FINAL_STATES, Status, WorkerStatus
 from dreamfleet.common.printable import truncate
+from dreamfleet.common.protocol.check_counts import CheckCounts
 from dreamfleet.common.runs.records import StoredConfirmation, StoredEvaluation
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 MAX_WORKERS, MAX_REASONS = 200, 50
 OTHER_CLASSES = "other"  # label of the host classes that a status does not list
 MAX_LABEL_CHARS = 128
-STATES = ("running", "evaluating", "waiting for workers", "paused", *FINAL_STATES)
+STATES = ("running", "evaluating", "waiting for workers", "waiting for a batch", "paused", *FINAL_STATES)
 ESCAPES = str.maketrans({"\\": r"\\", '"': r"\"", "\n": r"\n"})
 
 
@@ -95,7 +96,8 @@ def _fitness(status: Status) -> Iterator[Metric]:
     yield from _score_gauges(
         "confirmed_score", "Confirmed score of the reported mean, on fresh tracks.", status.confirmed
     )
-    yield _gauge("sigma", "The optimiser's step size.", status.generation.sigma)
+    sigma = None if status.settings.is_external else status.generation.sigma
+    yield _gauge("sigma", "The optimiser's step size.", sigma)
     yield _gauge("temperature", "The open generation's dream temperature.", status.generation.temperature)
 
 
@@ -114,6 +116,14 @@ def _fleet(status: Status) -> Iterator[Metric]:
         "host_classes", "Host classes of the accepted results; with one, all results are bit-identical.", classes.total
     )
     yield Metric("dreamfleet_class_results", "gauge", "Accepted results of the largest host classes.", by_class)
+    checks = status.checks or CheckCounts(0.0)
+    outcomes = {"equal": checks.checked - checks.differing, "differs": checks.differing, "unchecked": checks.unchecked}
+    yield _labelled_counter(
+        "drawn_results_total", "Results drawn to be scored again on another host.", "outcome", outcomes
+    )
+    yield _counter("recalled_results_total", "Results of barred hosts that count no more.", checks.recalled)
+    why = "Hosts that are barred: their results differ, or the operator says so."
+    yield _gauge("barred_hosts", why, len(checks.barred))
     yield _gauge("failing_jobs", "Open jobs that failed on some worker.", status.failing)
 
 

@@ -10,16 +10,19 @@ import json
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from dreamfleet.common.printable import plural
+from dreamfleet.common.printable import format_number, plural
+from dreamfleet.common.protocol.check_counts import CheckCounts
 from dreamfleet.common.protocol.failures import describe_job
 from dreamfleet.common.protocol.host_classes import HostClasses
-from dreamfleet.common.protocol.messages import MAX_MESSAGE, HostClass
+from dreamfleet.common.protocol.messages import MAX_MESSAGE, FleetShare, HostClass
+from dreamfleet.common.protocol.tasks import step_unit
 from dreamfleet.common.runs.records import (
     RunSettings,
     StoredConfirmation,
     StoredEvaluation,
     StoredGeneration,
     format_mean,
+    in_values,
 )
 from dreamfleet.common.serialization.display import Displayed
 from dreamfleet.common.serialization.optional_fields import OPTIONAL
@@ -226,6 +229,26 @@ class Waste:
 
 
 @dataclass(frozen=True)
+class ArchiveStatus:
+    """What a quality-diversity search has found: the elites, one a cell at most."""
+
+    cells: Count
+    filled: Count  # cells that have an elite
+    qd_score: float  # the sum of the elites' fitness
+    best: float | None  # fitness of the best elite; `None` before the first
+    best_cell: tuple[Count, ...]  # its numbers, as `evaluate --cell` takes them
+
+    @property
+    def description(self) -> str:
+        """The archive in words."""
+        filled = f"{self.filled:,} of {self.cells:,} cells filled"
+        if self.best is None:
+            return filled
+        best = f"best elite {format_number(self.best)} (--cell {','.join(map(str, self.best_cell))})"
+        return f"{filled}, QD score {format_number(self.qd_score)}, {best}"
+
+
+@dataclass(frozen=True)
 class FailureStatus:
     """An open job that failed on some worker."""
 
@@ -259,7 +282,7 @@ class Status(Displayed):
     run_uid: Word
     incarnation: Count
     package: Word | None  # version of the coordinator's dreamfleet
-    state: Word  # running, evaluating, waiting for workers, paused, ended, left
+    state: Word  # running, evaluating, waiting for workers, waiting for a batch, paused, ended, left
     why: LongText  # reason why it is paused or ended
     settings: RunSettings
     limits: dict[str, Any]
@@ -289,32 +312,46 @@ class Status(Displayed):
     confirming: EpisodeProgress = field(default=EpisodeProgress(0, 0), metadata=OPTIONAL)  # one round of a confirmation
     strict: bool = field(default=False, metadata=OPTIONAL)  # hosts of another class than the first result's are refused
     classes: HostClasses = field(default=HostClasses(), metadata=OPTIONAL)  # of the accepted results
+    checks: CheckCounts | None = field(default=None, metadata=OPTIONAL)  # of results that other hosts score again
     # When the coordinator's join file expires, in seconds since 1970; `None` without one.
     expires: Moment | None = field(default=None, metadata=OPTIONAL)
 
     failed: Count = field(default=0, metadata=OPTIONAL)  # candidates of closed generations that failed
     # Since the run began, by the wall clock: pauses, and time without coordinator or workers, included.
     elapsed: Seconds | None = field(default=None, metadata=OPTIONAL)
+    open_batches: Count = field(default=0, metadata=OPTIONAL)  # submitted ones that wait or are scored
     ending: bool = field(default=False, metadata=OPTIONAL)  # a limit is reached: only evaluations are left
     # Episodes of evaluations and of the confirmation until the run's end.
     closing: Count = field(default=0, metadata=OPTIONAL)
+    share: FleetShare = field(default=1.0, metadata=OPTIONAL)  # of workers that serve several runs
+    # Steps after which the environment itself ends an episode; `None`: it has no limit, or none is known.
+    episode_limit: Count | None = field(default=None, metadata=OPTIONAL)
+    archive: ArchiveStatus | None = field(default=None, metadata=OPTIONAL)  # of a run with `--archive`
     score_word: Word = field(default="seed", metadata=OPTIONAL)  # what the world calls a scored seed: "track", "game"
 
     def _display(self) -> tuple[str, dict[str, object]]:
-        now, best = self.generation, self.confirmed or self.best
+        task, now = self.settings.task, self.generation
+        last, best = in_values(self.last, task), in_values(self.confirmed or self.best, task)
         progress = f"generation {now.number}, {now.episodes_done} of {now.episodes} episodes"
         workers = plural(self.workers.present, "worker")
         facts: dict[str, object] = {
-            "task": self.settings.task.task,
+            "task": task.task,
             "state": f"{self.state}: {self.why}" if self.why else self.state,
             "progress": progress,
-            "last generation's mean": None if self.last is None else f"{self.last.mean:.6g}",
+            "last generation's mean": None if last is None else f"{last.mean:.6g}",
+            "archive": None if self.archive is None else self.archive.description,
             "confirmed" if self.confirmed else "best evaluation": None if best is None else format_mean(best),
             "workers": f"{workers}, {plural(self.slots, 'slot')}",
-            "speed": f"{self.throughput.steps_per_second:,.0f} steps/s",
+            "speed": f"{self.throughput.steps_per_second:,.0f} {step_unit(task.task)}/s",
             "failing jobs": self.failing or None,
         }
         return f"Status of {self.run}: {self.state}, {progress}, {workers}", facts
+
+    def _repr_html_(self) -> str:
+        """The card that notebooks show."""
+        from dreamfleet.common.monitoring.status_card import status_card
+
+        return status_card(self)
 
     @property
     def is_over(self) -> bool:

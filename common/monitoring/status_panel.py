@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -13,28 +14,31 @@ from rich.console import Console, ConsoleOptions, Group, RenderResult
 from rich.panel import Panel
 from rich.text import Text
 
+from dreamfleet.common.artifacts.objective import describe_sign
 from dreamfleet.common.monitoring.eta import describe_state, estimate_eta, format_duration
 from dreamfleet.common.monitoring.status import (
     EpisodeProgress,
     FailureStatus,
     GenerationStatus,
     Population,
-    StageStatus,
     Status,
 )
 from dreamfleet.common.monitoring.terminal_charts import bar_chart, candidate_grid, candidate_grid_height, share_bar
 from dreamfleet.common.monitoring.worker_table import WorkerTable
 from dreamfleet.common.printable import format_number, plural, printable
-from dreamfleet.common.protocol.tasks import DREAM, is_unregistered
+from dreamfleet.common.protocol.function_values import fitness_word, is_minimised, spans_decades, value_of
+from dreamfleet.common.protocol.tasks import DREAM, is_unregistered, step_unit
 from dreamfleet.common.runs.records import (
+    SUBMITTED,
     RunSettings,
     StoredConfirmation,
     StoredEvaluation,
     StoredGeneration,
     count_episodes,
     format_mean,
+    in_values,
 )
-from dreamfleet.common.runs.stages import describe_steps
+from dreamfleet.common.runs.stages import describe_limit, describe_steps
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, describe_time_left
 
 STATE_STYLES = {
@@ -44,6 +48,7 @@ STATE_STYLES = {
     "ended": "bold",
     "left": "bold yellow",
     "waiting for workers": "yellow",
+    "waiting for a batch": "yellow",
 }
 FRAME_WIDTH = 4  # columns of border and padding
 BORDER_LINES = 2
@@ -119,6 +124,8 @@ def _blocks(status: Status, width: int, worker_flags: str) -> Iterator[Block]:
     yield _text_block(0, Text(printable(describe_state(status)), style=state), width, min_lines=2)
     if status.failures and not status.why:
         yield _text_block(1, Text(printable(_describe_failure(status.failures[0])), style="red"), width, min_lines=1)
+    if status.checks is not None and status.checks.waiting and not status.why:
+        yield _text_block(1, Text(printable(status.checks.waiting), style="red"), width, min_lines=1)
     if status.worker_list:  # else they stand in its place
         for each in status.refusals:
             yield _text_block(1, Text(printable(each), style="yellow"), width, min_lines=1)
@@ -130,9 +137,7 @@ def _blocks(status: Status, width: int, worker_flags: str) -> Iterator[Block]:
     max_lines = len(_fact_lines(facts, width))
     yield Block(4, min(3, max_lines), min(5, max_lines), max_lines, lambda given: _fit_facts(facts, width, given))
     if len(status.recent) > 1:
-        yield Block(
-            7, 1, 4, MAX_CURVE_LINES, lambda given: _curve_lines(status.recent, width, given, status.generation.stage)
-        )
+        yield Block(7, 1, 4, MAX_CURVE_LINES, lambda given: _curve_lines(status, width, given))
     if (population := _open_population(status)) is not None:
         shown = population
         wanted = 1 + candidate_grid_height(shown, width)
@@ -157,19 +162,29 @@ def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
     temperature, stage = status.generation.temperature, status.generation.stage
     now, size = (task, settings) if stage is None else (stage, stage)
     warm = "" if temperature is None or size.driven == 1 else f", temperature {temperature:g}"
-    length = describe_steps(now.horizon, size.driven, dreamt=task.task == DREAM and size.driven > 0)
-    yield 6, "task", f"{task.task}, {length}{warm}"
-    yield 7, "population", f"{plural(size.population, 'candidate')} x {plural(size.episodes, 'episode')}"
+    limit, dreamt = status.episode_limit, task.task == DREAM and size.driven > 0
+    length = describe_steps(now.horizon, size.driven, dreamt=dreamt, limit=limit, word=step_unit(task.task))
+    length += describe_limit(now.horizon, limit)
+    yield 6, "task", ", ".join(filter(None, (task.task, length + warm, describe_sign(task.options))))
+    own = f"{plural(size.population, 'candidate')} x {plural(size.episodes, 'episode')}"
+    yield 7, "population", SUBMITTED if settings.is_external else own
     if stage is not None:
         yield 4, "stage", f"{stage.number} of {stage.total}, since generation {stage.since}"
-    yield 0, "last generation", _describe_generation(status.last) if status.last else "-"
-    yield 5, "step size", f"{format_number(status.generation.sigma)} ({_describe_optimiser(settings)})"
-    yield 1, "evaluated mean", _describe_evaluation(status.evaluation, status.score_word)
+    yield 0, "last generation", _describe_generation(in_values(status.last, task)) if status.last else "-"
+    if settings.is_external:
+        waiting = max(status.open_batches - bool(status.generation.episodes), 0)
+        yield 3, "batches", f"{status.open_batches} open, {waiting} of them wait"
+    else:
+        yield 5, "step size", f"{format_number(status.generation.sigma)} ({_describe_optimiser(settings)})"
+    if status.archive is not None:
+        yield 1, "archive", status.archive.description
+    yield 1, "evaluated mean", _describe_evaluation(in_values(status.evaluation, task), status.score_word)
     yield 2, "reported", _describe_reported(status)
     rate, steps = status.throughput.steps_per_second, status.throughput.environment_steps
-    yield 3, "throughput", f"{rate:,.0f} steps/s, {steps:,} steps in all"
+    word = step_unit(task.task)
+    yield 3, "throughput", f"{rate:,.0f} {word}/s, {steps:,} {word} in all"
     resent = f", {plural(waste.resent_batches, 'batch', 'batches')} resent" if waste.resent_batches else ""
-    yield 4, "redundant work", f"{waste.share:.1%} of steps, {plural(waste.reissued, 'job')} reissued{resent}"
+    yield 4, "redundant work", f"{waste.share:.1%} of {word}, {plural(waste.reissued, 'job')} reissued{resent}"
     if failed := status.failed + status.generation.failed:
         yield (
             2,
@@ -181,6 +196,8 @@ def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
         yield 6, "time", f"{format_duration(worked)} of work, {format_duration(status.elapsed)} since it began"
     if status.classes.total:
         yield 4 if status.classes.mixed or status.classes.varying else 7, "hosts", status.classes.description
+    if (checks := status.checks) is not None:
+        yield 2 if checks.differing or checks.barred or checks.waiting else 6, "checks", checks.description
     if status.expires is not None:
         left = datetime.fromtimestamp(status.expires, UTC) - datetime.now(UTC)
         yield 0 if left < EXPIRY_WARNING else 8, "join file", f"the coordinator's: {describe_time_left(left)}"
@@ -237,9 +254,10 @@ def _describe_evaluation(each: StoredEvaluation | StoredConfirmation | None, wor
 
 
 def _describe_reported(status: Status) -> str:
-    if status.confirmed is not None or status.best is None:
-        return _describe_evaluation(status.confirmed, status.score_word)
-    return f"{_describe_evaluation(status.best, status.score_word)}, provisional"
+    confirmed, best = (in_values(each, status.settings.task) for each in (status.confirmed, status.best))
+    if confirmed is not None or best is None:
+        return _describe_evaluation(confirmed, status.score_word)
+    return f"{_describe_evaluation(best, status.score_word)}, provisional"
 
 
 def _describe_failure(failure: FailureStatus) -> str:
@@ -278,7 +296,7 @@ def _candidate_lines(status: Status, population: Population, width: int, lines: 
     else:
         parts = [f"{done:,}/{wanted:,} episodes", *([f"{failed} failed (x)"] if failed else [])]
     if found:
-        values = [each.fitness or 0.0 for each in found]
+        values = [value_of(each.fitness or 0.0, status.settings.task) for each in found]
         parts.append(f"so far {format_number(min(values))} to {format_number(max(values))}")
     if population.total > len(population.done):
         parts.append(f"the first {len(population.done)} of {population.total} candidates")
@@ -286,15 +304,15 @@ def _candidate_lines(status: Status, population: Population, width: int, lines: 
     return [Text(caption[:width], style="dim"), *candidate_grid(population, width, lines - 1)]
 
 
-def _curve_lines(
-    history: Sequence[StoredGeneration], width: int, lines: int, stage: StageStatus | None = None
-) -> list[Text]:
-    """The mean fitness of all generations: a line of bars, or, with more lines, a bar chart under a caption.
+def _curve_lines(status: Status, width: int, lines: int) -> list[Text]:
+    """The mean fitness of the last generations: a line of bars, or, with more lines, a bar chart under a caption.
 
     If there are more generations than columns, a bar is the mean of several. Generations of earlier stages are dim:
     their fitness may not be comparable.
     """
-    caption = "mean fitness by generation"
+    task, stage = status.settings.task, status.generation.stage
+    history = [in_values(each, task) for each in status.recent]
+    caption = f"mean {fitness_word(task)} by generation"
     margin = max(len(format_number(each.mean)) for each in history) + 1
     room = width - margin - (len(caption) + 1 + margin if lines == 1 else 0)
     means = _downsample([each.mean for each in history], max(room, 1))
@@ -307,11 +325,14 @@ def _curve_lines(
         )
         return [drawn]
     wide = max(1, room // len(means))
-    rows = bar_chart([mean for mean in means for _ in range(wide)], lines - 1)
+    is_log = is_minimised(task) and spans_decades(means)
+    heights = [math.log10(mean) if is_log else mean for mean in means]
+    rows = bar_chart([each for each in heights for _ in range(wide)], lines - 1)
     marks = [high] if len(rows) == 1 else [high, *[""] * (len(rows) - 2), low]
     plot = [Text.assemble((f"{mark:>{margin - 1}} ", "dim"), *_colour_bars(row, earlier * wide))
             for mark, row in zip(marks, rows, strict=True)]  # fmt: skip
     each = "" if len(means) == len(history) else f", {round(len(history) / len(means))} to a bar"
+    each += ", log scale" if is_log else ""
     begun = f", stage {stage.number} since {since}" if stage is not None and earlier else ""
     return [Text(f"{caption}, {history[0].number} to {history[-1].number}{each}{begun}"[:width], style="dim"), *plot]
 

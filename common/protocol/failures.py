@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 HOST_PREFIX = "host: "
+OF_FUNCTION = "ObjectiveError"  # the cause where a function raised, or returned no finite number
 
 
 def failure_cause(error: str) -> str:
@@ -14,6 +15,16 @@ def failure_cause(error: str) -> str:
     'ValueError'
     """
     return error.partition(":")[0]
+
+
+def error_text(error: str) -> str:
+    """An error without its cause, if a function raised it: the text itself names the exception.
+
+    >>> error_text("ObjectiveError: cost returned nan"), error_text("slot crashed (exit status 3)")
+    ('cost returned nan', 'slot crashed (exit status 3)')
+    """
+    cause, _, text = error.partition(": ")
+    return text if cause == OF_FUNCTION else error
 
 
 def is_host_failure(error: str) -> bool:

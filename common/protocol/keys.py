@@ -103,6 +103,11 @@ def control(run: str, verb: str) -> str:
     return f"{_PREFIX}/{run}/control/{verb}"
 
 
+def batch(run: str, verb: str) -> str:
+    """Query about submitted batches: `submit`, `read` and `cancel` with an id in the parameters, or `list`."""
+    return f"{_PREFIX}/{run}/batch/{verb}"
+
+
 def bundle(run: str, sha256: str) -> str:
     """Query for a part of the frozen world model: parameters `offset` and `length`, in bytes."""
     return f"{_PREFIX}/{run}/bundle/{sha256}"
@@ -121,6 +126,11 @@ def event_generation(run: str) -> str:
 def event_status(run: str) -> str:
     """Coordinator to everyone, as it leaves: the last status."""
     return f"{_PREFIX}/{run}/event/status"
+
+
+def event_batch(run: str) -> str:
+    """Coordinator to everyone: each change of a submitted batch."""
+    return f"{_PREFIX}/{run}/event/batch"
 
 
 def view(run: str, worker: str) -> str:

@@ -14,6 +14,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
+from dreamfleet.common.protocol.measures import MeasureNames, Measures
 from dreamfleet.common.serialization.display import DisplayedFields
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
 from dreamfleet.common.serialization.validation import Between, Count, Digest, Length, Seconds, Text, Word
@@ -24,6 +25,7 @@ MAX_PICTURE_SIDE = 256  # pixels of a live frame's picture
 MAX_UPLOAD = 32 << 20  # a rollout of 1000 steps has 12 MB (64x64) or 28 MB (96x96) uncompressed
 MAX_OPTIONS = 8_000  # characters; statuses and controllers contain them too
 MAX_END = 32  # characters of an end rule
+MAX_REASON = 400  # characters of why a worker leaves, or a run has ended
 MAX_LEASES = 1024  # of one worker; a heartbeat lists them all and must stay under MAX_MESSAGE
 MAX_BATCHES = 2**53  # never reached
 MAX_SLOTS = 4096  # of one worker
@@ -37,9 +39,11 @@ Part = Annotated[bytes, Length(0, MAX_PART)]
 Temperature = Annotated[float, Between(MIN_TEMPERATURE, MAX_TEMPERATURE)]
 Horizon = Annotated[int, Between(1, 10**6)]  # maximum steps of an episode that is scored for the optimiser
 Share = Annotated[float, Between(0.0, 1.0)]
+MIN_SHARE, MAX_SHARE = 0.01, 100.0
+FleetShare = Annotated[float, Between(MIN_SHARE, MAX_SHARE)]  # of a fleet's slots, relative to the other runs' shares
 Patience = Annotated[int, Between(0, 10**6)]  # steps without reward after which a scored episode ends; 0: never
 Packages = Annotated[tuple[Word, ...], Length(0, 64)]
-Reason = Annotated[str, Length(0, 400)]  # why a worker leaves; empty: it stays, or does not say
+Reason = Annotated[str, Length(0, MAX_REASON)]  # why a worker leaves, or why a run has ended; empty: nothing is said
 HostClass = Annotated[str, Length(0, 32)]  # see `host_classes`; empty: not known yet
 Kind = Literal["score", "evaluate", "collect"]
 VerdictWord = Literal["accepted", "duplicate", "obsolete", "refused"]
@@ -73,6 +77,7 @@ class TaskSpec(DisplayedFields):
     driven: bool = field(default=False, metadata=OPTIONAL)  # score a dream task in the real environment
     # When dreams end, in place of the bundle's own rule: a text that `EndRule.parse` reads. Empty: the bundle's own.
     end: Annotated[str, Length(0, MAX_END)] = field(default="", metadata=OPTIONAL)
+    measures: MeasureNames = field(default=(), metadata=OPTIONAL)  # that each episode gives beside its fitness
 
     @property
     def world_version(self) -> int:
@@ -180,8 +185,9 @@ class JobBatch(Message):
     cancels: tuple[Digest, ...]
     verdicts: tuple[Verdict, ...]
     leave: bool = field(default=False, metadata=OPTIONAL)  # the run is over: the worker exits
-    # The run has ended. Only workers whose hello said `leaves_with_run` read it, and they exit.
+    # The run has ended. Only workers whose hello said `leaves_with_run` or `reads_end` get it.
     ended: bool = field(default=False, metadata=OPTIONAL)
+    why: Reason = field(default="", metadata=OPTIONAL)  # it ended, for workers whose hello said `reads_end`
 
 
 @dataclass(frozen=True)
@@ -194,6 +200,7 @@ class Result:
     seconds: Seconds
     error: Text | None
     upload: Digest | None
+    measures: Measures = field(default=(), metadata=OPTIONAL)  # those that the specification names, in its order
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,6 +242,8 @@ class Heartbeat(Message):
     drawn_by: Word  # renderer of the slots' pictures: native, gymnasium, or - if the task does not say
     host_class: HostClass | None = field(default=None, metadata=OPTIONAL)
     reason: Reason = field(default="", metadata=OPTIONAL)  # the worker leaves, and this is its last heartbeat
+    # Of `capacity`, what the worker's other runs use now: jobs given to it would wait.
+    taken: Annotated[int, Between(0, MAX_LEASES)] = field(default=0, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -306,6 +315,9 @@ class HelloRequest:
     packages: Packages = field(default=NUMERIC_PACKAGES, metadata=OPTIONAL)  # whose versions the fingerprint names
     host_class: HostClass | None = field(default=None, metadata=OPTIONAL)
     leaves_with_run: bool = field(default=False, metadata=OPTIONAL)  # it reads `JobBatch.ended`, and then exits
+    reads_end: bool = field(default=False, metadata=OPTIONAL)  # it reads `JobBatch.ended` and `why`, and may stay
+    # Shows that it runs on the coordinator's own host, as its user (`common/security/anchor_key.py`); empty if not.
+    anchor: Annotated[str, Length(0, 64)] = field(default="", metadata=OPTIONAL)
 
 
 @dataclass(frozen=True)
@@ -330,6 +342,8 @@ class HelloReply:
     numbering: Count = field(default=0, metadata=OPTIONAL)  # of the following batches; it increases
     classes: bool = field(default=False, metadata=OPTIONAL)  # whether this coordinator reads `host_class`
     reasons: bool = field(default=False, metadata=OPTIONAL)  # whether it reads `Heartbeat.reason`
+    share: FleetShare = field(default=1.0, metadata=OPTIONAL)  # of a worker's slots, relative to its other runs
+    taken: bool = field(default=False, metadata=OPTIONAL)  # whether it reads `Heartbeat.taken`
 
 
 @dataclass(frozen=True, kw_only=True)

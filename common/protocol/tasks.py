@@ -1,7 +1,8 @@
 """Looking up and loading tasks by name.
 
 A name is one that a package registers in the entry-point group `dreamfleet.tasks`; a registered family with an argument
-(`gym:LunarLander-v3`); or `module:attribute`, for an unregistered task. `gym:module:Environment-v0` names a module too.
+(`gym:LunarLander-v3`); or `module:attribute`, for an unregistered task. `gym:module:Environment-v0` and
+`function:module:name` name a module too.
 A name may come from a file or a message of somebody else, so only a trusted module is imported.
 """
 
@@ -25,6 +26,8 @@ GROUP = "dreamfleet.tasks"
 _NAME = re.compile(r"[\w-][\w.-]*(:\S+)?", re.ASCII)
 _ENVIRONMENT = re.compile(r"-v\d+$", re.ASCII)  # as the names of gymnasium's environments end
 GYM = "gym"  # the family of gymnasium's environments; they need no bundle
+FUNCTION = "function"  # the family of Python functions of a vector
+ARGUMENTS = {GYM: "ENVIRONMENT", FUNCTION: "MODULE:NAME"}  # what stands behind a family's name
 DREAM = "dream"  # the task whose candidates are scored in the world model
 
 
@@ -43,6 +46,30 @@ class Description(DisplayedFields):
     packages: tuple[str, ...] = NUMERIC_PACKAGES  # packages whose versions may change a fitness
     version: int = 1
     options: str = ""  # canonical JSON
+    steps: int = 0  # after which the environment itself ends an episode; 0: it has no limit, or none is known
+
+
+def steps_word(task: str) -> str:
+    """What a run's steps are: calls of a function, or steps of an environment.
+
+    >>> steps_word("function:mine:cost"), steps_word("dream")
+    ('evaluations', 'environment steps')
+    """
+    return "evaluations" if is_function_task(task) else "environment steps"
+
+
+def step_unit(task: str) -> str:
+    """The same in one word, for a speed or a table.
+
+    >>> step_unit("function:mine:cost"), step_unit("dream")
+    ('calls', 'steps')
+    """
+    return "calls" if is_function_task(task) else "steps"
+
+
+def is_function_task(task: str) -> bool:
+    """Whether a task is a Python function of a vector."""
+    return task.partition(":")[0] == FUNCTION
 
 
 def registered_tasks() -> dict[str, EntryPoint]:
@@ -65,6 +92,8 @@ def module_of(name: str) -> str:
     head, colon, rest = name.partition(":")
     if head == GYM:
         return rest.rpartition(":")[0]
+    if head == FUNCTION:
+        return rest.partition(":")[0]
     return head if colon and head not in registered_tasks() else ""
 
 
@@ -89,8 +118,17 @@ def load_task(name: str) -> Any:
         raise UsageError(f"task {name!r} cannot be loaded: {error}") from error
     if not colon and _ENVIRONMENT.search(name):
         raise UsageError(f"unknown task {name!r}: gymnasium's environments are written {GYM}:{name}")
-    known = ", ".join(f"{each}:ENVIRONMENT" if each == GYM else each for each in points) or "none"
+    known = ", ".join(map(written_name, points)) or "none"
     raise UsageError(f"unknown task {name!r}: known are {known}")
+
+
+def written_name(name: str) -> str:
+    """A registered name as people write it.
+
+    >>> written_name("function"), written_name("dream")
+    ('function:MODULE:NAME', 'dream')
+    """
+    return f"{name}:{ARGUMENTS[name]}" if name in ARGUMENTS else name
 
 
 def _task_class(module: Any, name: str) -> Any:
@@ -120,7 +158,7 @@ def is_shipped(name: str) -> bool:
 
 def is_self_describing(name: str) -> bool:
     """Whether a task needs no bundle; `UsageError` if the task cannot be loaded here."""
-    if name.partition(":")[0] == GYM:
+    if name.partition(":")[0] in ARGUMENTS:
         return True
     try:
         return callable(getattr(load_task(name), "describe", None))
@@ -133,7 +171,10 @@ def is_self_describing(name: str) -> bool:
 def check_task(name: str) -> None:
     """`UsageError` for an invalid task name, or one that nearly is a registered name."""
     if not _NAME.fullmatch(name):
-        raise UsageError(f"{name!r} cannot name a task: give a registered name, {GYM}:ENVIRONMENT, or module:attribute")
+        raise UsageError(
+            f"{name!r} cannot name a task: give a registered name, {GYM}:ENVIRONMENT, {written_name(FUNCTION)}, or "
+            "module:attribute"
+        )
     points = registered_tasks()
     head, colon, _ = name.partition(":")
     if head in points or "." in head:

@@ -7,14 +7,15 @@ is therefore common to both scores and cancels in a difference per track (`commo
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.protocol.function_values import is_minimised, value_of
 from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.learning import LearningCurve, Point
 from dreamfleet.common.runs.paired_difference import PairedDifference
-from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, expand_task_options
+from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, expand_task_options, in_values
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.serialization.optional_fields import to_dict
 
@@ -64,10 +65,28 @@ class ComparedRun:
         )
 
     @property
+    def in_values(self) -> ComparedRun:
+        """The same with the values of a minimised function as its means; what is paired by seed stays its fitness."""
+        task = self.settings.task
+        if not self.minimised:
+            return self
+        means = tuple(
+            replace(each, point=replace(each.point, score=value_of(each.point.score, task)))
+            for each in self.evaluated_means
+        )
+        return replace(self, evaluated_means=means, confirmed=in_values(self.confirmed, task))
+
+    @property
+    def minimised(self) -> bool:
+        """Whether it is of a function that is minimised."""
+        return is_minimised(self.settings.task)
+
+    @property
     def spent(self) -> str:
         """What was spent in all, and which part of it before the run began, in words."""
-        before = f" ({self.inherited.description} of it inherited)" if self.inherited != Effort() else ""
-        return f"{self.total.description}{before}"
+        task = self.settings.task.task
+        before = f" ({self.inherited.describe(task)} of it inherited)" if self.inherited != Effort() else ""
+        return f"{self.total.describe(task)}{before}"
 
     def last_within_budget(self, spent: Callable[[Effort], float], most: float) -> EvaluatedMean | None:
         """The last evaluated mean within the budget. Its score plays no part in the choice, so luck does not either."""
@@ -95,6 +114,11 @@ def differing_settings(sides: Sequence[ComparedRun]) -> dict[str, list[Any]]:
     names = sorted({name for each in flat for name in each})
     rows = {name: [each.get(name) for each in flat] for name in names}
     return {name: values for name, values in rows.items() if any(value != values[0] for value in values)}
+
+
+def are_comparable(sides: Sequence[ComparedRun]) -> bool:
+    """Whether their scores are of one world, and if that is a function, of one direction."""
+    return len({(each.world, each.minimised) for each in sides if each.world is not None}) == 1
 
 
 def at_equal_budget(sides: Sequence[ComparedRun]) -> list[EqualBudget]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite
-from dreamfleet.common.protocol.tasks import DREAM
+from dreamfleet.common.protocol.tasks import DREAM, is_function_task
 from dreamfleet.common.serialization.optional_fields import OPTIONAL
 from dreamfleet.common.serialization.validation import Count, MalformedError, from_plain_lenient
 
@@ -53,11 +53,11 @@ class Effort:
         """Slot time in core-hours; a slot uses one core."""
         return self.microseconds / 3.6e9
 
-    @property
-    def description(self) -> str:
-        """A text for display."""
+    def describe(self, task: str) -> str:
+        """A text for display, of a run in this task: a function has calls, and no steps."""
         dreamt = f", {format_steps(self.dreamt)} dreamt" if self.dreamt else ""
-        return f"{format_steps(self.steps)} steps in reality{dreamt}, {format_core_time(self.core_hours)}"
+        steps = "calls" if is_function_task(task) else "steps in reality"
+        return f"{format_steps(self.steps)} {steps}{dreamt}, {format_core_time(self.core_hours)}"
 
 
 @dataclass(frozen=True)

@@ -45,6 +45,8 @@ class EvaluationReport:
     failed: Annotated[tuple[FailedEpisode, ...], Length(0, MAX_EPISODES)] = field(default=(), metadata=OPTIONAL)
     #: scores of which the share of episodes above them is reported
     marks: Annotated[tuple[float, ...], Length(0, MAX_MARKS)] = field(default=FORMER_MARKS, metadata=OPTIONAL)
+    #: of `task`, as a run freezes them
+    options: str = field(default="", metadata=OPTIONAL)
 
     @cached_property
     def results(self) -> EpisodeResults:
@@ -56,6 +58,8 @@ class EvaluationReport:
         fields = asdict(self)
         if self.marks == FORMER_MARKS:  # as ever, to the byte
             del fields["marks"]
+        if not self.options:
+            del fields["options"]
         return json.dumps({**summary_figures(self.results, self.marks), **fields}, allow_nan=False)
 
     @property

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.protocol.function_values import is_minimised
 from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.records import StoredConfirmation, StoredEvaluation
@@ -38,6 +39,7 @@ class LearningCurve:
     confirmed: Point | None
     reported: Point | None  # the confirmed mean's evaluation
     total: Effort  # so far, including the run's start
+    minimised: bool = False  # whether it is of a function whose values are the negated scores
 
     @classmethod
     def of(cls, run: RunFolder) -> LearningCurve:
@@ -51,7 +53,19 @@ class LearningCurve:
         judged = None if confirmed is None else Point.of(total, confirmed)
         found = (point for point, each in zip(points, run.evaluations(), strict=True)
                  if confirmed is not None and each.generation == confirmed.generation)  # fmt: skip
-        return cls(run.name, _world(run), points, judged, next(found, None), total)
+        return cls(run.name, _world(run), points, judged, next(found, None), total, is_minimised(run.spec))
+
+    @property
+    def in_values(self) -> LearningCurve:
+        """The same with the values of a minimised function in place of its scores."""
+        if not self.minimised:
+            return self
+
+        def own(point: Point | None) -> Point | None:
+            return None if point is None else replace(point, score=0.0 - point.score)
+
+        points = tuple(replace(each, score=0.0 - each.score) for each in self.points)
+        return replace(self, points=points, confirmed=own(self.confirmed), reported=own(self.reported))
 
 
 def _points(run: RunFolder) -> Iterator[Point]:

@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.bundle_store import BundleStore, default_cache, find_bundle, pretrained_folder
-from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.artifacts.controller import Controller, import_hint
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.artifacts.trained_agent import TrainedAgent, is_agent
-from dreamfleet.common.errors import BundleError, ControllerError, JournalError, UsageError
-from dreamfleet.common.files.regular_files import is_file, path_exists
+from dreamfleet.common.errors import (
+    BundleError,
+    ConnectionFailedError,
+    ControllerError,
+    DreamfleetError,
+    HandshakeRejectedError,
+    JournalError,
+    UsageError,
+)
+from dreamfleet.common.files.regular_files import is_file, is_folder, path_exists
+from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, resume_command
+from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, resume_command, run_paths
 
 SUBSPACES = "subspaces"  # the folder of shipped subspaces, each named as its world model
 
@@ -33,17 +44,49 @@ def find_agent(name: str, runs_dir: Path) -> tuple[Controller | TrainedAgent, Pa
     path, run, shipped = Path(name), runs_dir / name, pretrained_folder() / f"{name}.npz"
     if is_file(path):
         return TrainedAgent.load(path) if is_agent(path) else Controller.load(path), path.parent / BUNDLE
-    if is_file(run / CONTROLLER):
-        return Controller.load(run / CONTROLLER), run / BUNDLE
+    for folder in (run, path):  # a run's name, or its folder
+        if is_file(folder / CONTROLLER):
+            return Controller.load(folder / CONTROLLER), folder / BUNDLE
     if is_file(shipped):
         return Controller.load(shipped), None
     if is_file(run / JOURNAL):
         raise ControllerError(
             f"run {name} has no controller yet: it is written when the first generation closes; an older run's is "
-            f"written when it is resumed: {resume_command(run)}"
+            f"written when it is resumed: {resume_command(run)}; a run of submitted batches has none"
         )
+    if is_folder(path):
+        raise ControllerError(f"{name} is a folder without {CONTROLLER}; {import_hint(path, '--out OUT')}")
     names = ", ".join(sorted(each.stem for each in pretrained_folder().glob("*.npz"))) or "none"
-    raise ControllerError(f"no controller {name!r}: give a file, a run, or one that ships: {names}")
+    raise ControllerError(
+        f"no controller {name!r}: no file, no run in {runs_dir.absolute()} (--runs-dir names another folder), and none "
+        f"that ships: {names}"
+    )
+
+
+@contextmanager
+def naming_the_stored_run(runs_dir: Path, name: str | None) -> Iterator[None]:
+    """Where no coordinator answers for a run, the error also says how the run of this name on this disk stands."""
+    try:
+        yield
+    except HandshakeRejectedError:
+        raise
+    except ConnectionFailedError as error:
+        if more := _describe_stored(runs_dir, name):
+            raise ConnectionFailedError(f"{error}; {more}") from error
+        raise
+
+
+def _describe_stored(runs_dir: Path, name: str | None) -> str:
+    if name is None:
+        count = len(list(run_paths(runs_dir)))
+        return f"for the {plural(count, 'run')} on this disk: `dreamfleet runs list`" if count else ""
+    with suppress(DreamfleetError), open_run(runs_dir, name) as run:
+        if run.ended:
+            return f"run {name} on this disk has ended after {run.ended}: `dreamfleet runs show {name}`"
+        if run.state == "live":
+            return f"run {name} on this disk is served at another address"
+        return f"run {name} on this disk was stopped or killed: `{resume_command(run.path)}`"
+    return ""
 
 
 def find_evaluated_mean(name: str, runs_dir: Path, generation: int) -> tuple[Controller, Path]:

@@ -78,9 +78,13 @@ class PairedDifference:
     @property
     def description(self) -> str:
         """A text for display."""
+        return self.describe()
+
+    def describe(self, *, minimised: bool = False) -> str:
+        """The same; of a function that is `minimised`, the difference of its values, whose fitness was paired."""
         if self.mean == self.error == 0:
             return f"bit-identical scores on {self.seeds} equal seeds"
-        size = format_with_error(self.mean, self.error, sign="+")
+        size = format_with_error(-self.mean if minimised else self.mean, self.error, sign="+")
         found = f"{size} (standard error) on {self.seeds} equal seeds"
         if self.is_significant:
             return f"{found}: {'better' if self.mean > 0 else 'worse'}"

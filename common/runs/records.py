@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields
-from typing import Annotated, Any, Literal
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Annotated, Any, Literal, TypeVar, cast
 
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.printable import plural
+from dreamfleet.common.protocol.function_values import is_minimised
+from dreamfleet.common.protocol.measures import MAX_AXES, MAX_AXIS
 from dreamfleet.common.protocol.messages import Horizon, Packages, Patience, Share, TaskSpec
 from dreamfleet.common.runs.standard_error import (
     error_from_population_std,
@@ -26,6 +28,8 @@ PopulationSize = Annotated[int, Between(2, 10**5)]
 EpisodesPerCandidate = Annotated[int, Between(1, 10**4)]
 ConfirmationEpisodes = Annotated[int, Between(0, 10**4)]  # fresh tracks; 0: no confirmation
 OnFailure = Literal["worst", "redraw", "pause"]
+EXTERNAL = "external"  # the optimiser of a run whose candidates others submit
+SUBMITTED = "candidates as others submit them"  # in place of such a run's population
 EpisodeCount = Annotated[int, Between(1, 2**63 - 1)]  # at least 1: a standard error divides by it
 
 
@@ -105,6 +109,15 @@ class RunSettings:
     on_failure: OnFailure = field(default="pause", metadata=OPTIONAL)
     # A schedule. The settings above are its first stage's, which changes none. The last stage has no end.
     stages: Annotated[tuple[StageSettings, ...], Length(0, MAX_STAGES)] = field(default=(), metadata=OPTIONAL)
+    # Axes of its archive, each as MEASURE=LOW:HIGH:CELLS; empty: it measures nothing beside fitness.
+    archive: Annotated[tuple[Annotated[str, Length(1, MAX_AXIS)], ...], Length(0, MAX_AXES)] = field(
+        default=(), metadata=OPTIONAL
+    )
+
+    @property
+    def is_external(self) -> bool:
+        """Whether the run has no search of its own: others submit its candidates in batches."""
+        return self.optimiser == EXTERNAL
 
     def to_json(self) -> str:
         """The text in the journal."""
@@ -265,6 +278,10 @@ class StoredConfirmation:
             raise JournalError(f"the journal's confirmed score is damaged: {error}") from error
 
 
+Scored = StoredGeneration | StoredEvaluation | StoredConfirmation
+S = TypeVar("S", bound=Scored | None)
+
+
 def best_evaluation(evaluations: Iterable[StoredEvaluation]) -> StoredEvaluation | None:
     """The evaluation of the highest rank, the first of equal ones; `None` if there are none."""
     return max(evaluations, key=lambda each: each.rank, default=None)
@@ -323,3 +340,13 @@ def count_episodes(found: StoredEvaluation | StoredConfirmation, noun: str = "ep
 def format_mean(found: StoredEvaluation | StoredConfirmation) -> str:
     """Format a mean with its standard error, if it has more than one episode."""
     return format_with_error(found.mean, found.error)
+
+
+def in_values(found: S, task: TaskSpec) -> S:
+    """A record with the function's values in place of fitness: `best` is then the smallest one of a minimised one."""
+    if found is None or not is_minimised(task):
+        return found
+    if isinstance(found, StoredGeneration):
+        own = {name: 0.0 - getattr(found, name) for name in ("mean", "best", "worst")}
+        return cast(S, replace(found, **own))
+    return cast(S, replace(found, mean=0.0 - found.mean))

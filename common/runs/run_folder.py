@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.printable import join_some, plural
+from dreamfleet.common.protocol.check_counts import MAX_BARRED, CheckCounts
 from dreamfleet.common.protocol.host_classes import HostClasses, class_from_fingerprint, count_results
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.protocol.messages import TaskSpec
@@ -41,6 +42,7 @@ from dreamfleet.common.runs.records import (
     StoredWork,
     best_evaluation,
     format_mean,
+    in_values,
 )
 from dreamfleet.common.runs.run_lock import is_run_locked
 from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, rollout_path, run_paths
@@ -53,6 +55,7 @@ MAX_LISTED_RUNS = 8  # in the error for an unknown run name
 # Names of facts in the journal.
 CONFIRMED = "confirmed"  # the confirmed score
 ENDED_AT = "ended_at"  # the time when the run ended
+EPISODE_LIMIT = "episode_limit"  # steps after which the environment itself ends an episode
 ENDING = "ending"  # the limit that ended the run; set while the last evaluations still run, and kept
 
 
@@ -84,19 +87,19 @@ class RunFolder(Displayed):
         try:
             with self.read_transaction():
                 count, confirmed, best = len(self.history()), self.confirmation(), best_evaluation(self.evaluations())
-                task, state = self.spec.task, self.state
+                spec, state = self.spec, self.state
         except JournalError as error:  # closed, or damaged
             return f"Run {self.name}: {error}", facts
         generations = plural(count, "generation")
         facts |= {
-            "task": task,
+            "task": spec.task,
             "state": state,
             "generations": count,
-            "best evaluation": best and format_mean(best),
-            "confirmed": confirmed and format_mean(confirmed),
+            "best evaluation": best and format_mean(in_values(best, spec)),
+            "confirmed": confirmed and format_mean(in_values(confirmed, spec)),
             "begun": self.created,
         }
-        return f"Run {self.name} of {task}: {generations}, {state}", facts
+        return f"Run {self.name} of {spec.task}: {generations}, {state}", facts
 
     def __enter__(self) -> Self:
         return self
@@ -164,6 +167,28 @@ class RunFolder(Displayed):
         return HostClasses.of(count_results(self._journal.rows("ssi", class_counts_query(self._class_column))))
 
     @property
+    def checks(self) -> CheckCounts | None:
+        """What came of checking results on other hosts; `None` if nothing was checked and nobody is barred."""
+        if self._journal.version < schema.VERIFICATION_VERSION:
+            return None
+        counts = dict(self._journal.rows("si", "SELECT outcome, count(*) FROM verification GROUP BY 1"))
+        column = "by_operator" if self._journal.version >= schema.OPERATOR_VERSION else "0"
+        rows = self._journal.rows("si", f"SELECT host, {column} FROM barred ORDER BY happened")  # noqa: S608
+        barred = rows[-MAX_BARRED:]
+        (recalled,) = self._journal.row("SELECT count(*) FROM recalled WHERE because = 'barred'")
+        if not (counts or barred or recalled):
+            return None
+        try:
+            share = float(json.loads(self.fact("network") or "{}").get("verify", 0.0))
+        except (ValueError, TypeError, AttributeError):
+            share = 0.0
+        differing = counts.get("differs", 0)
+        return CheckCounts(
+            share, counts.get("equal", 0) + differing, differing, counts.get("unchecked", 0), recalled,
+            tuple(host for host, _ in barred), tuple(host for host, named in barred if named),
+        )  # fmt: skip
+
+    @property
     def bundle_path(self) -> Path:
         """The run's own copy of its world model."""
         return self.path / BUNDLE
@@ -206,6 +231,25 @@ class RunFolder(Displayed):
             )
             for generation, number, fitness, episodes, steps, seconds in self._journal.rows("iiFiff", CANDIDATES_QUERY)
         ]
+
+    def measured_candidates(self, since: int = 0) -> list[tuple[int, int, float, tuple[float, ...]]]:
+        """Generation, number, fitness and measures of the candidates that have measures, in the order of the run.
+
+        They are those of the closed generations from `since` on.
+        """
+        if self._journal.version < schema.MEASURES_VERSION:
+            return []
+        query = (
+            "SELECT generation, number, fitness, measures FROM candidate WHERE generation >= ? "
+            "AND measures IS NOT NULL AND fitness IS NOT NULL ORDER BY generation, number"
+        )
+        try:
+            return [
+                (generation, number, to_finite(fitness), tuple(float(each) for each in json.loads(measures)))
+                for generation, number, fitness, measures in self._journal.rows("iifs", query, since)
+            ]
+        except (ValueError, TypeError, RecursionError) as error:
+            raise self._journal.damage_error("a candidate's measures are no numbers") from error
 
     def scores(self, generation: int, *, confirming: bool = False) -> dict[int, float]:
         """The scores of a generation's mean by validation seed, in its evaluation or in its confirmation.
@@ -339,6 +383,12 @@ class RunFolder(Displayed):
         """The optimiser's state before it was asked for the latest generation; `None` before the first."""
         rows = self._journal.rows("b", "SELECT state FROM strategy ORDER BY generation DESC LIMIT 1")
         return bytes(rows[0][0]) if rows else None
+
+    @property
+    def episode_limit(self) -> int | None:
+        """Steps after which the environment itself ends an episode; `None` if it has no limit, or none is known."""
+        text = self.fact(EPISODE_LIMIT)
+        return int(text) if text and text.isdecimal() else None
 
     def fact(self, key: str) -> str | None:
         """One of the run's facts, such as its most recent limits; `None` if it has no such fact."""

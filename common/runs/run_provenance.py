@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ControllerError
+from dreamfleet.common.protocol.check_counts import CheckCounts
 from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.effort import Effort
@@ -67,6 +68,7 @@ class RunProvenance:
     subspace: str | None = field(default=None, metadata=OPTIONAL)  # `Subspace.text`
     classes: HostClasses | None = field(default=None, metadata=OPTIONAL)  # of all results
     failed: Count = field(default=0, metadata=OPTIONAL)  # candidates that failed
+    checks: CheckCounts | None = field(default=None, metadata=OPTIONAL)  # of results that other hosts scored again
 
     @property
     def total(self) -> Effort:

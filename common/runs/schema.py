@@ -51,9 +51,44 @@ MIGRATIONS = (
     ALTER TABLE generation ADD COLUMN failed INTEGER NOT NULL DEFAULT 0;
     ALTER TABLE evaluation ADD COLUMN failed INTEGER NOT NULL DEFAULT 0;
     """,
+    """
+    ALTER TABLE result ADD COLUMN measures TEXT;
+    ALTER TABLE candidate ADD COLUMN measures TEXT;
+    """,
+    """
+    CREATE TABLE batch (
+        number INTEGER PRIMARY KEY, id TEXT NOT NULL UNIQUE, content BLOB NOT NULL, seeds TEXT NOT NULL,
+        population INTEGER NOT NULL, vectors BLOB, submitted REAL NOT NULL, generation INTEGER UNIQUE,
+        state TEXT NOT NULL, errors TEXT NOT NULL DEFAULT '{}'
+    ) STRICT;
+    CREATE INDEX waiting_batch ON batch (number) WHERE state = 'waiting';
+    """,
+    """
+    CREATE TABLE verification (
+        digest BLOB NOT NULL, kind TEXT NOT NULL, generation INTEGER NOT NULL, worker TEXT NOT NULL,
+        checker TEXT NOT NULL, outcome TEXT NOT NULL, happened REAL NOT NULL, stands INTEGER NOT NULL DEFAULT 1
+    ) STRICT;
+    CREATE INDEX verification_digest ON verification (digest);
+    CREATE TABLE barred (
+        host TEXT PRIMARY KEY, why TEXT NOT NULL, by_anchor INTEGER NOT NULL, incarnation INTEGER NOT NULL,
+        happened REAL NOT NULL
+    ) STRICT, WITHOUT ROWID;
+    CREATE TABLE recalled (
+        digest BLOB NOT NULL, kind TEXT NOT NULL, generation INTEGER NOT NULL, candidate INTEGER NOT NULL,
+        episode INTEGER NOT NULL, seed INTEGER NOT NULL, fitness REAL NOT NULL, steps INTEGER NOT NULL,
+        seconds REAL NOT NULL, worker TEXT NOT NULL, fingerprint TEXT NOT NULL, incarnation INTEGER NOT NULL,
+        host_class TEXT NOT NULL, measures TEXT, because TEXT NOT NULL, happened REAL NOT NULL
+    ) STRICT;
+    CREATE INDEX recalled_digest ON recalled (digest);
+    CREATE INDEX open_batch ON batch (number) WHERE state IN ('running', 'waiting');
+    """,
+    "ALTER TABLE barred ADD COLUMN by_operator INTEGER NOT NULL DEFAULT 0;",
 )
 """Entry i migrates a journal from version i to i + 1. Append only."""
 VERSION = len(MIGRATIONS)
+OPERATOR_VERSION = 7  # the first version that keeps which hosts the operator barred
+VERIFICATION_VERSION = 6  # the first version with results that were checked, barred hosts and recalled results
+MEASURES_VERSION = 5  # the first version with measures, JSON lists of numbers
 FAILURE_VERSION = 4  # the first version with failures that are facts of the journal
 HOST_CLASS_VERSION = 3  # the first version whose results have a host class; empty: derive it from the fingerprint
 

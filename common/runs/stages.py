@@ -43,7 +43,7 @@ class Stage:
         """The end conditions as a text."""
         end = self.end
         parts = [plural(end.generations, "generation")] if end.generations else []
-        parts += [f"{end.steps} environment steps"] if end.steps else []
+        parts += [f"{end.steps:,} environment steps"] if end.steps else []
         parts += [f"a score of {end.score:g}"] if end.score is not None else []
         return f"until {' or '.join(parts)}" if parts else "to the end"
 
@@ -56,7 +56,7 @@ class Stage:
         driven = ", all driven" if self.driven == 1 else f", {self.driven:.0%} of them driven" if self.driven else ""
         search += "" if self.whole else " in the subspace"
         size = f"{self.population} x {plural(self.episodes, 'episode')}"
-        return f"{self.horizon} steps{patience}, {size}{driven}{raced}, {search}"
+        return f"{self.horizon:,} steps{patience}, {size}{driven}{raced}, {search}"
 
     @property
     def driven_episodes(self) -> int:
@@ -118,13 +118,24 @@ def describe_stages(settings: RunSettings, begun: Sequence[BegunStage]) -> dict[
     return found
 
 
-def describe_steps(horizon: int, driven: float, *, dreamt: bool) -> str:
-    """Describe the steps of a candidate's episodes; in a dream task also the share in reality."""
+def describe_steps(horizon: int, driven: float, *, dreamt: bool, limit: int | None = None, word: str = "steps") -> str:
+    """Describe the steps of a candidate's episodes; in a dream task also the share in reality.
+
+    `limit` is the environment's own, which ends its episodes before a longer horizon; `word` names real steps.
+
+    >>> describe_steps(1000, 0.0, dreamt=False, limit=300)
+    '300 steps'
+    """
     if not dreamt:
-        return f"{horizon} steps"
+        return plural(min(horizon, limit or horizon), word.removesuffix("s"))
     if driven in (0, 1):
-        return f"{horizon} {'driven' if driven else 'dreamt'} steps"
-    return f"{horizon} steps, {driven:.0%} driven"
+        return f"{horizon:,} {'driven' if driven else 'dreamt'} steps"
+    return f"{horizon:,} steps, {driven:.0%} driven"
+
+
+def describe_limit(horizon: int, limit: int | None) -> str:
+    """Say where the steps come from if they are fewer than the horizon; else empty."""
+    return " (the environment's own limit)" if limit and limit < horizon else ""
 
 
 def join_distinct(values: Iterable[str]) -> str:

@@ -22,6 +22,7 @@ _ANY_RUN = "*"
 _STATUS = (keys.status(_ANY_RUN), keys.status(_ANY_RUN, "*"))
 _EVENTS = (keys.event_generation(_ANY_RUN), keys.event_status(_ANY_RUN))
 _BUNDLE, _CONTROL = keys.bundle(_ANY_RUN, "*"), keys.control(_ANY_RUN, "*")
+_BATCHES, _BATCH_EVENTS = keys.batch(_ANY_RUN, "*"), keys.event_batch(_ANY_RUN)
 _VIEWS = keys.all_workers("view", _ANY_RUN)
 _WORKER_MESSAGES = tuple(keys.all_workers(kind, _ANY_RUN) for kind in ("result", "beat", "upload", "view"))
 _COORDINATORS = keys.live_coordinator(_ANY_RUN, "*")
@@ -52,7 +53,7 @@ _ROLES = {
     "coordinator": ("trusted",),
     "router": ("trusted",),
     "viewer": ("look", "watch", "see"),
-    "operator": ("look", "watch", "see", "control", "control replies"),
+    "operator": ("look", "watch", "see", "control", "control replies", "watch batches", "see batches"),
     "worker": ("work", "work replies"),
 }
 _SEAT_RULES = ("sends", "receives", "is live", "gets")
@@ -68,8 +69,10 @@ def _viewer_rules() -> Iterator[dict[str, Any]]:
     yield _rule("look", (INGRESS,), ("query",), _STATUS)
     yield _rule("watch", (INGRESS,), ("declare_subscriber",), (*_EVENTS, _VIEWS))
     yield _rule("see", (EGRESS,), ("put", "reply", "declare_queryable"), (*_STATUS, *_EVENTS, _VIEWS))
-    yield _rule("control", (INGRESS,), ("query",), (_CONTROL, _BUNDLE))
-    yield _rule("control replies", (EGRESS,), ("reply", "declare_queryable"), (_CONTROL, _BUNDLE))
+    yield _rule("control", (INGRESS,), ("query",), (_CONTROL, _BUNDLE, _BATCHES))
+    yield _rule("control replies", (EGRESS,), ("reply", "declare_queryable"), (_CONTROL, _BUNDLE, _BATCHES))
+    yield _rule("watch batches", (INGRESS,), ("declare_subscriber",), (_BATCH_EVENTS,))
+    yield _rule("see batches", (EGRESS,), ("put",), (_BATCH_EVENTS,))
 
 
 def _common_worker_rules() -> Iterator[dict[str, Any]]:

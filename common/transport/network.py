@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import re
+import socket
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from ipaddress import ip_address
+from time import monotonic, sleep
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.security.credentials import Credentials
@@ -13,6 +16,7 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 LOOPBACK = "127.0.0.1"
 SECURED_PREFIX = "tls/"  # prefix of a secured fleet's endpoints
 SECURED_ENDPOINT = "tls/0.0.0.0:7447"  # default of a secured coordinator
+LOOK_INTERVAL = 0.02  # seconds between two looks whether a process of this host listens
 _ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws)/(\[[0-9a-fA-F:]+\]|[^:/\s]+):(\d{1,5})")
 
 
@@ -55,6 +59,35 @@ def _to_secured(endpoint: str) -> str:
 def is_loopback(endpoint: str) -> bool:
     """Whether only this host can reach an endpoint."""
     return is_loopback_host(endpoint.partition("/")[2].rpartition(":")[0].strip("[]"))
+
+
+def wait_for_listener(endpoints: Sequence[str], seconds: float, stopped: Callable[[], bool]) -> bool:
+    """Wait until something listens at one of these endpoints; return whether it does, or may.
+
+    Only endpoints of this host are waited for, as looking there costs next to nothing. Zenoh itself would try again
+    after growing pauses of up to a second.
+    """
+    if not all(is_loopback(each) and each.startswith(("tcp/", SECURED_PREFIX)) for each in endpoints):
+        return True
+    places, until = [_place(each) for each in endpoints], monotonic() + seconds
+    while not any(map(_is_open, places)):
+        if stopped() or monotonic() > until:
+            return False
+        sleep(LOOK_INTERVAL)
+    return True
+
+
+def _place(endpoint: str) -> tuple[str, int]:
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    return host.strip("[]"), int(port)
+
+
+def _is_open(place: tuple[str, int]) -> bool:
+    try:
+        with socket.create_connection(place, timeout=LOOK_INTERVAL):
+            return True
+    except OSError:
+        return False
 
 
 def is_loopback_host(host: str) -> bool:

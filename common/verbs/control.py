@@ -34,9 +34,11 @@ class ControlVerb:
     def run(self, args: argparse.Namespace) -> int:
         """Send the request, and print how the run continues."""
         from dreamfleet.common.monitoring.client import Client
+        from dreamfleet.common.runs.lookup import naming_the_stored_run
 
         asked = self.request_with_workers if self.request_with_workers and args.workers else self.name
-        with Client(resolve_network(args, "operator", "coordinator")) as client:
+        network = resolve_network(args, "operator", "coordinator")
+        with naming_the_stored_run(args.runs_dir, args.run_name), Client(network) as client:
             name = args.run_name or client.status().run
             command = printable(client.control(name, asked))
         again = {"continue": command or f"dreamfleet coordinator --resume {name}"} if self.coordinator_leaves else {}

@@ -46,10 +46,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the status; if several runs are live and none is named, one line per run."""
     from dreamfleet.common.monitoring.client import Client
+    from dreamfleet.common.runs.lookup import naming_the_stored_run
 
     if args.watch:
         return _watch(resolve_network(args), args.run_name, as_json=args.json)
-    with Client(resolve_network(args)) as client:
+    with naming_the_stored_run(args.runs_dir, args.run_name), Client(resolve_network(args)) as client:
         documents = [client.document(args.run_name)] if args.run_name or args.json else client.statuses()
         if args.json:
             print(json.dumps(documents[0], indent=2))
@@ -73,7 +74,7 @@ def print_runs(documents: Sequence[dict[str, Any]]) -> None:
     from dreamfleet.common.monitoring.eta import describe_departed, estimate_eta
     from dreamfleet.common.monitoring.status import read_status
     from dreamfleet.common.printable import plural
-    from dreamfleet.common.runs.records import format_mean
+    from dreamfleet.common.runs.records import format_mean, in_values
 
     statuses = []
     for document in documents:
@@ -82,17 +83,18 @@ def print_runs(documents: Sequence[dict[str, Any]]) -> None:
         except MalformedError as error:  # of one run, and no matter of the others
             print(f"note: {error}", file=sys.stderr)
     statuses.sort(key=lambda each: each.run)
+    best = [in_values(each.confirmed or each.best, each.settings.task) for each in statuses]
     rows = [
         {
             "run": each.run,
             "state": each.state,
             "generation": each.generation.number,
-            "best": None if (best := each.confirmed or each.best) is None else format_mean(best),
+            "best": None if judged is None else format_mean(judged),
             "workers": ", ".join(filter(None, (str(each.workers.present), describe_departed(each.workers)))),
             "steps/s": f"{each.throughput.steps_per_second:,.0f}",
             "to go": estimate_eta(each).description,
         }
-        for each in statuses
+        for each, judged in zip(statuses, best, strict=True)
     ]
     print_rows(rows, right=("generation", "steps/s"), drop_order=("steps/s", "workers", "best"))
     print(f"{plural(len(rows), 'live run')}; `dreamfleet status RUN` shows more", file=sys.stderr)

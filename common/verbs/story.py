@@ -56,9 +56,7 @@ def run(args: argparse.Namespace) -> int:
     _check(args)
     of_live = bool(args.worker or args.job or args.what)
     if args.journal and (of_live or args.run_name is None):
-        raise UsageError(
-            "--journal needs a RUN, and keeps no events of single jobs: leave --worker, --job and --what out"
-        )
+        raise UsageError("--journal needs a RUN, and keeps no events of single jobs: omit --worker, --job and --what")
     if args.journal:
         return _print_journal(args)
     try:

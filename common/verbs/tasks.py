@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from dreamfleet.common.cli.output import print_rows
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.packages import PACKAGES, install_command
+from dreamfleet.common.printable import plural
 
 if TYPE_CHECKING:
     from dreamfleet.common.cli.task_check import TaskReport
@@ -62,7 +63,7 @@ def _check(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({"task": args.task, **asdict(found)}, indent=2))
     else:
-        print_rows([{"check": name, "found": text} for name, text in _findings(found)])
+        print_rows([{"check": name, "result": text} for name, text in _findings(found)])
     return 1 if found.fault else 0
 
 
@@ -71,17 +72,21 @@ def _findings(found: TaskReport) -> Iterator[tuple[str, str]]:
         yield "cannot be scored", found.fault
         return
     about = found.description
-    yield "can be scored", f"{about.observations} observations, {about.outputs} outputs, {', '.join(about.packages)}"
+    sizes = f"{about.observations} observations, {about.outputs} outputs" if about.observations else (
+        f"a function of {plural(about.outputs, 'parameter')}"
+    )  # fmt: skip
+    yield "can be scored", f"{sizes}, {', '.join(about.packages)}"
     if found.compared:
-        yield ("not deterministic", found.varies) if found.varies else ("equal seeds", "give equal episodes")
+        what, values = ("seeds", "episodes") if about.observations else ("arguments", "values")
+        yield ("not deterministic", found.varies) if found.varies else (f"equal {what}", f"give equal {values}")
     yield from (("warning", text) for text in found.warnings)
 
 
 def _row(name: str, point: EntryPoint) -> dict[str, object]:
-    from dreamfleet.common.protocol.tasks import GYM
+    from dreamfleet.common.protocol.tasks import written_name
 
     distribution = "-" if point.dist is None else f"{point.dist.name} {point.dist.version}"
-    shown = f"{name}:ENVIRONMENT" if name == GYM else name
+    shown = written_name(name)
     try:
         made = point.load()
     except ModuleNotFoundError as error:

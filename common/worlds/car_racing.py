@@ -6,7 +6,7 @@ from typing import Any
 
 from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING
 from dreamfleet.common.runs.records import StageSettings
-from dreamfleet.common.worlds.profile import DemoPlan, PublishedScore, PublishedScores, WorldProfile
+from dreamfleet.common.worlds.profile import DemoPlan, PublishedScore, PublishedScores, ShippedScore, WorldProfile
 
 # A few generations in the dream, then reality, in the features that ship; docs/lab/results.md says what each is for.
 REAL: dict[str, Any] = {
@@ -82,6 +82,13 @@ FRUGAL: dict[str, Any] = {
 PROFILE = WorldProfile(
     task=CAR_RACING,
     score_word="track",
+    score_unit="points",
+    end_texts={"finished": "lap finished", "terminated": "left the track", "truncated": "time's up"},
+    shipped_scores=(
+        ShippedScore("102a4956f6d4", 915.2, 3.0, 100, 10012),  # real
+        ShippedScore("7d07a615d149", 905.5, 3.3, 100, 10076),  # dream
+        ShippedScore("e987f25edac2", 832.1, 14.3, 100, 10060),  # tiny
+    ),
     run_presets={
         "article": ARTICLE,
         "dream": DREAM,
@@ -91,6 +98,7 @@ PROFILE = WorldProfile(
         "paper": PAPER,
         "real": REAL,
     },
+    dream_preset="dream",
     default_training="tiny",
     # The public log of the experiment: the evaluated mean on 1024 tracks. Steps count candidates only. Only the total
     # time is known: 1119 hours on 64 cores.

@@ -1,4 +1,4 @@
-"""What a scored seed is called in reports: a track, a game."""
+"""What a scored seed is called in reports, a track or a game, and what a score counts."""
 
 from __future__ import annotations
 
@@ -11,6 +11,15 @@ from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.worlds.profile import WorldProfile
 from dreamfleet.common.worlds.shipped import WORLDS
+
+
+def profile_of(task: str) -> WorldProfile:
+    """The profile of a task's world; without one, what any world has.
+
+    >>> profile_of("takecover").format_score(836)
+    '836 tics survived (24 s)'
+    """
+    return WORLDS.get(task) or WorldProfile(task=task)
 
 
 def score_word(task: str, facts: WorldFacts | None = None) -> str:

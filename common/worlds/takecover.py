@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from dreamfleet.common.worlds.profile import DemoPlan, PublishedScore, PublishedScores, WorldProfile
+from dreamfleet.common.worlds.profile import DemoPlan, PublishedScore, PublishedScores, ShippedScore, WorldProfile
 
 TASK = "takecover"
 # 525 decisions of 4 tics are the game's limit of 2,100 tics.
@@ -47,7 +47,15 @@ TRAINING: dict[str, Any] = {
 PROFILE = WorldProfile(
     task=TASK,
     score_word="game",
+    score_unit="tics survived",
+    units_per_second=35,
+    end_texts={"terminated": "hit after {score:,.0f} tics", "truncated": "survived to the limit, {score:,.0f} tics"},
+    shipped_scores=(
+        ShippedScore("2be53319395a", 786.1, 50.7, 100, 10055),  # takecover
+        ShippedScore("35b4174dfc32", 979.9, 50.4, 100, 10070),  # takecover-real
+    ),
     run_presets={"takecover": DREAM, "takecover-real": REAL},
+    dream_preset="takecover",
     training_presets={"takecover": TRAINING},
     default_training="takecover",
     # The paper gives scores alone, of a tic a decision.

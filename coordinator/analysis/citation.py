@@ -14,8 +14,9 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import BundleError
 from dreamfleet.common.monitoring.eta import format_duration
 from dreamfleet.common.printable import plural
-from dreamfleet.common.protocol.tasks import module_of
+from dreamfleet.common.protocol.tasks import module_of, step_unit
 from dreamfleet.common.runs.records import (
+    SUBMITTED,
     RunSettings,
     StoredConfirmation,
     StoredEvaluation,
@@ -23,12 +24,13 @@ from dreamfleet.common.runs.records import (
     count_failed,
     describe_failed,
     describe_score,
+    in_values,
 )
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_paths import trust_flag
 from dreamfleet.common.runs.run_provenance import RunProvenance, read_run_provenance, read_run_settings
 from dreamfleet.common.runs.seeds import TRAINING_FIRST
-from dreamfleet.common.runs.stages import begun_stages, describe_stages
+from dreamfleet.common.runs.stages import begun_stages, describe_limit, describe_stages
 from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.common.serialization.times import parse_time
 from dreamfleet.common.worlds.score_words import score_word_of_run
@@ -99,12 +101,16 @@ def _rows(
         yield "search", f"{settings.optimiser}, {settings.covariance}, {generations}"
         yield from describe_stages(settings, begun).items()
     else:
-        yield "task", f"{spec.task}, {spec.horizon} steps{warm}, version {spec.version}"
+        limit = run.episode_limit
+        unit = step_unit(spec.task).removesuffix("s")
+        steps = plural(min(spec.horizon, limit or spec.horizon), unit) + describe_limit(spec.horizon, limit)
+        yield "task", f"{spec.task}, {steps}{warm}, version {spec.version}"
         size = f"population {settings.population} x {plural(settings.episodes, 'episode')}, sigma0 {settings.sigma0:g}"
-        yield "search", f"{settings.optimiser}, {settings.covariance}, {size}, {generations}"
+        own = f"{settings.optimiser}, {settings.covariance}, {size}, {generations}"
+        yield "search", f"{SUBMITTED}, {generations}" if settings.is_external else own
     yield "failed candidates", describe_failed(settings, run.history())
     so_far = "" if run.ended else "; so far, with the results of the open generation"
-    yield "spent", f"{run.total_effort().description}{so_far}"
+    yield "spent", f"{run.total_effort().describe(run.spec.task)}{so_far}"
     yield "seed", f"{settings.seed}; training seeds follow from it, from {TRAINING_FIRST} up"
     for what, (first, count) in (receipt.seeds or {}).items():
         yield f"seeds of the {what}", f"{first} to {first + count - 1}"
@@ -118,6 +124,8 @@ def _rows(
     elif receipt.fingerprint is not None:
         others = ", and others: no run on one host is bit-identical" if receipt.mixed else ""
         yield "hosts", f"`{receipt.fingerprint}`{others}"
+    if receipt.checks is not None:
+        yield "checked on other hosts", receipt.checks.description
     if receipt.versions is not None:
         yield "coordinator", ", ".join(f"{name} {version}" for name, version in receipt.versions.items())
 
@@ -127,7 +135,7 @@ def _reported(run: RunFolder) -> StoredConfirmation | StoredEvaluation | None:
 
 
 def _describe_score(run: RunFolder) -> str:
-    return describe_score(_reported(run), score_word_of_run(run.spec, run.bundle_path))
+    return describe_score(in_values(_reported(run), run.spec), score_word_of_run(run.spec, run.bundle_path))
 
 
 def _commands(run: RunFolder) -> dict[str, str]:

@@ -10,10 +10,13 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dreamfleet.common.errors import MissingExtraError, UsageError
 from dreamfleet.common.files.atomic_write import open_output, reporting_write_errors
 from dreamfleet.common.files.regular_files import is_file, is_folder
-from dreamfleet.common.files.tensorboard import EXTRA, EventFileWriter, open_event_file
+from dreamfleet.common.files.tensorboard import EVENTS, EXTRA, open_event_file
+from dreamfleet.common.monitoring.elites import EliteArchive, tables
 from dreamfleet.common.runs.records import (
     StoredCandidate,
     StoredConfirmation,
@@ -23,7 +26,6 @@ from dreamfleet.common.runs.records import (
 )
 from dreamfleet.common.runs.run_folder import RunFolder
 
-EVENTS = "events.out.tfevents.*"  # names of TensorBoard's files
 Row = dict[str, Any]
 TABLES: dict[str, tuple[type[Any], Callable[[RunFolder], Sequence[Any]]]] = {
     "generations": (StoredGeneration, RunFolder.history),
@@ -31,6 +33,7 @@ TABLES: dict[str, tuple[type[Any], Callable[[RunFolder], Sequence[Any]]]] = {
     "evaluations": (StoredEvaluation, RunFolder.evaluations),
     "confirmation": (StoredConfirmation, lambda run: [each] if (each := run.confirmation()) else []),
 }
+ELITES = "elites"  # a table of its own columns, and a file of their parameters
 JUDGED = ("evaluations", "confirmation")  # tables with a standard error
 
 
@@ -70,21 +73,32 @@ def export_tensorboard(run: RunFolder, folder: Path) -> list[Path]:
         raise UsageError(f"{folder} holds TensorBoard's events already: choose another --out")
     with _remove_on_failure(folder), open_event_file(folder) as events:
         events.add_text("settings", f"```\n{run.settings.to_json()}\n```")
-        for each in run.history():
-            events.add(each.number, fitness__mean=each.mean, fitness__std=each.std, fitness__best=each.best,
-                       fitness__worst=each.worst, search__sigma=each.sigma, effort__steps=each.steps,
-                       effort__seconds=each.seconds)  # fmt: skip
-        for judged in run.evaluations():
-            _add_score(events, judged, "evaluated")
-        if (confirmed := run.confirmation()) is not None:
-            _add_score(events, confirmed, "confirmed")
+        for step, numbers in scalars_of(run):
+            events.add(step, **numbers)
     return sorted(folder.glob(EVENTS))
 
 
-def _add_score(events: EventFileWriter, found: StoredEvaluation | StoredConfirmation, name: str) -> None:
-    """Add a mean's score, and its standard error if it has one."""
+def scalars_of(run: RunFolder, since: int = 0) -> Iterator[tuple[int, dict[str, float]]]:
+    """What is drawn over generations: of each closed one from `since` on, then of every score of a mean.
+
+    `__` in a name stands for the `/` that groups curves.
+    """
+    for each in run.history(since):
+        yield each.number, {
+            "fitness__mean": each.mean, "fitness__std": each.std, "fitness__best": each.best,
+            "fitness__worst": each.worst, "search__sigma": each.sigma, "effort__steps": each.steps,
+            "effort__seconds": each.seconds,
+        }  # fmt: skip
+    for judged in run.evaluations():
+        yield judged.generation, _score("evaluated", judged)
+    if (confirmed := run.confirmation()) is not None:
+        yield confirmed.generation, _score("confirmed", confirmed)
+
+
+def _score(name: str, found: StoredEvaluation | StoredConfirmation) -> dict[str, float]:
+    """A mean's score, and its standard error if it has one."""
     error = {} if found.error is None else {f"score__{name}_error": found.error}
-    events.add(found.generation, **{f"score__{name}": found.mean, **error})
+    return {f"score__{name}": found.mean, **error}
 
 
 @contextmanager
@@ -115,6 +129,8 @@ def _tables(run: RunFolder) -> Iterator[tuple[str, list[str], list[Row]]]:
     for name in TABLES:
         if rows := rows_of(run, name):
             yield name, columns_of(name), rows
+    if (archive := EliteArchive.of(run)) is not None and archive.elites:
+        yield ELITES, *tables(archive)
 
 
 def _export_tables(
@@ -127,8 +143,19 @@ def _export_tables(
     for name, columns, rows in _tables(run):
         written.append(folder / f"{name}.{kind}")
         save(written[-1], columns, rows)
+        if name == ELITES:
+            written.append(folder / f"{ELITES}.npz")
+            _save_elites(run, rows, written[-1])
     with reporting_write_errors(folder):
-        for path in (folder / f"{name}.{kind}" for name in TABLES):
+        for path in (*(folder / f"{name}.{kind}" for name in (*TABLES, ELITES)), folder / f"{ELITES}.npz"):
             if path not in written and is_file(path):
                 path.unlink()
     return written
+
+
+def _save_elites(run: RunFolder, rows: Sequence[Row], path: Path) -> None:
+    """Write the parameters `(elites, size)` of the table's rows, with its columns, as arrays of one `.npz`."""
+    columns: dict[str, Any] = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    parameters = np.stack([run.candidate(row["generation"], row["candidate"]) for row in rows])
+    with open_output(path) as file:
+        np.savez(file, parameters=parameters, **columns)

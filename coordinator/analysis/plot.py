@@ -9,15 +9,26 @@ from typing import Any
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import open_output
-from dreamfleet.common.monitoring.fitness_chart import HOLLOW_STAR, PLOT_COLOURS, draw_fitness, error_bars
+from dreamfleet.common.monitoring.elites import EliteArchive, exploration_note
+from dreamfleet.common.monitoring.fitness_chart import (
+    PLOT_COLOURS,
+    STAR,
+    draw_fitness,
+    error_bars,
+    has_score_panel,
+    seeds_note,
+)
 from dreamfleet.common.printable import plural
-from dreamfleet.common.protocol.tasks import DREAM
+from dreamfleet.common.protocol.function_values import is_minimised, spans_decades
+from dreamfleet.common.protocol.tasks import DREAM, is_function_task
 from dreamfleet.common.runs.effort import SHORT_HOURS, Effort, format_steps
 from dreamfleet.common.runs.learning import LearningCurve
+from dreamfleet.common.runs.records import SUBMITTED
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import begun_stages, describe_steps, join_distinct
 from dreamfleet.common.runs.standard_error import format_with_error
@@ -27,6 +38,8 @@ from dreamfleet.common.worlds.shipped import WORLDS
 
 TITLE = 90  # characters in a line of the title
 LABEL = 52  # characters in a line of the label of the y axis
+PAD = 0.08  # inches around panels, titles and legends
+LINE = 12  # points: the height of a line of the note under a title
 DECADE = 10
 KINDS = (".png", ".svg")
 NEAR_SHARE = 0.1  # of the steps of the first published score: a shorter run's curve would be squeezed beside it
@@ -35,7 +48,7 @@ REPEATABLE: dict[Any, str] = {"svg.hashsalt": "dreamfleet"}  # fixed identifiers
 
 def plot_fitness(run: RunFolder, path: Path) -> None:
     """Write the picture of `fitness_figure`."""
-    _save(fitness_figure(run), path)
+    save_figure(fitness_figure(run), path)
 
 
 def fitness_figure(run: RunFolder) -> Any:
@@ -47,35 +60,65 @@ def fitness_figure(run: RunFolder) -> Any:
         raise UsageError(f"run {run.name} has no closed generation, so there is nothing to draw: wait for the first")
     settings = run.settings
     stages = begun_stages(settings, run.history(), run.evaluations())
-    figure = Figure(figsize=(8, 5), layout="constrained")
-    axes = figure.subplots()
-    handles = draw_fitness(axes, run)
-    size = join_distinct(
-        f"{each.stage.population} candidates x {plural(each.stage.episodes, 'episode')}" for each in stages
-    )
+    two = has_score_panel(run)
+    figure = Figure(figsize=(8.5, 7.2 if two else 5.2), layout=ConstrainedLayoutEngine(w_pad=PAD, h_pad=PAD))
+    shares = [3, 2] if two else [1]
+    panels = figure.subplots(len(shares), 1, sharex=True, squeeze=False, height_ratios=shares)[:, 0]
+    handles = draw_fitness(list(panels), run)
     dreamt = settings.task.task == DREAM
-    steps = join_distinct(describe_steps(each.stage.horizon, each.stage.driven, dreamt=dreamt) for each in stages)
-    axes.set_ylabel(f"fitness over {steps} (sum of rewards)")
-    title = f"{run.name}: {settings.task.task}, {size}, seed {settings.seed}"
-    axes.set_title("\n".join(textwrap.wrap(title, TITLE)), fontsize=11)
-    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
+    limit_of_run = run.episode_limit
+    steps = join_distinct(
+        describe_steps(each.stage.horizon, each.stage.driven, dreamt=dreamt, limit=limit_of_run) for each in stages
+    )
+    evaluated = "; evaluated: whole episodes" if run.evaluations() and not two else ""
+    limit = textwrap.wrap(f"in {steps} at most{evaluated}", LABEL)
+    is_function = is_function_task(settings.task.task)
+    label = (_value_axis(run, panels[0]),) if is_function else ("fitness (sum of rewards)", *limit)
+    panels[0].set_ylabel("\n".join(label))
+    if two:
+        panels[1].set_ylabel("score in reality\n(whole episodes)")
+    size = (
+        SUBMITTED
+        if settings.is_external
+        else join_distinct(
+            f"{each.stage.population} candidates x {plural(each.stage.episodes, 'episode')}" for each in stages
+        )
+    )
+    _set_titles(panels[0], f"{run.name}: {settings.task.task}, {size}, seed {settings.seed}", _note(run))
+    _add_legend(figure, handles, columns=2)
     return figure
+
+
+def _note(run: RunFolder) -> str:
+    """What a reader of the curve must know; of a search that explores also what its archive holds."""
+    seeds, explores = seeds_note(run), exploration_note(run.settings)
+    archive = EliteArchive.of(run) if explores else None
+    found = "" if archive is None else f"Archive: {archive.status.description}."
+    return " ".join(filter(None, (f"{seeds}." if seeds and explores else seeds, explores, found)))
+
+
+def _value_axis(run: RunFolder, axes: Any) -> str:
+    goal = "smaller is better" if is_minimised(run.spec) else "larger is better"
+    return f"value of the function ({goal}{', log scale' if axes.get_yscale() == 'log' else ''})"
 
 
 def plot_learning(curves: Sequence[LearningCurve], marks: PublishedScores | None, path: Path) -> None:
     """Write the picture of `learning_figure`."""
-    _save(learning_figure(curves, marks), path)
+    save_figure(learning_figure(curves, marks), path)
 
 
 def learning_figure(curves: Sequence[LearningCurve], marks: PublishedScores | None) -> Any:
     """Evaluated scores over environment steps and core-hours, with published scores as `marks`: a matplotlib `Figure`.
+
+    Of a function its values, as `LearningCurve.in_values` has them.
 
     A published score of unknown steps is a horizontal line.
 
     Environment steps are all steps in reality: of candidates, kept rollouts, evaluations, and of the run that this one
     began from. The legend shows dreamt steps.
     """
-    figure = Figure(figsize=(11, 5.6), layout="constrained")
+    curves = [each.in_values for each in curves]
+    figure = Figure(figsize=(11, 5.6), layout=ConstrainedLayoutEngine(w_pad=PAD, h_pad=PAD))
     over_steps, over_hours = figure.subplots(1, 2, sharey=True)
     one_world = len({each.world for each in curves}) == 1
     short = marks is None and max(each.total.core_hours for each in curves) < SHORT_HOURS
@@ -91,15 +134,22 @@ def learning_figure(curves: Sequence[LearningCurve], marks: PublishedScores | No
         for level in (each.score for each in marks.scores if each.steps is None):
             over_steps.axhline(level, linestyle="--", color="black", linewidth=1, label=marks.source)
             over_hours.axhline(level, linestyle="--", color="black", linewidth=1)
-    over_steps.set_ylabel(_score_axis(curves))
+    values = [each.score for curve in curves for each in (*curve.points, curve.confirmed) if each is not None]
+    is_log = all(each.minimised for each in curves) and spans_decades(values)
+    if is_log:
+        over_steps.set_yscale("log")  # of both panels: they share the axis
+    over_steps.set_ylabel(_score_axis(curves, "log scale" if is_log else ""))
     for axes, spent_in in (
-        (over_steps, "environment steps in reality, evaluations included"),
+        (over_steps, _steps_axis(curves)),
         (over_hours, f"{unit}: time that slots worked on accepted results"),
     ):
         axes.set_xlabel(f"{spent_in}{' (log scale)' if _scale(axes) else ''}")
         axes.margins(y=0.1)
         axes.grid(alpha=0.3, which="major")
-    figure.legend(*over_steps.get_legend_handles_labels(), loc="outside lower center", fontsize=9, frameon=False)
+    where = f" in {curves[0].world}" if one_world else ""
+    title = f"evaluated score{where} over what the search spent: {', '.join(each.name for each in curves)}"
+    figure.suptitle("\n".join(textwrap.wrap(title, TITLE)), fontsize=11, x=0.01, ha="left")
+    _add_legend(figure, over_steps.get_legend_handles_labels()[0])
     return figure
 
 
@@ -119,7 +169,7 @@ def _scale(axes: Any) -> bool:
     named = FuncFormatter(lambda value, _: f"{value:g}" if value < 1000 else format_steps(round(value)))
     axes.xaxis.set_major_formatter(named)
     if low <= 0 or high < DECADE * low:
-        axes.set_xlim(left=0)
+        axes.set_xlim(0, 1.05 * high)
         axes.xaxis.set_major_locator(MaxNLocator(6, steps=(1, 2, 5, 10)))
         return False
     axes.set_xscale("log")
@@ -145,7 +195,7 @@ def _draw_curve(axes: Any, curve: LearningCurve, name: str, colour: str, spent: 
         markersize=4,
         linewidth=1.2,
         capsize=2,
-        label=f"{name}: {curve.total.description}",
+        label=f"{name}: {curve.total.describe(curve.world)}",
     )
     if last is None:
         return
@@ -154,7 +204,7 @@ def _draw_curve(axes: Any, curve: LearningCurve, name: str, colour: str, spent: 
         axes.plot(*ends, ":", color=colour, linewidth=1)
     score = format_with_error(last.score, last.error)
     axes.errorbar(
-        spent(last.effort), last.score, error_bars([last]), fmt="*", color=colour, **HOLLOW_STAR,
+        spent(last.effort), last.score, error_bars([last]), fmt="*", color=colour, **STAR,
         label=f"{curve.name}, confirmed on fresh {score_word(curve.world)}s: {score}",
     )  # fmt: skip
 
@@ -168,15 +218,41 @@ def _draw_marks(axes: Any, marks: Sequence[tuple[float, float]], source: str) ->
         axes.annotate(f"{score:g}", (spent, score), place, textcoords="offset points", ha="center", fontsize=9)
 
 
-def _score_axis(curves: Sequence[LearningCurve]) -> str:
-    worlds = {each.world for each in curves}
-    world = f"{worlds.pop()}: " if len(worlds) == 1 else ""
-    word = score_word(curves[0].world) if world else "seed"
-    text = f"{world}score of the mean, whole episodes on validation {word}s, ± standard error"
-    return "\n".join(textwrap.wrap(text, LABEL))
+def _set_titles(axes: Any, title: str, note: str) -> None:
+    """Write a title from the left edge, and under it a note in grey."""
+    lines = textwrap.wrap(note, TITLE)
+    axes.set_title("\n".join(textwrap.wrap(title, TITLE)), fontsize=11, loc="left", pad=6 + LINE * len(lines))
+    place = {"xycoords": "axes fraction", "xytext": (0, 6), "textcoords": "offset points"}
+    axes.annotate("\n".join(lines), (0, 1), **place, fontsize=9, color="dimgray", annotation_clip=False)
 
 
-def _save(figure: Any, path: Path) -> None:
+def _add_legend(figure: Figure, handles: Sequence[Any], columns: int = 1) -> None:
+    """Put a legend under the panels, in one column if more would be wider than the figure."""
+    for count in (columns, 1):
+        legend = figure.legend(
+            handles=handles, loc="outside lower left", ncols=count, fontsize=9, frameon=False, borderaxespad=1
+        )
+        if count == 1 or legend.get_window_extent().width < figure.bbox.width:
+            return
+        legend.remove()
+
+
+def _score_axis(curves: Sequence[LearningCurve], scale: str) -> str:
+    if all(is_function_task(each.world) for each in curves):
+        goals = {"smaller is better" if each.minimised else "larger is better" for each in curves}
+        about = ", ".join(filter(None, (*(goals if len(goals) == 1 else ()), scale)))
+        return f"value of the function at the mean{f' ({about})' if about else ''}"
+    word = score_word(curves[0].world) if len({each.world for each in curves}) == 1 else "seed"
+    return f"score of the mean (± standard error)\nin whole episodes on validation {word}s"
+
+
+def _steps_axis(curves: Sequence[LearningCurve]) -> str:
+    if all(is_function_task(each.world) for each in curves):
+        return "calls of the function, those of evaluated means included"
+    return "environment steps in reality, evaluations included"
+
+
+def save_figure(figure: Any, path: Path) -> None:
     """Write the figure atomically in the format of the file name; equal figures give equal files."""
     metadata = {"Date": None} if path.suffix == ".svg" else None
     with open_output(path) as file, mpl.rc_context(REPEATABLE):

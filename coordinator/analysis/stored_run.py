@@ -11,12 +11,14 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ControllerError, MissingExtraError, UsageError
 from dreamfleet.common.host.packages import install_command
+from dreamfleet.common.monitoring.elites import EliteArchive, controller_of, tables
 from dreamfleet.common.runs import run_folder, run_paths
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.coordinator.analysis.export import TABLES, columns_of, rows_of
+from dreamfleet.coordinator.analysis.export import ELITES, TABLES, columns_of, rows_of
 
-Plot = Literal["learning", "fitness"]
+Plot = Literal["fitness", "learning", "archive"]
 PLOTS: tuple[Plot, ...] = get_args(Plot)
+NO_ARCHIVE = "run {} has no archive: begin one with --archive"
 
 
 class StoredRun(RunFolder):
@@ -44,8 +46,22 @@ class StoredRun(RunFolder):
         """The run's own copy of its world model, for `evaluate` and `predict`; `None` if it has none."""
         return Bundle.open(self.bundle_path, self.spec.bundle) if self.spec.bundle else None
 
+    def archive(self) -> EliteArchive | None:
+        """The best candidate of each cell, of a run with `--archive`; `None` for another one."""
+        return EliteArchive.of(self)
+
+    def elite(self, cell: str) -> Controller:
+        """The elite of a cell of the archive, as `evaluate --cell` names it: `3,7`, or a value for each measure.
+
+        `UsageError` for an empty cell, or a run without an archive.
+        """
+        archive = self.archive()
+        if archive is None:
+            raise UsageError(NO_ARCHIVE.format(self.name))
+        return controller_of(self, archive.find(cell))
+
     def to_pandas(self, table: str = "generations") -> Any:
-        """A table as a pandas `DataFrame`: `generations`, `candidates`, `evaluations` or `confirmation`.
+        """A table as a pandas `DataFrame`: `generations`, `candidates`, `evaluations`, `confirmation` or `elites`.
 
         These are the tables of `dreamfleet runs export`. `MissingExtraError` without pandas.
 
@@ -61,38 +77,48 @@ class StoredRun(RunFolder):
         """The same as a polars `DataFrame`; `MissingExtraError` without polars."""
         return self._to_frame("polars", table)
 
-    def plot(self, kind: Plot | None = None) -> Any:
+    def plot(self, kind: Plot = "fitness") -> Any:
         """The picture of `dreamfleet runs plot`, as a matplotlib `Figure`, which notebooks show.
 
-        `learning` is the evaluated score over environment steps and core-hours, `fitness` that of the candidates over
-        generations. By default `learning`, where a mean was evaluated. `MissingExtraError` without matplotlib,
-        `UsageError` while there is nothing to draw.
+        `fitness` is that of the candidates over generations, with the evaluated means. `learning` is the evaluated
+        score over environment steps and core-hours, `archive` the elites of a run with an archive. `MissingExtraError`
+        without matplotlib, `UsageError` while there is nothing to draw.
 
         >>> from dreamfleet import open_run
         >>> with open_run("cartpole") as run:
         ...     figure = run.plot()
-        >>> figure.savefig("learning.png")
+        >>> figure.savefig("fitness.png")
         """
         from dreamfleet.common.runs.learning import LearningCurve
 
-        if kind not in (None, *PLOTS):
+        if kind not in PLOTS:
             raise UsageError(f"kind must be {' or '.join(PLOTS)}, not {kind!r}")
         _import("matplotlib", install_command("views"))
+        from dreamfleet.coordinator.analysis.archive_plot import archive_figure
         from dreamfleet.coordinator.analysis.plot import fitness_figure, learning_figure, published_scores
 
         with self.read_transaction():
-            if kind == "fitness" or (kind is None and not self.evaluations()):
+            if kind == "archive":
+                return archive_figure(self)
+            if kind == "fitness":
                 return fitness_figure(self)
             curves = [LearningCurve.of(self)]
             return learning_figure(curves, published_scores(curves))
 
     def _to_frame(self, package: str, table: str) -> Any:
-        if table not in TABLES:
-            raise UsageError(f"table must be one of {', '.join(TABLES)}, not {table!r}")
+        if table not in (*TABLES, ELITES):
+            raise UsageError(f"table must be one of {', '.join((*TABLES, ELITES))}, not {table!r}")
         make: Callable[[dict[str, list[Any]]], Any] = _import(package, f"pip install {package}").DataFrame
         with self.read_transaction():
-            rows = rows_of(self, table)
-        return make({name: [row[name] for row in rows] for name in columns_of(table)})
+            columns, rows = self._elites() if table == ELITES else (columns_of(table), rows_of(self, table))
+        return make({name: [row[name] for row in rows] for name in columns})
+
+    def _elites(self) -> tuple[list[str], list[dict[str, Any]]]:
+        """Columns and rows of the archive; `UsageError` for a run without one."""
+        archive = self.archive()
+        if archive is None:
+            raise UsageError(NO_ARCHIVE.format(self.name))
+        return tables(archive)
 
 
 def open_run(name: str, runs_dir: Path | str | None = None) -> StoredRun:

@@ -12,6 +12,7 @@ from dreamfleet.common.runs.comparison import (
     ComparedRun,
     EqualBudget,
     Scores,
+    are_comparable,
     at_equal_budget,
     difference,
     differing_settings,
@@ -37,8 +38,9 @@ def compare_runs(runs_dir: Path, one: str, other: str) -> dict[str, Any]:
         sides = base, other_side
         word = score_word_of_run(second.spec, second.bundle_path)
     worlds = {each.world for each in sides if each.world is not None}
-    equal = at_equal_budget(sides) if len(worlds) == 1 else []
-    pairs = _pairs(sides, equal) if len(worlds) == 1 else ()
+    comparable = are_comparable(sides)
+    equal = at_equal_budget(sides) if comparable else []
+    pairs = _pairs(sides, equal) if comparable else ()
     return {
         "problem": problem or other_problem,
         "worlds": sorted(map(printable, worlds)),
@@ -72,12 +74,14 @@ def _difference(of: str, sides: Sides, found: PairedDifference | str, word: str)
     """A difference with its texts: what it is of, its size and what follows from it."""
     if isinstance(found, str):
         return {"of": of, "verdict": f"no difference: fewer than 2 common {word}s"}
+    sign = -1 if sides[1].minimised else 1  # of a minimised function, the page shows values
     return {
         "of": of,
-        "mean": found.mean,
+        "mean": sign * found.mean,
+        "better": found.mean > 0,
         "error": found.error,
         "half": found.critical_value * found.error,  # a significant difference is larger
-        "size": format_with_error(found.mean, found.error, sign="+,"),
+        "size": format_with_error(sign * found.mean, found.error, sign="+,"),
         "on": plural(found.seeds, f"common {word}"),
         "clear": found.is_significant,
         "verdict": _verdict(sides, found),

@@ -32,7 +32,7 @@ class DashboardConfig:
             raise UsageError(f"--token must have at least {LEAST_TOKEN} characters: `openssl rand -hex 16` makes one")
         if self.token is None and not self.is_loopback:
             raise UsageError(
-                f"--host {self.host} shows the page to others: give a --token that they must know, or leave --host out"
+                f"--host {self.host} shows the page to others: give a --token that they must know, or omit --host"
             )
 
     @property

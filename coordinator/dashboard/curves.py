@@ -7,10 +7,19 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from dreamfleet.common.monitoring.elites import exploration_note
 from dreamfleet.common.printable import plural
-from dreamfleet.common.protocol.tasks import DREAM
+from dreamfleet.common.protocol.function_values import fitness_word, is_minimised, spans_decades, value_of
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.protocol.tasks import DREAM, is_function_task
 from dreamfleet.common.runs.effort import Effort, GenerationEffort
-from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs.records import (
+    RunSettings,
+    StoredConfirmation,
+    StoredEvaluation,
+    StoredGeneration,
+    in_values,
+)
 from dreamfleet.common.runs.scoring_params import ScheduleState
 from dreamfleet.common.runs.stages import begun_stages, describe_steps, join_distinct
 
@@ -27,6 +36,7 @@ class RunData:
     history: Sequence[StoredGeneration]
     evaluations: Sequence[StoredEvaluation]
     confirmed: StoredConfirmation | None
+    episode_limit: int | None = None  # steps; of the environment itself
 
 
 def downsample(rows: Sequence[T]) -> Sequence[T]:
@@ -49,18 +59,26 @@ def curves(
     Without quartiles the band is one standard deviation around the mean; `band` names which one it is. `word` names a
     seed of an evaluation.
     """
-    settings, rows = data.settings, downsample(data.history)
+    settings, task = data.settings, data.settings.task
+    rows = [in_values(each, task) for each in downsample(data.history)]
     dreamt = settings.task.task == DREAM
     finished = {each.generation: each for each in data.evaluations}
     stages = begun_stages(settings, data.history, data.evaluations)
-    steps = join_distinct(describe_steps(each.stage.horizon, each.stage.driven, dreamt=dreamt) for each in stages)
+    steps = join_distinct(
+        describe_steps(each.stage.horizon, each.stage.driven, dreamt=dreamt, limit=data.episode_limit)
+        for each in stages
+    )
+    band = _band(rows, quartiles, task)
+    is_log = (
+        is_minimised(task) and bool(rows) and spans_decades([end for each in rows for end in (each.best, each.mean)])
+    )
     drawn: dict[str, Any] = {
         "step": sampling_step(len(data.history)),
         "generation": [each.number for each in rows],
         "mean": [_rounded(each.mean) for each in rows],
         "best": [_rounded(each.best) for each in rows],
-        "low": [_rounded(low) for low, _ in _band(rows, quartiles)],
-        "high": [_rounded(high) for _, high in _band(rows, quartiles)],
+        "low": [_rounded(low) for low, _ in band],
+        "high": [_rounded(high) for _, high in band],
         "band": "± 1 standard deviation" if quartiles is None else "the middle half of the candidates",
         "sigma": [_rounded(each.sigma) for each in rows],
         "temperature": _temperatures(data, rows, finished),
@@ -68,13 +86,23 @@ def curves(
         "confirmed": None if data.confirmed is None else _confirmed(data.confirmed, data, spent),
         "stages": [each.since for each in stages[1:]],
         "dreamt": dreamt,
-        "fitness_axis": f"fitness over {steps}",
-        "score_axis": f"score{' in reality' * dreamt}, mean of {plural(settings.evaluation_episodes, word)}",
+        "fitness_axis": _value_axis(task, is_log=is_log) if is_function_task(task.task) else f"fitness over {steps}",
+        "score_word": fitness_word(task),
+        "log": is_log,
+        "score_axis": _value_axis(task, is_log=is_log)
+        if is_function_task(task.task)
+        else f"score{' in reality' * dreamt}, mean of {plural(settings.evaluation_episodes, word)}",
         "coming": _coming(settings),
+        "note": exploration_note(settings),
     }
     if spent is not None:
         drawn |= _effort_columns([spent[each.number] for each in rows if each.number < len(spent)])
     return drawn
+
+
+def _value_axis(task: TaskSpec, *, is_log: bool) -> str:
+    goal = "smaller is better" if is_minimised(task) else "larger is better"
+    return f"value: {goal}{' (log scale)' if is_log else ''}"
 
 
 def _coming(settings: RunSettings) -> str:
@@ -97,10 +125,15 @@ def cumulative_effort(start: Effort, efforts: Iterable[GenerationEffort], genera
     return found
 
 
-def _band(rows: Sequence[StoredGeneration], quartiles: Quartiles | None) -> list[tuple[float, float]]:
+def _band(rows: Sequence[StoredGeneration], quartiles: Quartiles | None, task: TaskSpec) -> list[tuple[float, float]]:
+    """The band's ends of rows in values; quartiles are of fitness."""
     if quartiles is None:
-        return [(each.mean - each.std, each.mean + each.std) for each in rows]
-    return [quartiles.get(each.number, (each.mean, each.mean)) for each in rows]
+        ends = [sorted((each.best, each.worst)) for each in rows]
+        return [(max(each.mean - each.std, low), min(each.mean + each.std, high))
+                for each, (low, high) in zip(rows, ends, strict=True)]  # fmt: skip
+    fitness = [quartiles.get(each.number) for each in rows]
+    return [(each.mean, each.mean) if pair is None else tuple(sorted(value_of(end, task) for end in pair))  # type: ignore[misc]
+            for each, pair in zip(rows, fitness, strict=True)]  # fmt: skip
 
 
 def _temperatures(
@@ -118,7 +151,7 @@ def _evaluations(data: RunData, spent: Sequence[Effort] | None) -> dict[str, Any
     rows = downsample(data.evaluations)
     columns: dict[str, Any] = {
         "generation": [each.generation for each in rows],
-        "mean": [_rounded(each.mean) for each in rows],
+        "mean": [_rounded(value_of(each.mean, data.settings.task)) for each in rows],
         "error": [_rounded(each.error) for each in rows],
         "episodes": [each.episodes for each in rows],
     }
@@ -129,9 +162,11 @@ def _evaluations(data: RunData, spent: Sequence[Effort] | None) -> dict[str, Any
 
 def _confirmed(found: StoredConfirmation, data: RunData, spent: Sequence[Effort] | None) -> dict[str, Any]:
     point = {
-        "generation": found.generation, "mean": _rounded(found.mean), "error": _rounded(found.error),
+        "generation": found.generation,
+        "mean": _rounded(value_of(found.mean, data.settings.task)),
+        "error": _rounded(found.error),
         "episodes": found.episodes,
-    }  # fmt: skip
+    }
     if spent is None:
         return point
     columns = _effort_columns([_effort_at(spent, len(data.history) - 1)])

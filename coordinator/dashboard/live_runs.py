@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, HandshakeRejectedError
 from dreamfleet.common.monitoring.client import Client
+from dreamfleet.common.monitoring.elites import EliteArchive
 from dreamfleet.common.monitoring.status import Population, Status, WorkerStatus, read_document, read_status
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol import keys
@@ -26,7 +27,7 @@ from dreamfleet.coordinator.dashboard.curves import RunData, curves, downsample
 from dreamfleet.coordinator.dashboard.lanes import Lanes
 from dreamfleet.coordinator.dashboard.page_state import RunSnapshot, page_state
 from dreamfleet.coordinator.dashboard.sse import event
-from dreamfleet.coordinator.dashboard.stored_runs import read_quartiles
+from dreamfleet.coordinator.dashboard.stored_runs import describe_archive, read_quartiles
 
 ANSWER_TIMEOUT = 1.5  # seconds to wait for answers
 PATIENCE = 5.0  # seconds of slow answers after which a silent run is lost; if others answer fast, at once
@@ -180,13 +181,15 @@ class _FollowedRun:
     _workers: Sequence[WorkerStatus] = ()
     _population: Sequence[Population] = ()
     _quartiles: dict[int, tuple[float, float]] | None = None  # `None`: no journal of it here
+    _archive: EliteArchive | None = None  # of a run with one, whose journal is on this disk
+    _archived: int = 0  # generations whose candidates are in it
     _rendered_curves: tuple[Any, bytes, int] = (None, b"", 0)  # cache key, event, counter
 
     def __post_init__(self) -> None:
         self._word = score_word(self.status.settings.task.task)
         with suppress(DreamfleetError), open_run(self.runs_dir, self.name) as stored:
             if stored.uid == self.uid:
-                self._quartiles = {}
+                self._quartiles, self._archive = {}, EliteArchive.empty(stored.settings)
                 self._word = score_word_of_run(stored.spec, stored.bundle_path)
 
     @property
@@ -283,13 +286,28 @@ class _FollowedRun:
         of = len(self.history), tuple(self.evaluations[-1:]), len(self.evaluations), self.status.confirmed
         if self._rendered_curves[0] == of:
             return
-        data = RunData(self.status.settings, self.history, self.evaluations, self.status.confirmed)
+        status = self.status
+        data = RunData(status.settings, self.history, self.evaluations, status.confirmed, status.episode_limit)
         self._read_quartiles()
+        self._read_elites()
+        drawn = {**curves(data, self._quartiles, word=self._word), "archive": describe_archive(self._archive)}
         self._rendered_curves = (
             of,
-            event("curves", curves(data, self._quartiles, word=self._word)),
+            event("curves", drawn),
             self._rendered_curves[2] + 1,
         )
+
+    def _read_elites(self) -> None:
+        """Add the candidates of newly closed generations to the archive, if it is drawn."""
+        if self._archive is None or self._archived >= len(self.history):
+            return
+        try:
+            with open_run(self.runs_dir, self.name) as stored:
+                if stored.uid == self.uid:
+                    self._archive.read(stored, self._archived)
+                    self._archived = len(self.history)
+        except DreamfleetError:
+            self._archive = None  # it was moved away
 
     def _read_quartiles(self) -> None:
         """Read the missing quartiles of drawn generations from the journal, if it is on this disk."""

@@ -7,19 +7,23 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from dreamfleet.common.artifacts.objective import describe_sign
 from dreamfleet.common.monitoring.eta import Eta, describe_state, estimate_eta, format_duration
-from dreamfleet.common.monitoring.status import Population, Status, WorkerStatus
-from dreamfleet.common.printable import plural, printable
-from dreamfleet.common.protocol.tasks import DREAM
+from dreamfleet.common.monitoring.status import ArchiveStatus, Population, Status, WorkerStatus
+from dreamfleet.common.printable import format_number, plural, printable
+from dreamfleet.common.protocol.function_values import fitness_word, is_minimised, value_of
+from dreamfleet.common.protocol.tasks import DREAM, is_function_task, step_unit
 from dreamfleet.common.runs.effort import format_steps
 from dreamfleet.common.runs.records import (
+    SUBMITTED,
     RunSettings,
     StoredConfirmation,
     StoredEvaluation,
     count_episodes,
+    in_values,
 )
 from dreamfleet.common.runs.run_paths import resume_command
-from dreamfleet.common.runs.stages import describe_steps
+from dreamfleet.common.runs.stages import describe_limit, describe_steps
 from dreamfleet.common.runs.standard_error import format_with_error
 
 LIVE, LOST, OVER = "live", "lost", "over"
@@ -101,9 +105,13 @@ def _task(status: Status) -> str:
     settings, stage = status.settings, status.generation.stage
     size = settings if stage is None else stage
     horizon = settings.task.horizon if stage is None else stage.horizon
-    steps = describe_steps(horizon, size.driven, dreamt=settings.task.task == DREAM)
-    candidates = f"{plural(size.population, 'candidate')}, {plural(size.episodes, 'episode')} each"
-    parts = [settings.task.task, candidates, steps]
+    limit = status.episode_limit
+    word = step_unit(settings.task.task)
+    steps = describe_steps(horizon, size.driven, dreamt=settings.task.task == DREAM, limit=limit, word=word)
+    steps += describe_limit(horizon, limit)
+    own = f"{plural(size.population, 'candidate')}, {plural(size.episodes, 'episode')} each"
+    candidates = SUBMITTED if settings.is_external else own
+    parts = [settings.task.task, candidates, steps, *filter(None, [describe_sign(settings.task.options)])]
     if stage is not None:
         parts.append(f"stage {stage.number} of {stage.total}")
     return ", ".join(parts)
@@ -111,19 +119,40 @@ def _task(status: Status) -> str:
 
 def _tiles(look: RunSnapshot, eta: Eta, link: str) -> list[dict[str, str]]:
     """The headline figures: name, value and caption."""
-    status, last = look.status, look.status.last
-    reported, spent = status.confirmed or status.best, status.throughput
+    status, task = look.status, look.status.settings.task
+    last, reported, spent = (
+        in_values(status.last, task),
+        in_values(status.confirmed or status.best, task),
+        status.throughput,
+    )
     workers, slots = plural(status.workers.present, "worker"), plural(status.slots, "slot")
-    spread = "" if last is None else f"mean; std {last.std:,.1f}; {last.worst:,.1f} to {last.best:,.1f}"
+    word = step_unit(task.task)
+
+    def figure(value: float) -> str:
+        return format_number(value, ",") if is_function_task(task.task) else f"{value:,.1f}"
+
+    spread = "" if last is None else f"mean; std {figure(last.std)}; {figure(last.worst)} to {figure(last.best)}"
     return [
         tile("score", NONE if reported is None else format_score(reported),
               _awaited_score(status) if reported is None else reported_caption(reported, look.word)),
-        tile("last generation", NONE if last is None else f"{last.mean:,.1f}", spread or "once a generation closes"),
+        tile("last generation", NONE if last is None else figure(last.mean), spread or "once a generation closes"),
+        *([] if status.archive is None else [_archive_tile(status.archive)]),
         tile("time per generation", NONE if eta.pace is None else format_duration(eta.pace), _worked(status)),
-        tile("throughput", f"{format_steps(round(spent.steps_per_second))} steps/s" if link == LIVE else NONE,
-              f"{format_steps(spent.environment_steps)} steps in all"),
+        tile("throughput", f"{format_steps(round(spent.steps_per_second))} {word}/s" if link == LIVE else NONE,
+              f"{format_steps(spent.environment_steps)} {word} in all"),
         tile("fleet", workers, slots) if link == LIVE else tile("fleet", NONE, f"{workers}, {slots} at the last"),
     ]  # fmt: skip
+
+
+def _archive_tile(archive: ArchiveStatus) -> dict[str, str]:
+    if archive.best is None:
+        return tile("archive", f"0 of {archive.cells:,}", "cells filled; once a generation closes")
+    best = f"the best elite {format_number(archive.best, ',')} in cell {','.join(map(str, archive.best_cell))}"
+    return tile(
+        "archive",
+        f"{archive.filled:,} of {archive.cells:,}",
+        f"cells filled; QD score {format_number(archive.qd_score, ',')}; {best}",
+    )
 
 
 def tile(name: str, value: str, caption: str) -> dict[str, str]:
@@ -162,12 +191,17 @@ def _candidates(parts: Sequence[Population], status: Status) -> dict[str, Any]:
     """Columns with a row a candidate: episodes done and wanted, fitness so far; empty without an open generation."""
     if status.state == "ended" or (status.state == "evaluating" and not status.generation.episodes_done):
         parts = ()
+    task = status.settings.task
     return {
         "generation": status.generation.number,
         "total": max((each.total for each in parts), default=0),
         "done": [done for each in parts for done in each.done],
         "wanted": [wanted for each in parts for wanted in each.wanted],
-        "fitness": [None if value is None else float(f"{value:.5g}") for each in parts for value in each.fitness],
+        "fitness": [
+            None if value is None else float(f"{value_of(value, task):.5g}") for each in parts for value in each.fitness
+        ],
+        "word": fitness_word(task),
+        "minimised": is_minimised(task),
     }
 
 
@@ -186,7 +220,9 @@ def _progress(status: Status, word: str) -> list[dict[str, Any]]:
 
 def _search(status: Status) -> Facts:
     open_one, settings = status.generation, status.settings
-    facts = [("step size", f"{open_one.sigma:.4g}"), ("optimiser", describe_optimiser(settings))]
+    facts = [("optimiser", describe_optimiser(settings))]
+    if not settings.is_external:
+        facts.insert(0, ("step size", f"{open_one.sigma:.4g}"))
     if open_one.axis_ratio is not None:
         facts.append(("axis ratio", f"{open_one.axis_ratio:,.4g}"))
     if open_one.temperature is not None:
@@ -203,16 +239,16 @@ def describe_optimiser(settings: RunSettings) -> str:
 
 def _redundant_work(status: Status) -> dict[str, Any]:
     """Work that was repeated or discarded: a line, and what is not zero."""
-    waste = status.waste
+    waste, word = status.waste, step_unit(status.settings.task.task)
     counts = [
-        ("discarded steps", waste.discarded_steps), ("jobs issued again", waste.reissued),
+        (f"discarded {word}", waste.discarded_steps), ("jobs issued again", waste.reissued),
         ("jobs recalled", waste.recalled), ("jobs copied at a generation's end", waste.copied),
         ("duplicate results", waste.duplicate), ("obsolete results", waste.obsolete), ("errors", waste.errors),
         ("batches sent again", waste.resent_batches), ("silences of workers", waste.silences),
         *((f"messages dropped: {printable(why)}", count) for why, count in status.dropped.items()),
     ]  # fmt: skip
     rows = [(name, f"{count:,}") for name, count in counts if count]
-    return {"text": f"{waste.share:.1%} of steps" if rows else "none", "rows": rows}
+    return {"text": f"{waste.share:.1%} of {word}" if rows else "none", "rows": rows}
 
 
 def _problems(status: Status) -> list[str]:
@@ -233,7 +269,9 @@ def _fleet(status: Status, link: str) -> str:
     parts = [f"{count} {state}" for count, state in ((silent, "silent"), (lost, "lost"), (counts.left, "left"))
              if count > 0]  # fmt: skip
     missing = f"{'' if link == LIVE else 'at the last: '}{', '.join(parts)}" if parts else ""
-    return "; ".join(filter(None, (missing, status.classes.description if status.classes.total else "")))
+    classes = status.classes.description if status.classes.total else ""
+    checks = "" if status.checks is None else f"checks: {status.checks.description}"
+    return "; ".join(filter(None, (missing, classes, checks)))
 
 
 def _workers(look: RunSnapshot, link: str) -> dict[str, list[Any]]:

@@ -7,8 +7,10 @@ import errno
 import socket
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import uvicorn
+from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from dreamfleet.common.errors import ConnectionFailedError
@@ -29,20 +31,9 @@ def serve(
     """Serve until SIGINT or SIGTERM; call `on_ready` with the URL once the port is open."""
     feed = Feed(watcher)
     app = make_app(feed, views, runs_dir, config)
-    with _open_socket(config) as listening:
+    with open_socket(config.host, config.port) as listening:
         server = _PageServer(
-            uvicorn.Config(
-                app,
-                log_config=None,
-                access_log=False,
-                server_header=False,
-                proxy_headers=False,
-                lifespan="off",
-                ws="none",
-                http=_Connection,
-                limit_concurrency=MOST_CONNECTIONS,
-                timeout_graceful_shutdown=SHUTDOWN_TIMEOUT,
-            ),
+            server_config(app, HttpConnection),
             feed,
             views,
         )
@@ -50,12 +41,33 @@ def serve(
         server.run(sockets=[listening])
 
 
-class _Connection(H11Protocol):
+def server_config(app: ASGIApp, connection: type[HttpConnection], **more: Any) -> uvicorn.Config:
+    """How a web server of ours runs `app`: few headers, bounded connections, no log of its own."""
+    return uvicorn.Config(
+        app,
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        proxy_headers=False,
+        lifespan="off",
+        ws="none",
+        http=connection,
+        limit_concurrency=MOST_CONNECTIONS,
+        timeout_graceful_shutdown=SHUTDOWN_TIMEOUT,
+        **more,
+    )
+
+
+class HttpConnection(H11Protocol):
     """A connection that is closed while idle: a client with half a request would hold it for ever."""
+
+    keep_alive = 0.0  # seconds for which a connection that has had a request stays at least
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Accept the connection as uvicorn does, and check it for idleness."""
         super().connection_made(transport)
+        self._idle_after: object = self  # the request after which it was idle at the last checks; itself: it was busy
+        self._idle_checks = 0
         self._schedule_idle_check()
 
     def _schedule_idle_check(self) -> None:
@@ -63,7 +75,10 @@ class _Connection(H11Protocol):
             self.loop.call_later(IDLE_TIMEOUT, self._drop_idle)
 
     def _drop_idle(self) -> None:
-        if self.cycle is None or self.cycle.response_complete:
+        is_idle = self.cycle is None or self.cycle.response_complete
+        self._idle_checks = self._idle_checks + 1 if is_idle and self.cycle is self._idle_after else 0
+        self._idle_after = self.cycle if is_idle else self
+        if is_idle and (self.cycle is None or self._idle_checks * IDLE_TIMEOUT >= self.keep_alive):
             self.transport.close()
         self._schedule_idle_check()
 
@@ -82,12 +97,13 @@ class _PageServer(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def _open_socket(config: DashboardConfig) -> socket.socket:
+def open_socket(host: str, port: int) -> socket.socket:
+    """A socket that listens there; `ConnectionFailedError` if that is not possible."""
     try:
-        family, kind, _, _, address = socket.getaddrinfo(config.host, config.port, type=socket.SOCK_STREAM)[0]
+        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         made = socket.socket(family, kind)
     except OSError as error:
-        raise ConnectionFailedError(f"cannot listen on {config.host}: {error.strerror or error}") from error
+        raise ConnectionFailedError(f"cannot listen on {host}: {error.strerror or error}") from error
     try:
         made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         made.bind(address)
@@ -95,7 +111,7 @@ def _open_socket(config: DashboardConfig) -> socket.socket:
     except OSError as error:
         made.close()
         if error.errno == errno.EADDRINUSE:
-            why = f"port {config.port} is in use, perhaps by another such page: choose another with --port N"
+            why = f"port {port} is in use, perhaps by another such page: choose another with --port N"
             raise ConnectionFailedError(why) from error
-        raise ConnectionFailedError(f"cannot listen on {config.host}:{config.port}: {error.strerror}") from error
+        raise ConnectionFailedError(f"cannot listen on {host}:{port}: {error.strerror}") from error
     return made

@@ -23,6 +23,7 @@ class FailureJudge:
 
     def __init__(self, jobs: PendingJobs, members: Mapping[str, Member]) -> None:
         self.working_hosts: set[str] = set()  # names of those that scored jobs of this run
+        self.lacks_proof = False  # no scored job is known that could show whether a new host can score
         self._causes: set[str] = set()  # that were seen
         self._jobs = jobs
         self._members = members
@@ -36,20 +37,26 @@ class FailureJudge:
         return is_new
 
     def find_lasting(self) -> list[JobFailure]:
-        """The wanted jobs that fail wherever they are scored."""
-        hosts = self._present_hosts()
+        """The wanted jobs that fail wherever they are scored.
+
+        R8: another host must have failed too, but not one that failed a job that was scored before.
+        """
+        proofs = self._failed_proofs
+        hosts = self._present_hosts() - {attempt.host for each in proofs for attempt in each.history}
         return [
             each
             for each in self._jobs.failures
-            if not self._jobs[each.work.job.digest].is_proof and is_lasting(each.history, self.working_hosts, hosts)
+            if each not in proofs and is_lasting(each.history, self.working_hosts, hosts)
         ]
 
     def find_pausing(self) -> JobFailure | None:
         """A job that failed so often that the run must pause; `None` if there is none.
 
-        R8: two workers, or three attempts on the only one, show that the job itself or every host is at fault.
+        R8: two workers, or three attempts on the only one, show that the job itself or every host is at fault. A host
+        that fails a job that was scored before is itself at fault, which is no matter while another is here that can.
         """
-        return next((each for each in self._jobs.failures if _is_pausing([each])), None)
+        passed = self._failed_proofs if self._present_hosts() & self.working_hosts else []
+        return next((each for each in self._jobs.failures if each not in passed and _is_pausing([each])), None)
 
     def find_broken_fleet(self, *, at_once: bool) -> JobFailure | None:
         """The job that failed most often, if all hosts that are here have failed and none of them has ever scored.
@@ -71,15 +78,28 @@ class FailureJudge:
 
     @property
     def awaits_proof(self) -> bool:
-        """Whether only suspects are open, and an idle host is here that has not scored yet, while others have."""
-        idle = {host_of(name) for name, each in self._members.items() if each.has_been_ready and not each.leases}
-        suspects = all(each.is_suspect for each in self._jobs.values())
-        return bool(self.working_hosts and self._jobs and suspects and idle - self.working_hosts)
+        """Whether only suspects and failed jobs are open, and an idle host has not scored, while others have."""
+        idle = {host_of(name) for name, each in self._members.items() if each.takes_jobs and not each.leases}
+        wanted = [each for each in self._jobs.values() if each.check is None]
+        is_stuck = all(each.is_suspect or (each.attempts and not each.is_proof) for each in wanted)
+        return bool(self.working_hosts and wanted and is_stuck and idle - self.working_hosts)
+
+    @property
+    def hosts_for_suspects(self) -> Collection[str]:
+        """The hosts that may be given suspects; empty: any host.
+
+        R8: hosts that have scored, if one is here, or if another that is here can still show that it can score.
+        """
+        return () if self.lacks_proof and not self._present_hosts() & self.working_hosts else self.working_hosts
 
     @property
     def has_failed_proof(self) -> bool:
         """Whether a job that was scored before is wanted again and failed."""
-        return any(self._jobs[each.work.job.digest].is_proof for each in self._jobs.failures)
+        return bool(self._failed_proofs)
+
+    @property
+    def _failed_proofs(self) -> list[JobFailure]:
+        return [each for each in self._jobs.failures if self._jobs[each.work.job.digest].is_proof]
 
     @property
     def has_hope(self) -> bool:

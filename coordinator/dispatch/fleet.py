@@ -24,6 +24,7 @@ from dreamfleet.coordinator.dispatch.packing import BatchContent, OutgoingBatch,
 from dreamfleet.coordinator.dispatch.pending_jobs import JobState, PendingJob, PendingJobs
 from dreamfleet.coordinator.dispatch.speculative_execution import Move, SpeculativeExecution
 from dreamfleet.coordinator.dispatch.worker_selection import assign_jobs
+from dreamfleet.coordinator.jobs.checks import Check
 from dreamfleet.coordinator.jobs.work import Work
 
 DEPARTURE_GRACE = 0.05  # seconds: a vanished token overtakes results that are still on their way
@@ -59,6 +60,7 @@ class Fleet:
         self.failure_judge = FailureJudge(self.jobs, self.members)
         self.drain_background = False  # only evaluations and kept rollouts are left to wait for
         self.paused = False
+        self.checked: Work | None = None  # the job whose accepted result the last result repeats
         self.single_job = False  # a slot scores one job at a time, even of a task whose slots score several at once
 
     def withdraw(self, digests: Iterable[bytes]) -> None:
@@ -125,7 +127,7 @@ class Fleet:
         beat = self._check_numbering(member, beat)
         if self.single_job:
             beat = replace(beat, capacity=min(beat.capacity, beat.slots))
-        for sent in member.apply_heartbeat(beat, now):
+        for sent in member.apply_heartbeat(beat, now, single_job=self.single_job):
             for work in sent.content.work:
                 self.event_log.add(now, "seen", identity, work.job.digest)
         running = {self.jobs.digest_of_tag(run.tag): run.steps for run in beat.running}
@@ -139,13 +141,15 @@ class Fleet:
                 self._add_lease(member, found, Lease(beat.seen, held, steps=running.get(found), steps_seen_at=now))
         member.resend_before(max((lease.batch for each, lease in member.leases.items() if each in listed), default=0))
 
-    def handle_result(self, identity: str, result: Result, now: float) -> tuple[VerdictWord, Work | None]:
+    def handle_result(
+        self, identity: str, result: Result, now: float, host_class: str = ""
+    ) -> tuple[VerdictWord, Work | None]:
         """Judge one result; return its work if it is the first valid one of a wanted job, for the journal.
 
         R5: a stranger's result is dropped. R7: a worker of this run gets a verdict on each result, a duplicate too, so
-        it can stop repeating it.
+        it can stop repeating it. `checked` is the work of a result that repeats an accepted one (R32).
         """
-        member, self._now = self.members.get(identity), now
+        member, self._now, self.checked = self.members.get(identity), now, None
         given = self.find_job_for_result(identity, result)
         if given is None and (member is None or member.is_guest):
             self.dropped["result of a stranger"] += 1  # a worker of this run repeats it after its first heartbeat
@@ -154,7 +158,7 @@ class Fleet:
             self._mark_heard(member, now)
             member.record_return(result)
         lease = None if member is None else member.leases.get(result.digest)
-        verdict, work = self._judge(identity, result, given)
+        verdict, work = self._judge(identity, result, given, host_class)
         if lease is not None and work is not None:
             self._speculation.record_duration(now - lease.group.given_at, is_background=lease.is_background)
         if member is not None or verdict == "accepted":
@@ -256,10 +260,19 @@ class Fleet:
             sends += batches
         return sends
 
+    def longest_held(self, *, is_background: bool) -> float:
+        """Seconds after which a job has been away for too long."""
+        return self._speculation.longest_held(is_background=is_background)
+
     @property
     def has_workers(self) -> bool:
         """Whether any worker is present, also one that replaces its scoring processes and takes no job."""
         return any(member.state is MemberState.PRESENT for member in self.members.values())
+
+    @property
+    def takes_jobs(self) -> bool:
+        """Whether any worker may be given candidates' jobs."""
+        return any(member.takes_jobs for member in self.members.values())
 
     @property
     def lease_count(self) -> int:
@@ -281,8 +294,11 @@ class Fleet:
 
     def _plan(self, now: float) -> dict[str, list[Work]]:
         """The work that each member is given now."""
-        working = self.failure_judge.working_hosts
-        given = assign_jobs(self.jobs, self.members, working, now, drain_background=self.drain_background)
+        judge = self.failure_judge
+        given = assign_jobs(
+            self.jobs, self.members, judge.working_hosts, now,
+            drain_background=self.drain_background, for_suspects=judge.hosts_for_suspects,
+        )  # fmt: skip
         if not self.jobs.queue_length:
             for move in self._speculation.plan(self.jobs, self.members, given, now):
                 self._apply_move(move, given, now)
@@ -315,13 +331,17 @@ class Fleet:
         if durable:
             member.verdicts = []
 
-    def _judge(self, identity: str, result: Result, given: Work | None) -> tuple[VerdictWord, Work | None]:
+    def _judge(
+        self, identity: str, result: Result, given: Work | None, host_class: str
+    ) -> tuple[VerdictWord, Work | None]:
         """The verdict on a result, and its work if it is accepted.
 
         R4: only the first valid result of a wanted job is accepted. R8: an error is recorded, never a fitness.
         """
         if result.digest not in self.jobs:
             return ("duplicate" if self.jobs.is_accepted(result.digest) else "obsolete"), None
+        if given is None and result.digest in self.jobs.checks:
+            return "duplicate", None  # a repetition of the accepted one
         if given is None:
             self.dropped["result of a job that was not given"] += 1
             return "refused", None
@@ -330,12 +350,30 @@ class Fleet:
             if member := self.members.get(identity):
                 self._drop_lease(member, result.digest, counted=True)
             return "refused", None
+        if result.digest in self.jobs.checks:
+            self.checked = given
+            self.jobs.remove_holder(result.digest, identity)
+            return "duplicate", None
         pending = self.jobs.accept(result)
         self.counts["discarded_steps"] += pending.steps_lost_to(identity, result.steps)
         pending.holders.discard(identity)
-        self._cancel(result.digest, pending)
+        if self.jobs.is_drawn(pending.work.job) and not pending.is_proof:
+            self.check_again(pending, Check(host_class, {host_of(identity)}))
+        else:
+            self._cancel(result.digest, pending)
         self.failure_judge.working_hosts.add(host_of(identity))
         return ("duplicate", None) if pending.is_proof else ("accepted", pending.work)
+
+    def check_again(self, pending: PendingJob, check: Check) -> None:
+        """Want an accepted job again from hosts that the check may ask; of its holders only these go on."""
+        digest = pending.work.job.digest
+        if digest in self.jobs:
+            self.jobs.remove(digest)
+        members = self.members
+        kept = {name for name in pending.holders if check.may_ask(host_of(name), members[name].host_class)}
+        pending.holders -= kept
+        self._cancel(digest, pending)
+        self.jobs.offer_check(pending.work, check, kept)
 
     def _record_failure(self, identity: str, result: Result) -> None:
         """Record a failed attempt; the first one of each cause is logged."""
@@ -412,7 +450,8 @@ class Fleet:
                 self._note_failure(digest)
 
     def _add_lease(self, member: Member, digest: bytes, lease: Lease) -> None:
-        lease.is_background = self.jobs[digest].is_background
+        pending = self.jobs[digest]
+        lease.is_background, lease.runs_alone = pending.is_background, pending.work.job.runs_alone
         member.leases[digest] = lease
         self.jobs.add_holder(digest, member.identity)
 

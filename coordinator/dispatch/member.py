@@ -45,6 +45,7 @@ class Lease:
     batch: int
     group: DispatchGroup
     is_background: bool = False
+    runs_alone: bool = False  # it takes a whole slot, also of a task whose slots score several jobs at once
     absent_heartbeats: int = 0  # in a row that confirm the batch and do not list the job
     steps: int | None = None  # environment steps so far, once a heartbeat has shown the job running
     steps_seen_at: float = 0.0  # when the last heartbeat came
@@ -73,8 +74,12 @@ class Member:
     last_heard: float
     joined_at: float = 0.0
     host_stats: HostStats = field(default_factory=HostStats)
-    capacity: int = 0  # slots that take jobs; 0, and so no credit, before the first heartbeat and once it drains
+    # Candidates' jobs that it scores at once; 0, and so no credit, before the first heartbeat and once it drains.
+    capacity: int = 0
+    batch_size: int = 1  # candidates' jobs that one of its slots scores at once
+    taken: int = 0  # of its capacity, what its other runs use now
     leaves_with_run: bool = False  # it reads that the run has ended, and then exits
+    reads_end: bool = False  # it reads why the run has ended, and leaves it
     gone_since: float | None = None  # when its token vanished, or its first heartbeat was its last
     farewell: str = ""  # why it leaves, by its last heartbeat
     silent: bool = False
@@ -85,6 +90,8 @@ class Member:
     steps_per_second: float = 0.0
     drawn_by: str = "-"
     host_class: str = ""  # empty: not known yet
+    is_anchor: bool = False  # it has shown that it is on the coordinator's own host
+    is_held: bool = False  # it differs from another host, and nobody has decided which of them is wrong
     finished: int = 0  # accepted results
     was_ready: bool = False  # some heartbeat named a slot that scores
     resent: int = 0  # batches that were sent again
@@ -109,8 +116,8 @@ class Member:
 
     @property
     def has_been_ready(self) -> bool:
-        """Whether it is present and could take a job before, though it may replace a scoring process now."""
-        return self.state is MemberState.PRESENT and self.was_ready
+        """Whether it is present, not held back, and could take a job before; it may replace a scoring process now."""
+        return self.state is MemberState.PRESENT and self.was_ready and not self.is_held
 
     @property
     def is_lost(self) -> bool:
@@ -132,15 +139,42 @@ class Member:
     @property
     def takes_jobs(self) -> bool:
         """Whether it is present and does not drain."""
+        return self.can_score and not self.is_held
+
+    @property
+    def can_score(self) -> bool:
+        """Whether it is present and does not drain, though it may be held back."""
         return self.is_reachable and self.capacity > 0
+
+    @property
+    def free_capacity(self) -> int:
+        """How many jobs it scores at once now, beside those of its other runs."""
+        return max(0, self.capacity - self.taken)
 
     @property
     def credit(self) -> int:
         """How many more jobs it may be given.
 
-        R14: at most twice as many jobs as it scores at once, so it never waits and its loss costs little.
+        R14: at most twice as many jobs as it scores at once, so it never waits and its loss costs little. A host that
+        is held back gets only jobs that decide about it.
         """
-        return min(2 * self.capacity, MAX_LEASES) - len(self.leases) if self.is_reachable else 0
+        return 0 if self.is_held else self.check_credit
+
+    @property
+    def check_credit(self) -> int:
+        """How many more jobs it may be given whose results are compared."""
+        return min(2 * self.capacity, MAX_LEASES) - self.held_share if self.is_reachable else 0
+
+    def share_of(self, *, runs_alone: bool) -> int:
+        """How much of its `capacity` a job takes: one that runs alone takes a whole slot."""
+        return self.batch_size if runs_alone else 1
+
+    @property
+    def held_share(self) -> int:
+        """How much of its `capacity` its leases take; more than all of it if some wait there."""
+        if self.batch_size == 1:
+            return len(self.leases)
+        return sum(self.share_of(runs_alone=lease.runs_alone) for lease in self.leases.values())
 
     @property
     def slot_steps_per_second(self) -> float:
@@ -161,15 +195,17 @@ class Member:
         self.unconfirmed.clear()
         self.cancels, self.verdicts = [], []
 
-    def apply_heartbeat(self, beat: Heartbeat, now: float) -> list[SentBatch]:
+    def apply_heartbeat(self, beat: Heartbeat, now: float, *, single_job: bool = False) -> list[SentBatch]:
         """Take what a heartbeat says of the worker; return the batches that it confirms for the first time.
 
         R11: a batch is kept until a heartbeat confirms it. R19: the first heartbeat turns a guest into a member
-        with credit.
+        with credit. With `single_job` its slots score one job at a time.
         """
         self.is_guest = False
         self.farewell = one_line(beat.reason)
         self.capacity, self.slots, self.confirmed = beat.capacity, beat.slots, beat.seen
+        self.taken = beat.taken
+        self.batch_size = 1 if single_job else max(self.batch_size, math.ceil(beat.capacity / max(beat.slots, 1)))
         self.was_ready = self.was_ready or beat.capacity > 0
         self.load, self.steps_per_second, self.drawn_by = beat.load, beat.steps_per_second, beat.drawn_by
         if beat.running and beat.steps_per_second:

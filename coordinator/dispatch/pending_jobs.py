@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from enum import Enum, auto
 
 from dreamfleet.common.protocol.failures import HOST_PREFIX
-from dreamfleet.common.protocol.messages import TAG_BYTES, Kind, Result
+from dreamfleet.common.protocol.messages import TAG_BYTES, Job, Kind, Result
 from dreamfleet.coordinator.dispatch.deficit_round_robin import DeficitCounter
-from dreamfleet.coordinator.dispatch.failures import Attempt, JobFailure, pause_before_retry
+from dreamfleet.coordinator.dispatch.failures import Attempt, JobFailure, host_of, pause_before_retry
+from dreamfleet.coordinator.jobs.checks import Check
 from dreamfleet.coordinator.jobs.work import Work
 
 MAX_FAILED = 64  # failed attempts of a job that are remembered
@@ -40,6 +41,7 @@ class PendingJob:
     attempts: list[Attempt] = field(default_factory=list)  # the failed ones
     lost_with: list[str] = field(default_factory=list)  # workers that ended while they held it
     is_proof: bool = False  # it was scored before: who scores it again shows that a host can score
+    check: Check | None = None  # it has an accepted result, which another host is to repeat
     retry_at: float = 0.0  # seconds of the monotonic clock before which it is not tried again
     # Worker that lost its lease -> environment steps it had made; `None`: it had finished.
     lost_steps: dict[str, int | None] = field(default_factory=dict)
@@ -103,6 +105,8 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         self._failing: dict[bytes, PendingJob] = {}  # wanted jobs that failed somewhere
         self._waiting: set[bytes] = set()  # failing jobs before their next attempt
         self._accepted: dict[bytes, int] = {}  # digest -> generation, of this generation and the last
+        self.checks: dict[bytes, PendingJob] = {}  # wanted jobs whose accepted result another host is to repeat
+        self.is_drawn: Callable[[Job], bool] = lambda _: False  # whether a job's result is to be checked
 
     def __getitem__(self, digest: bytes) -> PendingJob:
         return self._pending[digest]
@@ -128,7 +132,8 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         R5: it was given the job in this life of the coordinator; or an earlier life may have given it, to anybody.
         """
         pending = self._pending[digest]
-        return worker in pending.given_to or pending.work.job.generation <= self.previous_epoch_until
+        may_be_of_earlier_life = pending.check is None and pending.work.job.generation <= self.previous_epoch_until
+        return worker in pending.given_to or may_be_of_earlier_life
 
     def is_accepted(self, digest: bytes) -> bool:
         """Whether its result was accepted, in this generation or the last."""
@@ -162,8 +167,18 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         digest = work.job.digest
         if digest in self._pending:
             return False
-        self._add(PendingJob(work, self._next_order, is_proof=True))
+        pending = PendingJob(work, self._next_order, is_proof=True)
+        pending.in_queue = any(each == digest for _, each in self._queue)  # from before it was scored
+        self._add(pending)
         return True
+
+    def offer_check(self, work: Work, check: Check, holders: Iterable[str] = ()) -> None:
+        """Want a job again whose result was accepted; the `holders` may finish it."""
+        digest, pending = work.job.digest, PendingJob(work, self._next_order, check=check)
+        self._pending[digest] = self.checks[digest] = pending
+        self._tags[digest[:TAG_BYTES]] = digest
+        for holder in holders:
+            self.add_holder(digest, holder)
 
     def begin_generation(self, generation: int) -> None:
         """Forget the accepted jobs of generations before the last one.
@@ -180,6 +195,8 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         """Put a wanted job into its queue: in order of offer, or behind the others if it failed; it may wait before."""
         pending = self._pending[digest]
         self._share.release(digest)
+        if pending.check is not None:
+            return  # it waits in `checks`
         if pending.retry_at:
             self._waiting.add(digest)
         elif not pending.in_queue:
@@ -195,7 +212,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         while (next_job := self._next_queue(slots, idle=idle, drain_background=drain_background)) is not None:
             queue, by_share = next_job
             _, digest = heapq.heappop(queue)
-            if (pending := self._pending.get(digest)) is None:
+            if (pending := self._pending.get(digest)) is None or pending.check is not None:
                 continue  # answered meanwhile
             pending.in_queue = False
             if pending.state is JobState.QUEUED:  # else a former holder has its lease again
@@ -253,9 +270,13 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         self._failing = {digest: pending for digest, pending in self._failing.items() if pending.attempts}
 
     def _add_attempt(self, digest: bytes, attempt: Attempt, now: float) -> None:
-        pending = self._failing[digest] = self._pending[digest]
+        pending = self._pending[digest]
         pending.attempts.append(attempt)
         del pending.attempts[:-MAX_FAILED]
+        if pending.check is not None:
+            pending.check.passed_over.add(host_of(attempt.worker))
+            return
+        self._failing[digest] = pending
         pending.order, self._next_order = self._next_order, self._next_order + 1
         if pause := pause_before_retry(len(pending.attempts)):
             pending.retry_at = now + pause
@@ -290,6 +311,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
     def remove(self, digest: bytes) -> PendingJob:
         """Want a job no more; the returned job still names its holders."""
         pending = self._pending.pop(digest)
+        self.checks.pop(digest, None)
         self._failing.pop(digest, None)
         self._waiting.discard(digest)
         self._tags.pop(digest[:TAG_BYTES], None)

@@ -8,7 +8,7 @@ from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol.host_classes import effective_class
 from dreamfleet.common.protocol.keys import PROTOCOL_VERSION
 from dreamfleet.common.protocol.messages import HelloRequest
-from dreamfleet.common.protocol.tasks import GYM, is_unregistered, module_of
+from dreamfleet.common.protocol.tasks import ARGUMENTS, is_unregistered, module_of
 
 MAX_REFUSED = 8  # names that are remembered
 MAX_LOGGED = 100  # refusals that are logged: a stranger can invent names without end
@@ -31,7 +31,7 @@ def find_refusal(
             f"install dreamfleet {package_version('dreamfleet')} on the worker's host"
         )
     family = task.partition(":")[0]
-    if not ({task} if family == GYM and module_of(task) else {task, family}) & set(request.tasks):
+    if not ({task} if family in ARGUMENTS and module_of(task) else {task, family}) & set(request.tasks):
         remedy = "install the package that registers this task on the worker's host"
         if is_unregistered(task):
             remedy = f"start it with `dreamfleet worker --task {task}`, if you trust that, or {remedy}"

@@ -7,9 +7,10 @@ without a recent record, beside one with a record, first gets a trial copy of a 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.dispatch.host_stats import HostStats
 from dreamfleet.coordinator.dispatch.member import Lease, Member
 from dreamfleet.coordinator.dispatch.pending_jobs import JobState, PendingJob
@@ -48,6 +49,10 @@ class SpeculativeExecution:
         before = self._typical_seconds[is_background]
         self._typical_seconds[is_background] += SMOOTHING * (seconds - before) if before else seconds
 
+    def longest_held(self, *, is_background: bool) -> float:
+        """Seconds after which a job has been away for too long, whatever progress its worker reports."""
+        return LONGEST_HELD + LONGEST_HELD_TIMES * self._typical_seconds[is_background]
+
     def record_episode(self, steps: int) -> None:
         """Note the length of an accepted episode."""
         self._typical_steps += SMOOTHING * (steps - self._typical_steps) if self._typical_steps else steps
@@ -64,17 +69,18 @@ class SpeculativeExecution:
         R17: an idle slot helps with what other workers hold, so the last jobs of a generation end sooner.
         """
         takers = [member for member in members.values() if member.takes_jobs]
-        loads = {member.identity: len(member.leases) + len(given.get(member.identity, ())) for member in takers}
-        idle = [member for member in takers if loads[member.identity] < member.capacity]
+        loads = {each.identity: each.held_share + _share(each, given.get(each.identity, ())) for each in takers}
+        idle = [member for member in takers if loads[member.identity] < member.free_capacity]
         moved: set[bytes] = set()
         for taker in sorted(
             idle, key=lambda member: (member.host_stats.expected_seconds(1), -member.slot_steps_per_second)
         ):
             for move in self._moves(taker, takers, loads, jobs, moved, now):
                 moved.add(move.digest)
-                loads[taker.identity] += 1
+                runs_alone = jobs[move.digest].work.job.runs_alone
+                loads[taker.identity] += taker.share_of(runs_alone=runs_alone)
                 if move.donor:
-                    loads[move.donor] -= 1
+                    loads[move.donor] -= members[move.donor].share_of(runs_alone=runs_alone)
                 yield move
 
     def _moves(
@@ -91,8 +97,9 @@ class SpeculativeExecution:
         if not taker.host_stats.has_history and any(is_dependable(other, now) for other in others):
             return  # a trial copy measures it first
         stragglers = self._stragglers(others, taker, jobs, now)
-        while loads[taker.identity] < taker.capacity:
-            expected = self._expected_seconds(taker, loads[taker.identity] + 1)
+        while loads[taker.identity] < taker.free_capacity:
+            jobs_held = len(taker.leases) + loads[taker.identity] - taker.held_share
+            expected = self._expected_seconds(taker, jobs_held + 1)
             if (move := self._find_recall(taker, expected, others, loads, jobs, moved, now)) is not None:
                 yield move
                 continue
@@ -119,7 +126,7 @@ class SpeculativeExecution:
         """
         takers = [member for member in members.values() if member.takes_jobs]
         for taker in takers:
-            if taker.leases or taker.identity in busy or not _is_trial_due(taker, now):
+            if taker.leases or not taker.free_capacity or taker.identity in busy or not _is_trial_due(taker, now):
                 continue
             known = [other for other in takers if other is not taker and is_dependable(other, now)]
             donors = sorted(known, key=lambda member: -len(member.leases) / member.capacity)
@@ -132,8 +139,8 @@ class SpeculativeExecution:
         self, taker: Member, expected: float, others: Sequence[Member], loads: Mapping[str, int],
         jobs: Mapping[bytes, PendingJob], moved: set[bytes], now: float,
     ) -> Move | None:  # fmt: skip
-        """The latest job of the most loaded member with more leases than slots: it waits there, not begun."""
-        donors = [member for member in others if loads[member.identity] > member.capacity]
+        """The latest job of the most loaded member with more leases than free slots: it waits there, not begun."""
+        donors = [member for member in others if loads[member.identity] > member.free_capacity]
         for donor in sorted(donors, key=lambda member: -loads[member.identity] / member.capacity):
             for digest, lease in reversed(donor.leases.items()):
                 waits = lease.steps is None and lease.upload_pending_since is None and digest not in moved
@@ -163,7 +170,7 @@ class SpeculativeExecution:
         """Seconds that the holder of a job still needs; of two estimates the longer. Infinite: copy it in any case."""
         if now - holder.last_heard > QUIET_INTERVALS * self._heartbeat_interval:
             return math.inf
-        if now - lease.group.given_at > LONGEST_HELD + LONGEST_HELD_TIMES * self._typical_seconds[lease.is_background]:
+        if now - lease.group.given_at > self.longest_held(is_background=lease.is_background):
             return math.inf
         if lease.upload_pending_since is not None:
             return math.inf if now - lease.upload_pending_since > UPLOAD_SECONDS else 0.0
@@ -180,13 +187,21 @@ class SpeculativeExecution:
         return left
 
 
+def _share(member: Member, given: Iterable[Work]) -> int:
+    """How much of a member's capacity the work that it is about to be sent takes."""
+    return sum(member.share_of(runs_alone=work.job.runs_alone) for work in given)
+
+
 def _may_take(digest: bytes, taker: Member, jobs: Mapping[bytes, PendingJob]) -> bool:
     """Whether a job has one holder and may be given to `taker`.
 
-    R17: a job has at most two holders, which bounds the wasted work. R8: what may have ended its workers has one.
+    R17: a job has at most two holders, which bounds the wasted work. R8: what may have ended its workers has one, and
+    so has a job that is to show whether its holder can score.
     """
     job = jobs.get(digest)
-    if job is None or job.is_suspect:
+    if job is None or job.is_suspect or job.is_proof:
+        return False
+    if job.check is not None and not job.check.may_ask(host_of(taker.identity), taker.host_class):
         return False
     return job.state is JobState.LEASED and taker.identity not in job.avoided_workers
 

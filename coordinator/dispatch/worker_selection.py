@@ -1,18 +1,21 @@
 """Which worker is given which job. Pure.
 
 R15: the least loaded worker is next, unless it is known to be slower than others. A slower one gets only jobs that it
-should return before the others have finished the rest, so a bad worker does not delay a generation.
+should return before the others have finished the rest, so a bad worker does not delay a generation. Evaluations for
+which the run waits go to the least loaded worker, so that no slot idles.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
+from functools import cached_property
 
 from dreamfleet.coordinator.dispatch.failures import host_of
-from dreamfleet.coordinator.dispatch.member import Member
+from dreamfleet.coordinator.dispatch.member import Member, MemberState
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob, PendingJobs
+from dreamfleet.coordinator.jobs.checks import Check
 from dreamfleet.coordinator.jobs.work import Work
 
 PEER_RATIO = 1.5  # workers at most this many times slower than the best share jobs evenly with it
@@ -20,22 +23,26 @@ REST_FRACTION = 0.8  # a slower worker must return a job within this part of the
 
 
 class WorkerSelection:
-    """Chooses among the members in `loads`, which hold so many jobs, while `waiting` jobs are in the queue."""
+    """Chooses among the members in `shares`, by what they hold, while `waiting` jobs are in the queue.
 
-    def __init__(self, members: Mapping[str, Member], loads: Mapping[str, int], waiting: int, now: float) -> None:
+    `shares` says how much of each member's capacity its jobs take; its owner updates it.
+    """
+
+    def __init__(self, members: Mapping[str, Member], shares: Mapping[str, int], waiting: int, now: float) -> None:
         self._members = members
-        self._loads = dict(loads)
+        self._shares = shares
+        self._loads = {name: len(members[name].leases) for name in shares}
         self._waiting = waiting
         self._now = now
         self._dependable = {name for name, member in members.items() if is_dependable(member, now)}
         self._jobs = sum(len(members[name].leases) for name in self._dependable)
         self._rate = sum(members[name].host_stats.rate for name in self._dependable)
         self._expected_seconds = {
-            name: members[name].host_stats.expected_seconds(load + 1) for name, load in loads.items()
+            name: members[name].host_stats.expected_seconds(load + 1) for name, load in self._loads.items()
         }
         full = (
             members[name].host_stats.expected_seconds(len(members[name].leases) + 1)
-            for name in self._dependable - loads.keys()
+            for name in self._dependable - shares.keys()
         )
         self._soonest_full = min(full, default=math.inf)  # seconds of the fastest member without credit
         self._best: dict[int, list[tuple[float, str]]] = {}  # size class of a load -> the two fastest members
@@ -52,9 +59,32 @@ class WorkerSelection:
         suitable = [name for name in eligible if self._finishes_in_time(name)]
         if not suitable:
             return self._soonest(eligible)
+        return self._least_loaded(suitable)
+
+    def pick_for_background(self, eligible: Collection[str]) -> str | None:
+        """The worker to give an evaluation to, for which the run waits; `None` to wait for one that will stay up.
+
+        A slow host takes part: idle slots take over what waits there, and copy what it is late with (R17).
+        """
+        lasting = [name for name in eligible if name not in self._likely_lost]
+        if not lasting:
+            others_last = any(m.takes_jobs and name not in self._likely_lost for name, m in self._members.items())
+            return None if others_last else self._least_loaded(eligible)
+        return self._least_loaded(lasting)
+
+    def _least_loaded(self, names: Collection[str]) -> str:
         return min(
-            suitable, key=lambda name: (self._loads[name] / self._members[name].capacity, self._expected_seconds[name])
+            names, key=lambda name: (self._shares[name] / self._members[name].capacity, self._expected_seconds[name])
         )
+
+    @cached_property
+    def _likely_lost(self) -> set[str]:
+        """Members that may well be lost before they return one job."""
+        return {
+            name
+            for name, each in self._members.items()
+            if each.host_stats.is_likely_lost(1, self._now - each.joined_at)
+        }
 
     def _soonest(self, eligible: Collection[str]) -> str | None:
         """The fastest dependable worker, if it is eligible and no worker without credit is faster."""
@@ -89,6 +119,63 @@ class WorkerSelection:
         return next(seconds for seconds, other in self._best[size] if other != name)
 
 
+class JobAssignment:
+    """The work that each member is given at one moment, and who may be given more."""
+
+    def __init__(self, jobs: PendingJobs, members: Mapping[str, Member]) -> None:
+        self.given: dict[str, list[Work]] = {}
+        self.shares = {name: member.held_share for name, member in members.items() if member.credit > 0}
+        self._full_at = {name: share + members[name].credit for name, share in self.shares.items()}
+        self._jobs = jobs
+        self._members = members
+
+    @property
+    def has_idle(self) -> bool:
+        """Whether a member with credit has a slot without a job."""
+        return any(share < self._members[name].capacity for name, share in self.shares.items())
+
+    def give(self, digest: bytes, name: str, *, by_share: bool = False) -> None:
+        """Give a job to a member."""
+        job = self._jobs[digest].work.job
+        self.given.setdefault(name, []).append(self._jobs[digest].work)
+        self._jobs.add_holder(digest, name, by_share=by_share)
+        if name in self.shares:
+            self.shares[name] += self._members[name].share_of(runs_alone=job.runs_alone)
+            if self.shares[name] >= self._full_at[name]:
+                del self.shares[name]
+
+    def give_checks(self) -> None:
+        """Give jobs whose accepted results another host is to repeat, each to the least loaded one that may (R32)."""
+        for pending in [each for each in self._jobs.checks.values() if not each.holders]:
+            digest = pending.work.job.digest
+            able = [name for name, member in self._members.items() if self._may_check(pending, member)]
+            if able:
+                self.give(digest, min(able, key=lambda name: self._load(name) / self._members[name].capacity))
+
+    def give_copy(self, digest: bytes, first: str) -> None:
+        """Give a job that is to be checked to a second host of the class at once, so that nobody waits for it later.
+
+        R32: both get it in its turn, so its place says nothing.
+        """
+        member = self._members[first]
+        check = Check(member.host_class, {host_of(first)})
+        able = [name for name in self.shares if check.may_ask(host_of(name), self._members[name].host_class)]
+        if able and not self._jobs[digest].avoided_workers:
+            self.give(digest, min(able, key=lambda name: self._load(name) / self._members[name].capacity))
+
+    def _may_check(self, pending: PendingJob, member: Member) -> bool:
+        check, load = pending.check, self._load(member.identity) - member.held_share
+        free = member.can_score and member.state is MemberState.PRESENT and member.check_credit > load
+        may = check is not None and check.may_ask(host_of(member.identity), member.host_class)
+        return free and may and member.identity not in pending.avoided_workers
+
+    def _load(self, name: str) -> int:
+        """How much of a member's capacity its jobs take, those that it is given now included."""
+        member = self._members[name]
+        own = (member.share_of(runs_alone=work.job.runs_alone) for work in self.given.get(name, ()))
+        return member.held_share + sum(own)
+
+
 def assign_jobs(
     jobs: PendingJobs,
     members: Mapping[str, Member],
@@ -96,53 +183,67 @@ def assign_jobs(
     now: float,
     *,
     drain_background: bool,
+    for_suspects: Collection[str] | None = None,
 ) -> dict[str, list[Work]]:
     """Take queued jobs one by one and choose a member with credit for each; the work by member.
 
-    With `drain_background` background jobs may use all slots. A job without a suitable member stays queued.
+    With `drain_background` background jobs may use all slots. `for_suspects` are the hosts that may be given suspects:
+    the working ones by default, any host if it is empty. A job without a suitable member stays queued.
     """
-    given: dict[str, list[Work]] = {}
-    loads = {name: len(member.leases) for name, member in members.items() if member.credit > 0}
-    selection = WorkerSelection(members, loads, jobs.queue_length, now)
+    for_suspects = working_hosts if for_suspects is None else for_suspects
+    assignment = JobAssignment(jobs, members)
+    assignment.give_checks()
+    shares = assignment.shares
+    selection = WorkerSelection(members, shares, jobs.queue_length, now)
     slots = sum(member.slots for member in members.values() if member.takes_jobs)
     passed_over = []
-    while loads:
-        idle = any(load < members[name].capacity for name, load in loads.items())
-        if (next_job := jobs.next(slots, idle=idle, drain_background=drain_background)) is None:
+    while shares:
+        if (next_job := jobs.next(slots, idle=assignment.has_idle, drain_background=drain_background)) is None:
             break
         pending = jobs[next_job.digest]
-        free = _without_suspects(loads, jobs, working_hosts) if pending.is_suspect else loads
-        eligible = _eligible_workers(pending, free, members)
+        allowed: Mapping[str, Member] = members
+        free: Collection[str] = shares
+        if pending.is_suspect or pending.is_proof:
+            allowed = _allowed_members(pending, members, for_suspects if pending.is_suspect else working_hosts)
+            busy = jobs.holders_of_suspects() if pending.is_suspect else ()
+            free = [name for name in shares if name in allowed and name not in busy]
+        eligible = _eligible_workers(pending, free, allowed)
         if not eligible:
             passed_over.append(next_job.digest)
             continue
-        name = selection.pick(eligible)
-        if name is None and not pending.avoided_workers:
+        awaited = drain_background and pending.is_background
+        name = selection.pick_for_background(eligible) if awaited else selection.pick(eligible)
+        if name is None and not pending.avoided_workers and not pending.is_proof:
             passed_over.append(next_job.digest)
             break  # the jobs after it wait for a faster worker too
-        name = name or min(eligible, key=lambda name: loads[name])
+        name = name or min(eligible, key=lambda name: shares[name])
         selection.assign(name)
-        given.setdefault(name, []).append(pending.work)
-        jobs.add_holder(next_job.digest, name, by_share=next_job.by_share)
-        loads[name] += 1
-        if len(given[name]) >= members[name].credit:
-            del loads[name]
+        assignment.give(next_job.digest, name, by_share=next_job.by_share)
+        if jobs.is_drawn(pending.work.job) and not pending.is_suspect and not pending.is_proof:
+            assignment.give_copy(next_job.digest, name)
     for digest in passed_over:
         jobs.enqueue(digest)
-    return given
+    return assignment.given
 
 
-def _without_suspects(names: Iterable[str], jobs: PendingJobs, working_hosts: Collection[str]) -> list[str]:
-    """Which of these members may be given a suspect.
+def _allowed_members(
+    pending: PendingJob, members: Mapping[str, Member], working_hosts: Collection[str]
+) -> Mapping[str, Member]:
+    """Which members may be given a job at all.
 
-    R8: those that hold no other one, on hosts that have scored, if there were any.
+    R8: a suspect goes to the `working_hosts`, if any. A job that was scored before goes to hosts that have not scored,
+    if one is here: it is to show whether they can.
     """
-    busy = jobs.holders_of_suspects()
-    return [name for name in names if name not in busy and (not working_hosts or host_of(name) in working_hosts)]
+    if pending.is_suspect and working_hosts:
+        return {name: member for name, member in members.items() if host_of(name) in working_hosts}
+    if pending.is_proof:
+        new = {name: member for name, member in members.items() if host_of(name) not in working_hosts}
+        return new if any(member.takes_jobs for member in new.values()) else members
+    return members
 
 
 def _eligible_workers(pending: PendingJob, free: Collection[str], members: Mapping[str, Member]) -> list[str]:
-    """Which of these `free` members may be given a job.
+    """Which of these `free` members may be given a job; `members` are all that may be given it.
 
     R8: not one where it failed, unless every present member is such: then those where it failed least often. A process
     that was killed once must not stop the run. A stranger's hello cannot keep a failed job from being tried again, and

@@ -7,7 +7,8 @@ over Zenoh; it imports neither the service nor the worker.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, fields, replace
 from importlib.util import find_spec
@@ -17,13 +18,13 @@ from typing import Any
 
 from rich.console import Console
 from rich.live import Live
-from rich.table import Table
 from rich.text import Text
 
 from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli import model_commands
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.cli.model_commands import options
+from dreamfleet.common.cli.output import print_rows
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
 from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.host.processes import (
@@ -36,20 +37,21 @@ from dreamfleet.common.host.processes import (
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import never_stop
 from dreamfleet.common.monitoring.client import Client
+from dreamfleet.common.monitoring.eta import summarise_status
 from dreamfleet.common.monitoring.status_panel import RunPanel
-from dreamfleet.common.printable import format_number, plural
+from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.keys import check_run_name
-from dreamfleet.common.runs.records import best_evaluation
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL, resume_command
 from dreamfleet.common.runs.standard_error import format_with_error, standard_error
 from dreamfleet.common.worlds.profile import DemoPlan
-from dreamfleet.common.worlds.score_words import score_word
+from dreamfleet.common.worlds.score_words import profile_of
 from dreamfleet.coordinator.experiments.demo_plans import PLANS, find_plan, plan_defaults
 from dreamfleet.coordinator.experiments.local_run import START_SECONDS, LocalRun, has_begun
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE
 
 REFRESH = 0.5
+LOG_INTERVAL = 30.0  # seconds between two lines where no panel can be drawn, such as in a log
 PAGE_PACKAGES = ("plotly", "starlette", "uvicorn")
 PLOT, VIDEO, SCHEDULE = "fitness.png", "drive.mp4", "stages.toml"
 SUBSPACE_SIGMA0, FULL_SIGMA0 = 0.3, 0.1  # first step sizes from zero: in a subspace, and of all parameters
@@ -115,6 +117,7 @@ class DemoRun:
     """One of the demonstration's runs."""
 
     run: str
+    where: str  # its controller evolved
     what: str
     flags: Mapping[str, object]
     schedule: str = ""  # TOML
@@ -124,11 +127,12 @@ class Demo:
     """One demonstration run in `runs_dir`."""
 
     def __init__(self, config: DemoConfig, name: str, runs_dir: Path) -> None:
-        self._config, self._plan, self._word = config, config.plan, score_word(config.world)
+        self._config, self._plan, self._profile = config, config.plan, profile_of(config.world)
         self._runs_dir = runs_dir
         self._demo_runs = plan_runs(config, name, runs_dir)
         self._endpoint = f"tcp/127.0.0.1:{config.port}"
         self._console = Console()
+        self._next_line = 0.0  # when a line may say how a run goes, where no panel can be drawn
 
     def play(self) -> None:
         """Evolve, judge, plot, record, and print what to try next; `UsageError` if a run of that name exists."""
@@ -139,22 +143,17 @@ class Demo:
             self._show_page(stack)
             for demo_run in self._demo_runs:
                 self._evolve(demo_run)
+        drives = {each.run: self._judge(each) for each in self._demo_runs}
+        self._print_scores(drives)
+        for demo_run in self._demo_runs:
+            self._plot(demo_run)
         best = max(reversed(self._demo_runs), key=self._confirmed)  # of equals the last
         folder = self._runs_dir / best.run
         controller = folder / CONTROLLER
-        self._print(
-            f"judging run {best.run}'s controller on unseen {self._word}s, whole episodes, in {self._plan.judge}"
-        )
-        drives = self._judge(controller)
-        self._console.print(self._table(best, drives))
-        for demo_run in self._demo_runs:
-            self._plot(demo_run)
-        if self._plan.random_score is not None:
-            times = fmean(drives.values()) / self._plan.random_score
-            self._print(f"random play has {format_number(self._plan.random_score)}: this is {times:.1f} times as much")
-        seed, score = median_drive(drives)
-        what = f"{format_number(score)} on {self._word} {seed}"
-        self._print(f"recording the median of these drives ({what}), and what the model dreams")
+        seed, score = median_drive(drives[best.run])
+        why = " (the higher confirmed score)" if len(drives) > 1 else ""
+        what = f"{self._profile.score_word} {seed}, its median: {self._profile.format_score(score)}"
+        self._print(f"recording run {best.run}'s controller{why} on {what}")
         steps = self._plan.video_steps
         run_verb_to_end("record", "--controller", controller, "--out", folder / VIDEO, "--steps", steps, "--seed", seed)
         self._print_next_steps(folder)
@@ -185,25 +184,34 @@ class Demo:
             found = run.confirmation()
         return -math.inf if found is None else found.mean
 
-    def _judge(self, controller: Path) -> dict[int, float]:
+    def _judge(self, demo_run: DemoRun) -> dict[int, float]:
         """Score by track, on tracks that no part of the demonstration has seen."""
+        seeds = plural(self._plan.tracks, f"unseen {self._profile.score_word}")
+        self._print(f"judging run {demo_run.run}'s controller on {seeds}, in {self._plan.judge}")
+        controller = self._runs_dir / demo_run.run / CONTROLLER
         report = run_verb_for_json(*model_commands.evaluate(controller, self._plan.tracks, "--json"))
         return dict(zip(report["seeds"], report["scores"], strict=True))
 
-    def _table(self, chosen: DemoRun, drives: Mapping[int, float]) -> Table:
-        """Each run's best evaluation and confirmed score, and the chosen one's score on unseen tracks."""
-        words = f"{self._word}s"
-        table = Table("run", "its best evaluation", f"confirmed on fresh {words}", f"on unseen {words}", box=None)
+    def _print_scores(self, drives: Mapping[str, Mapping[int, float]]) -> None:
+        """Print a row for each controller: where it evolved, its confirmed score, and that on unseen tracks."""
+        word, random = self._profile.score_word, self._plan.random_score
+        rows = []
         for demo_run in self._demo_runs:
             with open_run(self._runs_dir, demo_run.run) as run:
-                best, confirmed = best_evaluation(run.evaluations()), run.confirmation()
-            table.add_row(
-                demo_run.run,
-                "-" if best is None else _format_score(best.mean, best.error, best.episodes),
-                "-" if confirmed is None else _format_score(confirmed.mean, confirmed.error, confirmed.episodes),
-                _format_drives(list(drives.values())) if demo_run is chosen else "",
-            )
-        return table
+                confirmed = run.confirmation()
+            scores = list(drives[demo_run.run].values())
+            row = {
+                "run": demo_run.run,
+                "evolved in": demo_run.where,
+                f"confirmed on fresh {word}s": None
+                if confirmed is None
+                else f"{format_with_error(confirmed.mean, confirmed.error)} ({confirmed.episodes})",
+                f"on unseen {word}s": f"{format_with_error(fmean(scores), standard_error(scores))} ({len(scores)})",
+            }
+            rows.append(row if random is None else {**row, "times random play": f"{fmean(scores) / random:.1f}"})
+        beside = "" if random is None else f"; random play has {random:g}"
+        self._print(f"means of {self._profile.score_label} ± standard error (number of {word}s){beside}:")
+        print_rows(rows, right=tuple(rows[0])[2:])
 
     def _evolve(self, demo_run: DemoRun) -> None:
         workers, logs, flags = self._config.workers or usable_cores(), self._runs_dir / demo_run.run, demo_run.flags
@@ -231,7 +239,11 @@ class Demo:
 
     def _show(self, live: Live, client: Client, run: str) -> None:
         with suppress(ConnectionFailedError):  # the coordinator is starting, or has just ended
-            live.update(RunPanel(client.status(run), client.worker_flags, fitted=self._console.is_terminal))
+            status = client.status(run)
+            live.update(RunPanel(status, client.worker_flags, fitted=self._console.is_terminal))
+            if not self._console.is_terminal and time.monotonic() >= self._next_line and not status.is_over:
+                self._next_line = time.monotonic() + LOG_INTERVAL
+                self._print(f"  {summarise_status(status)}")
 
     def _plot(self, demo_run: DemoRun) -> None:
         from dreamfleet.coordinator.analysis.plot import plot_fitness
@@ -248,27 +260,28 @@ class Demo:
         for command in (
             shell_command("verify", "candidate", folder.name, "--candidate", "0/0", "--runs-dir", self._runs_dir),
             shell_command(*model_commands.evaluate(controller, 100)),
-            shell_command("coordinator", "--run", "mine", "--preset", "frugal", "--listen", self._endpoint)
+            shell_command(
+                "coordinator",
+                "--run",
+                "mine",
+                "--preset",
+                self._plan.preset,
+                "--bundle",
+                self._plan.bundle,
+                "--listen",
+                self._endpoint,
+            )
             + f"   # and beside it: {shell_command('worker', '--connect', self._endpoint)}",
         ):
             self._console.print(f"  {command}", style="green", highlight=False, soft_wrap=True, markup=False)
 
     def _print(self, text: str) -> None:
-        self._console.print(text, style="bold", markup=False)
+        self._console.print(text, style="bold", markup=False, highlight=False, soft_wrap=True)
 
 
 def median_drive(drives: Mapping[int, float]) -> tuple[int, float]:
     """The track and score of the middle drive, neither the best nor a crash; of an even number the lower one."""
     return sorted(drives.items(), key=lambda drive: (drive[1], drive[0]))[(len(drives) - 1) // 2]
-
-
-def _format_score(mean: float, error: float | None, episodes: int) -> str:
-    return f"{format_with_error(mean, error)} ({episodes})"
-
-
-def _format_drives(scores: Sequence[float]) -> str:
-    score = _format_score(fmean(scores), standard_error(scores), len(scores))
-    return f"{score}, {format_number(min(scores))} to {format_number(max(scores))}"
 
 
 def _evaluation_flags(every: int, tracks: int, confirming: int) -> dict[str, object]:
@@ -295,7 +308,9 @@ def plan_runs(config: DemoConfig, name: str, runs_dir: Path) -> tuple[DemoRun, .
             **search, "preset": plan.preset, "temperature": plan.temperature, "sigma0": sigma0, "seed": config.seed,
             "minutes": plan.dream_minutes, **_evaluation_flags(*plan.dream_evaluations),
         }  # fmt: skip
-        found.append(DemoRun(dream, f"evolving in the dream for {plural(plan.dream_minutes, 'minute')}", flags))
+        found.append(
+            DemoRun(dream, "the dream", f"evolving in the dream for {plural(plan.dream_minutes, 'minute')}", flags)
+        )
         reality |= {
             "init": runs_dir / dream / CONTROLLER,
             "sigma0": SUBSPACE_SIGMA0_AFTER_DREAM if few else FULL_SIGMA0_AFTER_DREAM,
@@ -305,5 +320,8 @@ def plan_runs(config: DemoConfig, name: str, runs_dir: Path) -> tuple[DemoRun, .
             f"[[stage]]\nscore = {plan.able_score}\nsteps = {plan.quick_steps}\nepisodes = 1\n\n"
             f"[[stage]]\nepisodes = {plan.episodes}\n" + (f"sigma0 = {LATE_SIGMA0}\n" if few else "")
         )
-        found.append(DemoRun(name, f"evolving in reality for {plural(plan.minutes, 'minute')}", reality, schedule))
+        where = "the dream, then reality" if plan.dream_minutes else "reality"
+        found.append(
+            DemoRun(name, where, f"evolving in reality for {plural(plan.minutes, 'minute')}", reality, schedule)
+        )
     return tuple(found)

@@ -23,8 +23,12 @@ from dreamfleet.common.host.stop_signals import Stop, signals_deferred
 from dreamfleet.common.monitoring.client import Client
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import JOURNAL
+from dreamfleet.common.transport.network import wait_for_listener
 from dreamfleet.coordinator.settings.config import LimitsConfig, RunConfig
 
+# Variables of a process that stays on this host, even if its user is in a fleet.
+ALONE = {"DREAMFLEET_JOIN": "", "DREAMFLEET_CONNECT": ""}
+CONNECT_INTERVAL = 0.05  # seconds between two attempts to reach a coordinator that listens and does not answer yet
 START_SECONDS = 180.0  # a coordinator that ends earlier is seen at once; a busy host takes its time
 PORTS = range(20_000, 32_000)
 ANY_ADDRESS = re.compile(r"/(0\.0\.0\.0|\[::\]):")  # an endpoint that listens on all of this host's addresses
@@ -53,7 +57,7 @@ class LocalFleet:
         """Without `listen`: a free port of this host. Without `local`: a slot per core, or none where `listen` is."""
         joined = () if join is None else ("--join", str(join))
         security = (*joined, *(("--insecure",) if insecure else ()))
-        here = f"{'tcp' if join is None else 'tls'}/127.0.0.1:{_free_port()}"
+        here = f"{'tcp' if join is None else 'tls'}/127.0.0.1:{free_port()}"
         slots = local if local is not None else 0 if listen else usable_cores()
         return cls(listen or (here,), slots, coordinator, (*worker, *joined), security)
 
@@ -94,6 +98,7 @@ class LocalRun:
         while True:
             if (code := self.coordinator.popen.poll()) is not None:
                 raise (UsageError if code == UsageError.exit_code else DreamfleetError)(self.coordinator.last_line())
+            wait_for_listener((endpoint,), POLL_INTERVAL, lambda: False)
             try:
                 with ExitStack() as stack:
                     client = stack.enter_context(Client((endpoint,)))
@@ -103,11 +108,17 @@ class LocalRun:
             except ConnectionFailedError:
                 if time.monotonic() > deadline:
                     raise
-                time.sleep(POLL_INTERVAL)
+                time.sleep(CONNECT_INTERVAL)
 
     def start_worker(self, name: str, words: Sequence[str]) -> None:
         """Start a worker by its command line; it logs into `name`.log."""
         self._workers.append(self._start(words, self._logs / f"{name}.log"))
+
+    def end_workers(self) -> None:
+        """End the workers at once, which have nothing to finish."""
+        with signals_deferred():
+            while self._workers:
+                self._workers.pop().end(0)
 
     def _start(self, words: Sequence[str], log: Path) -> VerbProcess:
         with signals_deferred():  # what is started is also ended
@@ -187,14 +198,21 @@ def parse_run_flags(flags: Sequence[str], sources: Mapping[str, Any], verb: str)
     parsed = build_parser("coordinator", run_setup).parse_all(list(flags))
     if taken := [flag for name, flag in RESERVED.items() if getattr(parsed, name, None) is not None]:
         raise UsageError(f"{', '.join(taken)} in --run-flags: {verb} sets them for each run; give --config to {verb}")
-    args = argparse.Namespace(sources={**sources, "flags": parsed}, given=frozenset(vars(parsed)))
-    config, limits = run_setup.load_run_config(args, base={})
+    config, limits = load_parsed_flags(parsed, sources)
     if limits == LimitsConfig():
         raise UsageError("a run would never end: give --run-flags a limit, such as --generations 32")
     return config, limits
 
 
-def _free_port() -> int:
+def load_parsed_flags(parsed: argparse.Namespace, sources: Mapping[str, Any]) -> tuple[RunConfig, LimitsConfig]:
+    """What a run is and when it ends, by parsed flags of `coordinator` and the `sources` of another verb."""
+    from dreamfleet.coordinator.settings import run_setup
+
+    args = argparse.Namespace(sources={**sources, "flags": parsed}, given=frozenset(vars(parsed)))
+    return run_setup.load_run_config(args, base={})
+
+
+def free_port() -> int:
     """A port that is free, below those that connections get: one of them could take it before the coordinator does."""
     for port in SystemRandom().sample(PORTS, 100):
         with socket.socket() as probe, suppress(OSError):

@@ -6,8 +6,9 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any, Self
@@ -19,22 +20,39 @@ from dreamfleet.common.cli.config import suggestion
 from dreamfleet.common.cli.parser import Parser
 from dreamfleet.common.cli.verb_runner import POLL_INTERVAL
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
+from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
+from dreamfleet.common.files.locks import open_lock, try_lock
 from dreamfleet.common.host.resource_limits import usable_cores
+from dreamfleet.common.host.trusted_modules import check_trusted
 from dreamfleet.common.monitoring.client import Client
+from dreamfleet.common.monitoring.status import Status
+from dreamfleet.common.monitoring.status_card import show_live
 from dreamfleet.common.protocol.keys import check_run_name
+from dreamfleet.common.protocol.tasks import module_of
+from dreamfleet.common.runs.own_runs import trust_own_run
 from dreamfleet.common.runs.records import StoredGeneration
+from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import default_runs_dir
 from dreamfleet.coordinator.analysis.stored_run import StoredRun
-from dreamfleet.coordinator.experiments.local_run import LocalFleet, LocalRun, has_begun, task_flags
+from dreamfleet.coordinator.experiments.function_names import environment_for
+from dreamfleet.coordinator.experiments.local_run import ALONE, LocalFleet, LocalRun, has_begun, task_flags
 from dreamfleet.coordinator.run.run import BY_HAND
 from dreamfleet.coordinator.settings import run_setup
 
+MOST_WORKERS = 1024  # processes of one slot
+STARTING = "starting.lock"  # held while a program starts and serves a run
 STATUS_INTERVAL = 2.0  # seconds between looks whether the run is paused
 # Flags of `coordinator` that are no settings here: a secured fleet is started from the command line.
 NO_SETTINGS = ("help", "help_all", "json", "connect", "join", "access_dir", "config", "quiet", "runs_dir")
-# The run stays on this host, even if its user is in a fleet.
-ALONE = {"DREAMFLEET_JOIN": "", "DREAMFLEET_CONNECT": ""}
 Callback = Callable[[StoredGeneration, "StartedRun"], object]
+
+
+class RunPausedError(DreamfleetError):
+    """A run paused by itself; `errors` are those of its open jobs that failed."""
+
+    def __init__(self, text: str, errors: tuple[str, ...]) -> None:
+        super().__init__(text)
+        self.errors = errors
 
 
 class StartedRun(StoredRun):
@@ -47,11 +65,14 @@ class StartedRun(StoredRun):
     `address` is where further workers and `Client`s reach it, `client` a `Client` of it.
     """
 
-    def __init__(self, path: Path, processes: LocalRun, address: str, client: Client | None) -> None:
+    def __init__(
+        self, path: Path, processes: LocalRun, address: str, client: Client | None, *, resumed: bool
+    ) -> None:  # fmt: skip
+        """Of a `resumed` run, iterating begins with the generation that closes next."""
         super().__init__(path)
         self.address, self.client = address, client
         self._processes = processes
-        self._next = 1 + max((each.number for each in self.history()), default=-1)
+        self._next = 1 + max((each.number for each in self.history()), default=-1) if resumed else 0
         self._status_due = time.monotonic() + STATUS_INTERVAL
         self._end: Callable[[], object] = lambda: None
         finalize(self, self._journal.close)
@@ -100,6 +121,26 @@ class StartedRun(StoredRun):
             pass
         return self
 
+    def show(self, pause: float = 1.0) -> None:
+        """Show the live run in a notebook's cell until it has ended, as `Client.show`; errors as in iterating.
+
+        Interrupting the cell ends the showing and not the run.
+        """
+        if self.client is not None and self._is_live:
+            show_live(self._watch(self.client, pause))
+
+    def _watch(self, client: Client, pause: float) -> Iterator[Status]:
+        try:
+            for status in client.watch(self.name, pause):
+                yield status
+                if not status.is_over:
+                    self._processes.check_workers()
+        except ConnectionFailedError:  # it ended between two looks, or failed
+            if self._processes.coordinator.popen.poll() is None:
+                raise
+        if self._is_live and self._processes.coordinator.popen.poll() is not None:
+            self._processes.check_end()
+
     @property
     def _is_live(self) -> bool:
         """Whether its processes have not been ended from here."""
@@ -114,7 +155,8 @@ class StartedRun(StoredRun):
         except ConnectionFailedError:  # it is just ending
             return
         if status.state == "paused" and status.why != BY_HAND:
-            raise DreamfleetError(f"run {self.name} is paused: {status.why}; its logs are in {self.path}")
+            errors = tuple(text for each in status.failures for text in each.errors.values())
+            raise RunPausedError(f"run {self.name} is paused: {status.why}; its logs are in {self.path}", errors)
 
     def _display(self) -> tuple[str, dict[str, object]]:
         headline, facts = super()._display()
@@ -127,7 +169,8 @@ def start_run(workers: int | None = None, runs_dir: Path | str | None = None, **
     Settings are the flags of `dreamfleet coordinator` with `_` for `-`, such as `task`, `population`, `generations`,
     `bundle` or `init`; `run` is its name, `resume` one to continue. A list is a flag with several values, a dictionary
     one of KEY=VALUE, `True` and `False` a flag and its `--no-`. Workers are reached through a free port of this host;
-    with `listen` further ones of other hosts may join, and `workers=0` starts none.
+    with `listen` further ones of other hosts may join, and `workers=0` starts none. A module in `task` is found where
+    this program finds it, so it may lie beside your script.
 
     `UsageError` for a wrong setting, `DreamfleetError` with its last line if the coordinator fails.
 
@@ -143,25 +186,61 @@ def start_run(workers: int | None = None, runs_dir: Path | str | None = None, **
     >>> run.ended, run.controller().task
     ('3 generations', 'gym:CartPole-v1')
     """
+    named = settings.get("task"), settings.get("optimiser"), _resumed_task(settings.get("resume"), runs_dir)
+    return start_run_in(environment_for(named), workers, runs_dir, settings)
+
+
+def _resumed_task(name: object, runs_dir: Path | str | None) -> str | None:
+    """The task of the run to continue. `UsageError` if its module is not trusted: its folder may be a stranger's."""
+    if not isinstance(name, str):
+        return None
+    with open_run(default_runs_dir() if runs_dir is None else Path(runs_dir), name) as run:
+        uid, spec = run.uid, run.spec
+    trust_own_run(uid, spec.task, spec.options)
+    if module := module_of(spec.task):
+        check_trusted(module, f"task {spec.task!r}")
+    return spec.task
+
+
+def start_run_in(
+    environment: Mapping[str, str], workers: int | None, runs_dir: Path | str | None, settings: dict[str, Any]
+) -> StartedRun:
+    """As `start_run`, with variables of `environment` for the processes, over this one's."""
     slots = usable_cores() if workers is None else workers
-    if slots < 0:
-        raise UsageError(f"workers must not be negative, not {workers}")
+    if type(slots) is not int or not 0 <= slots <= MOST_WORKERS:
+        raise UsageError(f"workers must be a whole number from 0 to {MOST_WORKERS}, not {workers!r}")
     flags, listen = check_settings(settings), settings.pop("listen", ())
     fleet = LocalFleet.of((listen,) if isinstance(listen, str) else tuple(listen), slots, flags, ())
     folder = Path(default_runs_dir() if runs_dir is None else runs_dir).absolute()
     name, words = _coordinator_words(settings, folder, fleet)
-    processes = LocalRun(name, words, folder / name, {**os.environ, **ALONE})
+    processes = LocalRun(name, words, folder / name, {**os.environ, **ALONE, **environment})
     with ExitStack() as stack:
+        stack.enter_context(_claim(folder / name))
         stack.callback(_discard_unless_begun, folder / name)
         stack.enter_context(processes)
-        run = _open(processes, folder / name, fleet.local_endpoint, stack)
-        if run.client is not None:
-            tasks = (run.spec.task, *((found.manifest.task,) if (found := run.bundle()) else ()))
-            for worker in (f"core-{number}" for number in range(slots)):
-                more = ("--name", worker, "--exit-when-done", *task_flags(*tasks))
-                processes.start_worker(worker, model_commands.worker(name, fleet.local_endpoint, 1, *more))
+        start_workers = partial(_start_workers, processes, name, fleet.local_endpoint, slots)
+        expected = task_flags(settings["task"]) if settings.get("task") and not settings.get("resume") else None
+        if expected is not None:  # they load while the coordinator checks the task
+            start_workers(expected)
+        run = _open(processes, folder / name, fleet.local_endpoint, stack, resumed=bool(settings.get("resume")))
+        needed = None if run.client is None else _needed_flags(run)
+        if needed != expected:
+            processes.end_workers()
+            if needed is not None:
+                start_workers(needed)
         run.end_with(stack.pop_all())
     return run
+
+
+def _needed_flags(run: StartedRun) -> tuple[str, ...]:
+    """The flags by which a worker of this run announces its tasks."""
+    return task_flags(run.spec.task, *((found.manifest.task,) if (found := run.bundle()) else ()))
+
+
+def _start_workers(processes: LocalRun, name: str, endpoint: str, count: int, flags: tuple[str, ...]) -> None:
+    for worker in (f"core-{number}" for number in range(count)):
+        more = ("--name", worker, "--exit-when-done", *flags)
+        processes.start_worker(worker, model_commands.worker(name, endpoint, 1, *more))
 
 
 def evolve(
@@ -195,10 +274,10 @@ def check_settings(settings: Mapping[str, Any]) -> tuple[str, ...]:
     for name in settings:
         if name not in known:
             raise UsageError(f"unknown setting {name!r}{suggestion(name, known)}")
-    flags = tuple(word for name, value in settings.items() for word in _flag_words(name, value))
+    flags = tuple(word for name, value in settings.items() for word in flag_words(name, value))
     parser.parse_all(flags)
     apart = {key: value for key, value in settings.items() if key not in ("run", "resume", "listen")}
-    return tuple(word for name, value in apart.items() for word in _flag_words(name, value))
+    return tuple(word for name, value in apart.items() for word in flag_words(name, value))
 
 
 def _setting_names(parser: Parser) -> list[str]:
@@ -208,7 +287,8 @@ def _setting_names(parser: Parser) -> list[str]:
     return [name for name in dict.fromkeys(names) if name not in NO_SETTINGS]
 
 
-def _flag_words(name: str, value: Any) -> tuple[str, ...]:
+def flag_words(name: str, value: Any) -> tuple[str, ...]:
+    """A setting as the words of a command line."""
     flag = name.replace("_", "-")
     if value is None:
         return ()
@@ -232,21 +312,43 @@ def _coordinator_words(settings: Mapping[str, Any], folder: Path, fleet: LocalFl
 
 
 def _free_name(folder: Path) -> str:
-    """A name by the time that no run has."""
+    """A name by the time that no run has; its folder is made, so that no other program takes it."""
     now = f"run-{datetime.now():%Y%m%d-%H%M%S}"
-    return next(name for number in count() if not (folder / (name := f"{now}-{number}" if number else now)).exists())
+    with reporting_unwritable_folder(folder, "choose another runs_dir"):
+        folder.mkdir(parents=True, exist_ok=True)
+        for number in count():
+            with suppress(FileExistsError):
+                name = f"{now}-{number}" if number else now
+                (folder / name).mkdir()
+                return name
+    raise AssertionError("count ends never")
+
+
+@contextmanager
+def _claim(path: Path) -> Iterator[None]:
+    """Keep other programs from starting this run, until its processes have ended; `UsageError` if one has."""
+    with reporting_unwritable_folder(path, "choose another runs_dir"):
+        path.mkdir(parents=True, exist_ok=True)
+        file = open_lock(path / STARTING)
+    with file:
+        if not try_lock(file):
+            raise UsageError(
+                f"another program has started run {path.name} in {path.parent}: end it there first, or choose another "
+                "name"
+            )
+        yield
 
 
 def _discard_unless_begun(path: Path) -> None:
     """Remove the logs of a coordinator that made no run."""
     if not has_begun(path.parent, path.name):
-        for log in path.glob("*.log"):
-            log.unlink(missing_ok=True)
+        for each in (*path.glob("*.log"), path / STARTING):
+            each.unlink(missing_ok=True)
         with suppress(OSError):
             path.rmdir()
 
 
-def _open(processes: LocalRun, path: Path, address: str, stack: ExitStack) -> StartedRun:
+def _open(processes: LocalRun, path: Path, address: str, stack: ExitStack, *, resumed: bool) -> StartedRun:
     """The run once its coordinator listens, or has ended because a limit was reached before."""
     client = None
     try:
@@ -254,4 +356,4 @@ def _open(processes: LocalRun, path: Path, address: str, stack: ExitStack) -> St
     except DreamfleetError:
         if processes.coordinator.popen.poll() != 0:
             raise
-    return StartedRun(path, processes, address, client)
+    return StartedRun(path, processes, address, client, resumed=resumed)

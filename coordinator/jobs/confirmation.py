@@ -82,13 +82,13 @@ class Confirmation:
     @property
     def round_description(self) -> str:
         """The open round in words."""
-        seeds = len(self._digests) // len(self._remaining)
+        count = len(self._digests) // len(self._remaining)
         if len(self._remaining) == 1:
-            fresh = plural(seeds, "fresh seed")
-            return f"confirming: generation {self._remaining[0].generation}'s mean on {fresh}, for its score"
+            mean, episodes = self._remaining[0].generation, plural(count, "episode")
+            return f"confirming: generation {mean}'s mean in {episodes} on fresh seeds, for its score"
         names = ", ".join(str(each.generation) for each in self._remaining)
-        more = plural(seeds, "more seed")
-        return f"confirming: the means of generations {names} on {more} each; the better half continues"
+        episodes = plural(count, "more episode")
+        return f"confirming: the means of generations {names} in {episodes} each; the better half continues"
 
     @property
     def in_progress(self) -> bool:
@@ -102,14 +102,19 @@ class Confirmation:
             del self._scores[digest]
         return [each for each in self._work if each.job.digest in failed]
 
-    def advance(self, known: FindScores) -> list[Work]:
-        """Close a complete round and open the next one; return its missing jobs, none once there is an outcome."""
+    def advance(self, known: FindScores, is_checking: Callable[[Sequence[Work]], bool] = lambda _: False) -> list[Work]:
+        """Close a complete round and open the next one; return its missing jobs, none once there is an outcome.
+
+        `is_checking` says of a round's jobs whether known results of them wait for a check. Such a round stays open.
+        """
         missing: list[Work] = []
         while not self._is_over and not missing:
             if self._digests:
                 self._close()
             if not self._is_over:
                 missing = self._open(known)
+                if is_checking(self._work):
+                    break
         return missing
 
     @property

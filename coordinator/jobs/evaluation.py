@@ -130,6 +130,15 @@ class Evaluations:
         """Whether the evaluation of this generation's mean is open."""
         return generation in self._open
 
+    def digests(self, generation: int) -> list[bytes]:
+        """The digests of an open evaluation's jobs."""
+        return self._open[generation].digests
+
+    @property
+    def scored(self) -> list[int]:
+        """Generations of the open evaluations whose scores are complete."""
+        return [generation for generation, each in self._open.items() if len(each.scores) == len(each.digests)]
+
     @property
     def open_count(self) -> int:
         """How many evaluations are open."""

@@ -12,6 +12,9 @@ from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.result_bounds import to_finite
 from dreamfleet.coordinator.jobs.work import Work, make_work
 
+KnownResult = tuple[float, int, tuple[float, ...]]
+"""Fitness, steps and measures of an episode, NaN for one that failed for good."""
+
 
 @dataclass(frozen=True)
 class CandidateScores:
@@ -58,6 +61,7 @@ class Generation:
         self._wanted = np.zeros(self._scores.shape, dtype=bool)
         self._wanted[:, : self._first] = True
         self._steps = np.zeros(self._scores.shape, dtype=np.int64)  # a result's steps stand in the first of its places
+        self._measures = np.full((*self._scores.shape, len(spec.measures)), np.nan)
         self._failed = np.zeros(len(vectors), dtype=bool)
 
     @property
@@ -125,10 +129,10 @@ class Generation:
 
     @property
     def complete(self) -> bool:
-        """Whether every wanted episode is scored."""
-        return self.done == self.total
+        """Whether every wanted episode is scored; never without candidates."""
+        return self.population > 0 and self.done == self.total
 
-    def record(self, digest: bytes, fitness: float, steps: int) -> bool:
+    def record(self, digest: bytes, fitness: float, steps: int, measures: Sequence[float] = ()) -> bool:
         """Record a result of this generation, NaN for an episode that failed for good; whether others are wanted now.
 
         R27: the digest names the place that a result fills, so the order of arrival does not matter. A candidate that
@@ -139,10 +143,16 @@ class Generation:
                 self._failed[place[0]] = True
             self._scores[place] = fitness
             self._steps[place] = 0 if number else steps
+            if len(measures) == self._measures.shape[2]:
+                self._measures[place] = measures
         return self._open_second_half()
 
-    def recall(self, results: Mapping[bytes, tuple[float, int]]) -> None:
-        """Record results of an earlier life, fitness and steps by digest, NaN for an episode that failed for good.
+    def cancel(self) -> None:
+        """Want no more results: candidates that lack an episode count as failed."""
+        self._failed |= self._open_places.any(axis=1)
+
+    def recall(self, results: Mapping[bytes, KnownResult]) -> None:
+        """Record results of an earlier life by digest.
 
         The first half goes first: with racing, what failed in the second half must not count at the barrier.
         """
@@ -156,8 +166,20 @@ class Generation:
         R27: a mean is taken over a whole row, so any order of results gives the same bits.
         """
         fitness = np.full(len(self._scores), np.nan)
-        fitness[~self._failed] = np.nanmean(self._scores[~self._failed], axis=1)
+        if not self.all_failed:
+            fitness[~self._failed] = np.nanmean(self._scores[~self._failed], axis=1)
         return fitness
+
+    def measures(self) -> NDArray[np.float64] | None:
+        """The measures of each candidate, `(population, measures)`: means over its episodes, as the fitness.
+
+        NaN where an episode failed; `None` if nothing is measured beside fitness.
+        """
+        if not self._measures.shape[2]:
+            return None
+        measures = np.full((self.population, self._measures.shape[2]), np.nan)
+        measures[~self._failed] = np.nanmean(self._measures[~self._failed], axis=1)
+        return measures
 
     def candidate_scores(self) -> CandidateScores:
         """The scores of all candidates so far."""

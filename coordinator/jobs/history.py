@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite
 from dreamfleet.common.runs.records import StoredGeneration
 
+LEAST_IMPROVEMENT = 1e-11  # of the best fitness that counts, as pycma's `tolfun`
+
 
 class History:
     """Every closed generation, oldest first; it only grows."""
@@ -15,12 +17,18 @@ class History:
         self.steps = 0  # environment steps of all generations
         self.seconds = 0.0  # in which they could be scored
         self.failed = 0  # candidates
+        self.best: float | None = None  # fitness of a candidate
+        self.improved = 0  # the last generation whose best candidate beat the one of the last such generation
+        self._level = 0.0  # the fitness of that
         self._rows: list[StoredGeneration] = []
         for row in rows:
             self.append(row)
 
     def append(self, row: StoredGeneration) -> None:
         """Add the generation that was just closed."""
+        if self.best is None or row.best > self._level + LEAST_IMPROVEMENT:
+            self._level, self.improved = row.best, len(self._rows)
+        self.best = row.best if self.best is None else max(self.best, row.best)
         self._rows.append(row)
         self.steps = clamp_count(self.steps + row.steps)
         self.failed = clamp_count(self.failed + row.failed)

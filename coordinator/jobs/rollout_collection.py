@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -44,6 +45,12 @@ class RolloutCollections:
         self._scheduled += len(work)
         self._missing.update(each.job.digest for each in missing)
         return missing
+
+    def remove(self, recalled: Iterable[tuple[int, int]]) -> None:
+        """Remove the files of these rollouts, by generation and episode; no reader takes one that cannot be removed."""
+        for generation, episode in recalled:
+            with suppress(OSError):
+                rollout_path(self._folder, generation, episode).unlink(missing_ok=True)
 
     def finish(self, digest: bytes) -> None:
         """Count a rollout whose result was accepted."""

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.host.stall_watch import STALL_SECONDS
+from dreamfleet.common.host.stall_watch import FUNCTION_STALL_SECONDS, STALL_SECONDS
 from dreamfleet.common.protocol.messages import Job, Kind, TaskSpec
+from dreamfleet.common.protocol.tasks import is_function_task
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ def make_work(
                 seeds=(seed,),
                 vector=identity,
                 digest=spec.digest(kind, identity, (seed,)),
-                stall=STALL_SECONDS,
+                stall=FUNCTION_STALL_SECONDS if is_function_task(spec.task) else STALL_SECONDS,
                 temperature=None if spec.temperature == run_spec.temperature else spec.temperature,
                 horizon=None if spec.horizon == run_spec.horizon else spec.horizon,
                 patience=None if spec.patience == run_spec.patience else spec.patience,

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.protocol.measures import Axis
 
 State = dict[str, NDArray[Any]]
 """Named arrays of numbers or text, never of objects; names that begin with `optimiser.` belong to the coordinator."""
@@ -25,6 +26,7 @@ class Search:
 
     `mean` `(dimension,)` is where it begins, `sigma0` its first step size, `population` the candidates that every `ask`
     returns, `seed` a number of at least 0 from which all its randomness follows, and `options` what the user gave.
+    `archive` are the axes of the run's archive; empty if the run measures nothing beside fitness.
 
     >>> search = Search(mean=np.zeros(3), population=8, sigma0=0.5, seed=1, options={"covariance": "full"})
     >>> search.dimension, search.choice("covariance", "diagonal", "full")
@@ -36,6 +38,7 @@ class Search:
     sigma0: float
     seed: int
     options: Mapping[str, str] = field(default_factory=dict)
+    archive: tuple[Axis, ...] = ()
 
     @property
     def dimension(self) -> int:
@@ -68,10 +71,12 @@ class Optimiser(Protocol):
     `requirement` is what pip installs to get these very bits, such as "cma==4.5.0". A state names it, and is continued
     by the same one alone. `options` says which options there are, and what each takes.
 
-    Three more attributes are optional. `axis_ratio`, a float, is shown: how many times longer the longest axis of the
+    Four more attributes are optional. `axis_ratio`, a float, is shown: how many times longer the longest axis of the
     distribution is than the shortest. `redraw(indices)` is needed by `--on-failure redraw`: it replaces candidates of
     the last `ask`, which failed, and returns the new ones `(len(indices), dimension)`. `tell` then refers to these. A
     candidate that was not drawn at random may stay as it is. The result must not depend on `prepare`.
+    `takes_measures`, a class attribute that is true, says that `tell(fitness, measures)` also takes measures
+    `(population, axes)`: one for each axis of the search's archive, NaN for a candidate that failed.
     `footprint(dimension, population, options)`, a class method, returns a `Footprint`, so that a search which this
     host cannot hold is refused before it is built.
 

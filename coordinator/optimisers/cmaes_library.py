@@ -1,4 +1,4 @@
-"""Optimisers from the library `cmaes`: separable CMA-ES, and CMA-ES that adapts its learning rates.
+"""Optimisers from the library `cmaes`: separable CMA-ES, CMA-ES that adapts its learning rates, and xNES.
 
 The library minimises, and samples one candidate at a time. It offers pickle for its state, and drops the random
 generator from it. We store the attributes that an update reads, which each class names, and the generator. The
@@ -14,13 +14,16 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import Any, ClassVar
 
-import cmaes
 import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.packages import hidden
 from dreamfleet.coordinator.optimisers.api import Footprint, Search, State
 from dreamfleet.coordinator.optimisers.checkpoint import tag, untag
+
+with hidden("scipy"):  # which only other strategies of the library use; importing it takes a second
+    import cmaes
 
 
 def _seed_of(search: Search) -> int:
@@ -47,7 +50,7 @@ class CmaesOptimiser(ABC):
     @property
     def mean(self) -> NDArray[np.float64]:
         """The distribution's mean `(dimension,)`."""
-        return np.array(self._strategy.mean, dtype=np.float64)
+        return np.array(self._strategy._mean, dtype=np.float64)
 
     @property
     def sigma(self) -> float:
@@ -174,3 +177,35 @@ class RateAdapted(CmaesOptimiser):
         return cmaes.CMA(
             search.mean.copy(), search.sigma0, seed=_seed_of(search), population_size=search.population, lr_adapt=True
         )
+
+
+class ExponentialNes(CmaesOptimiser):
+    """xNES (Glasmachers et al. 2010): natural gradients of mean, step size and the full matrix of axes.
+
+    >>> optimiser = ExponentialNes(Search(mean=np.zeros(3), population=8, sigma0=0.1, seed=1))
+    >>> candidates = optimiser.ask()
+    >>> optimiser.tell(-np.square(candidates - 1).sum(axis=1))
+    """
+
+    state_names: ClassVar[tuple[str, ...]] = ("mean", "sigma", "B", "g")
+
+    @classmethod
+    def footprint(cls, dimension: int, population: int, options: Mapping[str, str]) -> Footprint:  # noqa: ARG003
+        """As measured: in an update two square matrices for each candidate and 8 more, of which one is state."""
+        return Footprint(8 * (2 * population + 8) * dimension**2, 8 * dimension**2)
+
+    @property
+    def sigma(self) -> float:
+        """The step size: the standard deviation of the middle coordinate."""
+        variances = np.square(self._strategy._B).sum(axis=1)
+        return float(self._strategy._sigma * np.sqrt(np.median(variances)))
+
+    @property
+    def axis_ratio(self) -> float:
+        """The longest axis of the distribution by the shortest."""
+        return float(np.linalg.cond(self._strategy._B))
+
+    def _build(self, search: Search) -> Any:
+        if search.dimension < 2:
+            raise UsageError("xnes needs at least 2 parameters: give --optimiser cma")
+        return cmaes.XNES(search.mean.copy(), search.sigma0, seed=_seed_of(search), population_size=search.population)

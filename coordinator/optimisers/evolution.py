@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.subspace import SearchSpace, Subspace
 from dreamfleet.common.errors import DreamfleetError, JournalError, UsageError
 from dreamfleet.common.printable import one_line
+from dreamfleet.common.protocol.measures import parse_axes
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.seeds import search_seed
 from dreamfleet.common.runs.stages import Stage
@@ -35,6 +36,7 @@ class EvolutionConfig:
     optimiser: str = "cma"
     optimiser_options: tuple[str, ...] = ()  # each as name=value
     space: SearchSpace | None = None  # what the search keeps to; `None`: all parameters
+    archive: tuple[str, ...] = ()  # its axes, each as MEASURE=LOW:HIGH:CELLS
 
     def __post_init__(self) -> None:
         if self.population < 2:
@@ -54,12 +56,13 @@ class EvolutionConfig:
             settings.optimiser,
             settings.optimiser_options,
             None if subspace is None or stage.whole else SearchSpace(subspace, settings.controller),
+            settings.archive,
         )
 
     def search(self, start: NDArray[np.float64]) -> Search:
         """What the optimiser is built from, to begin at `start` `(dimension,)`: of a subspace at its origin."""
         mean = start if self.space is None else np.zeros(self.space.dimension)
-        return Search(mean, self.population, self.sigma0, self.seed, self.options)
+        return Search(mean, self.population, self.sigma0, self.seed, self.options, parse_axes(self.archive))
 
     @property
     def options(self) -> dict[str, str]:
@@ -141,11 +144,18 @@ class Evolution:
             )
         return asked
 
-    def tell(self, fitness: NDArray[np.float64]) -> None:
-        """Update the distribution; `fitness` `(population,)`, larger is better, in the order of `ask`."""
+    def tell(self, fitness: NDArray[np.float64], measures: NDArray[np.float64] | None = None) -> None:
+        """Update the distribution; `fitness` `(population,)`, larger is better, in the order of `ask`.
+
+        `measures` `(population, axes)` are of a run with an archive, NaN for a candidate that failed; an optimiser that
+        does not take them gets none.
+        """
         if fitness.shape != (self._config.population,) or not np.isfinite(fitness).all():
             raise ValueError(f"an update needs {self._config.population} finite numbers")  # pycma accepts NaN silently
-        self._optimiser.tell(fitness)
+        if getattr(self._optimiser, "takes_measures", False):
+            cast(Any, self._optimiser).tell(fitness, measures)
+        else:
+            self._optimiser.tell(fitness)
         self._is_open = False
 
     def prepare(self) -> None:

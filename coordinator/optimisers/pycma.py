@@ -11,13 +11,15 @@ from warnings import catch_warnings, filterwarnings
 import numpy as np
 from numpy.typing import NDArray
 
-with catch_warnings():
-    filterwarnings("ignore", "Could not import matplotlib")  # which a coordinator need not have
-    import cma
-
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.packages import hidden
 from dreamfleet.coordinator.optimisers import pycma_state
 from dreamfleet.coordinator.optimisers.api import Footprint, Search, State
+
+# pycma's core needs neither, and a coordinator need not have them: importing them takes most of its start.
+with hidden("matplotlib", "scipy"), catch_warnings():
+    filterwarnings("ignore", "Could not import matplotlib")
+    import cma
 
 HISTORY = 100  # entries that stay of each of pycma's histories
 FURTHEST_FACTOR = 1e60  # from one: a factor that is further away is brought back

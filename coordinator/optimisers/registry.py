@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import difflib
 import inspect
+import re
 from collections.abc import Iterable, Mapping
 from importlib.metadata import entry_points
 from typing import Any
 
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.errors import MissingExtraError, UsageError
+from dreamfleet.common.host.packages import install_command_for
 from dreamfleet.common.host.resource_limits import usable_memory
 from dreamfleet.common.host.trusted_modules import import_trusted
 from dreamfleet.coordinator.optimisers.api import Footprint, Optimiser, Search
 
 GROUP = "dreamfleet.optimisers"
 LARGEST_STATE = 10**9  # bytes that SQLite keeps in one value
+# What the field calls them elsewhere, without case and punctuation.
+_OTHER_NAMES = {
+    "openaies": "openes", "es": "openes", "pgpe": "pepg", "cmaes": "cma", "pycma": "cma", "sepcma": "cmaes-sep",
+    "sepcmaes": "cmaes-sep", "lracma": "cmaes-lra", "lracmaes": "cmaes-lra", "nes": "xnes",
+}  # fmt: skip
 _OF_CLASS = tuple(Optimiser.__annotations__)
 _OF_INSTANCE = tuple(name for name in vars(Optimiser) if not name.startswith("_"))
 
@@ -58,15 +66,37 @@ def check_memory(name: str, dimension: int, population: int, options: Mapping[st
 def _find(name: str) -> Any:
     for point in entry_points(group=GROUP):
         if point.name == name:
-            return point.load()
+            try:
+                return point.load()
+            except ModuleNotFoundError as error:
+                remedy = install_command_for(error.name) or "install the package that has it"
+                raise MissingExtraError(f"optimiser {name!r} needs the package {error.name!r}: {remedy}") from error
     module, _, attribute = name.partition(":")
     if not attribute:
-        known = ", ".join(known_optimisers()) or "none"
-        raise UsageError(f"unknown optimiser {name!r}: known are {known}, and your own as module:attribute")
+        known, near = known_optimisers(), _suggest(name)
+        raise UsageError(
+            f"unknown optimiser {name!r}: {f'did you mean {near}? ' if near else ''}known are "
+            f"{', '.join(known) or 'none'}, and your own as module:attribute"
+        )
     try:
         return getattr(import_trusted(module, f"optimiser {name!r}"), attribute)
     except (ImportError, AttributeError) as error:
         raise UsageError(f"optimiser {name!r} cannot be loaded: {error}") from error
+
+
+def _suggest(name: str) -> str:
+    """The optimiser that an unknown name nearly is, or has elsewhere; empty: none.
+
+    >>> _suggest("OpenAI-ES"), _suggest("SepCMA"), _suggest("adam")
+    ('openes', 'cmaes-sep', '')
+    """
+    plain = {_plain(each): each for each in known_optimisers()} | _OTHER_NAMES
+    near = difflib.get_close_matches(_plain(name), plain, n=1, cutoff=0.75)
+    return plain[near[0]] if near else ""
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z]", "", name.lower())
 
 
 def _refuse_incomplete(name: str, what: object, wanted: Iterable[str]) -> None:

@@ -5,29 +5,41 @@ from __future__ import annotations
 from dreamfleet.common.protocol.host_classes import effective_class
 from dreamfleet.common.protocol.messages import HelloRequest
 from dreamfleet.common.runs.records import RunSettings
+from dreamfleet.common.security.anchor_key import is_proof
+from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.refusals import RefusedWorkers, class_mismatch, find_refusal
 from dreamfleet.coordinator.storage.journal import FINGERPRINT, HOST_CLASS, Journal
+from dreamfleet.coordinator.storage.verification_records import StoredBar
+
+BARRED_REMEDY = "test its memory and its installation; then start its worker with another --name"
+OPERATOR_REMEDY = "ask the run's operator, who can let it in again with `dreamfleet bar HOST --no-longer`"
 
 
 class WorkerAdmission:
     """Admits workers to a run's fleet and removes those of a foreign class; only a `strict` run has foreign classes."""
 
-    def __init__(self, journal: Journal, settings: RunSettings, fleet: Fleet, *, strict: bool) -> None:
+    def __init__(
+        self, journal: Journal, settings: RunSettings, fleet: Fleet, *, strict: bool, anchor_key: bytes = b""
+    ) -> None:
         self.strict = strict
         self.refused_workers = RefusedWorkers()
         # Of the first accepted result; `None` before it.
         self.fingerprint, self.host_class = journal.fingerprint(), journal.host_class()
+        self.barred = journal.barred()  # by host
         self._journal = journal
         self._settings = settings
         self._fleet = fleet
+        self._anchor_key = anchor_key
 
     def find_refusal(self, request: HelloRequest) -> tuple[str, str] | None:
         """Why a worker cannot join and what to do about it; `None` if it may."""
         settings = self._settings
         admitted = self.host_class if self.strict else None
         found = find_refusal(request, settings.task.task, admitted, settings.packages)
+        if (bar := self.barred.get(host_of(request.worker))) is not None:
+            found = f"it is barred from this run: {bar.why}", OPERATOR_REMEDY if bar.by_operator else BARRED_REMEDY
         final = request.packages == settings.packages  # otherwise the worker says hello again with these packages
         if found is not None and final and self.refused_workers.add(request.worker, found[0]):
             self._fleet.note_refusal(request.worker, f"refused worker {request.worker}: {found[0]}", found[0])
@@ -40,7 +52,8 @@ class WorkerAdmission:
         numbering = self._fleet.add_worker(request.worker, request.slots, request.fingerprint, now)
         if (member := self._fleet.members[request.worker]) is not known:
             member.host_class = self.class_of(request.host_class, request.fingerprint)
-            member.leaves_with_run = request.leaves_with_run
+            member.is_anchor = is_proof(self._anchor_key, request.worker, request.anchor)
+            member.leaves_with_run, member.reads_end = request.leaves_with_run, request.reads_end
         return numbering
 
     def update_class(self, worker: str, host_class: str | None) -> None:
@@ -59,6 +72,8 @@ class WorkerAdmission:
 
         Anybody can send messages in a worker's name: a fingerprint other than that of the worker's hello is not its.
         """
+        if host_of(worker) in self.barred:
+            return "result of a barred host"
         member = self._fleet.members.get(worker)
         if member is not None and member.fingerprint != fingerprint:
             return "result of another fingerprint than its worker's"
@@ -78,6 +93,21 @@ class WorkerAdmission:
         for member in list(self._fleet.members.values()):
             member.host_class = self.class_of(member.host_class, member.fingerprint)
             self._enforce_class(member)
+
+    def bar(self, host: str, bar: StoredBar, incarnation: int) -> None:
+        """Keep a host out of this run from now on, by the journal too; its workers are removed."""
+        self._journal.bar(host, bar, incarnation)
+        self.barred[host], why = bar, bar.why
+        for worker in [each for each in self._fleet.members if host_of(each) == host]:
+            self._fleet.remove_worker(worker)
+        self.refused_workers.add(host, f"it is barred from this run: {why}")
+        self._fleet.note_refusal(host, f"host {host} is barred from this run: {why}", f"barred: {why}")
+
+    def unbar(self, host: str) -> None:
+        """Let a host join this run again, by the journal too."""
+        self._journal.unbar(host)
+        del self.barred[host]
+        self.refused_workers.remove(host)
 
     def _accepts_class(self, host_class: str) -> bool:
         return not self.strict or self.host_class in (None, host_class)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from math import isnan, nan
 
 from dreamfleet.common.protocol.messages import Job
@@ -16,6 +16,7 @@ from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollection, RolloutCollections
 from dreamfleet.coordinator.jobs.work import Work
 from dreamfleet.coordinator.run.report import ControllerWriter
+from dreamfleet.coordinator.run.verification import Verification
 from dreamfleet.coordinator.settings.run_provenance import build_provenance
 from dreamfleet.coordinator.storage.journal import Journal
 
@@ -26,19 +27,24 @@ class BackgroundJobs:
     def __init__(
         self, journal: Journal, settings: RunSettings, run_uid: str, history: History,
         evaluations: Iterable[StoredEvaluation], agenda: ScheduleState,
+        verification: Verification,
     ) -> None:  # fmt: skip
-        """`agenda` knows the scoring parameters of each generation when it closes."""
+        """`agenda` knows the scoring parameters of each generation when it closes.
+
+        An evaluation is not finished before its results are checked, as far as `verification` draws them.
+        """
         folder = journal.path.parent
         self.evaluations = Evaluations(evaluations)
         self.rollout_collections = RolloutCollections(folder)
         self.report = ControllerWriter(
             folder / CONTROLLER, run_uid, settings,
-            lambda: build_provenance(journal, settings, len(history), history.failed),
+            lambda: build_provenance(journal, settings, len(history), history.failed, verification.summary),
         )  # fmt: skip
         self._journal = journal
         self._settings = settings
         self._history = history
         self._agenda = agenda
+        self._verification = verification
         self._confirmation: Confirmation | None = None  # while the run is ending
         text = journal.fact(CONFIRMED)
         self._confirmed = None if text is None else StoredConfirmation.from_json(text)
@@ -99,6 +105,7 @@ class BackgroundJobs:
             self.report.generation_closed(last.number, mean, self._history.steps, now)
         if (judged := self.confirmed or self.evaluations.best) is not None:
             self.report.set_judged(judged, self._journal.evaluated_vector(judged.generation), self._history.steps)
+        self.rollout_collections.remove(self._journal.recalled_rollouts())  # not before the recall was durable
         evaluations = [
             each for evaluation in self._journal.pending_evaluations() for each in self._evaluate(evaluation)
         ]
@@ -131,7 +138,7 @@ class BackgroundJobs:
     def confirm(self) -> list[Work]:
         """The next jobs that confirm the reported mean; call it when a limit is reached and nothing is in progress.
 
-        Empty once the mean is confirmed, or if nothing was evaluated.
+        Empty once the mean is confirmed, or if nothing was evaluated; also while only checks are missing.
         """
         closed = len(self._history)
         if self._confirmation is None:
@@ -141,7 +148,7 @@ class BackgroundJobs:
             if not (episodes and finalists):
                 return []
             self._confirmation = Confirmation(self._settings.task, episodes, finalists, closed)
-        work = self._confirmation.advance(self._journal.fitness_of)
+        work = self._confirmation.advance(self._journal.fitness_of, self._check_again)
         if self._confirmation.failed:
             return []
         if (outcome := self._confirmation.outcome) is not None:
@@ -149,6 +156,11 @@ class BackgroundJobs:
             self._confirmation, self._confirmed = None, outcome
             self.report.set_judged(outcome, self._journal.evaluated_vector(outcome.generation), self._history.steps)
         return work
+
+    def _check_again(self, work: Sequence[Work]) -> bool:
+        """Check what an earlier life accepted of these jobs and did not check; whether any waits for its check."""
+        self._verification.restore(work)
+        return self._verification.is_checking(each.job.digest for each in work)
 
     def have_fallen_behind(self, count: int) -> bool:
         """Whether each of the last `count` evaluated means is clearly below the best one before them."""
@@ -165,10 +177,18 @@ class BackgroundJobs:
     def _evaluate(self, evaluation: Evaluation) -> list[Work]:
         wanted = [each.job.digest for each in evaluation.work(self._settings.task)]
         work = self.evaluations.open(evaluation, self._settings.task, self._journal.fitness_of(wanted))
+        self._verification.restore(evaluation.work(self._settings.task))
         self._finish(evaluation.generation)
         return work
 
+    def settle(self) -> None:
+        """Finish the evaluations that waited for a check alone."""
+        for generation in self.evaluations.scored:
+            self._finish(generation)
+
     def _finish(self, generation: int) -> None:
+        if self._verification.is_checking(self.evaluations.digests(generation)):
+            return
         found = self.evaluations.finish(generation)
         if found is None:
             return

@@ -30,6 +30,8 @@ class FailureLimit:
 
     def find_excess(self, generation: Generation) -> str | None:
         """What failed so often that the run pauses, in words; `None` if nothing did."""
+        if self._generations.is_external:
+            return None  # who submits the candidates sees what fails
         if generation.all_failed and not self._generations.can_try_again(generation):
             return (
                 f"all candidates failed in generation {generation.number} on each set of seeds, so that none can be "

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import JournalError
+from dreamfleet.common.monitoring.elites import EliteArchive
+from dreamfleet.common.protocol.tasks import is_function_task
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.scoring_params import ScheduleState, ScoringParams
 from dreamfleet.common.runs.seeds import training_seed
@@ -15,6 +17,7 @@ from dreamfleet.common.runs.stages import Stage, stages_of
 from dreamfleet.coordinator.jobs.generation import CandidateScores, Generation
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.jobs.work import Work, vector_bytes
+from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
 from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
 from dreamfleet.coordinator.settings.start import SUBSPACE_FACT, stored_start_mean, stored_subspace
 from dreamfleet.coordinator.storage.journal import Journal, StoredOpenGeneration
@@ -26,6 +29,10 @@ RECENT = 5  # generations, the open one included, whose failures `--failure-limi
 
 class Generations:
     """Opens and closes generations, one at a time. `evaluations` maps a generation to its finished evaluation."""
+
+    is_external = False  # whether others submit the candidates
+    has_waiting = False  # whether a batch of theirs waits
+    open_batches = 0  # how many of theirs wait or are scored
 
     def __init__(
         self, journal: Journal, settings: RunSettings, agenda: ScheduleState, history: History,
@@ -45,6 +52,9 @@ class Generations:
         self._evaluations = evaluations
         self._subspace = stored_subspace(journal.fact(SUBSPACE_FACT), settings, journal.path)
         self._strategy = self._search(stages_of(settings)[0], stored_start_mean(journal))
+        self.archive = EliteArchive.empty(settings)  # of the closed generations
+        for each in history.rows if self.archive is not None else ():
+            self._add_elites(each.number, *journal.scores_of(each.number, len(settings.archive)))
 
     @property
     def mean(self) -> bytes:
@@ -96,47 +106,80 @@ class Generations:
 
     def open(self, number: int) -> Generation:
         """Ask for the next population and journal it with the strategy's state before that."""
-        self.scoring_params = scoring_params = self._terms(number)
-        if number and scoring_params.begun.since == number and scoring_params.stage.starts_new_search:
-            self._strategy = self._search(scoring_params.stage, self._strategy.mean)
+        scoring_params = self._begin_search(number)
         state, sigma = self._strategy.state(), self._strategy.sigma
         vectors = [vector_bytes(x) for x in self._strategy.ask()]
         seeds = self._seeds(number, scoring_params.stage.episodes)
         self._journal.open_generation(number, state, sigma, seeds, vectors)
         self.redrawn, self._rounds, self._reseeds = set(), 0, 0
-        return self._generation(number, vectors, seeds, scoring_params)
+        generation = self._generation(number, vectors, seeds, scoring_params)
+        if self._journal.take_back([each.job.digest for each in generation.work]):
+            generation.recall(self._journal.results_of("score", number))
+        return generation
+
+    def replay(self, number: int) -> Checkpoint:
+        """The strategy's state before it asked for generation `number`, from what the journal says that it was given.
+
+        Only of a new object: the strategy begins at generation 0. `JournalError` if it asks for other populations.
+        """
+        for each in range(number):
+            self._begin_search(each)
+            population = self._strategy.ask()
+            for indices in self._journal.redraws_of(each):
+                population[indices] = self._strategy.redraw(indices)
+            if tuple(vector_bytes(x) for x in population) != self._journal.vectors_of(each):
+                raise JournalError(
+                    f"the run cannot be rewound: in generation {each} the strategy asks for another population than "
+                    "the journal holds; use the host and package versions that wrote it"
+                )
+            fitness, measures = self._journal.scores_of(each, len(self._settings.archive))
+            self._strategy.tell(_ranked(fitness, fitness_statistics(fitness)["worst"]), measures)
+        self._begin_search(number)
+        return self._strategy.state()
+
+    def first_seeds(self, number: int) -> list[int]:
+        """The seeds of a generation of the journal, as it was first asked for."""
+        return self._seeds(number, len(self._journal.seeds_of(number)))
 
     def close(self, generation: Generation, seconds: float) -> StoredGeneration:
         """Give the strategy the generation's fitness and journal the generation, which took `seconds`.
 
         R8: failed candidates rank last. Their fitness for the strategy is the next number below the worst.
         """
-        fitness = generation.fitness()
-        found = fitness[np.isfinite(fitness)]
+        fitness, measures = generation.fitness(), generation.measures()
+        statistics = fitness_statistics(fitness)
         closed = StoredGeneration(
             number=generation.number,
-            mean=float(found.mean()),
-            std=float(found.std()),
-            best=float(found.max()),
-            worst=float(found.min()),
+            **statistics,
             sigma=self._strategy.sigma,
             steps=generation.steps,
             seconds=seconds,
             failed=len(self.redrawn.union(generation.failed)),
         )
-        self._strategy.tell(np.where(np.isfinite(fitness), fitness, np.nextafter(found.min(), -np.inf)))
-        self._journal.close_generation(closed, fitness)
+        self._strategy.tell(_ranked(fitness, statistics["worst"]), measures)
+        self._journal.close_generation(closed, fitness, measures)
+        self._add_elites(closed.number, fitness, measures)
         self.history.append(closed)
         self.last, self._scored_before = generation.candidate_scores(), generation.find_scored()
         return closed
+
+    def _add_elites(self, number: int, fitness: NDArray[np.float64], measures: NDArray[np.float64] | None) -> None:
+        if self.archive is None or measures is None:
+            return
+        for index in np.flatnonzero(np.isfinite(fitness) & np.isfinite(measures).all(axis=1)).tolist():
+            self.archive.add(number, index, float(fitness[index]), measures[index].tolist())
 
     def can_try_again(self, generation: Generation) -> bool:
         """Whether `try_again` would change the generation as its failures are now."""
         return self.can_reseed(generation) or (bool(generation.failed) and self._can_redraw)
 
     def can_reseed(self, generation: Generation) -> bool:
-        """Whether `try_again` would give the generation other seeds."""
-        return generation.has_bad_seeds and self._reseeds < MAX_RESEEDS
+        """Whether `try_again` would give the generation other seeds.
+
+        One call of a function for each candidate looks for no seed: other ones would fail alike.
+        """
+        is_call = is_function_task(self._settings.task.task) and generation.episodes == 1
+        return generation.has_bad_seeds and self._reseeds < MAX_RESEEDS and not is_call
 
     @property
     def _can_redraw(self) -> bool:
@@ -186,6 +229,13 @@ class Generations:
         assert stored is not None  # the open generation is never deleted
         return self._recall(stored, self.scoring_params)
 
+    def _begin_search(self, number: int) -> ScoringParams:
+        """The scoring parameters of a generation that opens; a stage may begin with a new search."""
+        self.scoring_params = scoring_params = self._terms(number)
+        if number and scoring_params.begun.since == number and scoring_params.stage.starts_new_search:
+            self._strategy = self._search(scoring_params.stage, self._strategy.mean)
+        return scoring_params
+
     def _terms(self, number: int) -> ScoringParams:
         return self._agenda.scoring_params(number, self.history.rows, self._evaluations)
 
@@ -226,3 +276,18 @@ class Generations:
             run_spec=run_spec,
             driven=stage.driven_episodes,
         )
+
+
+def _ranked(fitness: NDArray[np.float64], worst: float) -> NDArray[np.float64]:
+    """The fitness for the strategy: failed candidates get the next number below the `worst` (R8)."""
+    return np.where(np.isfinite(fitness), fitness, np.nextafter(worst, -np.inf))
+
+
+def fitness_statistics(fitness: NDArray[np.float64]) -> dict[str, float]:
+    """Mean, spread, best and worst of the candidates that have a fitness; 0 if none has one."""
+    found = fitness[np.isfinite(fitness)]
+    if not len(found):
+        return dict.fromkeys(("mean", "std", "best", "worst"), 0.0)
+    return {
+        "mean": float(found.mean()), "std": float(found.std()), "best": float(found.max()), "worst": float(found.min())
+    }  # fmt: skip

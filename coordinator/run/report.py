@@ -81,7 +81,9 @@ class ControllerWriter:
         self._next = float("-inf")  # when a mean without evaluation may be saved again
 
     def generation_closed(self, generation: int, mean: bytes, steps: int, now: float) -> None:
-        """Report a closed generation's mean, unless an evaluated mean is reported."""
+        """Report a closed generation's mean, unless an evaluated mean is reported; an external run has none."""
+        if self._settings.is_external:
+            return
         judged = self.current.judged if self.current is not None else None
         if self.current is not None and judged is not None:
             generation, mean = self.current.generation, self.current.vector

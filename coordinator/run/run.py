@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Collection, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from math import nan
@@ -17,7 +18,7 @@ from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.messages import Job, Result
 from dreamfleet.common.protocol.result_bounds import MAX_SECONDS
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
-from dreamfleet.common.runs.run_folder import ENDING
+from dreamfleet.common.runs.run_folder import ENDING, EPISODE_LIMIT
 from dreamfleet.common.runs.scoring_params import ScheduleState
 from dreamfleet.common.runs.stages import longest_horizon
 from dreamfleet.common.serialization.times import elapsed_seconds
@@ -28,9 +29,12 @@ from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.jobs.work import Work
 from dreamfleet.coordinator.run.admission import WorkerAdmission
 from dreamfleet.coordinator.run.background_jobs import BackgroundJobs
+from dreamfleet.coordinator.run.external_generations import ExternalGenerations
 from dreamfleet.coordinator.run.failure_limit import FailureLimit
 from dreamfleet.coordinator.run.generations import Generations
+from dreamfleet.coordinator.run.recall import BAR_BY_OPERATOR, find_bar_problem, recall, unbar_words
 from dreamfleet.coordinator.run.stop_reason import find_stop_reason
+from dreamfleet.coordinator.run.verification import Verification
 from dreamfleet.coordinator.run.work_clock import WorkClock
 from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
@@ -44,19 +48,25 @@ class Run:
     """One incarnation of a run, new or continued; `network` says how it treats its workers."""
 
     def __init__(
-        self, journal: Journal, settings: RunSettings, limits: LimitsConfig, network: NetworkConfig, now: float
-    ) -> None:
+        self, journal: Journal, settings: RunSettings, limits: LimitsConfig, network: NetworkConfig, now: float,
+        anchor_key: bytes = b"",
+    ) -> None:  # fmt: skip
+        """`anchor_key` is the key of this host, by which workers on it show that they are (R32)."""
         self.settings = settings
         self.limits = limits
         self.fleet = Fleet(network.beat, network.evaluation_share)
+        self.fleet_share = network.share
         self.ended: str | None = None
         self.paused: str | None = None
+        self.is_rewound = False  # its journal was taken back to an earlier generation: another life continues it
         self._lacks_host = False  # it is paused until a host comes that may score
         self.stalled: str | None = None  # why the journal cannot be written now
         self._retry_at = 0.0  # when it is tried again
         self._now = now
         self.uid = journal.fact("uid") or ""
         self.created = journal.fact("created") or ""  # ISO 8601, UTC
+        limit = journal.fact(EPISODE_LIMIT)
+        self.episode_limit = None if limit is None else int(limit)  # steps; of the environment itself, if it is known
         self.incarnation = journal.begin_incarnation()
         self._notes: list[str] = []  # that are in the journal and not in the log
         self._journal = journal
@@ -65,14 +75,18 @@ class Run:
             self.fleet.notes.append(
                 f"{dropped} results of an older version are too large to count: their jobs are scored again"
             )
-        self.admission = WorkerAdmission(journal, settings, self.fleet, strict=network.strict)
+        self.admission = WorkerAdmission(journal, settings, self.fleet, strict=network.strict, anchor_key=anchor_key)
+        self.verification = Verification(journal, self.fleet, self.admission, network.verify, self.incarnation)
         self._ending = self._stored_end_reason()  # the limit that is reached; only background jobs remain
         closed, evaluations = journal.read_closed()
         self.history = History(closed)
         self._agenda = ScheduleState(settings)
-        self.background_jobs = BackgroundJobs(journal, settings, self.uid, self.history, evaluations, self._agenda)
+        self.background_jobs = BackgroundJobs(
+            journal, settings, self.uid, self.history, evaluations, self._agenda, self.verification
+        )
         evaluated = self.background_jobs.evaluations.finished
-        self.generations = Generations(journal, settings, self._agenda, self.history, evaluated)
+        kind = ExternalGenerations if settings.is_external else Generations
+        self.generations = kind(journal, settings, self._agenda, self.history, evaluated)
         self.failure_limit = FailureLimit(journal, self.generations, network.failure_limit)
         self.generation = self.generations.begin()
         self.work_clock = WorkClock(now, self.generations.seconds)  # of the open generation
@@ -103,6 +117,11 @@ class Run:
         return None if seconds is None else round(min(seconds, MAX_SECONDS), 1)
 
     @property
+    def journal(self) -> Journal:
+        """The journal, whose only writer is the thread of this run."""
+        return self._journal
+
+    @property
     def classes(self) -> HostClasses:
         """The host classes of the accepted results."""
         return self._journal.classes
@@ -121,36 +140,51 @@ class Run:
             return "paused"
         if not self.fleet.has_workers:
             return "waiting for workers"
+        if self.verification.waiting and not self.fleet.takes_jobs:
+            return "paused"
+        if not self.generation.population:
+            return "waiting for a batch"
         return "evaluating" if self.fleet.drain_background else "running"
 
     def record_result(self, work: Work, result: Result, worker: str, fingerprint: str, host_class: str) -> None:
         """Journal an accepted result, then count it for the generation or the background job that wants it."""
         self._journal.add_result(work.job, result, worker, fingerprint, self.incarnation, host_class)
         self.admission.adopt_class(host_class, fingerprint)
+        self.verification.note_accepted(work.job, result, worker)
         assert result.fitness is not None
-        self._count(work.job, result.fitness, result.steps)
+        self._count(work.job, result.fitness, result.steps, result.measures)
 
-    def _count(self, job: Job, fitness: float, steps: int) -> None:
+    def _count(self, job: Job, fitness: float, steps: int, measures: Sequence[float] = ()) -> None:
         """Count a result that is in the journal; `fitness` is NaN for an episode that failed for good."""
         if job.kind != "score":
             self.background_jobs.count(job, fitness)
-        elif self.generation.record(job.digest, fitness, steps):  # it wants other jobs now
+        elif self.generation.record(job.digest, fitness, steps, measures):  # it wants other jobs now
             self.fleet.jobs.offer(self.generation.missing)
 
     def tick(self, now: float) -> None:
         """Let time pass: departed workers, silent workers, stalled uploads, and the generation's own time."""
         self._now = now
         self.fleet.tick(now)
-        self.work_clock.tick(now, is_working=not self.fleet.paused and self.fleet.has_workers)
+        has_work = self.generation.population > 0 and not self.fleet.paused
+        self.work_clock.tick(now, is_working=has_work and self.fleet.has_workers)
         self.background_jobs.rollout_collections.uploads.tick(now)
 
     def advance(self, now: float) -> bool:
         """Close the complete generation and open the next one; whether a generation was opened."""
         closed = len(self.history)
-        if self.stalled is not None or (self.generation.complete and not self._take_lock()):
+        if self.is_rewound or self.stalled is not None or (self.generation.complete and not self._take_lock()):
             return False
         self._settle_failures()
+        self.verification.settle(now)
+        if self.verification.has_findings:
+            if self._take_lock():
+                self._rewind(self.verification.condemn())
+            return False
+        self.background_jobs.settle()
+        has_opened = self._open_batch()
         while self.ended is None and self.paused is None and self.generation.complete and not self._is_waiting:
+            if self.verification.holds_generation:
+                break
             reseeds = self.generations.can_reseed(self.generation)
             if not reseeds and (why := self.failure_limit.find_excess(self.generation)) is not None:
                 self.pause(f"{why} (`dreamfleet story` lists why)")
@@ -161,7 +195,7 @@ class Run:
                 self._close(now)
         self.fleet.drain_background = self._is_waiting
         self._finish()
-        return len(self.history) > closed
+        return has_opened or len(self.history) > closed
 
     def commit(self) -> bool:
         """Make everything so far durable, then write the reported controller if it is due; whether that succeeded.
@@ -175,12 +209,13 @@ class Run:
             return False
         try:
             self._journal.commit()
-            self.background_jobs.report.save()
+            if not self.is_rewound:
+                self.background_jobs.report.save()
         except NotWritableNowError as error:
             self.wait_until_writable(error)
             return False
         if self.stalled is not None:
-            self.stalled, self.fleet.paused = None, self.paused is not None
+            self.stalled, self.fleet.paused = None, self.paused is not None or self.is_rewound
             goes_on = "the run continues" if self.paused is None else f"the run stays paused: {self.paused}"
             self.fleet.notes.append(f"the journal can be written again: {goes_on}")
         return True
@@ -207,7 +242,8 @@ class Run:
         self._journal.end_incarnation()
         self._journal.set_seconds(self.generation.number, self.work_clock.seconds)
         self._journal.commit()
-        self.background_jobs.report.save(at_once=True)
+        if not self.is_rewound:
+            self.background_jobs.report.save(at_once=True)
 
     def prepare(self) -> None:
         """Prepare the next generation while workers are busy."""
@@ -231,6 +267,7 @@ class Run:
         if self.paused is not None:
             self.fleet.notes.append("resumed")
         self._go_on()
+        self.verification.resume()
         self._journal.drop_fact(PAUSED)
         self.failure_limit.accept(self.generation.number)
         self.fleet.jobs.offer(self.background_jobs.retry_failed())
@@ -244,9 +281,35 @@ class Run:
         self.fleet.paused = self.stalled is not None
         self.fleet.jobs.clear_failures()
 
+    def bar(self, host: str, *, is_barred: bool = True) -> str:
+        """Bar a host as the operator says, and take back what it brought (R33); else let it in again.
+
+        Why that cannot be done, in words; empty if it was.
+        """
+        if self.is_rewound or not self._take_lock():
+            return f"the run cannot be changed now: {self.stalled or 'results are being recalled'}; ask again"
+        known = {*map(host_of, (*self._journal.workers(recalled=True), *self.fleet.members, *self.fleet.departed))}
+        if problem := find_bar_problem(host, self.admission.barred, known, is_barred=is_barred):
+            return problem
+        if is_barred:
+            self.admission.bar(host, BAR_BY_OPERATOR, self.incarnation)
+            self._rewind({host})
+        else:
+            self.admission.unbar(host)
+            self.fleet.notes.append(unbar_words(host))
+            self._journal_notes()
+        return ""
+
+    def _rewind(self, hosts: Collection[str]) -> None:
+        """Take back what these hosts brought, in the transaction that bars them (R33)."""
+        self.fleet.notes.append(recall(self._journal, self.settings, hosts))
+        self._journal_notes()
+        self.is_rewound = self.fleet.paused = True  # what it holds in memory is true no more
+
     def _settle_failures(self) -> None:
         """Make lasting failures facts of the run (R8), and pause it where too many candidates or all hosts fail."""
         judge, is_judged = self.fleet.failure_judge, self.settings.on_failure != "pause"
+        judge.lacks_proof = False
         if is_judged:
             for lasting in judge.find_lasting():
                 self._record_failure(lasting)
@@ -263,10 +326,11 @@ class Run:
                     f"another host, or `dreamfleet resume`, tries them again{OTHER_SEEDS if proof is None else ''}"
                 )
                 self._lacks_host = not judge.has_hope
-        elif is_judged and judge.awaits_proof and (proof := self.generations.find_scored(self.generation)) is not None:
-            self.fleet.jobs.offer_proof(proof)
         elif not is_judged and (failure := judge.find_pausing()) is not None:
             self.pause(f"{failure}; `dreamfleet resume` tries it again")
+        elif judge.awaits_proof:
+            proof = self.generations.find_scored(self.generation)
+            judge.lacks_proof = proof is None or not self.fleet.jobs.offer_proof(proof)
 
     def _record_failure(self, failure: JobFailure) -> None:
         """Journal that a job's episode fails wherever it is scored; it is wanted no more."""
@@ -277,6 +341,27 @@ class Run:
         self._count(job, nan, 0)
         if job.kind == "score":
             self.fleet.withdraw(self.generation.unwanted)
+
+    def _open_batch(self) -> bool:
+        """Open the next batch of a run that waits for one; whether one was opened."""
+        if self.generation.population or self.paused is not None or not self.generations.has_waiting:
+            return False
+        if not self._take_lock():
+            return False
+        self._begin_generation(self.generations.open(self.generation.number))
+        self.fleet.jobs.offer(self.generation.missing)
+        return True
+
+    def cancel_generation(self) -> None:
+        """Want no more results of the open generation: its batch is cancelled."""
+        self.generation.cancel()
+        self.fleet.withdraw(self.generation.unwanted)
+
+    def _begin_generation(self, generation: Generation) -> None:
+        self.generation = generation
+        self.verification.restore(generation.work)
+        self.work_clock.restart()
+        self._prepare_fleet(generation)
 
     def _replace_generation(self, generation: Generation) -> None:
         """Score the open generation as it is now."""
@@ -313,6 +398,7 @@ class Run:
         if len(self._agenda.stages) > 1:
             self.fleet.notes.append(f"generation {generation.number} is in {self._stage_text}")
         self._prepare_fleet(generation)
+        self.verification.restore(generation.work)
         if self._journal.fact(PAUSED) is not None:
             self.pause(BY_HAND)
         work = self.background_jobs.begin(self.generations.mean, now)
@@ -336,9 +422,7 @@ class Run:
         reason = self._stop_reason(generation)
         self.fleet.jobs.offer(self.background_jobs.schedule(closed.number, mean, now, last=reason is not None))
         self._note_stage_changes(generation)
-        self.generation = generation
-        self.work_clock.restart()
-        self._prepare_fleet(generation)
+        self._begin_generation(generation)
         if reason:
             self.fleet.withdraw(self.fleet.jobs.digests_of_kind("score"))
             self._begin_ending(reason)
@@ -361,20 +445,24 @@ class Run:
         return f"stage {stage.number} of {len(self._agenda.stages)} ({stage.description})"
 
     def _stop_reason(self, generation: Generation) -> str | None:
-        return find_stop_reason(self.limits, self.history, self.background_jobs, generation)
+        if self.settings.is_external:
+            return None
+        return find_stop_reason(self.limits, self.history, self.background_jobs, generation, self.settings.task)
 
     def _finish(self) -> None:
         """Once a limit is reached and no background job is left: confirm the reported mean, then end the run."""
         if self._ending is None or self.background_jobs.in_progress or self.ended is not None:
+            return
+        if self.fleet.jobs.checks:
             return
         if not self._take_lock():
             return
         if work := self.background_jobs.confirm():
             self.fleet.notes.append(self.background_jobs.round_description)
             self.fleet.jobs.offer(work)
-        else:
+        elif not self.fleet.jobs.checks:  # else results of an earlier life are checked first
             if self.background_jobs.confirmation_failed:
-                self.fleet.notes.append("no confirmed score: the episodes failed on every fresh seed")
+                self.fleet.notes.append("no confirmed score: every episode of the confirmation failed")
             self._end()
 
     def _begin_ending(self, reason: str) -> None:
@@ -385,10 +473,12 @@ class Run:
     def _stored_end_reason(self) -> str | None:
         """The limit that an earlier incarnation reached; `None` if this one has other limits."""
         reason, limits = json.loads(self._journal.fact(ENDING) or "[null, null]")
-        return reason if limits == asdict(self.limits) else None
+        known = None if limits is None else {**asdict(LimitsConfig()), **limits}  # an older version knew fewer
+        return reason if known == asdict(self.limits) else None
 
     def _end(self) -> None:
         self.ended = self._ending or "stopped"
+        self.fleet.withdraw(self.fleet.jobs.digests_of_kind("score"))  # a new host may still have one to show itself
         self._journal.end(self.ended)
         self._journal_notes()
         self._journal.add_event(f"ended: {self.ended}")

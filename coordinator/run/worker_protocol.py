@@ -12,6 +12,7 @@ from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.messages import (
+    MAX_REASON,
     Heartbeat,
     HelloReply,
     HelloRequest,
@@ -46,6 +47,7 @@ class WorkerProtocol:
         self._admission = run.admission
         self._collections = run.background_jobs.rollout_collections
         self._horizon = run.settings.task.horizon  # of a scored episode whose job names none
+        self._measures = len(run.settings.task.measures)
 
     def answer_hello(self, request: HelloRequest | None, refusal: tuple[str, str] | None, now: float) -> HelloReply:
         """Admit a worker or refuse it; `refusal` is why and what to do, if the caller knows a reason already.
@@ -75,10 +77,14 @@ class WorkerProtocol:
             numbering=numbering,
             classes=True,
             reasons=True,
+            share=self._run.fleet_share,
+            taken=True,
         )
 
     def handle(self, worker: str, message: WorkerMessage, now: float) -> None:
         """Handle a worker's message; one for another run, or a heartbeat for another coordinator, is dropped."""
+        if self._run.is_rewound:
+            return  # the next life of the coordinator hears it again
         if message.run_uid != self._run.uid:
             self._fleet.dropped["foreign run"] += 1
         elif isinstance(message, ResultBatch):
@@ -131,7 +137,8 @@ class WorkerProtocol:
 
     def job_batch(self, batch: OutgoingBatch, *, leave: bool = False, ended: bool = False) -> JobBatch:
         """The message for a batch; with `leave` it asks the worker to leave the run, with `ended` it says why."""
-        content = batch.content
+        content, member = batch.content, self._fleet.members.get(batch.identity)
+        reads_why = ended and member is not None and member.reads_end
         return JobBatch(
             run_uid=self._run.uid,
             incarnation=self._run.incarnation,
@@ -144,6 +151,7 @@ class WorkerProtocol:
             verdicts=tuple(content.verdicts),
             leave=leave,
             ended=ended,
+            why=truncate(self._run.ended or "", MAX_REASON) if reads_why else "",
         )
 
     def _handle_result(
@@ -151,16 +159,18 @@ class WorkerProtocol:
     ) -> None:
         """Judge one result; `work` is the wanted job that it names, `None` if it names none."""
         kind, horizon = ("evaluate", None) if work is None else (work.job.kind, work.job.horizon)
-        bounded = fail_if_excessive(reported, kind, horizon or self._horizon)
+        bounded = fail_if_excessive(reported, kind, horizon or self._horizon, self._measures)
         result: Result | None = bounded
         if kind == "collect":
             result = self._receive_rollout(worker, bounded)
         if result is None:
             self._fleet.defer_verdict(worker, reported.digest, now)
             return
-        _, accepted = self._fleet.handle_result(worker, result, now)
+        _, accepted = self._fleet.handle_result(worker, result, now, host_class)
         if accepted is not None:
             self._run.record_result(accepted, result, worker, fingerprint, host_class)
+        elif self._fleet.checked is not None:
+            self._run.verification.record(self._fleet.checked, result, worker)
         self._collections.uploads.forget(reported.digest)
 
     def _receive_rollout(self, worker: str, result: Result) -> Result | None:
@@ -176,8 +186,8 @@ class WorkerProtocol:
         return max_steps(LONGEST_EPISODE if job.kind == "evaluate" else job.horizon or self._horizon)
 
 
-def fail_if_excessive(result: Result, kind: Kind, horizon: int) -> Result:
-    """The result, turned into a failure of the job if its numbers would spoil the run's.
+def fail_if_excessive(result: Result, kind: Kind, horizon: int, measures: int = 0) -> Result:
+    """The result, turned into a failure of the job if its numbers would spoil the run's, or lacks `measures` of them.
 
     `horizon` is that of a scored or kept episode. Evaluations drive whole episodes, whose length only the task knows.
     """
@@ -187,7 +197,9 @@ def fail_if_excessive(result: Result, kind: Kind, horizon: int) -> Result:
     if result.fitness is None:
         return replace(result, steps=steps)
     why = rejection_reason(result.fitness, result.steps, result.seconds, horizon)
-    return result if why is None else replace(result, fitness=None, steps=steps, error=why, upload=None)
+    if why is None and len(result.measures) != measures:
+        why = f"wrong measures: the episode gave {len(result.measures)} numbers beside its fitness, not {measures}"
+    return result if why is None else replace(result, fitness=None, steps=steps, error=why, upload=None, measures=())
 
 
 def _half_counted_error(error: Exception) -> InternalError:

@@ -1,4 +1,4 @@
-"""The control verbs that steer a run: pause, resume, drain, stop, disband. No transport."""
+"""The control verbs that steer a run: pause, resume, drain, stop, disband, bar, unbar. No transport."""
 
 from __future__ import annotations
 
@@ -26,13 +26,16 @@ class Control:
         self._name = name
         self._beat = beat
         self._stop = stop
-        self._verbs: dict[str, Callable[[], None]] = {
+        self._verbs: dict[str, Callable[[], str | None]] = {
             "pause": self._pause_by_hand,
             "resume": self._resume,
             "drain": self._drain,
             "stop": stop,
             "disband": self._disband,
+            "bar": lambda: self._bar(is_barred=True),
+            "unbar": lambda: self._bar(is_barred=False),
         }
+        self._host = ""  # that the verb is about
         self._draining = False
         self._disbanding_since: float | None = None
         self._leave_sent_at = -math.inf
@@ -43,12 +46,13 @@ class Control:
         """Whether every batch asks its worker to leave."""
         return self._disbanding_since is not None
 
-    def obey(self, query_key: str, resume_command: str, now: float) -> ControlReply:
+    def obey(self, query_key: str, resume_command: str, now: float, host: str = "") -> ControlReply:
         """Obey the verb of a query's key expression; an unknown one, or one for several runs, is refused.
 
+        `bar` and `unbar` are about a `host`. A verb that cannot be obeyed now is refused with the reason.
         The reply to a verb that ends the coordinator holds `resume_command`.
         """
-        self._now, verb = now, query_key.rsplit("/", 1)[-1]
+        self._now, self._host, verb = now, host, query_key.rsplit("/", 1)[-1]
         why, again = "", ""
         if query_key != keys.control(self._name, verb):
             why = f"one run is controlled at a time, by its own key: query {keys.control(self._name, 'VERB')}"
@@ -56,7 +60,7 @@ class Control:
             known = ", ".join(self._verbs)
             why = f"{truncate(verb, LONGEST_VERB)!r} is not a control verb of this version; known are {known}"
         else:
-            self._verbs[verb]()
+            why = truncate(self._verbs[verb]() or "", MAX_TEXT)
             if verb == "resume" and self._run.stalled is not None:
                 why = f"it cannot continue now: {self._run.stalled}; repeat `resume` then"
             if verb in LEAVING_VERBS and len(resume_command) <= MAX_TEXT and resume_command.isprintable():
@@ -78,9 +82,9 @@ class Control:
         return []
 
     def last_batches(self) -> list[OutgoingBatch]:
-        """Empty batches that say that the run has ended, for those present that then exit."""
+        """Empty batches that say that the run has ended, for those present that then leave it."""
         return _empty_batches(each for each in self._run.fleet.members.values()
-                              if each.leaves_with_run and each.gone_since is None)  # fmt: skip
+                              if (each.leaves_with_run or each.reads_end) and each.gone_since is None)  # fmt: skip
 
     def _pause_by_hand(self) -> None:
         self._pause(BY_HAND)
@@ -95,6 +99,11 @@ class Control:
     def _resume(self) -> None:
         self._draining = False
         self._run.resume()
+
+    def _bar(self, *, is_barred: bool) -> str:
+        if self._draining or self.disbanding:
+            return "the coordinator leaves: ask again once it is back, or with the name of the run on its disk"
+        return self._run.bar(self._host, is_barred=is_barred)
 
     def _drain(self) -> None:
         self._draining = True

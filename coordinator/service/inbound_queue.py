@@ -34,6 +34,7 @@ QUEUE_LIMITS = {
     "token": QueueLimit(4096, 1),  # without a payload
     "hello": QueueLimit(256, 4 << 20, 100.0),  # each costs as much as dozens of results, and workers repeat it
     "control": QueueLimit(64, 1 << 20),
+    "batch": QueueLimit(1024, 32 << 20),
 }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,23 +13,28 @@ from time import monotonic
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.cli.global_config import GlobalConfig
-from dreamfleet.common.errors import ConnectionFailedError, JournalError, UsageError
+from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
 from dreamfleet.common.files.file_system import file_system_type, is_network, lock_problem
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.protocol.messages import Intervals
+from dreamfleet.common.protocol.tasks import DREAM
+from dreamfleet.common.runs.own_runs import remember_run
 from dreamfleet.common.runs.records import RunSettings
-from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_folder import EPISODE_LIMIT, open_run
 from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.common.runs.run_paths import ARCHIVE, BUNDLE, JOURNAL, resume_command
+from dreamfleet.common.security.anchor_key import make_anchor_key
 from dreamfleet.common.security.certificate_ledger import RevocationWatcher
 from dreamfleet.common.security.credentials import Credentials
 from dreamfleet.common.transport.session import Network
 from dreamfleet.common.worlds.score_words import score_word
+from dreamfleet.coordinator.analysis.live_log import live_log
 from dreamfleet.coordinator.run.run import Run
-from dreamfleet.coordinator.service.service import Service
+from dreamfleet.coordinator.service.service import OpenRun, Service
 from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.settings.environment_check import check_environment
+from dreamfleet.coordinator.settings.live_log import check_sinks
 from dreamfleet.coordinator.settings.resume_settings import serving_facts
 from dreamfleet.coordinator.settings.start import SUBSPACE_FACT, StartPoint
 from dreamfleet.coordinator.storage.file_watch import FileWatch
@@ -72,35 +77,78 @@ class RunRequest:
         return resume_command(folder or self.folder, self.join, own_access_dir, self.trust)
 
 
+class Stop:
+    """Stops whichever life of the coordinator serves the run now. Safe in a signal handler."""
+
+    def __init__(self) -> None:
+        self.is_requested = False
+        self.stop_service: Callable[[], None] = lambda: None
+
+    def __call__(self) -> None:
+        """End the loop soon."""
+        self.is_requested = True
+        self.stop_service()
+
+
 def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], None] = lambda _stop: None) -> Run:
-    """Serve a new or continued run until it ends or is stopped; `on_stoppable` receives the function that stops it."""
+    """Serve a new or continued run until it ends or is stopped; `on_stoppable` receives the function that stops it.
+
+    After results were recalled, another life goes on from the journal, as after a kill (R33).
+    """
+    stop = Stop()
+    on_stoppable(stop)
+    while True:
+        run = _serve_life(request, stop)
+        if not run.is_rewound or stop.is_requested:
+            return run
+        request = replace(request, config=None, start=None)
+
+
+def _serve_life(request: RunRequest, stop: Stop) -> Run:
+    """Serve one incarnation of a run."""
     folder = request.folder
     if request.config is not None and request.name == ARCHIVE:
         raise UsageError(f"{ARCHIVE!r} is where archived runs lie: choose another name")
     _check_file_system(folder)
-    settings, bundle = _resolve_settings(request, folder)
-    with reporting_unwritable_folder(request.runs_dir, "choose another --runs-dir", JournalError):
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    with run_lock(folder), ExitStack() as stack:
-        journal = stack.enter_context(closing(_open_journal(request, folder, settings, bundle)))
-        served = stack.enter_context(closing(ServedBundle(folder / BUNDLE))) if bundle else None
-        file_watch = stack.enter_context(
-            closing(FileWatch(journal, served, request.with_absolute_paths.resume_command))
+    check_sinks(request.network.log_to)
+    settings, bundle, limit = _resolve_settings(request, folder)
+    if request.network.verify and settings.is_external:
+        raise UsageError(
+            f"--verify: a run with --optimiser {settings.optimiser} hands its scores out as they come, so none can be "
+            "taken back; leave it out"
         )
-        service = _service(request, file_watch, served, _score_word(settings, bundle))
-        on_stoppable(service.stop)
+    with ExitStack() as stack:
+        if request.config is None:
+            journal: Journal | None = _open_journal(request, folder, settings, bundle, {}, stack)
+        else:
+            journal = None
+            Journal.check_absent(folder)
+
+        def open_run() -> OpenRun:
+            """The run; a new one is created here, once its addresses and its name are its own."""
+            nonlocal journal
+            known = {EPISODE_LIMIT: str(limit)} if limit else {}
+            journal = journal or _open_journal(request, folder, settings, bundle, known, stack)
+            served = stack.enter_context(closing(ServedBundle(folder / BUNDLE))) if bundle else None
+            file_watch = FileWatch(journal, served, request.with_absolute_paths.resume_command)
+            stack.enter_context(closing(file_watch))
+            stack.enter_context(live_log(folder, request.network.log_to))
+            anchor_key = make_anchor_key() if request.network.verify else b""
+            run = Run(journal, settings, request.limits, request.network, monotonic(), anchor_key)
+            return OpenRun(run, file_watch, served)
+
+        service = _service(request, _score_word(settings, bundle))
+        stop.stop_service = service.stop
+        if stop.is_requested:
+            service.stop()
         try:
-            return service.serve(lambda: Run(journal, settings, request.limits, request.network, monotonic()))
+            return service.serve(open_run)
         except JournalError as error:
-            if not isinstance(error.__cause__, (OSError, sqlite3.OperationalError)) or not journal.is_whole:
+            if not isinstance(error.__cause__, (OSError, sqlite3.OperationalError)):
+                raise
+            if journal is None or not journal.is_whole:
                 raise
             raise JournalError(f"{error}; continue it with: {request.resume_command()}") from error
-        except ConnectionFailedError as error:
-            if request.config is None:
-                raise
-            raise ConnectionFailedError(
-                f"{error}; the run was created; start it with: {request.resume_command()}"
-            ) from error
 
 
 def _check_file_system(folder: Path) -> None:
@@ -117,25 +165,40 @@ def _score_word(settings: RunSettings, bundle: Bundle | None) -> str:
     return score_word(task) if bundle is None else score_word(bundle.manifest.task, bundle.manifest.world)
 
 
-def _service(request: RunRequest, file_watch: FileWatch, bundle: ServedBundle | None, word: str) -> Service:
+def _service(request: RunRequest, word: str) -> Service:
     network = request.network
     intervals = Intervals(network.beat, network.beat)
     revocations = RevocationWatcher(request.access_dir, request.credentials)
     reached = Network(network.listen, network.connect, request.credentials, revocations.revoked_seats)
-    return Service(request.name, reached, intervals, file_watch, bundle, network.metrics_port, revocations, word)
+    return Service(request.name, reached, intervals, network.metrics_port, revocations, word)
 
 
-def _open_journal(request: RunRequest, folder: Path, settings: RunSettings, bundle: Bundle | None) -> Journal:
-    """Open the run's journal and write its limits, network settings and, of a new run, its start point.
+def _open_journal(
+    request: RunRequest, folder: Path, settings: RunSettings, bundle: Bundle | None, known: Mapping[str, str],
+    stack: ExitStack,
+) -> Journal:  # fmt: skip
+    """Lock the run's folder, and open its journal with its limits, network settings and, of a new run, its start point.
 
-    They are durable before anything else can fail: a coordinator that finds its port taken, or is killed, resumes with
-    all its settings.
+    They are durable before anything else can fail: a coordinator that is killed resumes with all its settings.
+    `known` are more facts of a new run; `stack` closes the journal and releases the folder.
     """
+    with reporting_unwritable_folder(request.runs_dir, "choose another --runs-dir", JournalError):
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    stack.enter_context(run_lock(folder))
+    return stack.enter_context(closing(_write_facts(request, folder, settings, bundle, known)))
+
+
+def _write_facts(
+    request: RunRequest, folder: Path, settings: RunSettings, bundle: Bundle | None, known: Mapping[str, str]
+) -> Journal:
     facts = serving_facts(request.limits, request.network)
     if request.config is not None:
         start = request.start.facts if request.start else {}
-        loaded_subspace = {SUBSPACE_FACT: request.config.loaded_subspace.text} if request.config.loaded_subspace else {}
-        return Journal.create(folder, settings, bundle.path if bundle else None, {**facts, **start, **loaded_subspace})
+        subspace = {SUBSPACE_FACT: request.config.loaded_subspace.text} if request.config.loaded_subspace else {}
+        own = {**facts, **start, **subspace, **known}
+        created = Journal.create(folder, settings, bundle.path if bundle else None, own)
+        remember_run(created.fact("uid") or "", settings.task.task, settings.task.options)
+        return created
     journal = Journal(folder / JOURNAL)
     for name, text in facts.items():
         journal.set_fact(name, text)
@@ -143,25 +206,33 @@ def _open_journal(request: RunRequest, folder: Path, settings: RunSettings, bund
     return journal
 
 
-def _resolve_settings(request: RunRequest, folder: Path) -> tuple[RunSettings, Bundle | None]:
-    """The run's settings, and its verified bundle if its task needs one."""
+def _resolve_settings(request: RunRequest, folder: Path) -> tuple[RunSettings, Bundle | None, int]:
+    """The run's settings, its verified bundle if its task needs one, and a new run's `_episode_limit`."""
     if request.config is not None:
         return _resolve_new_settings(request.config, request.start, strict=request.network.strict)
     with open_run(request.runs_dir, request.name) as stored:
         settings = stored.settings
     if not settings.task.bundle:
-        return settings, None
-    return settings, Bundle.open(folder / BUNDLE, settings.task.bundle)
+        return settings, None, 0
+    return settings, Bundle.open(folder / BUNDLE, settings.task.bundle), 0
 
 
 def _resolve_new_settings(
     config: RunConfig, start: StartPoint | None, *, strict: bool
-) -> tuple[RunSettings, Bundle | None]:
+) -> tuple[RunSettings, Bundle | None, int]:
     if start is not None and config.needs_no_bundle == (not start.bundle):
         config = start.apply_to(config)
     bundle = None if config.needs_no_bundle else find_bundle(config.bundle or DEFAULT_BUNDLE)
     config = check_environment(config, bundle, strict=strict)
     settings = config.settings(bundle)
     if start is not None:
-        start.check(settings)
-    return settings, bundle
+        start.check(settings, bundle)
+    return settings, bundle, _episode_limit(config, bundle)
+
+
+def _episode_limit(config: RunConfig, bundle: Bundle | None) -> int:
+    """Steps after which a scored episode's environment ends it; 0 if it has no limit, none is known, or it dreams."""
+    if bundle is None:
+        return config.description.steps if config.description else 0
+    world = bundle.manifest.world
+    return world.horizon if world is not None and config.task != DREAM else 0

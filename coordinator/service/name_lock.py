@@ -37,9 +37,12 @@ class NameLock:
         )
         stack.callback(watcher.undeclare)
 
-    def acquire(self) -> None:
-        """Take the name; `RefusedError` if a live coordinator has it: a newcomer has nothing to lose."""
-        until = monotonic() + DISCOVERY_SECONDS
+    def acquire(self, *, linked: bool) -> None:
+        """Take the name; `RefusedError` if a live coordinator has it: a newcomer has nothing to lose.
+
+        Unless `linked` to other routers, a router that just opened sees nobody, and waits for nobody.
+        """
+        until = monotonic() + (DISCOVERY_SECONDS if linked else 0.0)
         while (now := monotonic()) < until or self._leader_check.has_any:
             self._listen(now, DISCOVERY_SECONDS / 10)
             if self._leader_check.live(now):

@@ -17,7 +17,7 @@ from dreamfleet.common.monitoring.eta import estimate_eta, summarise_status
 from dreamfleet.common.monitoring.status import Status
 from dreamfleet.common.printable import format_number
 from dreamfleet.common.protocol.tasks import is_unregistered
-from dreamfleet.common.runs.records import StoredGeneration, count_episodes, format_mean, with_error
+from dreamfleet.common.runs.records import StoredGeneration, count_episodes, format_mean, in_values, with_error
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, Credentials, describe_time_left
 from dreamfleet.common.transport.network import Network, is_loopback
 from dreamfleet.coordinator.run.run import Run
@@ -58,16 +58,19 @@ class RunLog:
 
     def report_closed(self, generations: Iterable[StoredGeneration]) -> None:
         """Log these closed generations, and the evaluations that have finished since the last call."""
+        task = self._run.settings.task
         for closed in generations:
             failed = f", {closed.failed} failed" if closed.failed else ""
-            log.info("generation %d: mean %s, best %s%s", closed.number, format_number(closed.mean),
-                     format_number(closed.best), failed,
+            shown = in_values(closed, task)
+            log.info("generation %d: mean %s, best %s%s", closed.number, format_number(shown.mean),
+                     format_number(shown.best), failed,
                      extra={"facts": {"event": "generation", **asdict(closed)}})  # fmt: skip
         evaluations = self._run.background_jobs.evaluations
         if len(evaluations) > self._evaluations_logged:
             for each in islice(evaluations.finished.values(), self._evaluations_logged, None):  # as they finished
-                log.info("evaluation of generation %d's mean: %s%s, %s",
-                         each.generation, format_mean(each), "" if each.error is None else " (standard error)",
+                mean = format_mean(in_values(each, task))
+                log.info("evaluation of generation %d's mean: %s%s over %s",
+                         each.generation, mean, "" if each.error is None else " (standard error)",
                          count_episodes(each),
                          extra={"facts": {"event": "evaluation", **with_error(each)}})  # fmt: skip
             self._evaluations_logged = len(evaluations)

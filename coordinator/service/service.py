@@ -10,6 +10,7 @@ import queue
 import secrets
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
@@ -34,8 +35,10 @@ from dreamfleet.common.security.credentials import worker_seat_identity
 from dreamfleet.common.serialization.validation import MalformedError
 from dreamfleet.common.transport.session import Network, open_session
 from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
+from dreamfleet.coordinator.run.batches import Batches
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.run.worker_protocol import WorkerMessage, WorkerProtocol
+from dreamfleet.coordinator.service.batch_queries import BatchQueries
 from dreamfleet.coordinator.service.control import Control
 from dreamfleet.coordinator.service.inbound_queue import InboundQueue
 from dreamfleet.coordinator.service.metrics_server import serve_metrics
@@ -56,16 +59,23 @@ END_GRACE = 2.0  # seconds that workers may take to leave a run that has ended
 _WORKER_MESSAGES: dict[str, type[WorkerMessage]] = {"result": ResultBatch, "beat": Heartbeat, "upload": UploadPart}
 
 
+@dataclass(frozen=True)
+class OpenRun:
+    """A run to serve, with its files."""
+
+    run: Run
+    file_watch: FileWatch
+    bundle: ServedBundle | None
+
+
 class Service:
     """Serves one run until it ends or `stop` is called."""
 
     def __init__(
-        self, name: str, network: Network, intervals: Intervals, file_watch: FileWatch, bundle: ServedBundle | None,
-        metrics_port: str, revocations: RevocationWatcher, score_word: str,
+        self, name: str, network: Network, intervals: Intervals, metrics_port: str, revocations: RevocationWatcher,
+        score_word: str,
     ) -> None:  # fmt: skip
         self._name = name
-        self._file_watch = file_watch
-        self._bundle = bundle
         self._network = network
         self._secured = network.credentials is not None
         self._revocations = revocations
@@ -83,15 +93,17 @@ class Service:
         self._stopping = True
         self._events.wake()
 
-    def serve(self, make_run: Callable[[], Run]) -> Run:
-        """Claim the name on the network, make the run, serve it; the run as it was at shutdown."""
+    def serve(self, open_run: Callable[[], OpenRun]) -> Run:
+        """Claim all addresses and the name on the network, then open the run and serve it; the run as it was left."""
         with ExitStack() as last, open_session(self._network) as session, ExitStack() as stack:
             self._name_lock = NameLock(session, self._name, self._nonce, stack)
-            self._name_lock.acquire()
-            declared = self._start(session, make_run(), last)
+            self._name_lock.acquire(linked=bool(self._network.connect))
+            last.enter_context(serve_metrics(self._metrics_port, lambda: self._snapshot, lambda: self._stopping))
+            declared = self._start(session, open_run())
             try:
                 self._loop(session)
-                self._shut_down(session, declared)
+                if not self._run.is_rewound:
+                    self._shut_down(session, declared)
             except JournalError:
                 self._file_watch.check(monotonic(), at_once=True)  # what was done to the files may be rescued
                 raise
@@ -100,16 +112,17 @@ class Service:
                 raise
         return self._run
 
-    def _start(self, session: zenoh.Session, run: Run, stack: ExitStack) -> list[Any]:
+    def _start(self, session: zenoh.Session, opened: OpenRun) -> list[Any]:
         """Answer for the run from now on; what is declared on the session."""
-        self._run, name = run, self._name
+        self._run, self._file_watch, name = opened.run, opened.file_watch, self._name
+        run = opened.run
         self._name_lock.announce(run.uid, run.incarnation)
         self._protocol = WorkerProtocol(run, name, self._nonce, self._intervals)
         self._control = Control(run, name, self._intervals.beat, self.stop)
+        self._batch_queries = BatchQueries(Batches(run, run.journal, name), name)
         self._started = monotonic()
         self._run_log = RunLog(run, name, self._network, self._started)
         self._snapshot = self._take_snapshot()
-        stack.enter_context(serve_metrics(self._metrics_port, lambda: self._snapshot, lambda: self._stopping))
         subscribe, answer = session.declare_subscriber, session.declare_queryable
         declared = [
             *(subscribe(keys.all_workers(kind, name), self._enqueue(kind)) for kind in _WORKER_MESSAGES),
@@ -118,12 +131,13 @@ class Service:
             ),
             answer(self._hello_key("*/*"), self._enqueue("hello")),
             answer(keys.control(name, "*"), self._enqueue("control")),
+            answer(keys.batch(name, "*"), self._enqueue("batch")),
             *declare_status(session, name, lambda: self._snapshot, self._error_counter),
         ]
-        if self._bundle is not None:
+        if opened.bundle is not None:
             sha256 = run.settings.task.bundle
             head = {"run_uid": run.uid, "incarnation": run.incarnation, "sha256": bytes.fromhex(sha256)}
-            server = BundleServer(self._bundle, keys.bundle(name, sha256), head)
+            server = BundleServer(opened.bundle, keys.bundle(name, sha256), head)
             declared.append(server.declare(session, self._error_counter))
         self._run_log.begin()
         return declared
@@ -137,6 +151,10 @@ class Service:
             if self._run.advance(now):  # the new generation's jobs need not wait for the disk
                 self._put(session, self._run.fleet.dispatch(now, durable=False))
             durable = self._run.commit()
+            if self._run.is_rewound:  # no verdict: the next life counts what workers still hold
+                self._run_log.write_notes()
+                self._stopping = self._stopping or durable
+                continue
             self._put(session, self._run.fleet.dispatch(now, durable=durable))
             self._run.prepare()
             # A new state is in the snapshot before it is announced: a client that hears of it and asks must see it.
@@ -145,6 +163,7 @@ class Service:
                 self._run_log.check(self._snapshot, now)
             closed = self._run.take_closed()
             self._publish(session, closed)
+            self._batch_queries.send(session, (each.number for each in closed), now, durable=durable)
             self._run_log.report_closed(closed)
             self._run_log.write_notes()
             self._put(session, self._control.advance(now))
@@ -156,6 +175,7 @@ class Service:
         """Make the run durable, stop answering, and publish the last status."""
         self._file_watch.check(monotonic(), at_once=True)
         self._run.leave()
+        self._batch_queries.send(session, (), monotonic(), durable=True)
         self._snapshot = self._take_snapshot().as_left()
         if self._run.ended is not None:
             self._dismiss_workers(session)
@@ -230,6 +250,8 @@ class Service:
             self._handle_hello(event, now)
         elif kind == "control":
             self._handle_control(event, now)
+        elif kind == "batch":
+            self._batch_queries.handle(event, now)
         elif kind == "token":
             if event.kind == zenoh.SampleKind.DELETE:
                 self._run.fleet.handle_departure(keys.worker_from_key(str(event.key_expr)), now)
@@ -284,7 +306,8 @@ class Service:
 
     def _handle_control(self, query: zenoh.Query, now: float) -> None:
         with query:
-            reply = self._control.obey(str(query.key_expr), self._file_watch.command, now)
+            host = query.parameters.get("host") or ""
+            reply = self._control.obey(str(query.key_expr), self._file_watch.command, now, host)
             self._snapshot = self._take_snapshot()  # a client that asks after this answer must see its effect
             query.reply(query.key_expr, encode_json(reply), encoding="application/json")
 

@@ -104,7 +104,7 @@ def _status(
         incarnation=run.incarnation,
         package=_package(),
         state=run.state,
-        why=run.paused or run.stalled or run.ended or "",
+        why=run.paused or run.stalled or run.ended or (run.verification.waiting if run.state == "paused" else ""),
         settings=run.settings,
         limits=asdict(run.limits),
         uptime=round(uptime, 1),
@@ -137,8 +137,13 @@ def _status(
         closing=0 if run.ended is not None else run.background_jobs.episodes_until_end(ending=run.ending),
         strict=run.admission.strict,
         classes=run.classes,
+        checks=run.verification.summary,
         expires=expires,
+        share=run.fleet_share,
+        episode_limit=run.episode_limit,
         score_word=score_word,
+        archive=None if (archive := run.generations.archive) is None else archive.status,
+        open_batches=run.generations.open_batches,
     )
 
 

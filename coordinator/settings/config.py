@@ -25,9 +25,11 @@ from dreamfleet.common.cli.key_values import parse_arguments
 from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
+from dreamfleet.common.protocol.measures import NO_ARCHIVE, check_dreamt, parse_axes
 from dreamfleet.common.protocol.messages import (
     MAX_OPTIONS,
     OWN_END_VERSION,
+    FleetShare,
     Horizon,
     Patience,
     Share,
@@ -40,10 +42,12 @@ from dreamfleet.common.protocol.tasks import (
     Description,
     check_task,
     describe_task,
+    is_function_task,
     is_self_describing,
     is_shipped,
 )
 from dreamfleet.common.runs.records import (
+    EXTERNAL,
     STAGE_FIELDS,
     ConfirmationEpisodes,
     EpisodesPerCandidate,
@@ -55,6 +59,7 @@ from dreamfleet.common.runs.records import (
 from dreamfleet.common.runs.stages import Stage, stages_of
 from dreamfleet.common.serialization.validation import Between, Count
 from dreamfleet.common.transport.network import parse_metrics_address
+from dreamfleet.coordinator.settings.live_log import parse_sinks
 from dreamfleet.coordinator.settings.presets import check_preset_fits
 from dreamfleet.coordinator.settings.schedule import check_schedule, split_first_stage
 from dreamfleet.coordinator.settings.task_options import (
@@ -86,7 +91,9 @@ class RunConfig:
         "the frozen world model: a shipped name, a file, or none (default tiny; none for gym:ENVIRONMENT and other "
         "tasks that need none)",
     )
-    environment: tuple[str, ...] = option((), "KEY=VALUE arguments of gym:ENVIRONMENT; values as in JSON")
+    environment: tuple[str, ...] = option(
+        (), "KEY=VALUE arguments of gym:ENVIRONMENT or function:MODULE:NAME; values as in JSON"
+    )
     normalise: bool = option(
         False, "shift and scale the observations of gym:ENVIRONMENT by their statistics when the run begins"
     )
@@ -96,7 +103,7 @@ class RunConfig:
     variant: tuple[str, ...] = option(
         (),
         f"NAME=VALUE of how controllers of a world model drive: decide_every=, feedback=last; and in {FIRST_WORLD} "
-        "actions=discrete, pedals=half or one, pedal_shift=, in its dream too, time_cost=, offroad_cost= "
+        "actions=linear or discrete, pedals=half or one, pedal_shift=, in its dream too, time_cost=, offroad_cost= "
         "(docs/reference/tasks.md)",
     )
     controller: Literal["linear", "hidden"] = option("linear", "a linear map, or one with a layer of tanh units")
@@ -110,10 +117,19 @@ class RunConfig:
     )
     sigma0: float = frozen_option(RunSettings, 0.1, "first step size")
     optimiser: str = frozen_option(
-        RunSettings, "cma", "what proposes candidates: cma, cmaes-lra, cmaes-sep, or yours as module:attribute"
+        RunSettings,
+        "cma",
+        "what proposes candidates: cma, cmaes-lra, cmaes-sep, openes, pepg, snes, xnes, of an archive cma-me and "
+        "map-elites, or yours as module:attribute; external: a search elsewhere submits them, over Zenoh or HTTP",
     )
     optimiser_options: tuple[str, ...] = frozen_option(
         RunSettings, (), "the optimiser's own options, each as name=value"
+    )
+    archive: tuple[str, ...] = frozen_option(
+        RunSettings,
+        (),
+        "keep the best candidate of each kind of behaviour: axes, each MEASURE=LOW:HIGH:CELLS, such as steps=0:500:20; "
+        "cma-me and map-elites need it; none: no archive (docs/how-to/quality-diversity.md)",
     )
     covariance: Literal["diagonal", "full"] = frozen_option(
         RunSettings, "diagonal", "the model of CMA-ES; an option of cma"
@@ -167,8 +183,8 @@ class RunConfig:
     confirm_episodes: ConfirmationEpisodes | None = frozen_option(
         RunSettings,
         None,
-        "fresh seeds that confirm what is reported, once a limit is reached (default as many as of an evaluation, 2 "
-        "at least); 0: never. Before, the best evaluated means drive about twice as many seeds in rounds",
+        "episodes on fresh seeds that confirm what is reported, once a limit is reached (default as many as of an "
+        "evaluation, 2 at least); 0: never. Before, the best evaluated means have about twice as many in rounds",
     )
     collect_every: Interval = frozen_option(
         RunSettings, 0, "keep rollouts of the mean for training, every so many generations; 0: never"
@@ -201,11 +217,32 @@ class RunConfig:
         for name, nothing in {"recorded": "0", "driven": "0", "end": "''"}.items():
             if getattr(self, name) and self.task != DREAM:
                 other = self.task or (default_world() if self.bundle is None else "the world that it dreams of")
-                raise UsageError(f"--{name} needs task {DREAM}, not {other}: leave it out, or pass {nothing}")
+                raise UsageError(f"--{name} needs task {DREAM}, not {other}: omit it, or pass {nothing}")
         if self.end:
             EndRule.parse(self.end)
         if 0 < self.driven < 1:
             self._check_driven()
+        if self.optimiser == EXTERNAL:
+            self._check_external()
+
+    def _check_external(self) -> None:
+        """`UsageError` for what only a run's own search can have."""
+        given = {
+            "--racing": self.racing,
+            "--driven": self.driven,
+            "--schedule": self.stages,
+            "--subspace": self.loaded_subspace is not None,
+            "--collect-every": self.collect_every,
+            "--archive": any(each != NO_ARCHIVE for each in self.archive),
+            "--covariance": self.covariance != "diagonal",
+            "--optimiser-options": any(self.optimiser_options),
+            "--on-failure": self.on_failure != "worst",
+            "--evaluate-every": self.evaluate_every not in (0, RunConfig.evaluate_every),
+        }
+        if named := [flag for flag, is_given in given.items() if is_given]:
+            raise UsageError(
+                f"{' and '.join(named)}: a run with --optimiser {EXTERNAL} has no search of its own, so leave this out"
+            )
 
     def _check_driven(self) -> None:
         """`UsageError` for a mixture of dreams and drives that no candidate can have."""
@@ -217,7 +254,7 @@ class RunConfig:
         if self.racing:
             raise UsageError(
                 "--racing compares all candidates by the first half of their episodes, and of a mixture that would be "
-                "the driven ones: leave it out, or pass --driven 0 or 1"
+                "the driven ones: omit it, or pass --driven 0 or 1"
             )
 
     @property
@@ -239,36 +276,53 @@ class RunConfig:
             return own.settings(bundle)
         if self.task is None and bundle is not None:
             return replace(self, task=bundle.manifest.task).settings(bundle)
+        if self.task is not None and is_function_task(self.task) and self.horizon != 1:
+            return replace(self, horizon=1).settings(bundle)
         if self.horizon is None:
             world = None if bundle is None else bundle.manifest.world
             limit = DEFAULT_HORIZON if world is None else world.horizon
             return replace(self, horizon=min(limit, DEFAULT_HORIZON)).settings(bundle)
         spec, shape, packages = self._resolve_without_bundle() if bundle is None else self._resolve_with_bundle(bundle)
+        if names := self.measures:
+            if self.task == DREAM:
+                check_dreamt(names)
+            spec = replace(spec, measures=names)
         if self.loaded_subspace is not None:
-            _check_subspace(self.loaded_subspace, spec, shape)
+            _check_subspace(self.loaded_subspace, spec, shape, bundle)
         derived = {
             "task": spec,
             "packages": packages,
             "controller": shape,
             "confirm_episodes": self._confirm_episodes,
             "optimiser_options": tuple(filter(None, self.optimiser_options)),
+            "archive": self._archive,
             "subspace": "" if self.loaded_subspace is None else self.loaded_subspace.sha256,
+            "evaluate_every": 0 if self.optimiser == EXTERNAL else self.evaluate_every,
         }
         settings = RunSettings(**{**frozen_values(RunSettings, self), **derived})
         check_schedule(settings)
         for stage in stages_of(settings):
             with _naming_stage(stage.number if self.stages else None):
                 replace(self, **{name: getattr(stage, name) for name in STAGE_FIELDS})  # checks each value
-                if stage.starts_new_search:
+                if stage.starts_new_search and not settings.is_external:
                     _try_optimiser(settings, stage, self.loaded_subspace)
         return settings
 
     @property
     def _confirm_episodes(self) -> int:
         """0 where nothing is evaluated: there is nothing to choose among."""
-        if not self.evaluate_every:
+        if not self.evaluate_every or self.optimiser == EXTERNAL:
             return 0
         return max(self.evaluation_episodes, 2) if self.confirm_episodes is None else self.confirm_episodes
+
+    @property
+    def measures(self) -> tuple[str, ...]:
+        """The measures of the archive's axes; empty without an archive."""
+        return tuple(axis.measure for axis in parse_axes(self._archive))
+
+    @property
+    def _archive(self) -> tuple[str, ...]:
+        return tuple(each for each in self.archive if each not in ("", NO_ARCHIVE))
 
     @property
     def _hidden(self) -> int:
@@ -321,7 +375,7 @@ class RunConfig:
         if costs and self.task == DREAM:
             raise UsageError(
                 f"{costs[0].partition('=')[0]} needs candidates that drive in the world: a dream has no lap and no "
-                "road; leave it out of --variant"
+                "road; omit it from --variant"
             )
         return driving
 
@@ -333,15 +387,17 @@ class RunConfig:
                 "--variant": self.variant,
             }
             named = " and ".join(flag for flag, is_given in given.items() if is_given)
-            raise UsageError(f"{named}: only tasks with a world model take this; leave it out for {self.task}")
+            raise UsageError(f"{named}: only tasks with a world model take this; omit it for {self.task}")
         assert self.task is not None
         description = self.description or describe_task(self.task, self.description_options())
         options = description.options if self.task_options is None else self.task_options
+        if self._hidden and not description.observations:
+            raise UsageError(f"{self.task} observes nothing, so there is no controller: leave --controller out")
         shape = ControllerShape(description.observations, description.outputs, self._hidden)
         if len(options) > MAX_OPTIONS:
             raise UsageError(
                 f"the options of {self.task} to freeze with the run have {len(options)} characters, {MAX_OPTIONS} at "
-                "most: leave --normalise out, or give smaller arguments"
+                "most: omit --normalise, or give smaller arguments"
             )
         check_normalisation(options, description.observations)
         return self._spec("", shape, options, description.version), shape, description.packages
@@ -398,9 +454,9 @@ def _naming_stage(number: int | None) -> Iterator[None]:
         raise error if number is None else UsageError(f"stage {number}: {error}") from error
 
 
-def _check_subspace(subspace: Subspace, spec: TaskSpec, shape: ControllerShape) -> None:
+def _check_subspace(subspace: Subspace, spec: TaskSpec, shape: ControllerShape, bundle: Bundle | None) -> None:
     """`UsageError` for a subspace of another world model, or of controllers with other inputs."""
-    if subspace.bundle != spec.bundle:
+    if bundle is None or subspace.bundle not in bundle.same_models:
         own = f"world model {spec.bundle[:12]}" if spec.bundle else "a task without a world model"
         raise UsageError(
             f"--subspace (given, or the preset's) belongs to world model {subspace.bundle[:12]}, the run uses {own}: "
@@ -409,7 +465,7 @@ def _check_subspace(subspace: Subspace, spec: TaskSpec, shape: ControllerShape) 
     if (inputs := subspace.weights.shape[1]) != shape.features:
         raise UsageError(
             f"--subspace fits controllers that see {inputs} numbers, latent and hidden state alone, and this run's "
-            f"see {shape.features}: leave --features and feedback=last out, or pass --subspace {NO_SUBSPACE}"
+            f"see {shape.features}: omit --features and feedback=last, or pass --subspace {NO_SUBSPACE}"
         )
 
 
@@ -427,24 +483,34 @@ def _try_optimiser(settings: RunSettings, stage: Stage, subspace: Subspace | Non
         evolution.check_redraws()
 
 
+MOST_OF_A_LIMIT = 2**53  # every float below it is exact
+
+
 @dataclass(frozen=True)
 class LimitsConfig:
     """When a run ends: at the first limit reached; all are checked as a generation ends. 0: no such limit."""
 
     generations: int = option(0, "stop after so many generations")
-    steps: int = option(0, "stop after so many environment steps")
+    steps: int = option(0, "stop with the generation that reaches so many environment steps")
     minutes: float = option(
-        0.0, "stop after so many minutes of generations; the last evaluation and the confirmation come on top"
+        0.0,
+        "stop with the generation that closes after so many minutes of work: its episodes are finished, and the last "
+        "evaluation and the confirmation come on top",
     )
     target: float | None = option(None, "stop when an evaluated mean reaches this score")
+    candidate_target: float | None = option(None, "stop when a candidate reaches this score")
+    stagnation: int = option(0, "stop when no candidate beat the best one before for so many generations")
     parted: int = option(0, "stop when so many evaluations in a row fell clearly behind the best one before them")
 
     def __post_init__(self) -> None:
-        for name in ("generations", "steps", "minutes", "parted"):
-            if not 0 <= getattr(self, name) < float("inf"):
+        for name in ("generations", "steps", "minutes", "parted", "stagnation"):
+            if not getattr(self, name) >= 0:
                 raise UsageError(f"--{name} must not be negative")
-        if self.target is not None and not math.isfinite(self.target):
-            raise UsageError(f"--target must be a number, not {self.target}")
+            if getattr(self, name) > MOST_OF_A_LIMIT:
+                raise UsageError(f"--{name} must be at most {MOST_OF_A_LIMIT:,}, or 0 for no limit")
+        for name, score in (("target", self.target), ("candidate-target", self.candidate_target)):
+            if score is not None and not math.isfinite(score):
+                raise UsageError(f"--{name} must be a number, not {score}")
 
 
 @dataclass(frozen=True)
@@ -460,15 +526,29 @@ class NetworkConfig:
     failure_limit: Annotated[float, Between(0.0, 1.0)] = option(
         0.5, "pause when more than this share of the last five generations' candidates failed, 0 to 1"
     )
+    share: FleetShare = option(
+        1.0, "weight of this run among those that share workers: 3 gets three times the time of 1, while both have work"
+    )
     strict: bool = option(
         False,
         "take results only of hosts that compute the same bits as the first one that scored, so that the run ends with "
         "the same bits even if processes are killed",
     )
+    verify: Share = option(
+        0.0,
+        "share of each worker's results, 0 to 1, that another host of its class scores again; a host that differs is "
+        "barred, and all its results are scored again (docs/how-to/trust.md)",
+    )
     metrics_port: str = option(
         "",
         "serve Prometheus metrics under /metrics at this port of 127.0.0.1, or at HOST:PORT; anybody there may read "
         "them",
+    )
+    log_to: tuple[str, ...] = option(
+        (),
+        "also write the run's curves, as it goes on, to tensorboard, wandb or mlflow, or to several of them; a folder, "
+        "project or address may stand behind a colon (docs/how-to/monitor.md). It has no flag",
+        flag=False,
     )
     insecure: bool = option(
         False, "listen beyond this host without a join file: anyone who reaches the port owns the run, may read, forge "
@@ -478,4 +558,5 @@ class NetworkConfig:
     def __post_init__(self) -> None:
         if self.metrics_port:
             parse_metrics_address(self.metrics_port)
+        parse_sinks(self.log_to)
         check_bounds(self)

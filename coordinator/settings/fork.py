@@ -35,6 +35,10 @@ class Fork:
     def of(cls, runs_dir: Path, source: str, given: Collection[str]) -> Fork:
         """What a run takes over from the run `source`, which is only read; `given` are the settings of its own."""
         with open_run(runs_dir, source) as stored:
+            if stored.settings.is_external:
+                raise UsageError(
+                    f"run {source} has no search of its own, and no mean to begin at: begin with --init CONTROLLER"
+                )
             start, (_, sigma), heat = start_from_run(stored), latest_mean_and_sigma(stored), stored.settings.heat
             scoring_params = scoring_params_of(stored, len(stored.history()))
             present = {

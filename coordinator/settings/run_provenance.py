@@ -6,6 +6,7 @@ import platform
 from functools import cache
 
 from dreamfleet.common.host.packages import package_version
+from dreamfleet.common.protocol.check_counts import CheckCounts
 from dreamfleet.common.runs.effort import START_EFFORT, parse_start_effort
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_provenance import RunProvenance, StartProvenance, validation_seed_ranges
@@ -15,14 +16,16 @@ from dreamfleet.coordinator.storage.journal import Journal
 DECIDING_PACKAGES = ("dreamfleet", "numpy", "cma", "cmaes")  # packages whose versions decide what is asked for
 
 
-def build_provenance(journal: Journal, settings: RunSettings, generations: int, failed: int) -> RunProvenance:
+def build_provenance(
+    journal: Journal, settings: RunSettings, generations: int, failed: int, checks: CheckCounts | None = None
+) -> RunProvenance:
     """The receipt of a run that has closed so many generations, in which so many candidates `failed`.
 
     It costs the same however long the run is.
     """
     return RunProvenance(
         generations, journal.effort, _start(journal), journal.fingerprint(), journal.classes.mixed, versions(),
-        validation_seed_ranges(settings), journal.fact(SUBSPACE_FACT), journal.classes, failed,
+        validation_seed_ranges(settings), journal.fact(SUBSPACE_FACT), journal.classes, failed, checks,
     )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from dreamfleet.common.cli.config import Table, add_flags, load
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.runs.records import EXTERNAL
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE, LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.settings.presets import find_preset
 from dreamfleet.coordinator.settings.schedule import find_schedule, split_first_stage
@@ -24,8 +25,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help=f"name of the new run: a-z, 0-9 and '-' (default {DEFAULT_NAME}, or RUN-fork with --from RUN)",
     )  # fmt: skip
     how = parser.add_mutually_exclusive_group()
-    how.add_argument("--resume", metavar="RUN", help="continue this run from its journal, with the limits and the "
-                     "network that it last had where no other are given")  # fmt: skip
+    how.add_argument("--resume", metavar="RUN", help="continue this run from its journal; its limits and network "
+                     "are the last ones, unless flags give others")  # fmt: skip
     how.add_argument(
         "--from", dest="source", metavar="RUN",
         help="begin a new run where this one stands: with its mean, step size, temperature, stage and all settings, "
@@ -46,7 +47,7 @@ def load_run_config(args: argparse.Namespace, base: Table) -> tuple[RunConfig, L
     """What a new run is, and when it ends, as its flags, the environment and the file say."""
     config = _with_subspace(_with_stages(args, load(RunConfig, "run", base=base, preset=find_preset, **args.sources)))
     limits = load(LimitsConfig, "limits", **args.sources)
-    check_target(limits, config.evaluate_every)
+    check_limits(limits, config.evaluate_every, is_external=config.optimiser == EXTERNAL)
     return config, limits
 
 
@@ -57,7 +58,7 @@ def _with_stages(args: argparse.Namespace, config: RunConfig) -> RunConfig:
         return config
     twice = [name for name in split_first_stage(found)[0] if name in args.given]
     if twice:
-        raise UsageError(f"--{twice[0]} and {twice[0]} of stage 1 are the same setting: leave one of them out")
+        raise UsageError(f"--{twice[0]} and {twice[0]} of stage 1 are the same setting: omit one of them")
     return replace(config, stages=found)
 
 
@@ -72,7 +73,12 @@ def _with_subspace(config: RunConfig) -> RunConfig:
     return replace(config, loaded_subspace=None if config.subspace == NO_SUBSPACE else find_subspace(config.subspace))
 
 
-def check_target(limits: LimitsConfig, evaluate_every: int) -> None:
-    """`UsageError` for a target score where no mean is ever evaluated."""
+def check_limits(limits: LimitsConfig, evaluate_every: int, *, is_external: bool) -> None:
+    """`UsageError` for a target score where no mean is ever evaluated, and for any limit of an external run."""
+    if is_external and limits != LimitsConfig():
+        raise UsageError(
+            f"a run with --optimiser {EXTERNAL} has no limits: it waits for batches until `dreamfleet stop`, so leave "
+            "--generations, --steps, --minutes, --target and --parted out"
+        )
     if limits.target is not None and not evaluate_every:
         raise UsageError("--target is reached by an evaluated mean: give --evaluate-every too")

@@ -50,7 +50,7 @@ def split_first_stage(stages: tuple[StageSettings, ...]) -> tuple[dict[str, Any]
         return {}, ()
     first = stages[0]
     if first.whole:
-        raise UsageError("stage 1: whole is for a later stage, which leaves the subspace; leave --subspace out instead")
+        raise UsageError("stage 1: whole is for a later stage, which leaves the subspace; omit --subspace instead")
     return first.overrides, (first.end, *stages[1:]) if first.has_end or len(stages) > 1 else ()
 
 
@@ -65,7 +65,7 @@ def check_schedule(settings: RunSettings) -> None:
     stages = stages_of(settings)
     for before, stage, each in zip(stages, stages[1:], settings.stages[1:], strict=False):
         if each.whole and before.whole:
-            raise UsageError(f"stage {stage.number}: the search is whole already; leave that out, or give --subspace")
+            raise UsageError(f"stage {stage.number}: the search is whole already; omit that, or give --subspace")
         if each.whole and each.sigma0 is None:
             raise UsageError(
                 f"stage {stage.number} leaves the subspace, where a step is something else: give it a sigma0"
@@ -79,7 +79,7 @@ def check_schedule(settings: RunSettings) -> None:
         _check_end(stage, settings.evaluate_every)
     if stages[-1].end.has_end:
         raise UsageError(
-            f"stage {stages[-1].number} is the last and names an end: leave it out there; the run itself ends by "
+            f"stage {stages[-1].number} is the last and names an end: omit it there; the run itself ends by "
             "--generations, --steps and the like"
         )
 
@@ -91,11 +91,10 @@ def _check_end(stage: Stage, every: int) -> None:
     if end.score is not None and 0 < end.generations <= every:
         raise UsageError(
             f"{name} never ends by its score: an evaluation counts {every} generations later (--evaluate-every), and "
-            f"it has {end.generations}: give it more, or leave the score out"
+            f"it has {end.generations}: give it more, or omit the score"
         )
     most = end.generations * stage.population * stage.episodes * stage.horizon
     if end.generations and end.steps > most:
         raise UsageError(
-            f"{name} never ends by its steps: {end.generations} generations have {most} at most; leave one of the two "
-            "out"
+            f"{name} never ends by its steps: {end.generations} generations have {most} at most; omit one of the two"
         )

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.bundle import describe_bundle
+from dreamfleet.common.artifacts.bundle import Bundle, describe_bundle
 from dreamfleet.common.artifacts.driving import Variant
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.errors import ControllerError, DreamfleetError, JournalError
@@ -62,10 +62,10 @@ class StartPoint:
         spent = {} if self.effort is None else {START_EFFORT: json.dumps(to_dict(self.effort))}
         return {START_SOURCE: self.source, START_MEAN: mean, **spent}
 
-    def check(self, settings: RunSettings) -> None:
+    def check(self, settings: RunSettings, bundle: Bundle | None) -> None:
         """Refuse parameters that mean nothing to this world model, these options and this controller."""
         spec, shape = settings.task, settings.controller
-        if self.bundle != spec.bundle:
+        if self.bundle not in (("",) if bundle is None else bundle.same_models):
             raise ControllerError(
                 f"{self.source} belongs to {describe_bundle(self.bundle)}, not to {describe_bundle(spec.bundle)}: "
                 "give its own --bundle, or fit it to this one by `dreamfleet lab refit`"
@@ -83,16 +83,16 @@ class StartPoint:
         """What candidates pay is no part of a controller: a start may be of another time cost."""
         if not spec.bundle and self.options != spec.options:
             raise ControllerError(
-                f"{self.source} was evolved under other options of {spec.task}: leave --environment and --normalise "
-                "out, and it brings its own"
+                f"{self.source} was evolved under other options of {spec.task}: omit --environment and --normalise, "
+                "and it brings its own"
             )
         if spec.bundle and (own := Variant.from_json(self.options).without_costs) != (
             wanted := Variant.from_json(spec.options).without_costs
         ):
             raise ControllerError(
                 f"{self.source} drives {_describe_variant(own)}, this run's controllers "
-                f"{_describe_variant(wanted)}, so that its parameters mean something else: leave "
-                "--variant out, and it brings its own"
+                f"{_describe_variant(wanted)}, so that its parameters mean something else: omit "
+                "--variant, and it brings its own"
             )
 
 

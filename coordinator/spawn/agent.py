@@ -38,10 +38,9 @@ LONGEST_TAIL = 8192  # bytes read from the end of a log for its last line
 JOIN, LOG, STATE, COMPLETE, CREATED = "join", "log", "worker.json", "whole", "made"
 FOLDERS = ("environments", "workers", "cache")  # under the root
 JOIN_HERE = "{join}"  # placeholder for the join file's path
-_LOG_PREFIX = re.compile(
-    r"^\S+ \S+ [A-Z]+ dreamfleet[\w.]*: |^dreamfleet: "
-)  # before the text of a log line or an error
-_LOG_RECORD = re.compile(rb"(?m)^(\d{4}-\S+ \S+ [A-Z]+ dreamfleet|\{)")  # the start of a log line, as text or JSON
+_TIME = r"^(?:\d{4}-\d\d-\d\d )?\d\d:\d\d:\d\d\S* "  # of a log line; its date stands in a day's first one
+_LOG_PREFIX = re.compile(rf"{_TIME}(?:[A-Z]+ )?[^:]*: |^dreamfleet: ")  # before the text of a log line or an error
+_LOG_RECORD = re.compile(rf"(?m){_TIME}|^\{{".encode())  # the start of a log line, as text or JSON
 
 
 class FailedError(Exception):

@@ -6,7 +6,6 @@ import json
 import secrets
 import shutil
 import sqlite3
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -32,13 +31,15 @@ from dreamfleet.common.runs.run_paths import BUNDLE, JOURNAL
 from dreamfleet.common.runs.stages import begun_stages
 from dreamfleet.coordinator.jobs.confirmation import Finalist
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
+from dreamfleet.coordinator.jobs.generation import KnownResult
 from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollection
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
-from dreamfleet.coordinator.storage.journal_connection import JournalConnection
+from dreamfleet.coordinator.storage.batch_records import MOST_VARIABLES
 from dreamfleet.coordinator.storage.journal_file import (
     journal_errors,
     sqlite_side_files,
 )
+from dreamfleet.coordinator.storage.recall_records import RecallRecords
 
 sqlite3.register_adapter(Checkpoint, Checkpoint.packed)  # when it is written, not while workers wait
 
@@ -46,7 +47,6 @@ MAX_EVENTS = 10_000  # R26: strangers and failing hosts cause some
 LEAVES = "the coordinator leaves"  # the last event of an incarnation that was not killed
 # Seconds for which a write waits for another program's lock. A run tries again, so that it answers meanwhile.
 SERVING_PATIENCE, LEAVING_PATIENCE = 0.5, 5.0
-MOST_VARIABLES = 500  # of one SQL statement
 FINGERPRINT, HOST_CLASS = "fingerprint", "host_class"  # the facts' names
 
 
@@ -62,14 +62,14 @@ class StoredOpenGeneration:
     seconds: float = 0.0  # for which it could be scored so far
 
 
-class Journal(JournalConnection):
+class Journal(RecallRecords):
     """The journal of one coordinator's life."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self._incarnation = 0
-        self._effort: Effort | None = None  # of every result, once somebody asked
-        self._counted: Counter[tuple[str, str]] | None = None  # results by class and fingerprint, likewise
+        self._effort = None
+        self._counted = None
 
     @classmethod
     def create(
@@ -79,12 +79,8 @@ class Journal(JournalConnection):
 
         `facts` are what else the run must never be without: where it begins, and how it is served.
         """
+        cls.check_absent(folder)
         path = folder / JOURNAL
-        if path.exists():
-            raise JournalError(
-                f"run {folder.name} exists: choose another --run, or continue it with --resume; "
-                f"`dreamfleet runs delete {folder.name}` removes it"
-            )
         aside = path.with_suffix(".new")
         own = {"uid": secrets.token_hex(16), "settings": settings.to_json(), "created": _now()}
         with reporting_unwritable_folder(folder, "choose another --runs-dir", JournalError):
@@ -102,6 +98,15 @@ class Journal(JournalConnection):
             aside.replace(path)
             fsync_path(folder)
         return cls(path)
+
+    @staticmethod
+    def check_absent(folder: Path) -> None:
+        """`JournalError` if `folder` holds a run already."""
+        if (folder / JOURNAL).exists():
+            raise JournalError(
+                f"run {folder.name} exists: choose another --run, or continue it with --resume; "
+                f"`dreamfleet runs delete {folder.name}` removes it"
+            )
 
     def check_incarnation(self) -> None:
         """`JournalError` if another coordinator began a life in this journal: a lock held neither of them back."""
@@ -174,17 +179,29 @@ class Journal(JournalConnection):
         self._write("DELETE FROM strategy WHERE generation < ?", number - 1)
         self._opened = number
 
-    def close_generation(self, closed: StoredGeneration, fitness: NDArray[np.float64]) -> None:
-        """Write the fitness that updates the strategy, and the generation's statistics."""
+    def close_generation(
+        self, closed: StoredGeneration, fitness: NDArray[np.float64], measures: NDArray[np.float64] | None = None
+    ) -> None:
+        """Write fitness and measures, which update the strategy, and the generation's statistics, if it has any."""
+        is_scored = bool(np.isfinite(fitness).any())
+        statistics = (closed.mean, closed.std, closed.best, closed.worst) if is_scored else (None,) * 4
         self._write_all(
             "UPDATE candidate SET fitness = ? WHERE generation = ? AND number = ?",
             [(float(value), closed.number, index) for index, value in enumerate(fitness)],  # SQLite has NULL for NaN
         )
+        if measures is not None:
+            self._write_all(
+                "UPDATE candidate SET measures = ? WHERE generation = ? AND number = ?",
+                [
+                    (json.dumps(row.tolist()), closed.number, index)
+                    for index, row in enumerate(measures)
+                    if np.isfinite(row).all()
+                ],
+            )
         self._write(
             "UPDATE generation SET closed = ?, mean = ?, std = ?, best = ?, worst = ?, steps = ?, seconds = ?, "
             "failed = ? WHERE number = ?",
-            time(), closed.mean, closed.std, closed.best, closed.worst, closed.steps, closed.seconds, closed.failed,
-            closed.number,
+            time(), *statistics, closed.steps, closed.seconds, closed.failed, closed.number,
         )  # fmt: skip
 
     def set_seconds(self, generation: int, seconds: float) -> None:
@@ -232,9 +249,10 @@ class Journal(JournalConnection):
         """Write an accepted result; without a class, the class follows from the fingerprint."""
         self._write(
             "INSERT INTO result (digest, kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, "
-            "fingerprint, incarnation, host_class) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            "fingerprint, incarnation, host_class, measures) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             job.digest, job.kind, job.generation, job.candidate, job.episode, job.seeds[0], result.fitness,
             result.steps, result.seconds, worker, fingerprint, incarnation, host_class,
+            json.dumps(result.measures) if result.measures else None,
         )  # fmt: skip
         if self._counted is not None:
             self._counted[host_class or class_from_fingerprint(fingerprint), fingerprint] += 1
@@ -328,22 +346,29 @@ class Journal(JournalConnection):
         with RunFolder(self.path.parent) as folder:
             return folder.history(), folder.evaluations()
 
-    def workers(self) -> list[str]:
-        """The workers that have scored jobs of the run."""
-        return [str(worker) for (worker,) in self._read("SELECT DISTINCT worker FROM result")]
+    def workers(self, *, recalled: bool = False) -> list[str]:
+        """The workers that have scored jobs of the run; with `recalled` also those whose results count no more."""
+        query = "SELECT DISTINCT worker FROM result"
+        if recalled:
+            query += " UNION SELECT worker FROM recalled"
+        return [str(worker) for (worker,) in self._read(query)]
 
-    def results_of(self, kind: str, generation: int) -> dict[bytes, tuple[float, int]]:
-        """Fitness and steps of a generation's accepted results, by digest; NaN for what failed for good."""
-        query = "SELECT digest, fitness, steps FROM result WHERE kind = ? AND generation = ?"
-        found = {digest: (to_finite(fitness), steps) for digest, fitness, steps in self._read(query, kind, generation)}
+    def results_of(self, kind: str, generation: int) -> dict[bytes, KnownResult]:
+        """Fitness, steps and measures of a generation's accepted results, by digest; NaN for what failed for good."""
+        query = "SELECT digest, fitness, steps, measures FROM result WHERE kind = ? AND generation = ?"
+        found: dict[bytes, KnownResult] = {
+            digest: (to_finite(fitness), steps, tuple(json.loads(measures or "[]")))
+            for digest, fitness, steps, measures in self._read(query, kind, generation)
+        }
         query = "SELECT digest FROM failure WHERE kind = ? AND generation = ?"
-        return found | {digest: (nan, 0) for (digest,) in self._read(query, kind, generation)}
+        return found | {digest: (nan, 0, ()) for (digest,) in self._read(query, kind, generation)}
 
     def fitness_of(self, digests: Sequence[bytes]) -> dict[bytes, float]:
         """Fitness of those of these jobs that have an accepted result, whichever generation asked for it.
 
         NaN for those that failed for good.
         """
+        self.take_back(digests)
         found: dict[bytes, float] = {}
         for start in range(0, len(digests), MOST_VARIABLES):
             some = digests[start : start + MOST_VARIABLES]

@@ -1,4 +1,4 @@
-"""`dreamfleet compare`: runs or evaluation reports beside each other, each against the first."""
+"""`dreamfleet compare`: runs or evaluation reports beside each other; the settings of sweeps."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,9 @@ from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import is_file
-from dreamfleet.common.printable import format_setting, plural
+from dreamfleet.common.printable import format_number, format_setting, plural
+from dreamfleet.common.protocol.function_values import value_of
+from dreamfleet.common.protocol.tasks import is_function_task
 from dreamfleet.common.runs.evaluation_report import EvaluationReport, read_evaluation_report
 from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.common.runs.records import count_episodes, format_mean, with_error
@@ -26,8 +28,8 @@ if TYPE_CHECKING:
     from dreamfleet.common.runs.comparison import ComparedRun, EqualBudget, EvaluatedMean
 
 SUMMARY = (
-    "compare runs (settings that differ, scores at equal steps and core-hours, confirmed scores), or reports of "
-    "`evaluate --out` (paired differences), each with the first"
+    "compare runs (settings that differ, scores at equal steps and core-hours, confirmed scores), reports of "
+    "`evaluate --out` (paired differences), or the settings of sweeps"
 )
 EXTRAS = ()
 SAME_SEEDS = (
@@ -38,14 +40,21 @@ SAME_SEEDS = (
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument(
-        "names", metavar="RUN|REPORT", nargs="+", help="names of runs, or files of `evaluate --out`; 2 or more"
+        "names",
+        metavar="RUN|SWEEP|REPORT",
+        nargs="+",
+        help="names of runs, or files of `evaluate --out`, 2 or more; or names of sweeps, with runs beside them",
     )
     add_global_flags(parser, "runs_dir")
     add_json_flag(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compare files as reports and other names as runs, and note which of them it was."""
+    """Compare files as reports and other names as runs or sweeps, and note which of them it was."""
+    from dreamfleet.coordinator.experiments.sweep.folder import find_sweep
+
+    if any(find_sweep(args.runs_dir, name) for name in args.names):
+        return _compare_sweeps(args, list(dict.fromkeys(args.names)))
     files = [name for name in args.names if is_file(Path(name))]
     if len(args.names) < 2:
         raise UsageError("give two runs or more, or two reports or more: each is compared with the first")
@@ -60,6 +69,36 @@ def run(args: argparse.Namespace) -> int:
     if files:
         return _compare_reports(args, [Path(name) for name in args.names])
     return _compare_runs(args, list(dict.fromkeys(args.names)))
+
+
+def _compare_sweeps(args: argparse.Namespace, names: Sequence[str]) -> int:
+    """Print the mean of each setting over its seeds; a run beside a sweep is a setting of its own."""
+    from dreamfleet.coordinator.experiments.sweep import summary
+    from dreamfleet.coordinator.experiments.sweep.folder import find_sweep
+    from dreamfleet.coordinator.verbs.sweep import print_settings
+
+    results: list[summary.RunResult] = []
+    for name in names:
+        folder = find_sweep(args.runs_dir, name)
+        if folder is None:
+            results.append(summary.read_result(args.runs_dir, name, name))
+            continue
+        found = summary.read_results(args.runs_dir, folder.read()[0].runs)
+        results += found if len(names) == 1 else [replace(each, setting=f"{name}: {each.setting}") for each in found]
+    kind = summary.judged_by(results)
+    if args.json:
+        settings = [] if kind is None else [asdict(each) for each in summary.means(results, kind)]
+        runs = [{"run": each.name, "setting": each.setting, "ended": each.ended, "scores": each.scores}
+                for each in results]  # fmt: skip
+        equal = [] if kind is None else summary.find_equal(results, kind)
+        print(json.dumps({"judged_by": kind, "settings": settings, "equal": equal, "runs": runs}))
+        return 0
+    if len(tasks := sorted({each.task.task for each in results if each.task is not None})) > 1:
+        print(f"note: these are of different tasks ({', '.join(tasks)}): their scores do not compare", file=sys.stderr)
+    print_settings(results)
+    if open_ones := sum(not each.ended for each in results):
+        print(f"{open_ones} of {plural(len(results), 'run')} not ended, and left out", file=sys.stderr)
+    return 0
 
 
 def _compare_reports(args: argparse.Namespace, paths: Sequence[Path]) -> int:
@@ -91,7 +130,7 @@ def _warn(first: Path, base: EvaluationReport, path: Path, other: EvaluationRepo
 
 def _compare_runs(args: argparse.Namespace, names: Sequence[str]) -> int:
     """Print settings that differ, scores at equal budgets, and differences from the first run."""
-    from dreamfleet.common.runs.comparison import ComparedRun, at_equal_budget, differing_settings
+    from dreamfleet.common.runs.comparison import ComparedRun, are_comparable, at_equal_budget, differing_settings
 
     if len(names) < 2:
         raise UsageError(f"{names[0]} is one run: give another to compare it with")
@@ -100,22 +139,26 @@ def _compare_runs(args: argparse.Namespace, names: Sequence[str]) -> int:
         with open_run(args.runs_dir, name) as stored:
             sides.append(ComparedRun.of(stored))
     settings, worlds = differing_settings(sides), {each.world for each in sides if each.world is not None}
-    equal = at_equal_budget(sides) if len(worlds) == 1 else []
-    found = list(_run_differences(sides, equal)) if len(worlds) == 1 else []
+    comparable = are_comparable(sides)
+    equal = at_equal_budget(sides) if comparable else []
+    found = list(_run_differences(sides, equal)) if comparable else []
     if args.json:
         runs = [_run_facts(each) for each in sides]
         budgets = [_budget_facts(sides, each) for each in equal]
         print(json.dumps({"runs": runs, "settings": settings, "equal": budgets, "differences": found}, default=str))
         return 0
-    print_rows([_run_row(each) for each in sides], drop_order=("task", "spent"))
+    shown = [each.in_values for each in sides]
+    print_rows([_run_row(each) for each in shown], drop_order=("task", "spent"))
     print()
     _print_settings(sides, settings)
     if len(worlds) > 1:
         print(f"their evaluations are in different worlds ({', '.join(sorted(worlds))}): scores are not compared")
-    for each in equal:
+    elif sides and not comparable and worlds:
+        print("one is minimised and another is not: their values are not compared")
+    for each in at_equal_budget(shown) if comparable else []:
         print(_format_budget(sides, each))
     if found:
-        print(f"\n{SAME_SEEDS}")
+        print(f"\n{SAME_SEEDS}" if any("seeds" in each for each in found) else "")
         print("\n".join(f"{each['of']}: {each['run']} less {each['against']}: {each['text']}" for each in found))
     return 0
 
@@ -152,8 +195,15 @@ def _print_settings(sides: Sequence[ComparedRun], settings: Mapping[str, Sequenc
 
 def _format_budget(sides: Sequence[ComparedRun], equal: EqualBudget) -> str:
     spent = f"{equal.spent:,.0f}" if equal.what.startswith("steps") else f"{equal.spent:.3g}"
+    what = _describe_budget(sides, equal)
     parts = [f"{side.name} {_format_evaluation(look)}" for side, look in zip(sides, equal.evaluated_means, strict=True)]
-    return f"at {spent} {equal.what}: {', '.join(parts)}"
+    return f"at {spent} {what}: {', '.join(parts)}"
+
+
+def _describe_budget(sides: Sequence[ComparedRun], equal: EqualBudget) -> str:
+    """What was spent, in words: a function has calls, and no steps."""
+    is_function = all(is_function_task(each.settings.task.task) for each in sides)
+    return equal.what.replace("steps in reality", "calls") if is_function else equal.what
 
 
 def _format_evaluation(look: EvaluatedMean | None) -> str:
@@ -169,16 +219,30 @@ def _run_differences(sides: Sequence[ComparedRun], equal: Sequence[EqualBudget])
     def paired(of: str, side: ComparedRun, one: dict[int, float], other: dict[int, float]) -> dict[str, Any]:
         found = difference(one, other)
         figures = {**asdict(found), "clear": found.is_significant} if isinstance(found, PairedDifference) else {}
-        text = found.description if isinstance(found, PairedDifference) else found
+        if isinstance(found, PairedDifference):
+            text = found.describe(minimised=side.minimised)
+        else:
+            text = _describe_one_call(side, one, other) or found
         return {"of": of, "run": side.name, "against": sides[0].name, **figures, "text": text}
 
     for number, side in enumerate(sides[1:], 1):
         for each in equal:
             base, look = each.evaluated_means[0], each.evaluated_means[number]
             if base is not None and look is not None:
-                yield paired(f"at equal {each.what}", side, base.scores, look.scores)
+                yield paired(f"at equal {_describe_budget(sides, each)}", side, base.scores, look.scores)
         if sides[0].confirmed is not None and side.confirmed is not None:
             yield paired("confirmed", side, sides[0].confirmed_scores, side.confirmed_scores)
+
+
+def _describe_one_call(side: ComparedRun, one: Mapping[int, float], other: Mapping[int, float]) -> str:
+    """The difference of two values of a function without noise, which has one call; empty for anything else."""
+    task = side.settings.task
+    if not is_function_task(task.task) or not len(one) == len(other) == len(one.keys() | other.keys()) == 1:
+        return ""
+    (seed,) = one
+    better = other[seed] - one[seed]
+    verdict = "equal" if not better else "better" if better > 0 else "worse"
+    return f"{format_number(value_of(better, task), '+')} in one call each: {verdict}"
 
 
 def _run_facts(side: ComparedRun) -> dict[str, Any]:

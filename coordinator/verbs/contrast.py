@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_signals
@@ -28,7 +29,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of the trials; one that was begun is resumed")
     parser.add_argument(
         "--kind", nargs=2, action="append", default=[], metavar=("NAME", "FLAGS"),
-        help="a kind by its flags of `train mdnrnn`, with the world's preset, as one text; the others are compared "
+        help="a kind by its flags of `train mdnrnn`, with the world's preset, as one text; each is "
         f"compared with the first (default {shown})",
     )  # fmt: skip
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS), help="of each kind (default 1 2 3)")
@@ -37,7 +38,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--run-flags", default=RUN_FLAGS, metavar="FLAGS",
-        help=f"of every `coordinator`, whose preset is dream unless another is named (default {RUN_FLAGS})",
+        help=f"of every `coordinator`, whose preset is the world's unless another is named (default {RUN_FLAGS})",
     )  # fmt: skip
     parser.add_argument("--local", type=int, help="scoring processes (default one per core)")
     add_json_flag(parser)
@@ -51,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.coordinator.experiments.local_run import LocalFleet, parse_run_flags
 
     contrast = Contrast(parse_kinds(args.kind), tuple(args.seeds), args.mdnrnn_flags, args.run_flags)
-    parse_run_flags(contrast.common_run_flags, args.sources, "lab contrast")  # wrong flags end it now
+    parse_run_flags(contrast.run_flags_in(FIRST_WORLD), args.sources, "lab contrast")  # wrong flags end it now
     file = ("--config", str(args.config)) if args.config else ()
     check_modules(PACKAGES)
     with folder_lock(args.out / LOCK, "contrast"), stop_on_signals() as stop:

@@ -15,13 +15,16 @@ from dreamfleet.common.cli.config import Table, configured_values, load
 from dreamfleet.common.cli.global_config import load_credentials
 from dreamfleet.common.cli.output import print_answer
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.logs import label_logs
 from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking
 from dreamfleet.common.host.resource_limits import check_room_for_session, raise_open_file_limit
+from dreamfleet.common.printable import plural
+from dreamfleet.common.protocol.failures import error_text
 from dreamfleet.common.protocol.tasks import module_of
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE, LimitsConfig, NetworkConfig, RunConfig
 from dreamfleet.coordinator.settings.presets import find_preset
-from dreamfleet.coordinator.settings.run_setup import DEFAULT_NAME, SUMMARY, check_target, configure, load_run_config
+from dreamfleet.coordinator.settings.run_setup import DEFAULT_NAME, SUMMARY, check_limits, configure, load_run_config
 from dreamfleet.coordinator.settings.schedule import find_schedule, split_first_stage
 
 if TYPE_CHECKING:
@@ -51,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.resume:
         if args.run_name is not None:
-            raise UsageError("--run names a new run: a continued one keeps its name, so leave it or --resume out")
+            raise UsageError("--run names a new run: a continued one keeps its name, so omit it or --resume")
         return _resume(args)
     if args.source:
         return _serve_fork(args)
@@ -86,7 +89,7 @@ def _resume(args: argparse.Namespace) -> int:
         _refuse_frozen(args)
         _warn_ignored_settings(args, stored)
         limits = load(LimitsConfig, "limits", base=stored_limits(stored), **args.sources)
-        check_target(limits, stored.settings.evaluate_every)
+        check_limits(limits, stored.settings.evaluate_every, is_external=stored.settings.is_external)
         request = build_request(args, args.resume, None, limits, stored_network(stored), None)
         before = len(stored.history())
     return serve_request(args, request, before)
@@ -124,6 +127,7 @@ def serve_request(
     raise_open_file_limit()
     check_room_for_session()  # before anything else starts a thread
     make_stderr_nonblocking()
+    label_logs(f"run {request.name}")
     run = serve_run(request, _stop_on_signals)
     _restore_signals()  # its last word may wait for a reader of stdout
     outcome = ExitReport(code=LEFT_OPEN) if run.ended is None else on_ended()
@@ -185,11 +189,22 @@ def _restore_signals() -> None:
         signal.signal(number, signal.SIG_DFL)
 
 
+def _describe_failures(request: RunRequest, failed: int) -> str:
+    """How many candidates failed, and why the first one did."""
+    from dreamfleet.common.runs.run_folder import open_run
+
+    if not failed:
+        return ""
+    with open_run(request.runs_dir, request.name) as stored:
+        errors = [error_text(each.error) for each in stored.failures() if each.kind == "score"]
+    return f"; {plural(failed, 'candidate')} failed, first: {errors[0] if errors else 'its error is not kept'}"
+
+
 def _report(
     args: argparse.Namespace, run: Run, request: RunRequest, outcome: ExitReport, *, nothing_new: bool
 ) -> None:  # fmt: skip
     from dreamfleet.common.monitoring.eta import format_duration
-    from dreamfleet.common.runs.records import describe_score, with_error
+    from dreamfleet.common.runs.records import describe_score, in_values, with_error
     from dreamfleet.common.runs.run_folder import open_run
     from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER
     from dreamfleet.common.serialization.times import elapsed_seconds
@@ -208,7 +223,7 @@ def _report(
     facts["confirmed"] = None if run.confirmed is None else with_error(run.confirmed)
     judged = run.confirmed or run.best
     word = score_word_of_run(run.settings.task, request.folder / BUNDLE)
-    score = f"; {describe_score(judged, word)}" if judged else ""
+    score = f"; {describe_score(in_values(judged, run.settings.task), word)}" if judged else ""
     if run.ended is None:
         with open_run(request.runs_dir, request.name) as stored:
             stored.history()  # `JournalError`: what cannot be read cannot be continued
@@ -216,9 +231,10 @@ def _report(
     else:
         where = f"; controller: {controller}" if controller else "; it has no controller yet"
         more = f"; to continue it, widen its limits: {again} --generations 0 --minutes 30" if nothing_new else ""
+        failed = _describe_failures(request, run.history.failed)
         lasted = elapsed_seconds(run.created, datetime.now(UTC).isoformat())
         ago = "" if lasted is None else f" (begun {format_duration(lasted)} ago)"
-        text = f"run {request.name} ended after {run.ended}{ago}{score}{where}{outcome.text or more}"
+        text = f"run {request.name} ended after {run.ended}{ago}{score}{where}{failed}{outcome.text or more}"
     if run.ended is None and not args.json:
         print(text, file=sys.stderr)
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 from dreamfleet.common.cli.config import add_flags, configured_values, load
 from dreamfleet.common.cli.global_config import add_global_flags, load_credentials
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
+from dreamfleet.common.cli.presets import default_run_preset
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import is_file
 from dreamfleet.common.host.packages import check_modules
@@ -90,7 +92,7 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
         config = replace(config, init=str(Path(config.init).resolve()))
     # Until --init has been copied, nothing was made, and all settings may change.
     new = begun is None or (not begun.entries and bool(config.init))
-    more = _common_run_flags(args)
+    more = _common_run_flags(args, config)
     first, limits = parse_run_flags([*more, *config.flags_of_run(1)], args.sources, "iterate")
     later, _ = parse_run_flags([*more, *config.flags_of_run(2)], args.sources, "iterate")  # wrong flags end it now
     task = first.task or config.task or default_world()
@@ -114,17 +116,19 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
         if (phase := Phase.of(args.redo)).name == INIT:
             find_init(config.init, layout.runs)  # before all that followed from it is removed
         iteration.redo(phase)
+    whose = config.task or default_world()
+    print(f"a world model of {whose}; each round's run has the preset {first.preset}", file=sys.stderr)
     iteration.begin()
     iteration.ledger.save(layout.ledger)
     return iteration
 
 
-def _common_run_flags(args: argparse.Namespace) -> tuple[str, ...]:
-    """Flags that come before `--run-flags`: the config file, and preset dream unless the settings name one."""
+def _common_run_flags(args: argparse.Namespace, config: IterateConfig) -> tuple[str, ...]:
+    """Flags that come before `--run-flags`: the config file, and the world's preset unless the settings name one."""
     sources = args.sources
     named = "preset" in configured_values(RunConfig, "run", sources["file"], sources["environment"])
     file = ("--config", str(args.config)) if args.config else ()
-    return (*file, *(() if named else ("--preset", "dream")))
+    return (*file, *(() if named else ("--preset", default_run_preset(config.task))))
 
 
 def _check_run(config: IterateConfig, run: RunConfig, layout: IterationFolder) -> None:
@@ -141,11 +145,9 @@ def _check_run(config: IterateConfig, run: RunConfig, layout: IterationFolder) -
         start, (_, bundle) = find_start(config.init, layout.runs), find_init(config.init, layout.runs)
         settings = (start.apply_to(run) if config.go_on else run).settings(bundle)
         if config.go_on:
-            start.check(settings)
+            start.check(settings, bundle)
     if config.go_on and settings.task.option("feedback") == "last":
-        raise UsageError(
-            "--go-on fits a controller to the next model, and one with feedback=last cannot be: leave one out"
-        )
+        raise UsageError("--go-on fits a controller to the next model, and one with feedback=last cannot be: omit one")
 
 
 def _stand_in(config: IterateConfig) -> Bundle:

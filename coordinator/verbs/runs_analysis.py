@@ -27,11 +27,15 @@ def _add_place_flags(parser: argparse.ArgumentParser) -> None:
 def configure_plot(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `runs plot`."""
     parser.add_argument("run_names", metavar="RUN", nargs="+", help="names of runs")
-    parser.add_argument("--fitness", action="store_true", help="draw one run's fitness, even if it has evaluations")
+    parser.add_argument(
+        "--kind", choices=("fitness", "learning", "archive"),
+        help="fitness: over generations; learning: evaluated scores over steps and core-hours; archive: the "
+        "elites of cma-me and map-elites (default fitness of one run, learning of several)",
+    )  # fmt: skip
     parser.add_argument(
         "--out",
         type=Path,
-        help="a PNG or SVG to write (default RUN-learning.png or RUN-fitness.png, with the names of the runs)",
+        help="a PNG or SVG to write (default RUN-KIND.png, with the names of the runs)",
     )
     _add_place_flags(parser)
 
@@ -40,12 +44,15 @@ def plot_runs(args: argparse.Namespace) -> int:
     """Draw, and print the picture's path."""
     from dreamfleet.coordinator.analysis.plot import KINDS
 
-    fitness = args.fitness or _has_no_evaluation(args)
-    out = args.out or _picture_name(args.run_names, "fitness" if fitness else "learning")
+    kind = args.kind or ("fitness" if len(args.run_names) == 1 else "learning")
+    out = args.out or _picture_name(args.run_names, kind)
     if out.suffix not in KINDS:
         raise UsageError(f"--out {out}: give a name that ends in {' or '.join(KINDS)}")
     check_output_path(out)
-    (_draw_fitness if fitness else _draw_learning)(args, out)
+    if kind == "learning":
+        _draw_learning(args, out)
+    else:
+        _draw_one(args, kind, out)
     print_answer(args, str(out), picture=out, runs=args.run_names)
     return 0
 
@@ -57,21 +64,14 @@ def _picture_name(runs: Sequence[str], what: str) -> Path:
     return Path("-".join((*names[:MOST_IN_NAME], *more, f"{what}.png")))
 
 
-def _has_no_evaluation(args: argparse.Namespace) -> bool:
-    """Whether one run is named and none of its means was evaluated, so only fitness can be drawn."""
-    if len(args.run_names) > 1:
-        return False
-    with open_run(args.runs_dir, args.run_names[0]) as stored:
-        return not stored.evaluations()
-
-
-def _draw_fitness(args: argparse.Namespace, out: Path) -> None:
+def _draw_one(args: argparse.Namespace, kind: str, out: Path) -> None:
+    from dreamfleet.coordinator.analysis.archive_plot import plot_archive
     from dreamfleet.coordinator.analysis.plot import plot_fitness
 
     if len(args.run_names) > 1:
-        raise UsageError("--fitness draws one run: name one")
-    with open_run(args.runs_dir, args.run_names[0]) as stored:
-        plot_fitness(stored, out)
+        raise UsageError(f"--kind {kind} draws one run: name one")
+    with open_run(args.runs_dir, args.run_names[0]) as stored, stored.read_transaction():
+        (plot_archive if kind == "archive" else plot_fitness)(stored, out)
 
 
 def _draw_learning(args: argparse.Namespace, out: Path) -> None:
@@ -116,8 +116,7 @@ def write_receipt(args: argparse.Namespace) -> int:
 
 
 PLOT = SimpleVerb(
-    "draw runs' evaluated scores over environment steps and core-hours; or one run's fitness over generations, which "
-    "is the default while it has no evaluation",
+    "draw one run's fitness over generations, or runs' evaluated scores over environment steps and core-hours",
     configure_plot,
     plot_runs,
     EXTRAS=("views",),

@@ -79,7 +79,7 @@ def _find_hosts(args: argparse.Namespace, name: str | None = None) -> list[Host]
     """The hosts of the file or of the command line; a single one's worker may have a `name`."""
     if args.file is not None:
         if args.config != args.file:
-            raise UsageError("--hosts is a file of settings itself: leave --config out")
+            raise UsageError("--hosts is a file of settings itself: omit --config")
         if args.hosts:
             raise UsageError("give the hosts of a file with --hosts, or hosts by their names, and not both")
         return read_hosts(args.sources["file"].get(HOSTS, []), args.sources)

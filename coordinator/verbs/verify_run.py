@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from pathlib import Path
 
@@ -36,6 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve the run for as many generations; exit 1 if it then reports another controller."""
     from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
+    from dreamfleet.coordinator.experiments.local_run import task_flags
     from dreamfleet.coordinator.settings.rerun import Rerun
     from dreamfleet.coordinator.verbs.coordinator import ExitReport, build_request, serve_request
 
@@ -45,6 +47,9 @@ def run(args: argparse.Namespace) -> int:
     config, kept = again.plan(folder)
     if again.expected_difference:
         print(f"note: {again.expected_difference}", file=sys.stderr)
+    task = shlex.join(task_flags(controller.task))
+    print(f"note: workers score run {folder.name} as they scored the first; start some on this host or others: "
+          f"dreamfleet worker --run {folder.name} {task}".rstrip(), file=sys.stderr)  # fmt: skip
     request = build_request(args, folder.name, config, again.limits, kept, again.start if config else None)
 
     def on_ended() -> ExitReport:

@@ -12,15 +12,20 @@ WHOLE = 3 * DEADLINE  # seconds that a page's commands may take together
 
 
 def run_tutorial(page, module, shares, folder):
-    """What its commands print, but for its first block, which installs; `module` is the file of its Python block."""
-    text = (ROOT / "docs" / "tutorials" / page).read_text()
-    (code,), (install, *commands) = _blocks(text, "python"), _blocks(text, "sh")
+    """What a tutorial's commands print, as `run_page`; `module` is the file of its Python block."""
+    (code,) = _blocks((ROOT / "docs" / "tutorials" / page).read_text(), "python")
+    (folder / module).write_text(code)
+    return run_page(f"tutorials/{page}", shares, folder)
+
+
+def run_page(page, shares, folder):
+    """What a page's commands print, but for its first block, which installs."""
+    install, *commands = _blocks((ROOT / "docs" / page).read_text(), "sh")
     assert "pip install" in install
     script = "".join(commands)
     for whole, share in shares.items():
         assert whole in script
         script = script.replace(whole, share)
-    (folder / module).write_text(code)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     own = {
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}", "OMP_NUM_THREADS": "1",

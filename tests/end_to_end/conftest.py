@@ -1,10 +1,19 @@
 import pytest
 
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support import tasks
 from tests.support.access import Access
 from tests.support.attacks import SETTINGS, outcome
+from tests.support.bundles import write_random_bundle
 from tests.support.processes import free_port, processes_in
 from tests.support.sshd import ssh_hosts
+
+
+@pytest.fixture(scope="session")
+def random_bundle(tmp_path_factory):
+    """A world model of few megabytes: nearly all tests here only hand it on, from file to file and over the network."""
+    path = tmp_path_factory.mktemp("bundle") / "random.zip"
+    return write_random_bundle(path, vae=VAEConfig(channels=(8, 16, 32, 64)))
 
 
 @pytest.fixture(scope="session")

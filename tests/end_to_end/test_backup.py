@@ -12,12 +12,13 @@ from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import BUNDLE, JOURNAL, ROLLOUTS
 from dreamfleet.coordinator.storage import backup
 from tests.end_to_end.test_same_bits import GENERATIONS, SETTINGS, outcome
+from tests.support.processes import call_here, processes_in
 
 FLAGS = (*SETTINGS, "--evaluate-every", 0, "--collect-every", 1, "--collect-episodes", 1)
 
 
-def back_up(processes, to, name="test"):
-    return processes.call("runs", "backup", name, "--runs-dir", processes.runs, "--to", to)
+def back_up(processes, to, name="test", call=call_here):
+    return call("runs", "backup", name, "--runs-dir", processes.runs, "--to", to)
 
 
 @pytest.mark.slow
@@ -52,51 +53,52 @@ def test_a_run_goes_on_from_a_copy_that_was_made_while_it_was_served(processes, 
     assert len(list((processes.runs / "test" / ROLLOUTS).iterdir())) == GENERATIONS
 
 
-@pytest.fixture
-def finished(processes):
-    """A run of two generations."""
-    coordinator = processes.coordinator(
-        "--task", "gym:CartPole-v1", "--population", 4, "--generations", 2, "--evaluate-every", 0, "--horizon", 20
-    )
-    processes.worker("--run", "test")
-    assert coordinator.finish()[0] == 0
-    return processes.runs / "test"
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run of two generations, which no test changes, and what made it."""
+    with processes_in(tmp_path_factory.mktemp("finished")) as processes:
+        coordinator = processes.coordinator(
+            "--task", "gym:CartPole-v1", "--population", 4, "--generations", 2, "--evaluate-every", 0, "--horizon", 20
+        )
+        processes.worker("--run", "test")
+        assert coordinator.finish()[0] == 0
+        yield processes
 
 
-def test_what_cannot_be_a_copy_is_left_alone(processes, finished, tmp_path):
+def test_what_cannot_be_a_copy_is_left_alone(finished, tmp_path):
     other = tmp_path / "other"
     for wrong, why in (
-        (processes.runs, "is the run itself"),
+        (finished.runs, "is the run itself"),
         (tmp_path / "taken", "is not a run"),
         (other, "another run of this name"),
     ):
         if wrong.name == "taken":
             (wrong / "test").mkdir(parents=True)
         elif wrong == other:
-            assert back_up(processes, other)[0] == 0
+            assert back_up(finished, other)[0] == 0
             with closing(sqlite3.connect(other / "test" / JOURNAL)) as journal, journal:
                 journal.execute("UPDATE run SET value = 'another' WHERE key = 'uid'")
-        code, _, err = back_up(processes, wrong)
+        code, _, err = back_up(finished, wrong)
         assert (code, why in err) == (2, True), err
-    code, _, err = back_up(processes, "/proc/nowhere")
+    code, _, err = back_up(finished, "/proc/nowhere")
     assert (code, "cannot back up into" in err) == (1, True), err
-    code, _, err = back_up(processes, tmp_path, name="nobody")
+    code, _, err = back_up(finished, tmp_path, name="nobody")
     assert (code, "no run 'nobody'" in err) == (1, True), err
 
 
-def test_a_call_that_was_killed_between_two_names_is_made_good(processes, finished, tmp_path):
+def test_a_call_that_was_killed_between_two_names_is_made_good(finished, tmp_path):
     safe = tmp_path / "safe"
-    assert back_up(processes, safe)[0] == 0
+    assert back_up(finished, safe)[0] == 0
     (safe / "test").rename(safe / ".test.former")
     (safe / ".test.part").mkdir()
-    code, _, err = back_up(processes, safe)
+    code, _, err = back_up(finished, safe)
     assert code == 0, err
     assert [path.name for path in safe.iterdir()] == ["test"]
 
 
-def test_a_call_that_is_interrupted_leaves_the_earlier_copy(processes, finished, tmp_path, monkeypatch):
+def test_a_call_that_is_interrupted_leaves_the_earlier_copy(finished, tmp_path, monkeypatch):
     safe = tmp_path / "safe"
-    assert back_up(processes, safe)[0] == 0
+    assert back_up(finished, safe)[0] == 0
     rename = Path.rename
 
     def interrupted(self, target):
@@ -105,7 +107,7 @@ def test_a_call_that_is_interrupted_leaves_the_earlier_copy(processes, finished,
         return rename(self, target)
 
     monkeypatch.setattr(Path, "rename", interrupted)
-    with open_run(processes.runs, "test") as source, pytest.raises(KeyboardInterrupt):
+    with open_run(finished.runs, "test") as source, pytest.raises(KeyboardInterrupt):
         backup.back_up(source, safe / "test")
     assert [path.name for path in safe.iterdir()] == ["test"]
     with open_run(safe, "test") as copy:
@@ -121,17 +123,17 @@ def test_a_world_model_is_copied_too(processes, tmp_path):
     assert copied.read_bytes() == find_bundle("tiny").path.read_bytes()
 
 
-def test_two_at_once_leave_a_whole_copy(processes, finished, tmp_path, monkeypatch):
+def test_two_at_once_leave_a_whole_copy(finished, tmp_path, monkeypatch):
     safe = tmp_path / "safe"
-    assert back_up(processes, safe)[0] == 0
+    assert back_up(finished, safe)[0] == 0
     unserved, said = backup._hold_target, []
 
     def meanwhile(target):
-        said.append(back_up(processes, safe))
+        said.append(back_up(finished, safe, call=finished.call))
         return unserved(target)
 
     monkeypatch.setattr(backup, "_hold_target", meanwhile)
-    with open_run(processes.runs, "test") as source:
+    with open_run(finished.runs, "test") as source:
         backup.back_up(source, safe / "test")
     assert [(code, "is running" in err) for code, _, err in said] == [(2, True)]
     assert [path.name for path in safe.iterdir()] == ["test"]
@@ -139,10 +141,10 @@ def test_two_at_once_leave_a_whole_copy(processes, finished, tmp_path, monkeypat
         assert len(copy.history()) == 2
 
 
-def test_a_link_is_no_copy_to_replace(processes, finished, tmp_path):
-    assert back_up(processes, tmp_path / "far")[0] == 0
+def test_a_link_is_no_copy_to_replace(finished, tmp_path):
+    assert back_up(finished, tmp_path / "far")[0] == 0
     (tmp_path / "near").mkdir()
     (tmp_path / "near" / "test").symlink_to(tmp_path / "far" / "test")
-    code, _, err = back_up(processes, tmp_path / "near")
+    code, _, err = back_up(finished, tmp_path / "near")
     assert (code, "is a link" in err) == (2, True), err
     assert [path.name for path in (tmp_path / "near").iterdir()] == ["test"]

@@ -11,11 +11,20 @@ import pytest
 
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from tests.support import tasks
-from tests.support.processes import DEADLINE, command, environment
+from tests.support.processes import DEADLINE, call_here, command, environment, processes_in
+from tests.support.tables import cells
 
 
 def complains(processes, *arguments, says):
-    code, out, err = processes.call(*arguments)
+    assert_complaint(*processes.call(*arguments), says)
+
+
+def complains_here(*arguments, says):
+    """As `complains`, of what is refused before it opens or starts anything."""
+    assert_complaint(*call_here(*arguments), says)
+
+
+def assert_complaint(code, out, err, says):
     assert code not in (0, None)
     line = err.strip().splitlines()[-1]
     assert says in line, err
@@ -40,26 +49,23 @@ def complains(processes, *arguments, says):
     ],
 )
 def test_the_coordinator_complains(processes, arguments, says):
-    complains(processes, "coordinator", "--runs-dir", processes.runs, *arguments, says=says)
+    complains_here("coordinator", "--runs-dir", processes.runs, *arguments, says=says)
     assert not processes.runs.exists() or not any(processes.runs.iterdir())
 
 
 def test_an_unknown_configuration_key_names_the_nearest(processes, tmp_path):
     path = tmp_path / "run.toml"
     path.write_text("[run]\npopluation = 8\n")
-    complains(processes, "coordinator", "--config", path, says="did you mean 'population'")
+    complains_here("coordinator", "--config", path, says="did you mean 'population'")
 
 
-def test_a_port_in_use_costs_nothing(processes, random_bundle):
+def test_a_port_in_use_leaves_no_run_behind(processes, random_bundle):
     with socket.create_server(("127.0.0.1", processes.port)):
         complains(
             processes, "coordinator", "--run", "night", "--runs-dir", processes.runs, "--listen", processes.endpoint,
             "--bundle", random_bundle.path, says="is in use",
         )  # fmt: skip
-    again = processes.start(
-        "coordinator", "--resume", "night", "--runs-dir", processes.runs, "--listen", processes.endpoint
-    )
-    again.wait_for("incarnation")
+    assert not (processes.runs / "night").exists()
 
 
 def test_a_damaged_bundle_starts_nothing(processes, tmp_path):
@@ -97,14 +103,21 @@ def test_the_archives_own_name_is_no_runs(processes, random_bundle):
     )  # fmt: skip
 
 
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory, random_bundle):
+    """The folder of a run that has begun, which no test changes."""
+    with processes_in(tmp_path_factory.mktemp("begun")) as processes:
+        processes.coordinator("--bundle", random_bundle.path, "--task", tasks.TOY).end()
+        yield processes.runs / "test"
+
+
 @pytest.fixture
-def odd(processes, random_bundle):
+def odd(begun, tmp_path):
     """A runs folder in which one run's folder is a link, and another holds a third."""
-    processes.coordinator("--bundle", random_bundle.path, "--task", tasks.TOY).end()
-    runs = processes.folder / "odd"
-    shutil.copytree(processes.runs / "test", runs / "whole")
-    shutil.copytree(processes.runs / "test", runs / "outer" / "inner")
-    shutil.copy(processes.runs / "test" / "journal.sqlite", runs / "outer")
+    runs = tmp_path / "odd"
+    shutil.copytree(begun, runs / "whole")
+    shutil.copytree(begun, runs / "outer" / "inner")
+    shutil.copy(begun / "journal.sqlite", runs / "outer")
     (runs / "link").symlink_to(runs / "whole")
     (runs / "archive").write_text("no folder")
     (runs / "strange" / "journal.sqlite").mkdir(parents=True)
@@ -121,7 +134,7 @@ def odd(processes, random_bundle):
     ],
 )
 def test_odd_folders_lose_nothing(processes, odd, words, says):
-    complains(processes, *words, "--runs-dir", odd, says=says)
+    complains_here(*words, "--runs-dir", odd, says=says)
     assert (odd / "whole" / "journal.sqlite").exists()
     assert (odd / "outer" / "inner" / "journal.sqlite").exists()
 
@@ -141,13 +154,12 @@ def test_a_full_stdout_is_one_line(processes, odd, more):
 def test_a_controller_of_another_shape(processes, tmp_path):
     path = tmp_path / "small.npz"
     Controller(ControllerShape(4, 3), np.zeros(15, np.float32), "car-racing", "ab" * 32).save(path)
-    complains(
-        processes, "evaluate", "--controller", path, "--bundle", "tiny", "--episodes", "1",
+    complains_here("evaluate", "--controller", path, "--bundle", "tiny", "--episodes", "1",
         says="a controller of 15 parameters does not fit tiny.zip, which needs 867",
     )  # fmt: skip
-    complains(processes, "evaluate", "--controller", path, "--episodes", "1", says="name it with --bundle")
-    complains(processes, "evaluate", "--controller", "absent", says="no controller 'absent'")
-    complains(processes, "record", "--controller", path, "--out", "drive.avi", says="ends in .mp4")
+    complains_here("evaluate", "--controller", path, "--episodes", "1", says="name it with --bundle")
+    complains_here("evaluate", "--controller", "absent", says="no controller 'absent'")
+    complains_here("record", "--controller", path, "--out", "drive.avi", says="ends in .mp4")
 
 
 @pytest.mark.slow
@@ -162,8 +174,8 @@ def test_a_worker_or_viewer_without_a_coordinator(processes):
 def test_runs_that_do_not_exist(processes):
     candidate = ("verify", "candidate", "--candidate", "0/0")
     for verb in (("runs", "show"), ("runs", "delete"), ("runs", "archive"), candidate):
-        complains(processes, *verb, "night", "--runs-dir", processes.runs, says="no run 'night'")
-    complains(processes, "verify", "candidate", "night", "--candidate", "first", says="write generation/index")
+        complains_here(*verb, "night", "--runs-dir", processes.runs, says="no run 'night'")
+    complains_here("verify", "candidate", "night", "--candidate", "first", says="write generation/index")
 
 
 def test_a_run_is_listed_shown_archived_and_deleted(processes, random_bundle):
@@ -182,20 +194,21 @@ def test_a_run_is_listed_shown_archived_and_deleted(processes, random_bundle):
     processes.worker("--task", tasks.TOY)
     assert coordinator.finish()[0] == 0
     where = ("--runs-dir", processes.runs)
-    assert "ended" in processes.call("runs", "list", *where)[1]
-    assert "sigma0" in processes.call("runs", "show", "test", *where)[1]
-    complains(processes, "runs", "delete", "test", *where, says="give --yes")
-    _, shown, _ = processes.call("runs", "show", "test", *where)
-    assert f"task\t{tasks.TOY}" in shown
-    assert "task.bundle\t" + random_bundle.sha256 in shown
-    assert shown.count("\n0\t") == shown.count("\n1\t") == 1, "a line a generation"
-    code, out, _ = processes.call("runs", "archive", "test", *where, "--json")
+    assert "ended" in call_here("runs", "list", *where)[1]
+    assert "sigma0" in call_here("runs", "show", "test", *where)[1]
+    complains_here("runs", "delete", "test", *where, says="give --yes")
+    _, shown, _ = call_here("runs", "show", "test", *where)
+    rows = [cells(line) for line in shown.splitlines()]
+    assert ["task", tasks.TOY] in rows
+    assert ["task.bundle", random_bundle.sha256] in rows
+    assert [row[0] for row in rows[-2:]] == ["0", "1"], "a line a generation"
+    code, out, _ = call_here("runs", "archive", "test", *where, "--json")
     assert (code, json.loads(out)["archived"]) == (0, str(processes.runs / "archive" / "test"))
-    assert "no runs" in processes.call("runs", "list", *where)[2]
-    assert "test" in processes.call("runs", "list", "--archived", *where)[1]
+    assert "no runs" in call_here("runs", "list", *where)[2]
+    assert "test" in call_here("runs", "list", "--archived", *where)[1]
     archive = ("--runs-dir", processes.runs / "archive")
-    assert "test\t" in processes.call("runs", "list", *archive)[1]
-    code, out, _ = processes.call("runs", "delete", "test", "--yes", *archive, "--json")
+    assert "\ntest " in call_here("runs", "list", *archive)[1]
+    code, out, _ = call_here("runs", "delete", "test", "--yes", *archive, "--json")
     assert (code, json.loads(out)["run"]) == (0, "test")
 
 
@@ -209,4 +222,4 @@ def test_the_doctor_finds_this_installation_well(processes):
 @pytest.mark.parametrize("seconds", ["nan", "inf", "0", "-1"])
 def test_a_live_view_wants_seconds_that_end(processes, seconds):
     asked = ("live", "--controller", "tiny", "--out", processes.folder / "drive.mp4", f"--seconds={seconds}")
-    complains(processes, *asked, says="--seconds above 0")
+    complains_here(*asked, says="--seconds above 0")

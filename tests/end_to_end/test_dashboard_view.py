@@ -118,7 +118,7 @@ def test_a_task_without_pictures_takes_no_room_for_them(browser, processes, rand
     with dashboard(processes) as started, tab(browser) as page:
         page.goto(started.address)
         page.wait_for_selector("[data-part=view]:not([hidden])").scroll_into_view_if_needed()
-        say(page, "This task shows no picture.")
+        say(page, "Workers score this task without drawing it; `dreamfleet record` and `live` draw it.")
         assert facts(page)["worker"].startswith("alpha/")
         assert page.locator("[data-part=view]").bounding_box()["height"] < 300
 

@@ -1,6 +1,7 @@
 """The demonstration, seconds long."""
 
 import os
+import re
 import signal
 import time
 from pathlib import Path
@@ -13,6 +14,7 @@ from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.coordinator.experiments.demo import Demo, DemoConfig, median_drive, plan_runs
+from tests.support.tables import cells
 
 
 @pytest.mark.parametrize(
@@ -42,10 +44,12 @@ def test_both_stages_search_in_the_features_that_ship_for_its_world_model(config
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle):
     code, out, err = processes.call(
         "demo", "--run", "demo", "--runs-dir", processes.runs, "--port", processes.port, "--bundle", random_bundle.path,
         "--dream-minutes", 0.02, "--minutes", 0.02, "--horizon", 30, "--tracks", 1, "--population", 4,
+        timeout=900,
     )  # fmt: skip
     assert code == 0, err
     with open_run(processes.runs, "demo-dream") as dream, open_run(processes.runs, "demo") as real:
@@ -60,8 +64,15 @@ def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle):
         confirmed = [f"{format_with_error(each.mean, each.error)} ({each.episodes})" for each in found]
         provenance = Controller.load((real if best == "demo" else dream).controller_path).provenance
     assert provenance["confirmed"]
-    assert f"run {best}'s" in out.replace("\n", " ")
+    assert f"recording run {best}'s controller (the higher confirmed score) on track " in out
     assert all(score in out for score in confirmed), out
+    table = [cells(line) for line in out.splitlines()]
+    first = table.index(["run", "evolved in", "confirmed on fresh tracks", "on unseen tracks"])
+    rows = table[first : first + 3]
+    assert [row[:2] for row in rows[1:]] == [["demo-dream", "the dream"], ["demo", "the dream, then reality"]]
+    assert all(row[3].endswith(" (1)") for row in rows[1:])
+    assert re.search("^  .*, nothing evaluated yet, ", out, re.MULTILINE), "in a log, a line says how the run goes"
+    assert "coordinator --run mine --preset dream --bundle" in out
     for made in (f"{best}/drive.mp4", "demo/fitness.png", "demo-dream/fitness.png"):
         assert (processes.runs / made).stat().st_size > 1000
     assert "evolving in the dream" in out

@@ -73,7 +73,7 @@ def test_dreams_from_recorded_states_are_the_same_on_every_worker(processes, tmp
     assert code == 0, err
     code, out, err = processes.call("coordinator", "--from", "alone", *runs, "--task", "car-racing")
     assert (code, err.count("\n")) == (2, 1)
-    assert "--recorded needs task dream, not car-racing: leave it out, or pass 0" in err
+    assert "--recorded needs task dream, not car-racing: omit it, or pass 0" in err
 
 
 def test_recorded_states_that_a_bundle_lacks_are_refused_as_the_run_begins(processes, random_bundle):

@@ -9,7 +9,7 @@ from tests.support import tasks
 @pytest.mark.parametrize("task", [tasks.EXPLODING, tasks.ENDLESS])
 def test_extreme_numbers_pause_the_run_with_their_reason_and_it_can_be_continued(processes, random_bundle, task):
     coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--task", task, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
+        "--bundle", random_bundle.path, "--task", task, "--population", 3, "--episodes", 1, "--evaluate-every", 0,
         "--generations", 2,
     )  # fmt: skip
     processes.worker("--task", task)

@@ -32,8 +32,8 @@ OWN, GYM = f"{MARK}:World", f"gym:{MARK}:X-v0"
 NAMELESS = {
     "access.init", "access.issue", "access.list", "access.revoke", "baseline.export",
     "baseline.train", "completion", "dashboard", "demo", "doctor", "down", "drain", "encode",
-    "iterate", "lab.contrast", "pause", "pipeline", "resume", "router", "spawn", "status", "stop",
-    "tasks", "train", "worker",
+    "iterate", "lab.contrast", "pause", "pipeline", "resume", "router", "serve", "spawn", "status",
+    "stop", "sweep", "tasks", "train", "worker",
 }  # fmt: skip
 
 
@@ -145,11 +145,15 @@ def commands(port=0):
         yield "lab", "bench", "dream", "--bundle", file
         yield "lab", "bench", "live", "--bundle", file
         yield "lab", "bench", "env", "--bundle", file, "--episodes", "1"
+    for file in CONTROLLERS[:1]:
+        yield "card", file, "--out", "card"
+        yield "import", file, "--out", "converted", "--like", "tiny"
     for file in BUNDLES:
         yield "coordinator", "--run", "x", "--bundle", file, *serve
         yield "inspect", file, "--out", "page.html"
         yield "lab", "subspace", file, "--data", "data", "--out", "s.npz"
         yield "bundle", "--extract", file, "--data", "unbundled"
+        yield "bundle", "--from", file, "--out", "rounded.zip"
         yield "drive", "--dream", "--bundle", file, "--steps", "1"
     yield "verify", "run", "optimiser", "--run", "again", *serve
     for run in RUNS:
@@ -166,6 +170,7 @@ def commands(port=0):
         yield "runs", "plot", run, "--out", "a.png"
         yield "runs", "export", run, "--csv", "--out", f"csv-{run}"
         yield "compare", run, "own"
+        yield "bar", "nobody", run
         yield "runs", "backup", run, "--to", f"backup-{run}"
     yield "runs", "archive", "gym"
     yield "runs", "list"

@@ -60,6 +60,7 @@ def test_a_run_on_a_full_disk_waits_and_goes_on_by_itself_to_the_same_bits(proce
         assert history == [(each.number, each.mean) for each in other.history()]
 
 
+@pytest.mark.slow
 def test_a_run_whose_journal_is_locked_waits_and_goes_on(processes, random_bundle):
     flags = ("--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 1, "--evaluate-every", 0, "--generations", 12)
     locked = processes.coordinator("--bundle", random_bundle.path, *flags)
@@ -70,7 +71,7 @@ def test_a_run_whose_journal_is_locked_waits_and_goes_on(processes, random_bundl
         locked.wait_for("locked; end the program that keeps it locked, and the run then continues")
         code, _, err = processes.call("resume", "test", "--connect", processes.endpoint)
         assert (code, "it cannot continue now" in err) == (1, True), err
-        time.sleep(15 * FILE_CHECK)  # meanwhile the coordinator looks whether its files are still there
+        time.sleep(7 * FILE_CHECK)  # one wait for the lock, 5 s, and then it looks whether its files are still there
         assert locked.popen.poll() is None, "".join(locked.lines)
         other.rollback()
     locked.wait_for("can be written again")

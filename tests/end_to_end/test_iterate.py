@@ -31,6 +31,7 @@ from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
 from tests.support.drives import write_drives
 from tests.support.processes import DEADLINE, processes_in
+from tests.support.tables import cells
 from tests.support.variants import controller_of
 
 pytestmark = pytest.mark.slow
@@ -221,11 +222,11 @@ def test_what_is_finished_is_not_done_again_and_other_settings_are_refused(undis
     code, out, err = processes.call("iterate", "--data", layout.root)
     assert code == 0, err
     assert "finished: 14 phases" in err
-    assert out.splitlines()[0].split("\t")[:3] == ["round", "drives", "frames"]
+    assert cells(out.splitlines()[0])[:3] == ["round", "drives", "frames"]
     assert f"world model: {answer['model']}" in out
     assert layout.ledger.read_bytes() == before
     for flags, said in (
-        (("--noise", 0.5), "was begun with noise 0.3, not 0.5: leave that out, or begin in another --data"),
+        (("--noise", 0.5), "was begun with noise 0.3, not 0.5: omit that, or begin in another --data"),
         (("--run-flags", "--generations 3"), "generations 2, not 3"),
         (("--redo", "3/vae"), "3/vae is not finished"),
     ):

@@ -54,7 +54,7 @@ def test_a_run_of_another_optimiser_is_continued_and_forked_to_one_of_ones_own(p
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("--optimiser", "cmea"), "unknown optimiser 'cmea': known are cma, cmaes-lra, cmaes-sep"),
+        (("--optimiser", "cmea"), "unknown optimiser 'cmea': did you mean cma? known are cma, cma-me, cmaes-lra"),
         (("--optimiser", "cmaes-sep", "--preset", "article"), "give --covariance diagonal"),
         (("--population", "2"), "needs a population of at least 3"),
     ],

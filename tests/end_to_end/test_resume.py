@@ -117,7 +117,7 @@ def test_one_file_serves_coordinator_worker_and_status(processes, random_bundle)
     assert coordinator.finish()[0] == 0
     assert worker.finish()[0] == 0
     code, out, _ = processes.call("runs", "list", "--config", path)
-    assert "filed\t" in out
+    assert "\nfiled " in out
 
 
 @pytest.mark.slow

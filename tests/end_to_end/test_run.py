@@ -2,6 +2,7 @@
 
 import json
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -105,7 +106,8 @@ def test_status_is_json_that_zenoh_cli_reads_too(processes, settings):
     ("on_failure", "why"), [("worst", "no present host has ever scored"), ("pause", "failed on two workers")]
 )
 def test_failures_on_all_workers_pause_the_run_and_say_why(processes, settings, on_failure, why):
-    flags = "--task", tasks.RAISING, "--generations", 2, "--on-failure", on_failure
+    few = ("--population", 3, "--episodes", 1)  # each failed try costs a process
+    flags = "--task", tasks.RAISING, "--generations", 2, "--on-failure", on_failure, *few
     coordinator = processes.coordinator(*settings, *flags)
     for name in ("one", "two"):
         processes.worker("--task", tasks.RAISING, "--name", name)
@@ -141,6 +143,21 @@ def test_a_foreign_coordinator_on_the_same_network_is_refused(processes, setting
     )  # fmt: skip
     assert code != 0
     assert "has a live coordinator already" in err
+    assert not (tmp_path / "elsewhere").exists(), "a run that cannot be served is not created"
+
+
+@pytest.mark.parametrize("flag", ["--listen", "--metrics-port"])
+def test_a_new_run_whose_port_is_taken_is_not_created(processes, settings, flag):
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        taken = f"127.0.0.1:{other.getsockname()[1]}"
+        where = ("--listen", f"tcp/{taken}") if flag == "--listen" else ("--listen", processes.endpoint, flag, taken)
+        code, _, err = processes.call("coordinator", "--run", "test", "--runs-dir", processes.runs, *where, *settings)
+    assert code == 1
+    assert taken in err
+    assert flag in err
+    assert not processes.runs.exists()
 
 
 @pytest.mark.slow
@@ -230,7 +247,7 @@ def test_several_runs_on_one_router_never_see_each_other_and_a_worker_serves_the
     second.wait_for("incarnation")
     workers = []
     for number in range(2):
-        workers.append(processes.worker("--task", tasks.SLOW_TOY, "--any", "--name", f"any{number}"))
+        workers.append(processes.worker("--task", tasks.SLOW_TOY, "--any", "--runs", 1, "--name", f"any{number}"))
         workers[-1].wait_for("joined run")
         while not all(each.slots for each in processes.statuses()[: number + 1]):
             pass

@@ -10,6 +10,7 @@ from dreamfleet.common.runs.stages import begun_stages, stages_of
 from dreamfleet.coordinator.analysis.plot import plot_fitness
 from dreamfleet.worker.inspection.curve_sections import fitness_section
 from tests.support import tasks
+from tests.support.tables import cells
 
 GENERATIONS, BEGUN, SIZES = 8, [0, 4, 6], [5] * 4 + [7] * 4
 STAGES = """
@@ -93,7 +94,7 @@ def test_a_run_of_three_stages_gives_the_same_bits_however_often_it_is_killed(pr
         assert (code, "DIFFERS" in out) == (0, False), err
     code, out, err = processes.call("runs", "show", "night", "--runs-dir", processes.runs)
     assert code == 0, err
-    shown = [line.split("\t") for line in out.splitlines()]
+    shown = [cells(line) for line in out.splitlines()]
     assert ["stage", "3 of 3"] in shown
     assert any(row[0] == "stage 2" and row[1].startswith("since generation 4, until 2 generations: ") for row in shown)
     code, out, err = processes.call("runs", "show", "night", "--runs-dir", processes.runs, "--json")

@@ -126,7 +126,7 @@ def test_a_log_is_followed_until_the_worker_ends_or_somebody_has_seen_enough(pro
     coordinator.wait_for("generation 1: mean")
     command.popen.send_signal(signal.SIGINT)
     code, out = command.finish()
-    assert code == 0
+    assert code == 0, "".join(command.lines)
     assert "continues without this command" in out
     assert runs(state(a)["pid"])
 

@@ -1,7 +1,6 @@
-"""A run's start is in its journal before anything else can fail: a coordinator that is continued begins there."""
+"""A run's start is in its journal before anything is scored: a coordinator that is continued begins there."""
 
 import signal
-import socket
 
 import numpy as np
 import pytest
@@ -30,12 +29,12 @@ def controller(random_bundle, tmp_path):
     return path
 
 
-def refused(processes, *words):
-    """Started where the port is taken: the run is made, and nothing of it begins."""
-    with socket.create_server(("127.0.0.1", processes.port)):
-        code, _, err = processes.call(*words, "--runs-dir", processes.runs, "--listen", processes.endpoint)
-    assert code != 0
-    assert "is in use" in err
+def killed(processes, *words):
+    """Started, and killed before anything is scored."""
+    began = processes.start(*words, "--runs-dir", processes.runs, "--listen", processes.endpoint)
+    began.wait_for("generation 0")
+    began.popen.kill()
+    began.finish()
 
 
 def continued(processes, name):
@@ -52,9 +51,9 @@ def first_population(processes, coordinator, name):
         return np.stack([run.candidate(0, number) for number in range(4)])
 
 
-def test_a_start_outlives_a_coordinator_that_never_began_and_its_own_file(processes, settings, controller):
+def test_a_start_outlives_a_coordinator_that_was_killed_at_once_and_its_own_file(processes, settings, controller):
     mean = Controller.load(controller).parameters
-    refused(processes, "coordinator", "--run", "night", "--init", controller, *settings)
+    killed(processes, "coordinator", "--run", "night", "--init", controller, *settings)
     controller.unlink()
     population = continued(processes, "night")
     assert np.abs(population - mean).max() < 10 * SIGMA
@@ -62,26 +61,26 @@ def test_a_start_outlives_a_coordinator_that_never_began_and_its_own_file(proces
         assert "start.npz" in run.fact("start")
 
 
-def test_a_run_that_was_refused_its_port_asks_for_what_one_that_was_not_asks_for(processes, settings, controller):
+def test_a_run_that_was_killed_at_once_asks_for_what_one_that_was_not_asks_for(processes, settings, controller):
     again = processes.start("coordinator", "--run", "whole", "--runs-dir", processes.runs, "--listen",
                             processes.endpoint, "--init", controller, *settings)  # fmt: skip
     whole = first_population(processes, again, "whole")
-    refused(processes, "coordinator", "--run", "parts", "--init", controller, *settings)
+    killed(processes, "coordinator", "--run", "parts", "--init", controller, *settings)
     assert np.array_equal(continued(processes, "parts"), whole)
 
 
-def test_a_fork_that_never_began_goes_on_from_its_source_though_that_is_gone(processes, settings, controller):
+def test_a_fork_that_was_killed_at_once_goes_on_from_its_source_though_that_is_gone(processes, settings, controller):
     mean = Controller.load(controller).parameters
     first = processes.coordinator(*settings, "--init", controller, name="first")
     processes.worker("--task", tasks.TOY, "--run", "first", "--exit-when-done")
     assert first.finish()[0] == 0
-    refused(processes, "coordinator", "--from", "first")
+    killed(processes, "coordinator", "--from", "first")
     processes.call("runs", "delete", "first", "--yes", "--runs-dir", processes.runs)
     assert np.abs(continued(processes, "first-fork") - mean).max() < 10 * SIGMA
 
 
 def test_how_a_run_is_served_is_kept_with_its_start(processes, settings, controller):
-    refused(processes, "coordinator", "--run", "night", "--init", controller, *settings, "--strict")
+    killed(processes, "coordinator", "--run", "night", "--init", controller, *settings, "--strict")
     with open_run(processes.runs, "night") as run:
         assert run.fact("limits") == '{"generations": 1}'
         assert '"strict": true' in run.fact("network")

@@ -100,7 +100,7 @@ def test_a_run_begins_from_a_controller_that_drives_alike_alone(processes, rando
             ("coordinator", "--run", "two", "--init", "tiny", "--bundle", "tiny", "--variant", "pedals=one"),
             "the plain way",
         ),
-        (("coordinator", "--from", "one", "--variant", "feedback=last"), "leave --variant out, and it brings its own"),
+        (("coordinator", "--from", "one", "--variant", "feedback=last"), "omit --variant, and it brings its own"),
         (("coordinator", "--run", "two", "--variant", "pedal=one"), "knows no option pedal: known are actions, "),
         (("coordinator", "--run", "two", "--task", "gym:CartPole-v1", "--variant", "pedals=one"), "with a world model"),
     ):

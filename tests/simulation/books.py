@@ -32,7 +32,8 @@ def check_coordinator(fleet: Fleet) -> None:
     for digest, each in jobs.items():
         holders = each.holders
         _require(each.in_queue == (digest in named), "a job and the queue disagree on whether it is queued")
-        _require(bool(holders) or digest in named or each.retry_at > 0, "a wanted job is neither held nor queued")
+        waits = each.retry_at > 0 or jobs.checks.get(digest) is each
+        _require(bool(holders) or digest in named or waits, "a wanted job is neither held nor queued")
         _require(len(holders) <= MAX_HOLDERS, "a job has more copies than two")
         for holder in holders:
             _require(holder in members, "a job is held by no member")
@@ -49,7 +50,10 @@ def check_coordinator(fleet: Fleet) -> None:
     _require(jobs._background_held == is_background, "what fills the slack is miscounted")
     _require(jobs._tags.keys() == {digest[:TAG_BYTES] for digest in jobs}, "tags are not those of the wanted jobs")
     _require(jobs._failing.keys() <= jobs.keys(), "a job fails that nobody wants")
-    _require(not jobs._accepted.keys() & jobs.keys(), "an accepted job is wanted still")
+    checks = jobs.checks.keys()
+    _require(checks == {digest for digest in jobs if jobs[digest].check}, "checks are not those that are wanted")
+    again = {digest for digest in jobs if jobs[digest].is_proof}
+    _require(not jobs._accepted.keys() & (jobs.keys() - checks - again), "an accepted job is wanted still")
     _require(all(count >= 0 for count in fleet.counts.values()), "a count is negative")
 
 
@@ -115,7 +119,8 @@ def check_worker(worker: Worker, now: float) -> None:
             if job.digest not in turn.unwanted]  # fmt: skip
     _require(len(held) == len(set(held)), "a worker scores a job in two slots at once", "waste")
     vectors, queued = len(worker.backlog._vectors), len(worker.backlog.queued)
-    _require(vectors <= queued + MAX_UNUSED_VECTORS, "a worker keeps vectors that no job needs", "memory")
+    just_taken = 2 * worker.capacity  # the next batch drops their vectors
+    _require(vectors <= queued + just_taken + MAX_UNUSED_VECTORS, "a worker keeps vectors that no job needs", "memory")
     for digest in worker.outbox.digests if worker.nonce is not None and not worker.asking else ():
         quiet = now - worker.sent_at.get(digest, now)
         _require(quiet <= REPEATED_WITHIN, "a result without a verdict is not repeated", "promptness")
@@ -148,7 +153,8 @@ def at_rest(fleet: Fleet, run: Run) -> bool:
 
 
 def _queued(jobs: PendingJobs) -> list[bytes]:
-    return [digest for *_, digest in (*jobs._queue, *jobs._background_queue) if digest in jobs]
+    return [digest for *_, digest in (*jobs._queue, *jobs._background_queue)
+            if digest in jobs and jobs[digest].check is None]  # fmt: skip
 
 
 def _require(holds: bool, otherwise: str, rule: str = "books") -> None:

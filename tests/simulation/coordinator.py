@@ -27,6 +27,8 @@ BEAT = REPEAT = 1.0  # virtual seconds, as the run's intervals say
 TICK = 0.25  # virtual seconds between turns without a message; the product's are shorter, and cost as much
 LINGER = 0.005
 
+ANCHOR_KEY = bytes(32)  # of the coordinator's own host
+
 OPENED, COMMITTED = "opened", "committed"
 Step = OutgoingBatch | str | None
 """A batch to send, the name of a moment, or any other moment at which a life may end."""
@@ -51,7 +53,8 @@ class Coordinator:
         self.nonce = f"{life:016x}"
         limits = LimitsConfig(generations=shape.generations if shape.ends else 0)
         journal = cast(Journal, MemoryJournal(disk, witness))
-        self.run = Run(journal, settings_of(shape), limits, NetworkConfig(beat=BEAT), now)
+        network = NetworkConfig(beat=BEAT, verify=shape.verify, failure_limit=1.0)
+        self.run = Run(journal, settings_of(shape), limits, network, now, ANCHOR_KEY)
         self.fleet = self.run.fleet
         self.worker_protocol = WorkerProtocol(self.run, "simulated", self.nonce, Intervals(BEAT, REPEAT))
         self.draining = False
@@ -78,6 +81,8 @@ class Coordinator:
         yield None
         self.run.commit()
         yield COMMITTED
+        if self.run.is_rewound:
+            return
         yield from self.fleet.dispatch(now)
         self.run.prepare()
         self.run.take_closed()
@@ -89,5 +94,7 @@ class Coordinator:
 
     @property
     def over(self) -> bool:
-        """Whether this life leaves by itself: the run has ended, or a drain is done."""
+        """Whether this life leaves by itself: the run has ended or was rewound, or a drain is done."""
+        if self.run.is_rewound:
+            return True
         return self.run.ended is not None or (self.draining and not self.fleet.lease_count)

@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Collection, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from io import BytesIO
+from math import nan
 from pathlib import Path
 from typing import Any, Protocol
+
+import numpy as np
 
 from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.messages import Job, Result
 from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_paths import JOURNAL
+from dreamfleet.coordinator.dispatch.failures import host_of
+from dreamfleet.coordinator.jobs.checks import Answer
 from dreamfleet.coordinator.jobs.confirmation import Finalist
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
+from dreamfleet.coordinator.jobs.generation import KnownResult
 from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollection
 from dreamfleet.coordinator.storage.journal import StoredOpenGeneration
+from dreamfleet.coordinator.storage.verification_records import StoredAnswer, StoredBar
 from tests.simulation.violation import Violation
 
-TABLES = ("fact", "generation", "result", "evaluation", "collection")
+TABLES = ("fact", "generation", "result", "failure", "evaluation", "collection", "verification", "barred", "recalled")
 FOLDER = Path("/simulated/run")
 
 
@@ -43,9 +52,23 @@ class Witness(Protocol):
     """Who looks at each row before it is written."""
 
     def opened(self, number: int, vectors: tuple[bytes, ...]) -> None: ...
+    def redrawn(self, number: int, rounds: int, vectors: tuple[bytes, ...]) -> None: ...
     def counted(self, job: Job, result: Result) -> None: ...
-    def check_fitness(self, number: int, fitness: list[float]) -> None: ...
+    def failed(self, job: Job) -> None: ...
+    def check_fitness(self, number: int, fitness: list[float | None]) -> None: ...
     def evaluated(self, generation: int, mean: float, std: float) -> None: ...
+
+
+@dataclass(frozen=True)
+class _Packed:
+    """A strategy's state, packed as it was or not yet."""
+
+    state: Any
+
+    @property
+    def data(self) -> bytes:
+        packed: bytes = self.state if isinstance(self.state, bytes) else self.state.packed()
+        return packed
 
 
 class MemoryJournal:
@@ -113,9 +136,9 @@ class MemoryJournal:
     def add_event(self, text: str) -> None:
         """No rule hangs on it."""
 
-    def workers(self) -> list[str]:
-        """Only lasting failures hang on it, and a simulated run pauses instead."""
-        return []
+    def workers(self, *, recalled: bool = False) -> list[str]:
+        rows = [*self._tables["result"].values(), *(row for _, row in self._tables["recalled"].values() if recalled)]
+        return sorted({worker for _, _, worker, _ in rows})
 
     def drop_excessive(self, horizon: int) -> int:
         """No older version wrote here."""
@@ -132,20 +155,137 @@ class MemoryJournal:
 
     def open_generation(self, number: int, state: Any, sigma: float, seeds: Sequence[int], vectors: Any) -> None:
         self._witness.opened(number, tuple(vectors))
-        self._insert("generation", number, {"state": state, "seeds": tuple(seeds), "vectors": tuple(vectors)})
+        first = {"vectors": tuple(vectors), "first": tuple(vectors), "redrawn": ()}
+        self._insert("generation", number, {"state": state, "seeds": tuple(seeds), **first})
 
-    def close_generation(self, closed: StoredGeneration, fitness: Any) -> None:
+    def close_generation(self, closed: StoredGeneration, fitness: Any, measures: Any = None) -> None:
         row = self._tables["generation"][closed.number]
         if "closed" in row:
             raise Violation("counted twice", f"generation {closed.number} was closed before")
-        self._witness.check_fitness(closed.number, fitness.tolist())
-        self._put("generation", closed.number, {**row, "closed": closed, "fitness": fitness.tolist()})
+        found = [None if np.isnan(each) else each for each in fitness.tolist()]
+        self._witness.check_fitness(closed.number, found)
+        self._put("generation", closed.number, {**row, "closed": closed, "fitness": found})
 
     def add_result(
         self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int, host_class: str = ""
     ) -> None:
         self._witness.counted(job, result)
-        self._insert("result", result.digest, (job, result))
+        self._insert("result", result.digest, (job, result, worker, host_class))
+
+    def verify_key(self) -> bytes:
+        return b"a secret"  # a play is the same every time
+
+    def add_verification(self, job: Job, worker: str, checker: str, outcome: str) -> None:
+        if outcome != "unchecked" and checker in ("", host_of(worker)):
+            raise Violation("checked", f"{worker} checked its own result")
+        self._put("verification", job.digest, (job, worker, checker, outcome))
+
+    def verification_counts(self) -> Counter[str]:
+        return Counter(outcome for *_, outcome in self._tables["verification"].values())
+
+    def unverified(self, digests: Sequence[bytes]) -> dict[bytes, StoredAnswer]:
+        rows, known = self._tables["result"], self._tables["verification"]
+        return {
+            digest: StoredAnswer(worker, host_class, Answer.of(host_of(worker), result))
+            for digest in digests
+            if digest in rows and digest not in known
+            for _, result, worker, host_class in (rows[digest],)
+        }
+
+    def barred(self) -> dict[str, StoredBar]:
+        return dict(self._tables["barred"])
+
+    def bar(self, host: str, bar: StoredBar, incarnation: int) -> None:
+        self._put("barred", host, bar)
+
+    def unbar(self, host: str) -> None:
+        self._put("barred", host, None)
+
+    def first_brought(self, hosts: Collection[str]) -> dict[str, int]:
+        first: dict[str, int] = {}
+        for job, _, worker, _ in self._tables["result"].values():
+            if host_of(worker) in hosts:
+                first[job.kind] = min(job.generation, first.get(job.kind, job.generation))
+        for job, _ in self._failures_of(hosts).values():
+            first[job.kind] = min(job.generation, first.get(job.kind, job.generation))
+        return first
+
+    def _failures_of(self, hosts: Collection[str]) -> dict[bytes, Any]:
+        return {digest: row for digest, row in self._tables["failure"].items() if set(hosts) & {*map(host_of, row[1])}}
+
+    def recall_results(self, hosts: Collection[str]) -> int:
+        mine = {digest: row for digest, row in self._tables["result"].items() if host_of(row[2]) in hosts}
+        reopened = {row[0].generation for row in mine.values() if row[0].kind == "evaluate"}
+        vectors = {each.vector for number, (each, _) in self._tables["evaluation"].items() if number in reopened}
+        for number, (evaluation, _) in list(self._tables["evaluation"].items()):
+            if evaluation.vector in vectors:
+                self._put("evaluation", number, (evaluation, None))
+        for digest in self._failures_of(hosts):
+            self._put("failure", digest, None)
+        for digest, row in mine.items():
+            self._set_aside("barred", digest, row)
+        for key, (_, row) in list(self._tables["recalled"].items()):
+            if host_of(row[2]) in hosts:
+                self._put("recalled", key, ("barred", row))
+        for digest, (*_, checker, _outcome) in list(self._tables["verification"].items()):
+            if checker in hosts or digest not in self._tables["result"]:
+                self._put("verification", digest, None)
+        self._settle_recall()
+        return len(mine)
+
+    def _set_aside(self, because: str, digest: bytes, row: Any) -> None:
+        self._put("recalled", (digest, row[2]), (because, row))
+        self._put("result", digest, None)
+
+    def _settle_recall(self) -> None:
+        for fact in ("ending", "ended", "ended_at", "confirmed"):
+            self.drop_fact(fact)
+
+    def rewind(self, number: int, state: Any, seeds: Sequence[int]) -> None:
+        for digest, row in list(self._tables["result"].items()):
+            job = row[0]
+            if job.generation > number or (job.generation == number and job.kind != "score"):
+                self._set_aside("rewound", digest, row)
+        for digest, (job, _) in list(self._tables["failure"].items()):
+            if job.generation > number or (job.generation == number and job.kind != "score"):
+                self._put("failure", digest, None)
+        for table in ("evaluation", "collection"):
+            for each in [each for each in self._tables[table] if each >= number]:
+                self._put(table, each, None)
+        for each in [each for each in self._tables["generation"] if each > number]:
+            self._put("generation", each, None)
+        row = self._tables["generation"][number]
+        first = {"vectors": row["first"], "first": row["first"], "redrawn": ()}
+        self._put(
+            "generation", number, {"state": row["state"], **first, "seeds": tuple(seeds), "restored": _Packed(state)}
+        )
+        self._settle_recall()
+
+    def take_back(self, digests: Sequence[bytes]) -> bool:
+        found = {digest: (key, row) for key, (because, row) in self._tables["recalled"].items()
+                 for digest in [key[0]] if because == "rewound" and digest in digests}  # fmt: skip
+        for digest, (key, row) in found.items():
+            self._put("recalled", key, None)
+            if digest not in self._tables["result"]:
+                self._put("result", digest, row)
+        return bool(found)
+
+    def recalled_rollouts(self) -> list[tuple[int, int]]:
+        """Nothing reads them, and the simulated folder is not there."""
+        return []
+
+    def vectors_of(self, number: int) -> tuple[bytes, ...]:
+        vectors: tuple[bytes, ...] = self._tables["generation"][number]["vectors"]
+        return vectors
+
+    def redraws_of(self, number: int) -> list[list[int]]:
+        return [list(each) for each in self._tables["generation"][number]["redrawn"]]
+
+    def seeds_of(self, number: int) -> list[int]:
+        return list(self._tables["generation"][number]["seeds"])
+
+    def scores_of(self, number: int, axes: int) -> tuple[Any, Any]:
+        return np.array(self._tables["generation"][number]["fitness"], dtype=np.float64), None
 
     def schedule_evaluation(self, evaluation: Evaluation) -> None:
         self._insert("evaluation", evaluation.generation, (evaluation, None))
@@ -158,19 +298,27 @@ class MemoryJournal:
         self._put("evaluation", generation, (evaluation, found))
 
     def add_failure(self, job: Job, error: str, workers: Sequence[str], attempts: int) -> None:
-        raise Violation("raised", "a simulated run pauses where an episode fails")
+        self._witness.failed(job)
+        self._insert("failure", job.digest, (job, tuple(workers)))
 
     def drop_failures(self, generation: int) -> None:
-        """There are none."""
+        of_it = [digest for digest, (job, _) in self._tables["failure"].items()
+                 if job.kind == "score" and job.generation == generation]  # fmt: skip
+        self.drop_failures_of(of_it)
 
     def drop_failures_of(self, digests: Sequence[bytes]) -> None:
-        """There are none."""
+        for digest in digests:
+            self._put("failure", digest, None)
 
     def set_seeds(self, generation: int, seeds: Sequence[int]) -> None:
-        """A simulated run pauses at a failure instead."""
+        self._put("generation", generation, {**self._tables["generation"][generation], "seeds": tuple(seeds)})
 
     def redraw(self, generation: int, indices: Sequence[int], vectors: Sequence[bytes]) -> None:
-        raise Violation("raised", "a simulated run pauses where an episode fails")
+        row, new = self._tables["generation"][generation], dict(zip(indices, vectors, strict=True))
+        now = tuple(new.get(index, vector) for index, vector in enumerate(row["vectors"]))
+        rounds = (*row["redrawn"], tuple(indices))
+        self._witness.redrawn(generation, len(rounds), now)
+        self._put("generation", generation, {**row, "vectors": now, "redrawn": rounds})
 
     def schedule_collection(self, collection: RolloutCollection) -> None:
         self._insert("collection", collection.generation, collection)
@@ -186,23 +334,28 @@ class MemoryJournal:
         row = self._tables["generation"].get(number)
         if row is None or number < max(self._tables["generation"]) - 1:
             return None
-        return StoredOpenGeneration(number, row["state"].packed(), row["seeds"], row["vectors"])
+        state = row["restored"].data if "restored" in row else row["state"].packed()
+        return StoredOpenGeneration(number, state, row["seeds"], row["vectors"], row["redrawn"])
 
     def read_closed(self) -> tuple[list[StoredGeneration], list[StoredEvaluation]]:
         generations = [row["closed"] for _, row in sorted(self._tables["generation"].items()) if "closed" in row]
         return generations, [done for _, (_, done) in sorted(self._tables["evaluation"].items()) if done]
 
-    def results_of(self, kind: str, generation: int) -> dict[bytes, tuple[float, int]]:
+    def results_of(self, kind: str, generation: int) -> dict[bytes, KnownResult]:
         rows = self._tables["result"].items()
-        return {
-            digest: (result.fitness, result.steps)
-            for digest, (job, result) in rows
+        found = {
+            digest: (result.fitness, result.steps, result.measures)
+            for digest, (job, result, *_) in rows
             if job.kind == kind and job.generation == generation
         }
+        failed = {digest: (nan, 0, ()) for digest, (job, _) in self._tables["failure"].items()
+                  if job.kind == kind and job.generation == generation}  # fmt: skip
+        return found | failed
 
     def fitness_of(self, digests: Sequence[bytes]) -> dict[bytes, float]:
         rows = self._tables["result"]
-        return {digest: rows[digest][1].fitness for digest in digests if digest in rows}
+        failed = {digest: nan for digest in digests if digest in self._tables["failure"]}
+        return {digest: rows[digest][1].fitness for digest in digests if digest in rows} | failed
 
     def pending_evaluations(self) -> list[Evaluation]:
         return [evaluation for _, (evaluation, done) in sorted(self._tables["evaluation"].items()) if done is None]

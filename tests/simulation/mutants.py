@@ -14,19 +14,25 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import numpy as np
+
 from dreamfleet.common.protocol.messages import MAX_PART
 from dreamfleet.common.runs.stages import StageTracker, stages_of
-from dreamfleet.coordinator.dispatch import fleet, member, packing
+from dreamfleet.coordinator.dispatch import failure_judge, fleet, member, packing
 from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.dispatch.member import Member, SentBatch
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJobs
+from dreamfleet.coordinator.jobs.checks import Check
 from dreamfleet.coordinator.jobs.confirmation import Confirmation
 from dreamfleet.coordinator.jobs.evaluation import Evaluations
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollections
 from dreamfleet.coordinator.jobs.upload_assembler import UploadAssembler as Intake
+from dreamfleet.coordinator.run import generations
+from dreamfleet.coordinator.run.background_jobs import BackgroundJobs
 from dreamfleet.coordinator.run.generations import Generations
 from dreamfleet.coordinator.run.run import Run
+from dreamfleet.coordinator.run.verification import Verification
 from dreamfleet.worker.service.backlog import Backlog, PartialVector
 from dreamfleet.worker.service.membership import Membership
 from dreamfleet.worker.service.outbox import Outbox, UploadQueue
@@ -71,6 +77,7 @@ MUTANTS: dict[str, Mutant] = {}
 FOUND = [Schedule.from_json(line) for line in Path(__file__).with_name("found.jsonl").read_text().splitlines()]
 COLLECTING = {"collect_every": 1, "rollout": 90_000}
 SCORED = {"evaluate_every": 1, "first_stage": 3, "first_score": 1.2, "generations": 3}
+FAILING = {"on_failure": "redraw", "failing": 0.15}
 LONG = {"parameters": 23_000, "width": 1}
 
 
@@ -83,6 +90,34 @@ def mutant(target: Any, attribute: str, **shape: Any) -> Callable[[Callable[...,
         return make
 
     return register
+
+
+# The coordinator: checks of results. Mutants of a recall are in `test_liars.py`.
+
+
+@mutant(Check, "may_ask", verify=1.0)
+def checks_ask_the_host_that_answered(_original):
+    return lambda self, host, host_class: True
+
+
+@mutant(Verification, "settle", verify=1.0, workers=1)
+def checks_wait_for_hosts_that_are_not_there(_original):
+    return lambda self, now: None
+
+
+@mutant(Verification, "restore", verify=1.0)
+def checks_are_forgotten_in_a_restart(_original):
+    return lambda self, work: None
+
+
+@mutant(BackgroundJobs, "_check_again", verify=1.0, confirm_episodes=4, evaluate_every=1, ends=True)
+def checks_of_a_confirmation_are_forgotten_in_a_restart(_original):
+    return lambda self, work: False
+
+
+@mutant(Verification, "holds_generation", verify=1.0)
+def generations_do_not_wait_for_their_checks(_original):
+    return False
 
 
 # The coordinator: fleet, wanted jobs, member, packing.
@@ -99,25 +134,25 @@ def fleet_forgets_to_queue_what_a_lost_worker_held(_original):
 
 @mutant(Fleet, "_judge")
 def fleet_accepts_what_it_has_accepted_already(original):
-    def judge(self, identity, result, given):
+    def judge(self, identity, result, given, host_class):
         work = self.jobs.work(result.digest)
         works = self.__dict__.setdefault("mutated", {})
         if work is not None:
             works[result.digest] = work
         elif self.jobs.is_accepted(result.digest) and result.digest in works:
             return "accepted", works[result.digest]
-        return original(self, identity, result, given)
+        return original(self, identity, result, given, host_class)
 
     return judge
 
 
 @mutant(Fleet, "_judge")
 def fleet_believes_every_result_of_the_generation_that_is_open(original):
-    def judge(self, identity, result, given):
+    def judge(self, identity, result, given, host_class):
         if result.digest not in self.jobs and result.fitness is not None and self.jobs:
             result = replace(result, digest=next(iter(self.jobs)))
             given = self.find_job_for_result(identity, result)
-        return original(self, identity, result, given)
+        return original(self, identity, result, given, host_class)
 
     return judge
 
@@ -174,8 +209,8 @@ def jobs_that_fill_the_slack_are_not_counted(_original):
 
 @mutant(Fleet, "handle_result")
 def fleet_gives_no_verdict_on_a_duplicate(original):
-    def result(self, identity, result, now):
-        judged = original(self, identity, result, now)
+    def result(self, identity, result, now, *host_class):
+        judged = original(self, identity, result, now, *host_class)
         if judged[0] == "duplicate" and identity in self.members:
             self.members[identity].verdicts.pop()
         return judged
@@ -249,6 +284,26 @@ def generation_lets_the_worse_half_pass_the_barrier(original):
 @mutant(Generations, "_recall")
 def generations_forget_the_results_of_the_life_before(_original):
     return lambda self, stored, terms: self._generation(stored.number, stored.vectors, stored.seeds, terms)
+
+
+@mutant(Generations, "begin", **FAILING)
+def generations_forget_how_often_candidates_were_drawn_anew(original):
+    def begin(self):
+        generation = original(self)
+        self._rounds = 0
+        return generation
+
+    return begin
+
+
+@mutant(generations, "_ranked", **FAILING)
+def generations_rank_failed_candidates_above_the_worst(_original):
+    return lambda fitness, worst: np.where(np.isfinite(fitness), fitness, worst + 0.5)
+
+
+@mutant(failure_judge, "is_lasting", **FAILING)
+def failures_become_facts_after_one_attempt(_original):
+    return lambda attempts, working, present: True
 
 
 @mutant(Run, "commit")

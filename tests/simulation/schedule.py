@@ -6,6 +6,7 @@ import json
 import random
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
+from typing import Literal
 
 SPAN = 9.0  # virtual seconds over which faults are spread: an undisturbed run takes about as long
 
@@ -32,6 +33,9 @@ class Shape:
     rollout: int = 300  # bytes; more than 40,960 travel in several parts
     turn: float = 0.6  # virtual seconds that a slot's turn takes
     run_seed: int = 1
+    verify: float = 0.0  # share of the results that another worker scores again
+    on_failure: Literal["pause", "worst", "redraw"] = "pause"
+    failing: float = 0.0  # share of a candidate's episodes that fail wherever they are scored
     ends: bool = True  # whether the run reaches its limit, or is paused after its last generation, and falls silent
 
     @property
@@ -113,6 +117,8 @@ def draw(seed: int, number: int) -> Schedule:
     """The schedule of this number in the campaign of this seed."""
     source = random.Random(f"{seed}/{number}")
     shape = _staged(_draw_shape(source), random.Random(f"stages of {seed}/{number}"))
+    shape = replace(shape, verify=random.Random(f"checks of {seed}/{number}").choice((0.0, 0.0, 0.3, 1.0)))
+    shape = _failing(shape, random.Random(f"failures of {seed}/{number}"))
     count = source.choice((0, 1, 5, 20, 20, 30, 40, 60))  # few faults too: each alone must be harmless
     kinds, weights = list(KINDS), [often for often, _, _ in KINDS.values()]
     faults = [_draw_fault(source, kind, shape.workers) for kind in source.choices(kinds, weights, k=count)]
@@ -128,6 +134,12 @@ def _staged(shape: Shape, source: random.Random) -> Shape:
     return replace(
         shape, generations=3, first_stage=first, first_score=1.4 if scored else 0.0, anew=anew, evaluate_every=every
     )
+
+
+def _failing(shape: Shape, source: random.Random) -> Shape:
+    """In one of six, episodes fail for good; what else is drawn does not hang on it."""
+    policy, failing = source.choice(("worst", "redraw")), source.choice((0.05, 0.15))
+    return shape if source.random() > 1 / 6 else replace(shape, on_failure=policy, failing=failing)
 
 
 def _draw_fault(source: random.Random, kind: str, workers: int) -> Fault:

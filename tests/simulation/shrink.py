@@ -11,8 +11,8 @@ from tests.simulation.world import Outcome, play
 MAX_PLAYS = 600
 # Features of a shape that the shrinker turns off, in this order.
 PLAINER = (
-    "first_score", "first_stage", "anew", "racing", "width", "parameters", "rollout", "collect_every",
-    "confirm_episodes", "evaluate_every", "slots",
+    "failing", "on_failure", "first_score", "first_stage", "anew", "racing", "width", "parameters", "rollout",
+    "collect_every", "confirm_episodes", "evaluate_every", "slots",
 )  # fmt: skip
 SMALLER = {"generations": 1, "workers": 1, "population": 2, "episodes": 1}
 

@@ -6,7 +6,7 @@ Restated here from the protocol, apart from the product's own code, so that a fa
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, ClassVar
@@ -23,6 +23,13 @@ from tests.simulation.schedule import Shape
 STEPS = 100  # of every episode
 TASK = "simulated"
 SECOND_HORIZON, SECOND_PATIENCE, SECOND_SIGMA = 2 * STEPS, 7, 0.25  # of a second stage
+
+MAX_RETRIES = 3  # times that a generation gets other seeds, and that its failed candidates are drawn anew
+
+
+class HopelessError(Exception):
+    """All candidates of a generation fail whatever is tried: the run would wait for somebody to change the task."""
+
 
 Named = tuple[float | None, int | None, int | None, bool | None]  # nothing is driven where nothing dreams
 """Temperature, horizon and patience of a job where they are not the run's."""
@@ -41,8 +48,15 @@ class Strategy:
     def ask(self) -> Any:
         source = np.random.Generator(np.random.PCG64([self._search.seed, self._count]))
         steps = source.standard_normal((self._search.population, self._search.dimension), dtype=np.float32)
-        self._asked = self.mean + self.sigma * steps
+        self._asked, self._redraws = self.mean + self.sigma * steps, 0
         return self._asked
+
+    def redraw(self, indices: Sequence[int]) -> Any:
+        self._redraws += 1
+        source = np.random.Generator(np.random.PCG64([self._search.seed, self._count, self._redraws]))
+        steps = source.standard_normal((len(indices), self._search.dimension), dtype=np.float32)
+        self._asked[list(indices)] = self.mean + self.sigma * steps
+        return self._asked[list(indices)]
 
     def tell(self, fitness: Any) -> None:
         self.mean = fitness @ self._asked / fitness.sum()
@@ -76,6 +90,7 @@ def settings_of(shape: Shape) -> RunSettings:
         collect_every=shape.collect_every,
         optimiser=TASK,
         stages=_stages_of(shape),
+        on_failure=shape.on_failure,
     )
 
 
@@ -98,6 +113,12 @@ def fitness_of_job(job: Job) -> float:
     return _fitness(job.vector, job.seeds[0], job.overrides)
 
 
+def fails(share: float, vector: bytes, seed: int) -> bool:
+    """Whether a candidate's episode fails wherever it is scored; `vector` is the digest of the parameters."""
+    hashed = hashlib.blake2b(b"fails" + vector + str(seed).encode(), digest_size=4).digest()
+    return int.from_bytes(hashed, "little") < share * 2**32
+
+
 def _fitness(identity: bytes, seed: int, named: Named) -> float:
     content = seed, *(named if any(named[1:]) else named[:1])
     hashed = hashlib.blake2b(identity + repr(content).encode(), digest_size=4).digest()
@@ -113,8 +134,9 @@ def rollout_of(vector: bytes, seed: int, size: int) -> bytes:
 class Truth:
     """An undisturbed run, generation by generation."""
 
-    vectors: list[tuple[bytes, ...]]
-    fitness: list[list[float]]
+    vectors: list[tuple[bytes, ...]]  # as they were first asked for
+    redrawn: list[list[tuple[bytes, ...]]]  # after each round in which failed candidates were drawn anew
+    fitness: list[list[float | None]]  # `None`: it failed
     evaluations: dict[int, StoredEvaluation]
     rollouts: dict[str, bytes]  # by the name of their file
     jobs: int  # that are counted
@@ -122,14 +144,14 @@ class Truth:
 
 def truth_of(shape: Shape) -> Truth:
     """What a run of this shape comes to; how many work on it does not matter."""
-    return _truth(replace(shape, workers=1, slots=1, width=1, turn=1.0, ends=True))
+    return _truth(replace(shape, workers=1, slots=1, width=1, turn=1.0, verify=0.0, ends=True))
 
 
 @lru_cache(1024)
 def _truth(shape: Shape) -> Truth:
     settings = settings_of(shape)
     strategy = Strategy(Search(np.zeros(settings.controller.size), shape.population, settings.sigma0, shape.run_seed))
-    truth, counted, second = Truth([], [], {}, {}, 0), set(), False
+    truth, counted, second = Truth([], [], [], {}, {}, 0), set(), False
     for number in range(shape.generations):
         named: Named = (None, None, None, None)
         episodes, racing = shape.episodes, shape.racing
@@ -139,13 +161,13 @@ def _truth(shape: Shape) -> Truth:
         if second:
             named, episodes, racing = (None, SECOND_HORIZON, SECOND_PATIENCE, None), episodes + 1, not racing
         vectors = tuple(row.astype("<f4").tobytes() for row in strategy.ask())
-        seeds = [training_seed(shape.run_seed, number, episode) for episode in range(episodes)]
-        scores = [[fitness_of(vector, seed, named) for seed in seeds] for vector in vectors]
-        fitness, driven = _fitness_and_driven(scores, racing)
         truth.vectors.append(vectors)
-        truth.fitness.append(fitness)
+        vectors, seeds, fitness, driven = _scored(
+            shape, strategy, number, list(vectors), named, episodes, racing, truth
+        )
+        truth.fitness.append([None if np.isnan(each) else each for each in fitness])
         counted |= {("score", vectors[candidate], seeds[episode]) for candidate, episode in driven}
-        strategy.tell(np.array(fitness))
+        strategy.tell(np.where(np.isnan(fitness), np.nextafter(np.nanmin(fitness), -np.inf), fitness))
         last = number == shape.generations - 1
         mean = strategy.mean.astype("<f4").tobytes()
         if _due(shape.evaluate_every, number, last and shape.ends):
@@ -177,16 +199,56 @@ def _second_search(shape: Shape, first: Strategy) -> Strategy:
     return Strategy(Search(first.mean, shape.population + 1, SECOND_SIGMA, search_seed(shape.run_seed, 2)))
 
 
-def _fitness_and_driven(scores: list[list[float]], racing: bool) -> tuple[list[float], set[tuple[int, int]]]:
-    """The mean of each candidate's own episodes, and which those are."""
+def _scored(
+    shape: Shape, strategy: Strategy, number: int, vectors: list[bytes], named: Named, episodes: int, racing: bool,
+    truth: Truth,
+) -> tuple[list[bytes], list[int], list[float], set[tuple[int, int]]]:  # fmt: skip
+    """A generation's last vectors and seeds, its fitness (NaN: failed) and what was driven for it.
+
+    Bad seeds are replaced, then failed candidates drawn anew, three times each at most.
+    """
+    reseeds, rounds, drove = 0, list[tuple[bytes, ...]](), set[int]()  # candidates that drove all episodes before
+    truth.redrawn.append(rounds)
+    while True:
+        seeds = [training_seed(shape.run_seed, number, reseeds * episodes + each) for each in range(episodes)]
+        scores = [[_score(shape.failing, vector, seed, named) for seed in seeds] for vector in vectors]
+        fitness, driven, whole = _fitness_and_driven(scores, racing, drove)
+        failed = [each for each, value in enumerate(fitness) if np.isnan(value)]
+        if whole <= set(failed) and reseeds < MAX_RETRIES:
+            reseeds, drove = reseeds + 1, set()
+        elif failed and shape.on_failure == "redraw" and len(rounds) < MAX_RETRIES:
+            for each, row in zip(failed, strategy.redraw(failed), strict=True):
+                vectors[each] = row.astype("<f4").tobytes()
+            rounds.append(tuple(vectors))
+            drove = (drove | whole) - set(failed)
+        elif len(failed) == len(fitness):
+            raise HopelessError
+        else:
+            return vectors, seeds, fitness, driven
+
+
+def _score(failing: float, vector: bytes, seed: int, named: Named) -> float:
+    is_failed = fails(failing, hashlib.sha256(vector).digest(), seed)
+    return np.nan if is_failed else fitness_of(vector, seed, named)
+
+
+def _fitness_and_driven(
+    scores: list[list[float]], racing: bool, drove: set[int]
+) -> tuple[list[float], set[tuple[int, int]], set[int]]:  # fmt: skip
+    """The mean of each candidate's own episodes, which those are, and which candidates were to drive all episodes.
+
+    A failed candidate's fitness is NaN, and none of its episodes is needed.
+    """
     episodes = len(scores[0])
     first = (episodes + 1) // 2 if racing else episodes
-    early = [float(np.mean(row[:first])) for row in scores]
+    early = [-np.inf if np.isnan(row[:first]).any() else float(np.mean(row[:first])) for row in scores]
     order = sorted(range(len(scores)), key=lambda candidate: (-early[candidate], candidate))
-    further = set(order[: (len(scores) + 1) // 2])
-    own = [row if candidate in further else row[:first] for candidate, row in enumerate(scores)]
-    driven = {(candidate, episode) for candidate, row in enumerate(own) for episode in range(len(row))}
-    return [float(np.mean(row)) for row in own], driven
+    further = set(order[: (len(scores) + 1) // 2]) if first < episodes else set(order)
+    own = [row if candidate in further | drove else row[:first] for candidate, row in enumerate(scores)]
+    fitness = [float(np.mean(row)) for row in own]
+    driven = {(candidate, episode) for candidate, row in enumerate(own) for episode in range(len(row))
+              if not np.isnan(fitness[candidate])}  # fmt: skip
+    return fitness, driven, further
 
 
 def _due(every: int, number: int, last: bool) -> bool:

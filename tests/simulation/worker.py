@@ -27,12 +27,14 @@ from dreamfleet.common.protocol.messages import (
     TaskSpec,
     UploadPart,
 )
+from dreamfleet.common.security.anchor_key import proof_for
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.membership import LeaveConditions, Membership, WorkerLoad
 from dreamfleet.worker.service.outbox import BURST_INTERVAL, Outbox, UploadQueue
-from tests.simulation.coordinator import BEAT, REPEAT
+from tests.simulation.coordinator import ANCHOR_KEY, BEAT, REPEAT
 from tests.simulation.schedule import Shape
 from tests.simulation.truth import STEPS, TASK, fitness_of, rollout_of
+from tests.simulation.truth import fails as truth_fails
 from tests.simulation.violation import Violation
 
 UID = "0123456789abcdef" * 2
@@ -77,6 +79,7 @@ class Scored:
 
     steps: int = 0
     errors: int = 0
+    failures: int = 0  # attempts of episodes that fail wherever they are scored
 
 
 class Worker:
@@ -89,6 +92,9 @@ class Worker:
         self.stopped = False
         self.left = False
         self.slowness = 1.0
+        self.lie: Callable[[Job, float], float] = lambda _, fitness: fitness  # what it says of a job
+        self.host_class: str | None = None  # `None`: it says none, as older workers
+        self.is_anchor = False  # whether it is on the coordinator's own host
         self.failures = 0  # turns that are still to fail
         self.nonce: str | None = None  # of the life that it has joined; `None` before the first
         self.inbox: deque[Any] = deque()
@@ -202,7 +208,16 @@ class Worker:
         self.asked_at = now
         self._waits_until = now + HELLO_TIMEOUT
         request = HelloRequest(
-            PROTOCOL_VERSION, PROTOCOL_VERSION, "0", self.identity, (TASK,), "f", self._shape.slots, NUMERIC_PACKAGES
+            PROTOCOL_VERSION,
+            PROTOCOL_VERSION,
+            "0",
+            self.identity,
+            (TASK,),
+            "f",
+            self._shape.slots,
+            NUMERIC_PACKAGES,
+            host_class=self.host_class,
+            anchor=proof_for(ANCHOR_KEY, self.identity) if self.is_anchor else "",
         )
         self._send((request, self._question))
 
@@ -267,15 +282,20 @@ class Worker:
         self._scored.steps += STEPS * len(turn.work)
         for job, vector in turn.work:
             if fails:
-                self._scored.errors += 1
-                self.outbox.add(Result(job.digest, None, STEPS, 0.1, "boom", None))
+                self._scored.errors += 1  # of the host, where failures become facts
+                error = "host: boom" if self._shape.on_failure != "pause" else "boom"
+                self.outbox.add(Result(job.digest, None, STEPS, 0.1, error, None))
                 continue
-            fitness, upload = fitness_of(vector, job.seeds[0], job.overrides), None
+            if job.kind == "score" and truth_fails(self._shape.failing, job.vector, job.seeds[0]):
+                self._scored.failures += 1
+                self.outbox.add(Result(job.digest, None, STEPS, 0.1, f"ValueError: at {turn.ends}", None))
+                continue
+            fitness, upload = self.lie(job, fitness_of(vector, job.seeds[0], job.overrides)), None
             if job.kind == "collect":
                 data = rollout_of(vector, job.seeds[0], self._shape.rollout)
                 self.uploads.add(job.digest, data)
                 upload = hashlib.sha256(data).digest()
-            self.outbox.add(Result(job.digest, fitness, STEPS, 0.1, None, upload))
+            self.outbox.add(Result(job.digest, fitness, STEPS, 0.1 + 1e-6 * turn.ends, None, upload))
 
     def _fill(self, now: float) -> None:
         if self.membership.is_leaving(now):
@@ -294,7 +314,7 @@ class Worker:
             self._beat_at = now + BEAT
             self._send(self._beat(now))
         for results in self.outbox.due(now):
-            self._send(ResultBatch(**head, fingerprint="f", results=results))
+            self._send(ResultBatch(**head, fingerprint="f", results=results, host_class=self.host_class))
             self.sent_at.update((result.digest, now) for result in results)
         for piece in self.uploads.due(now):
             self._send(UploadPart(**head, **vars(piece)))
@@ -315,4 +335,5 @@ class Worker:
             load=0.0,
             steps_per_second=STEPS / self._shape.turn / self.slowness * len(running),
             drawn_by="-",
+            host_class=self.host_class,
         )

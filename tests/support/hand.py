@@ -48,6 +48,7 @@ class Hand:
         self.reasons = True  # whether it reads why a worker leaves
         self.worker = None
         self.slots = 0  # in its status
+        self.answers = False  # whether it answers each heartbeat by an empty batch, as a coordinator does
         self.offsets = queue.SimpleQueue()  # of the requested parts of the bundle
         self.damage = lambda offset, data: data  # changes a part of the bundle; `None`: no answer
         self._held = []
@@ -80,6 +81,9 @@ class Hand:
         self.vanish()
         for each in self._declared:
             each.undeclare()
+
+    def answer_no_hello(self):
+        self._declared.pop(0).undeclare()
 
     def close(self):
         for query in self._held:
@@ -148,7 +152,12 @@ class Hand:
         self.session.put(keys.job(self.run, self.worker), payload, congestion_control=block)
 
     def _hear(self, kind):
-        return _direct(lambda sample: self._said.put(decode(kind, sample.payload.to_bytes())))
+        def hear(sample):
+            self._said.put(decode(kind, sample.payload.to_bytes()))
+            if kind is Heartbeat and self.answers:
+                self.send(0, vectors=())
+
+        return _direct(hear)
 
     def _hello(self, query):
         with query:

@@ -1,14 +1,16 @@
 """Real coordinators and workers as child processes, with waits for their output."""
 
 import fcntl
-import json
+import io
 import os
 import socket
 import subprocess
 import threading
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 
+from dreamfleet.common.cli import command_line
+from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.host.processes import VerbProcess, command
 from dreamfleet.common.monitoring.client import Client
 
@@ -20,6 +22,16 @@ def free_port():
     with socket.socket() as sock:
         sock.bind(("127.0.0.1", 0))
         return sock.getsockname()[1]
+
+
+def call_here(*words):
+    """Run a verb in this process, where no process of its own is the point: exit code, stdout, stderr."""
+    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
+        try:
+            code = command_line.main([*map(str, words)])
+        except SystemExit as ended:  # such as for --help
+            code = ended.code
+    return code, out.getvalue(), err.getvalue()
 
 
 def environment(cache, root=ROOT):
@@ -116,8 +128,12 @@ class Processes:
         return done.returncode, done.stdout, done.stderr
 
     def status(self):
-        code, out, _ = self.call("status", "--connect", self.endpoint, "--json")
-        return json.loads(out) if code == 0 else None
+        """The raw status of the only live run; `None` if none answers."""
+        try:
+            with Client((self.endpoint,)) as client:
+                return client.document()
+        except ConnectionFailedError:
+            return None
 
     def statuses(self):
         """The status of every live run, most slots first."""

@@ -11,6 +11,8 @@ VARIANTS = {
     "shifted pedal": Variant(pedals="one", pedal_shift=0.25),
     "every third": Variant(decide_every=3),
     "feedback": Variant(feedback="last"),
+    "linear": Variant(actions="linear"),
+    "linear, held and seen": Variant(actions="linear", decide_every=3, feedback="last"),
     "discrete": Variant(actions="discrete"),
     "discrete, held and seen": Variant(actions="discrete", decide_every=3, feedback="last"),
     "all": Variant(pedals="one", decide_every=3, feedback="last"),

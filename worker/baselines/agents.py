@@ -3,33 +3,45 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.random import SeedSequence
 
-from dreamfleet.common.errors import MissingExtraError
+from dreamfleet.common.artifacts.actions import FIVE_CHOICES, STEERING_GAS_BRAKE
+from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.artifacts.driving import FIRST_WORLD
+from dreamfleet.common.errors import MissingExtraError, UsageError
 from dreamfleet.common.files.regular_files import is_file, path_exists
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.protocol.tasks import describe_task
 from dreamfleet.common.runs.lookup import find_agent, find_bundle_of
 from dreamfleet.worker.baselines.policies import RandomPolicy
 from dreamfleet.worker.baselines.presets import CHECKPOINT, DISCRETE, RANDOM
 from dreamfleet.worker.car_racing.agents import NetworkAgent, PictureAgent
 from dreamfleet.worker.car_racing.preprocessing import RAW
-from dreamfleet.worker.scoring.agents import Agent, make_agent
+from dreamfleet.worker.scoring.agents import Agent, EvolvedAgent, make_agent
+from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT
+from dreamfleet.worker.tasks.policy import NO_PARAMETERS
+from dreamfleet.worker.tasks.registry import find_task
+
+ACTIONS_KEY = (3,)  # of the seed's child that random actions come from
 
 
 @dataclass(frozen=True)
-class RandomAgent(PictureAgent):
-    """One of the random drivers; the episode's seed is its random seed."""
+class CarRacingRandomAgent(PictureAgent):
+    """One of CarRacing's two random drivers; the episode's seed is its random seed."""
 
     name: str
 
     @property
     def sha256(self) -> str:
         """The SHA-256 of its name, hexadecimal."""
-        return hashlib.sha256(self.name.encode()).hexdigest()
+        return _hash(self.name)
 
     @property
     def preprocessing(self) -> str:
@@ -38,20 +50,73 @@ class RandomAgent(PictureAgent):
 
     def make_policies(self) -> Callable[[int], RandomPolicy]:
         """Return a function from an episode's seed to a policy."""
-        return lambda seed: RandomPolicy(np.random.default_rng(seed), discrete=self.name == DISCRETE)
+        actions = FIVE_CHOICES if self.name == DISCRETE else STEERING_GAS_BRAKE
+        return lambda seed: RandomPolicy(np.random.default_rng(seed), actions)
 
 
-def find_driver(name: str, runs_dir: Path, bundle: str | None = None) -> Agent:
+class UniformAgent(EvolvedAgent):
+    """Uniform random actions in the world in which a run without a world model would judge its controllers."""
+
+    def make_policies(self) -> Callable[[int], RandomPolicy]:
+        """Return a function from an episode's seed to a policy.
+
+        Environments draw from their seed as it is, so its actions come from a child of that seed.
+        """
+        actions = self.world.actions
+        return lambda seed: RandomPolicy(np.random.default_rng(SeedSequence(seed, spawn_key=ACTIONS_KEY)), actions)
+
+
+def find_driver(
+    name: str,
+    runs_dir: Path,
+    bundle: str | None = None,
+    task: str | None = None,
+    options: Mapping[str, Any] | None = None,
+) -> Agent:
     """The agent of this name: what `find_agent` finds, a random driver, or the network in its training's folder.
 
-    `bundle` names another world model than the controller's own. `DatasetError` for a damaged or foreign checkpoint.
+    `bundle` names another world model than the controller's own. `task` and the task's `options` are the world of a
+    random driver, by default the first world. `UsageError` where they do not apply, `DatasetError` for a damaged or
+    foreign checkpoint.
     """
+    if is_random(name, runs_dir):
+        if bundle is not None:
+            raise UsageError(f"--controller {name} sees nothing: omit --bundle")
+        return make_random_agent(name, task or FIRST_WORLD, options or {})
+    if task is not None or options:
+        raise UsageError(
+            f"--task and --environment are the world of --controller {RANDOM}; {name} has a world of its own"
+        )
     if is_file(Path(name) / CHECKPOINT):
         return _find_network(Path(name))
-    if name in (RANDOM, DISCRETE) and not (path_exists(Path(name)) or path_exists(runs_dir / name)):
-        return RandomAgent(name)
     controller, beside = find_agent(name, runs_dir)
     return make_agent(controller, find_bundle_of(controller, bundle, beside))
+
+
+def is_random(name: str, runs_dir: Path) -> bool:
+    """Whether this is the name of a random driver, and of no file and no run."""
+    return name in (RANDOM, DISCRETE) and not (path_exists(Path(name)) or path_exists(runs_dir / name))
+
+
+def make_random_agent(name: str, task: str, options: Mapping[str, Any]) -> Agent:
+    """The random driver of this name in a task under its options; `UsageError` for a task that needs a world model."""
+    if task == FIRST_WORLD and not options:
+        return CarRacingRandomAgent(name)
+    if name == DISCRETE:
+        raise UsageError(f"{DISCRETE} draws CarRacing's five actions: give --controller {RANDOM}")
+    if not callable(getattr(find_task(task), "describe", None)):
+        raise UsageError(
+            f"{RANDOM} actions need a task that is played without a world model, and {task} is not: give "
+            f"{FIRST_WORLD} without options, gym:ENVIRONMENT or module:Task"
+        )
+    about = describe_task(task, options)
+    shape = ControllerShape(about.observations, about.outputs)
+    spec = TaskSpec(task, "", ENVIRONMENT_LIMIT, 0, controller=shape, options=about.options, version=about.version)
+    return UniformAgent(_hash(f"{name} {task} {about.options}"), spec, NO_PARAMETERS)
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _find_network(folder: Path) -> Agent:

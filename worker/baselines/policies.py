@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.actions import FIVE_CHOICES, STEERING_GAS_BRAKE
+from dreamfleet.common.artifacts.actions import Actions, Discrete, one_hot
+from dreamfleet.worker.tasks.drivers import UniformActions
 from dreamfleet.worker.tasks.frame_skip_policy import FrameSkipPolicy
 
 if TYPE_CHECKING:
@@ -17,19 +19,24 @@ Floats = NDArray[np.float32]
 
 
 class RandomPolicy:
-    """Draws each action uniformly: from the whole range, or from gymnasium's five discrete ones."""
+    """Draws each action uniformly: one of its choices, or a number between the bounds of each component.
 
-    def __init__(self, random: np.random.Generator, *, discrete: bool) -> None:
-        self._random, self._discrete = random, discrete
+    >>> RandomPolicy(np.random.default_rng(1), Discrete(3, first=5)).act(None)
+    np.int64(6)
+    """
+
+    def __init__(self, random: np.random.Generator, actions: Actions) -> None:
+        self._driver = UniformActions(random, one_hot(actions.outputs) if isinstance(actions, Discrete) else actions)
+        self._convert: Callable[[Floats], Any] = (
+            actions.to_action if isinstance(actions, Discrete) else lambda drawn: drawn
+        )
 
     def begin(self, parameters: Floats) -> None:
         """Do nothing: it has no memory."""
 
-    def act(self, _observation: Any) -> Floats:
-        """Return steering, gas and brake `(3,)`."""
-        if self._discrete:
-            return np.array(self._random.choice(FIVE_CHOICES.choices), np.float32)
-        return self._random.uniform(STEERING_GAS_BRAKE.low, STEERING_GAS_BRAKE.high).astype(np.float32)
+    def act(self, _observation: Any) -> Any:
+        """Return an action as the environment's `step` takes it."""
+        return self._convert(self._driver.act())
 
 
 class QPolicy(FrameSkipPolicy):

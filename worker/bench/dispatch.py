@@ -82,24 +82,25 @@ def measure_crowd(count: int) -> Figures:
 
 
 class BenchRun:
-    """A real coordinator in its own process and folder, with a run that ends after `GENERATIONS` generations."""
+    """A real coordinator in its own process and folder: a run of `GENERATIONS` generations, or an external one."""
 
-    def __init__(self, task: str, population: int, episodes: int) -> None:
+    def __init__(self, task: str, population: int, episodes: int, *, external: bool = False) -> None:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
         self.peak_mb = 0.0
         self._arguments = (
             "--listen", self.endpoint, "--task", task, "--population", population, "--episodes", episodes,
-            "--generations", GENERATIONS, "--evaluate-every", 0,
+            *(("--optimiser", "external") if external else ("--generations", GENERATIONS, "--evaluate-every", 0)),
         )  # fmt: skip
 
     def __enter__(self) -> BenchRun:
         with ExitStack() as stack:
             self._runs = stack.enter_context(tempfile.TemporaryDirectory())
-            self._coordinator = stack.enter_context(
+            self.coordinator = stack.enter_context(
                 VerbProcess("coordinator", "--run", "bench", "--runs-dir", self._runs, *self._arguments)
-            ).popen
+            )
+            self._coordinator = self.coordinator.popen
             self._stack = stack.pop_all()
         return self
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dreamfleet.worker.tasks.api import Assignment, Continuous, Task, World
 
 SLEEP_SECONDS = 0.05
-SLEEP_TASK, NULL_TASK = (f"{__name__}:{name}" for name in ("SleepTask", "NullTask"))
+SLEEP_TASK, NULL_TASK, HALF_SECOND_TASK = (f"{__name__}:{name}" for name in ("SleepTask", "NullTask", "HalfSecondTask"))
 
 
 class SleepEnvironment(gymnasium.Env[Any, Any]):
@@ -69,3 +69,10 @@ class NullTask(SleepTask):
 
     name = NULL_TASK
     seconds = 0.0
+
+
+class HalfSecondTask(SleepTask):
+    """Episodes of half a second."""
+
+    name = HALF_SECOND_TASK
+    seconds = 0.5

@@ -31,8 +31,10 @@ class PictureAgent(ABC):
     reality: ClassVar[str] = CarRacingTask.name
     world: ClassVar[World] = WORLD
     threshold: ClassVar[float | None] = WORLD.threshold
+    options: ClassVar[str] = ""
     bundle: ClassVar[None] = None
     parameters: ClassVar[Floats] = NO_PARAMETERS
+    known_score: ClassVar[None] = None
 
     @property
     @abstractmethod

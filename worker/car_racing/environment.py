@@ -100,7 +100,7 @@ class CarRacing(_Base):  # type: ignore[misc]
             _native.picture(picture, out)
             return picture
         self._draw_bar(out[84:])
-        return out
+        return self._preprocessing.picture(out)
 
     def _draw_bar(self, rows: NDArray[np.uint8]) -> None:
         car, hull = self.car, self.car.hull

@@ -9,10 +9,12 @@ import numpy as np
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.protocol.measures import check_dreamt
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.dream.noise import SharedNoise
 from dreamfleet.worker.dream.world import DreamWorld
 from dreamfleet.worker.tasks.api import Episode, Score, StepObserver, StepSnapshot, World
+from dreamfleet.worker.tasks.measures import Measurer
 
 DEFAULT_TEMPERATURE = 1.0
 MAX_ROWS = 256  # episodes that are dreamt together: larger batches are slower
@@ -27,6 +29,9 @@ class DreamBatch:
         self._horizon = spec.horizon
         self._observer: StepObserver | None = None
         self._world = DreamWorld(bundle, spec.temperature or DEFAULT_TEMPERATURE, world, spec.recorded, spec.end)
+        check_dreamt(spec.measures)
+        names = (world or self._world).action_names
+        self._measurer = Measurer(spec.measures, self._world.actions, names)
 
     def watched(self, observer: StepObserver) -> DreamBatch:
         """A copy that passes steps to `observer`: those of the first episode that has not ended."""
@@ -53,6 +58,7 @@ class DreamBatch:
         world, rows = self._world, np.arange(len(episodes))
         noise = SharedNoise(np.array([seed for _, seed in episodes]), world.chance, world.start_states, world.bars)
         fitness, steps = np.zeros(len(rows)), np.zeros(len(rows), dtype=np.int64)
+        tally = self._measurer.begin(len(rows))
         latent, state, made = noise.first.latent, world.begin(len(rows), noise.first.memory), 0
         for step in range(self._horizon):
             moment = world.step_controllers(latent, parameters, state, noise.next(rows))
@@ -62,6 +68,8 @@ class DreamBatch:
                 self._observer.observe(start + first, lambda seen=seen: seen)  # type: ignore[misc]
             fitness[rows] += moment.reward
             steps[rows] += 1
+            if self._measurer.names:
+                tally.add(rows, moment.action)
             made += len(rows)
             on_step(made)
             latent, state = moment.latent, moment.state
@@ -71,4 +79,7 @@ class DreamBatch:
                 latent, state = latent[going], state[going]
             if not len(rows):
                 break
-        return [Score(float(total), int(count)) for total, count in zip(fitness, steps, strict=True)]
+        return [
+            Score(float(total), int(count), self._measurer.values(tally, row, int(count)))
+            for row, (total, count) in enumerate(zip(fitness, steps, strict=True))
+        ]

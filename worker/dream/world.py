@@ -53,6 +53,7 @@ class DreamWorld:
         if not isinstance(described.actions, Continuous):
             raise BundleError(f"the actions of {bundle.manifest.task} are numbers: a dream needs vectors (`one_hot`)")
         self.actions, self.frames_per_second = described.actions, described.frames_per_second
+        self.action_names = described.action_names
         self._reward = _reward_of(bundle, described, self._reward_kind)
         self._step = DreamStep(bundle)
         self._ends = DreamEnds(bundle, temperature, end)

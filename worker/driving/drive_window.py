@@ -139,7 +139,8 @@ def _plain_display() -> Iterator[None]:
     """
     wanted = {"SDL_FRAMEBUFFER_ACCELERATION": "0"}
     if sys.platform == "linux":
-        wanted["SDL_VIDEODRIVER"] = "wayland,x11"
+        # Wayland's library prints a line of its own where its socket's folder has no name.
+        wanted["SDL_VIDEODRIVER"] = "wayland,x11" if os.environ.get("XDG_RUNTIME_DIR") else "x11"
     added = {name: value for name, value in wanted.items() if name not in os.environ}
     os.environ.update(added)
     try:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
+from enum import IntEnum
 from importlib import import_module
-from importlib.metadata import packages_distributions
 from math import isfinite
 from typing import Any
 
@@ -15,6 +16,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.foreign_code import contained
+from dreamfleet.common.host.packages import find_distributions
 from dreamfleet.common.host.trusted_modules import check_trusted
 from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, World
@@ -22,6 +24,7 @@ from dreamfleet.worker.tasks.closing import close_environment
 
 RGB = "rgb_array"  # gymnasium's render mode that returns pictures
 _MODULE_PREFIX = re.compile(r"([\w.]+):")  # of an environment's name
+LONGEST_NAME = 128  # characters of an action's name, as a manifest holds it
 FASTEST = 1000  # pictures a second, as a manifest holds them
 DEFAULT_MAX_STEPS = 10_000  # steps of an episode, if the environment was registered without a limit
 # Packages that gymnasium's own environments compute with. Other environments: the distribution of their module.
@@ -63,7 +66,7 @@ def make_environment(name: str, arguments: Mapping[str, Any], render_mode: str |
 def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
     _check_arguments(f"{GYM}:{name}", arguments)
     if arguments.get("render_mode") == "human":
-        raise UsageError(f"render_mode=human opens a window in every process that plays {name}: leave it out")
+        raise UsageError(f"render_mode=human opens a window in every process that plays {name}: omit it")
     try:
         with contained(f"making {name}"):
             return gymnasium.make(_unregistered_class(name) or name, disable_env_checker=True, **arguments)
@@ -75,7 +78,10 @@ def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
         if known := next((each for start, each in PACKAGES.items() if name.startswith(start)), None):
             remedy = f"; install it on this host with `pip install {known[0]}`, and write {GYM}:{known[1]}:{name}"
         if colon and isinstance(error, ModuleNotFoundError):
-            remedy = f"; install the package of {module} on this host, or name its folder in PYTHONPATH"
+            remedy = (
+                f"; install the package of {module} on this host, or name its folder in PYTHONPATH, and trust it by "
+                f"--trust {module}"
+            )
         raise UsageError(f"gymnasium makes no environment {name!r} here ({error}){remedy}") from error
     except TypeError as error:
         raise UsageError(f"{name} takes no such arguments: {error}") from error
@@ -105,6 +111,24 @@ def _check_arguments(task: str, arguments: Any) -> None:
     if isinstance(arguments, list):
         for each in arguments:
             _check_arguments(task, each)
+
+
+def action_meanings(environment: Environment) -> tuple[str, ...]:
+    """The names of an environment's numbered actions, if it has any.
+
+    The Arcade Learning Environment returns them from a method. MiniGrid has an enumeration, of which some of its
+    environments take the first ones.
+    """
+    found: Any = ()
+    with suppress(Exception):  # environments may raise anything
+        inner: Any = environment.unwrapped
+        if isinstance(numbered := getattr(inner, "actions", None), type) and issubclass(numbered, IntEnum):
+            taken: Any = environment.action_space
+            found = tuple(numbered(number).name for number in range(taken.n))
+        else:
+            found = tuple(getattr(inner, "get_action_meanings", tuple)())
+    are_names = all(type(each) is str and each.isprintable() and 0 < len(each) <= LONGEST_NAME for each in found)
+    return found if are_names else ()
 
 
 def describe_environment(environment: Environment, frames: int = 1) -> dict[str, Any]:
@@ -141,4 +165,4 @@ def _engine_packages(environment: Environment) -> tuple[str, ...]:
 
 def distributions_of(module: str) -> tuple[str, ...]:
     """The installed distributions that have a module; empty for a module of no distribution."""
-    return tuple(sorted(set(packages_distributions().get(module.partition(".")[0], ()))))
+    return tuple(sorted(set(find_distributions(module))))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
 from typing import Annotated, Any
@@ -22,7 +21,13 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
 from dreamfleet.common.serialization.validation import Between, Length, MalformedError, from_plain
-from dreamfleet.worker.gym.environments import RGB, describe_environment, distributions_of, make_environment
+from dreamfleet.worker.gym.environments import (
+    RGB,
+    action_meanings,
+    describe_environment,
+    distributions_of,
+    make_environment,
+)
 from dreamfleet.worker.gym.spaces import make_converter, vector_actions
 from dreamfleet.worker.tasks.api import Assignment, Driver, Policy, Preprocessing, Task, World
 from dreamfleet.worker.tasks.closing import close_environment
@@ -43,7 +48,6 @@ from dreamfleet.worker.worldmodel.policy import ModelPolicy
 
 RENDERED = "render"  # as an observation: what the environment draws
 SIZES = (64, 96)
-LONGEST_NAME = 128  # characters of an action's name, as a manifest holds it
 _CROP = re.compile(r"(\d{1,5}):(\d{1,5}),(\d{1,5}):(\d{1,5})", re.ASCII)
 
 
@@ -107,15 +111,6 @@ class PixelOptions:
         return f"box-{self.size}{crop}{'-difference' if self.difference else ''}"
 
 
-def _action_meanings(environment: gymnasium.Env[Any, Any]) -> tuple[str, ...]:
-    """The names of an environment's numbered actions, as the Arcade Learning Environment gives them; empty for none."""
-    found: Any = ()
-    with suppress(Exception):  # environments may raise anything
-        found = tuple(getattr(environment.unwrapped, "get_action_meanings", tuple)())
-    are_names = all(type(each) is str and each.isprintable() and 0 < len(each) <= LONGEST_NAME for each in found)
-    return found if are_names else ()
-
-
 class GymPixelTask(Task):
     """The task `gym:ENVIRONMENT` under options: its pictures, its actions as vectors, and drivers that draw these.
 
@@ -143,7 +138,7 @@ class GymPixelTask(Task):
         try:
             actions = self._wrap(made).actions
             facts = describe_environment(made, self._options.skip)
-            meanings = _action_meanings(made)
+            meanings = action_meanings(made)
         finally:
             close_environment(made)
         drawing = distributions_of("pygame") if self._options.observation == RENDERED else ()

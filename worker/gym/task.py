@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
+from dreamfleet.common.artifacts.actions import Discrete
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.worker.gym.environments import (
     DEFAULT_MAX_STEPS,
     RGB,
+    action_meanings,
     describe_environment,
     is_gymnasiums,
     make_environment,
@@ -89,6 +93,14 @@ class GymTask(Task):
         normal = assignment.spec.option("normal", {"mean": 0.0, "deviation": 1.0})
         return FlatPolicy(assignment.controller, self.world_of(assignment).actions, normal["mean"], normal["deviation"])
 
+    def find_standalone_script(self, assignment: Assignment) -> Path | None:
+        """The script for Discrete and flat Box actions; `None` for other actions, which it would have to convert."""
+        made = make_environment(self._id, assignment.spec.option("environment", {}))
+        space = made.action_space
+        close_environment(made)
+        is_plain = isinstance(space, spaces.Discrete) or (isinstance(space, spaces.Box) and len(space.shape) == 1)
+        return Path(__file__).with_name("standalone_play.py") if is_plain else None
+
     def describe(self, options: Mapping[str, Any]) -> Description:
         """Sizes, packages, and the options that a run freezes.
 
@@ -105,10 +117,11 @@ class GymTask(Task):
                 mean, deviation = _measure_normalisation(environment, int(options.get("seed", 0)))
                 frozen["normal"] = {"mean": mean.tolist(), "deviation": deviation.tolist()}
             observations = int(np.prod(environment.observation_space.shape or (1,)))
+            steps = (environment.spec and environment.spec.max_episode_steps) or 0
         finally:
             close_environment(environment)
         text = json.dumps(frozen, sort_keys=True) if frozen else ""
-        return Description(observations, world.actions.outputs, world.packages, world.version, text)
+        return Description(observations, world.actions.outputs, world.packages, world.version, text, steps)
 
     def _open(
         self, arguments: Mapping[str, Any], render_mode: str | None = None
@@ -120,7 +133,9 @@ class GymTask(Task):
         except UsageError:
             close_environment(made)
             raise
-        return environment, World(actions, **describe_environment(made))
+        meanings = action_meanings(made)
+        names = meanings if len(meanings) == actions.outputs and isinstance(actions, Discrete) else ()
+        return environment, World(actions, action_names=names, **describe_environment(made))
 
 
 class _RenderOnDemand(gymnasium.Wrapper[Any, Any, Any, Any]):

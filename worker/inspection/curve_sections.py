@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
-from dreamfleet.common.monitoring.fitness_chart import PLOT_COLOURS, draw_fitness
+from dreamfleet.common.monitoring.fitness_chart import PLOT_COLOURS, draw_fitness, has_score_panel
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import begun_stages, join_distinct
 from dreamfleet.worker.inspection.charts import FONT, new_figure, render_png
@@ -114,10 +114,13 @@ def fitness_section(run: RunFolder) -> Section | None:
     history = run.history()
     if not history:
         return None
-    figure, axes = new_figure(3.6)
-    panel = axes[0, 0]
-    panel.legend(handles=draw_fitness(panel, run), fontsize=FONT, loc="best")
-    panel.set_ylabel("fitness")
+    two = has_score_panel(run)
+    figure, axes = new_figure(5.6 if two else 4, 2 if two else 1, sharex=True)
+    handles = draw_fitness(list(axes[:, 0]), run)
+    figure.legend(handles=handles, fontsize=FONT, loc="outside lower left", ncols=2, frameon=False)
+    axes[0, 0].set_ylabel("fitness")
+    if two:
+        axes[1, 0].set_ylabel("score in reality")
     horizon = join_distinct(str(each.stage.horizon) for each in begun_stages(run.settings, history, run.evaluations()))
     text = f"Run {run.name}, task {run.spec.task}, {horizon} steps an episode: fitness over the generations."
     return Section("fitness", "How its controller evolved", text, render_png(figure))

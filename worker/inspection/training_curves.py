@@ -88,7 +88,7 @@ def _load_folder(folder: Path, name: str) -> list[TrainingCurves]:
     paths = {model: folder / f"{model}.jsonl" for model in MODELS}
     found = [_load_training(path, name, model) for model, path in paths.items() if path.exists()]
     if not found:
-        raise DatasetError(f"{folder} holds no loss curve: give --data the folder of a training, or leave it out")
+        raise DatasetError(f"{folder} holds no loss curve: give --data the folder of a training, or omit it")
     return found
 
 

@@ -15,6 +15,8 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.trained_agent import TrainedAgent
 from dreamfleet.common.errors import ControllerError
 from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.runs.own_runs import trust_own_run
+from dreamfleet.common.worlds.known_score import KnownScore, find_known_score
 from dreamfleet.worker.scoring.scorer import find_checked_world
 from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, Assignment, Policy, Task, TaskWithTrueState, World
 from dreamfleet.worker.tasks.registry import find_scored_task, find_task, known_tasks
@@ -37,6 +39,10 @@ class Agent(Protocol):
         """Name of the task that it was evolved or trained in."""
 
     @property
+    def options(self) -> str:
+        """The options of that task, as a run freezes them."""
+
+    @property
     def bundle(self) -> Bundle | None:
         """Its world model, if it has one."""
 
@@ -55,6 +61,10 @@ class Agent(Protocol):
     @property
     def threshold(self) -> float | None:
         """Mean score at which gymnasium considers that world solved; `None`: unknown."""
+
+    @property
+    def known_score(self) -> KnownScore | None:
+        """Its mean score, where it was measured before."""
 
     def make_evaluation_environment(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         """The environment that reported scores and videos come from."""
@@ -86,8 +96,12 @@ def make_agent(controller: Controller | TrainedAgent, bundle: Bundle | None = No
     """
     if isinstance(controller, TrainedAgent):
         return _make_trained_agent(controller)
+    trust_own_run(controller.provenance.get("run_uid"), controller.task, controller.options)
     fitting = None if bundle is None else bundle.for_controller(controller)
-    agent = EvolvedAgent(controller.sha256, make_evaluation_spec(controller, bundle), controller.parameters, fitting)
+    agent = EvolvedAgent(
+        controller.sha256, make_evaluation_spec(controller, bundle), controller.parameters, fitting,
+        find_known_score(controller),
+    )  # fmt: skip
     find_checked_world(agent.assignment)
     return agent
 
@@ -116,6 +130,7 @@ class EvolvedAgent:
     spec: TaskSpec
     parameters: Floats = field(repr=False)
     bundle: Bundle | None = None  # of the controller's shape and variant
+    known_score: KnownScore | None = None
 
     @property
     def assignment(self) -> Assignment:
@@ -126,6 +141,11 @@ class EvolvedAgent:
     def task(self) -> str:
         """Name of the task that it was evolved in."""
         return self.spec.task
+
+    @property
+    def options(self) -> str:
+        """The options of that task."""
+        return self.spec.options
 
     @property
     def world(self) -> World:

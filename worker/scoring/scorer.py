@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from time import monotonic
 from typing import Any
@@ -34,6 +35,7 @@ from dreamfleet.worker.tasks.api import (
 )
 from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tasks.former_names import FORMER_OBSERVER_NAMES, accept_former_names
+from dreamfleet.worker.tasks.measures import Measurer
 from dreamfleet.worker.tasks.registry import find_scored_task
 
 DRIVER_NAME = "controller"  # the driver's name in collected rollouts
@@ -71,6 +73,8 @@ class Scorer(Displayed):
         self._task, self._assignment = task, assignment
         self._environment = task.make_environment(assignment)
         self._policy = task.make_policy(assignment)
+        truth = getattr(task.reality(assignment), "truth", None)
+        self._measurer = Measurer(spec.measures, self.world.actions, self.world.action_names, truth)
         self._preprocessing = "" if bundle is None else bundle.manifest.preprocessing
         self._data_world = OF_FIRST_WORLD if bundle is None else DataWorld.of(bundle)
 
@@ -208,12 +212,19 @@ class Scorer(Displayed):
         rollout: Rollout | None = None,
     ) -> Score:
         """Drive the episode with this index in its group, and let the observer watch if there is one."""
-        if self.observer is None:
-            return score(self._environment, self._policy, parameters, episode_config, on_step, rollout)
-        shown = self._watched_environment
-        policy = WatchedPolicy(self._policy, self.observer, episode, None if shown is None else shown.render)
-        environment = self._environment if shown is None else shown
-        return score(environment, policy, parameters, episode_config, on_step, rollout)
+        environment, policy = self._environment, self._policy
+        if self.observer is not None:
+            shown = self._watched_environment
+            policy = WatchedPolicy(policy, self.observer, episode, None if shown is None else shown.render)
+            environment = environment if shown is None else shown
+        if not self.spec.measures:
+            return score(environment, policy, parameters, episode_config, on_step, rollout)
+        watch = self._measurer.watch(environment)
+        found = score(
+            environment, policy, parameters, episode_config, on_step, rollout,
+            lambda moment: watch.on_transition(moment.action, moment.info),
+        )  # fmt: skip
+        return replace(found, measures=watch.values)
 
     @cached_property
     def _watched_environment(self) -> gymnasium.Env[Any, Any] | None:

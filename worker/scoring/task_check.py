@@ -11,7 +11,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from time import monotonic
@@ -114,18 +114,24 @@ def _describe(value: Any) -> str:
 
 
 def dry_run(
-    name: str, options: Mapping[str, Any], announce: Callable[[str], None], *, thorough: bool
+    name: str,
+    options: Mapping[str, Any],
+    announce: Callable[[str], None],
+    *,
+    thorough: bool,
+    measures: Sequence[str] = (),
 ) -> Iterator[DryRunReport]:
     """Describe the task, drive its probe episode, and yield what was found.
 
     `thorough`: drive the episode twice and normalise, then yield again with what gymnasium's checker says.
-    `UsageError` if the task cannot be described, `FaultError` if its environment cannot be scored.
+    `UsageError` if the task cannot be described or lacks one of `measures`, `FaultError` if its environment cannot be
+    scored.
     """
     announce("making it")
     description = describe_task(name, {key: value for key, value in options.items() if key != "normalise"})
     from dreamfleet.worker.scoring.host_class_probe import REPEAT_LIMIT  # needs gymnasium, as the task may not
 
-    checked, drive = _prepare(name, description, announce)
+    checked, drive = _prepare(name, description, announce, measures)
     began = monotonic()
     report = DryRunReport(description, episode=drive(), first=_digest(checked.first))
     report.seconds = monotonic() - began
@@ -150,13 +156,14 @@ def dry_run(
 
 
 def _prepare(
-    name: str, description: Description, announce: Callable[[str], None]
+    name: str, description: Description, announce: Callable[[str], None], measures: Sequence[str]
 ) -> tuple[CheckedEnvironment, Callable[[], str]]:
     """The task's environment, and what drives its probe episode and returns the digest; empty: there is no probe."""
     from dreamfleet.common.artifacts.controller import ControllerShape
     from dreamfleet.common.protocol.messages import TaskSpec
     from dreamfleet.worker.scoring.host_class_probe import HostClassProbe
     from dreamfleet.worker.tasks.api import Assignment
+    from dreamfleet.worker.tasks.measures import Measurer
     from dreamfleet.worker.tasks.registry import find_task
 
     task: Task = find_task(name)
@@ -164,6 +171,8 @@ def _prepare(
     assignment = Assignment(
         TaskSpec(name, "", 1000, 0, shape, options=description.options, version=description.version)
     )
+    world = task.world_of(assignment)
+    Measurer(measures, world.actions, world.action_names, getattr(task, "truth", None))
     environment: Any = CheckedEnvironment(task.make_environment(assignment), description.observations, announce)
     policy = task.make_policy(assignment)
 
@@ -191,7 +200,7 @@ def _check_by_gymnasium(environment: Any) -> list[str]:
     from gymnasium.utils.env_checker import check_env
 
     own = environment.unwrapped
-    if not isinstance(own, gymnasium.Env) or type(own).__module__.startswith("gymnasium.envs."):
+    if not isinstance(own, gymnasium.Env) or type(own).__module__.startswith(("gymnasium.envs.", "dreamfleet.")):
         return []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -214,6 +223,15 @@ def _describe_pictures(name: str, environment: Any) -> list[str]:
     ]
 
 
+def _load_and_wait(go: int) -> None:
+    """Import what any dry run needs, and wait until the descriptor `go` is closed elsewhere."""
+    with suppress(Exception):  # the dry run reports it
+        import dreamfleet.worker.scoring.host_class_probe
+        import dreamfleet.worker.tasks.registry  # noqa: F401
+    os.read(go, 1)
+    os.close(go)
+
+
 def main() -> None:
     """Answer the request on stdin; whatever the environment prints goes to stderr."""
     request = json.load(sys.stdin)
@@ -222,6 +240,7 @@ def main() -> None:
     os.dup2(2, 1)
     os.environ["SDL_VIDEODRIVER"] = "dummy"
     pin_thread_pools()
+    _load_and_wait(int(sys.argv[1]))
     step = "loading it"
 
     def announce(name: str) -> None:
@@ -234,7 +253,9 @@ def main() -> None:
 
     name = request["task"]
     try:
-        for found in dry_run(name, request["options"], announce, thorough=request["thorough"]):
+        for found in dry_run(
+            name, request["options"], announce, thorough=request["thorough"], measures=request["measures"]
+        ):
             send(found)
     except DreamfleetError as error:
         send(DryRunReport(fault=one_line(str(error) if isinstance(error, UsageError) else f"{name}: {error}")))

@@ -17,7 +17,8 @@ from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import CountingDecoder, encode_json
-from dreamfleet.common.protocol.messages import HelloReply, HelloRequest, Intervals, TaskSpec
+from dreamfleet.common.protocol.messages import MIN_SHARE, HelloReply, HelloRequest, Intervals, TaskSpec
+from dreamfleet.common.security.anchor_key import anchor_proof
 from dreamfleet.common.serialization.validation import MAX_TEXT, MalformedError, from_plain
 from dreamfleet.common.transport.query import query_all, query_every_responder
 from dreamfleet.worker.tasks.registry import check_task_allowed
@@ -40,6 +41,8 @@ class Admission:
     numbering: int = 0  # R12: of the batches that follow; older ones cannot pass for current ones
     classes: bool = False  # whether the coordinator supports host classes
     reasons: bool = False  # whether the coordinator reads why a worker leaves
+    share: float = 1.0  # of the worker's slots, relative to its other runs' shares
+    taken: bool = False  # whether the coordinator reads what other runs use
 
 
 def request_admission(
@@ -85,7 +88,7 @@ def _send_hello(
     welcome, then a refusal. Of equal answers one is drawn at random, so that no stranger always wins.
     """
     key = keys.secured_hello(run or "*", request.worker) if secured else keys.hello(run or "*")
-    replies = []
+    request, replies = replace(request, anchor=anchor_proof(request.worker)), []
     for _, payload in query_every_responder(session, [key], HELLO_TIMEOUT, encode_json(request)):
         reply = inbox.decode_json(HelloReply, payload)
         if reply is not None and _is_reply_of(reply, run):
@@ -95,7 +98,8 @@ def _send_hello(
     if not replies:
         return None
     if len(names := sorted({reply.run for reply in replies})) > 1:
-        raise RefusedError(f"several runs are live: choose one with --run: {', '.join(names[:MAX_RUNS_LISTED])}")
+        listed = ", ".join(names[:MAX_RUNS_LISTED])
+        raise RefusedError(f"several runs are live, {listed}: choose one with `dreamfleet worker --run {names[0]}`")
     return max(replies, key=lambda reply: (reply.run_uid == joined_run_uid, reply.accepted, random.random()))  # noqa: S311
 
 
@@ -107,23 +111,30 @@ def _is_reply_of(reply: HelloReply, run: str | None) -> bool:
 
 
 def find_run_with_fewest_slots(session: zenoh.Session, excluded: Collection[str] = ()) -> str | None:
-    """The live run with the fewest slots, without those in `excluded`; of equals the first by name."""
+    """The live run with the fewest slots by its share, without those in `excluded`; of equals the first by name."""
     found = []
     for document in _live_statuses(session):
         with suppress(ValueError, KeyError, TypeError):  # another version may answer in another form
             if document["state"] not in ("ended", "paused") and document["run"] not in excluded:
-                found.append((int(document["slots"]), str(document["run"])))
+                slots = int(document["slots"]) / max(float(document.get("share", 1.0)), MIN_SHARE)
+                found.append((slots, str(document["run"])))
     return min(found)[1] if found else None
 
 
 def find_names_of_run(session: zenoh.Session, uid: str) -> list[str]:
     """The names under which the run of this `uid` is live now, sorted: more than one where a copy is served too."""
-    found = []
+    return sorted(name for name, own in _live_names(session) if own == uid)
+
+
+def find_live_names(session: zenoh.Session) -> list[str]:
+    """The names of all live runs, sorted."""
+    return sorted({name for name, _ in _live_names(session)})
+
+
+def _live_names(session: zenoh.Session) -> Iterator[tuple[str, Any]]:
     for document in _live_statuses(session):
         with suppress(KeyError, TypeError, UsageError):
-            if document["run_uid"] == uid:
-                found.append(keys.check_run_name(document["run"]))
-    return sorted(found)
+            yield keys.check_run_name(document["run"]), document["run_uid"]
 
 
 def _live_statuses(session: zenoh.Session) -> Iterator[Any]:
@@ -144,6 +155,7 @@ def make_request(worker: str, tasks: tuple[str, ...], slots: int, *, leaves_with
         fingerprint=fingerprint(),
         slots=slots,
         leaves_with_run=leaves_with_run,
+        reads_end=True,
     )
 
 
@@ -159,5 +171,5 @@ def _read_admission(reply: HelloReply) -> Admission:
         ) from error
     return Admission(
         keys.check_run_name(reply.run), reply.run_uid, reply.incarnation, reply.nonce, spec, intervals, reply.packages,
-        reply.numbering, reply.classes, reply.reasons,
+        reply.numbering, reply.classes, reply.reasons, reply.share, reply.taken,
     )  # fmt: skip

@@ -11,12 +11,14 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from math import prod
 
+from dreamfleet.common.protocol.failures import HOST_PREFIX
 from dreamfleet.common.protocol.messages import MAX_LEASES, Job, JobBatch, TaskSpec, VectorPart
 
 # R26: strangers can send batches too, so what they can fill is limited. The coordinator gives a dropped job again,
 # because the next heartbeats do not list it.
 MAX_UNUSED_VECTORS = 64  # vectors that no queued job needs
 MAX_BATCHES_AHEAD = 1024  # batches after a missing one
+DAMAGED = f"{HOST_PREFIX}the job's digest is not of its content"  # it says nothing of the candidate
 MAX_VECTOR_BYTES = 256 << 20  # of all vectors; with 1024 candidates: 65,000 parameters each
 
 
@@ -55,6 +57,9 @@ class Backlog:
         """Drop the queued jobs; the coordinator gives them again."""
         self._jobs.clear()
 
+    def __len__(self) -> int:
+        return len(self._jobs)
+
     @property
     def queued(self) -> list[bytes]:
         """Digests of the queued jobs."""
@@ -82,7 +87,7 @@ class Backlog:
         for job in batch.jobs:
             spec = job.spec(self._spec)
             if job.digest != spec.digest(job.kind, job.vector, job.seeds) or job.task != spec.task:
-                refused.append((job, "the job's digest is not of its content"))
+                refused.append((job, DAMAGED))
             elif job.digest not in in_slots and job.vector in self._vectors and len(self._jobs) < MAX_LEASES:
                 self._jobs[job.digest] = job
         self._trim()

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dreamfleet.common.protocol.measures import LARGEST_MEASURE
 from dreamfleet.common.protocol.messages import MAX_UPLOAD, Job, Result, TaskSpec
 from dreamfleet.common.protocol.result_bounds import LONGEST_EPISODE, clamp_count, rejection_reason
 from dreamfleet.worker.service.failure_log import ScoringFailure
@@ -111,6 +112,8 @@ def _results(
         raise ValueError("the task gave a fitness that is not a finite number")
     if not all(0 <= int(score.steps) < 2**63 for score in scores):
         raise ValueError("the task gave a number of steps that is not from 0 to 2**63 - 1")
+    if not all(abs(each) <= LARGEST_MEASURE for score in scores for each in score.measures):
+        raise ValueError("the task gave a measure that is not a finite number")
     sha256 = None if upload is None else hashlib.sha256(upload).digest()
     return tuple(_result(job, score, spent, sha256, horizon) for (job, _), score in zip(work, scores, strict=True))
 
@@ -124,7 +127,7 @@ def _result(job: Job, score: Score, spent: float, sha256: bytes | None, horizon:
     fitness, steps = float(score.fitness), int(score.steps)
     why = rejection_reason(fitness, steps, spent, LONGEST_EPISODE if job.kind == "evaluate" else horizon)
     if why is None:
-        return Result(job.digest, fitness, steps, spent, None, sha256)
+        return Result(job.digest, fitness, steps, spent, None, sha256, tuple(map(float, score.measures)))
     return Result(job.digest, None, clamp_count(steps), spent, why, None)
 
 

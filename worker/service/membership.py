@@ -36,25 +36,36 @@ class WorkerLoad:
     uploading: bool  # it is sending a rollout, which delays the verdict
 
 
-class Membership:
-    """One worker's life, through one run after another. All `now` arguments are of the same monotonic clock."""
+class StopRequests:
+    """How often a worker was asked to stop; all its memberships share it."""
 
-    def __init__(self, conditions: LeaveConditions, now: float) -> None:
+    def __init__(self) -> None:
+        self.count = 0
+
+
+class Membership:
+    """One worker in one run after another. All `now` arguments are of the same monotonic clock.
+
+    `now` of the constructor is when the worker started: its lifetime counts from there.
+    """
+
+    def __init__(self, conditions: LeaveConditions, now: float, stops: StopRequests | None = None) -> None:
         self._conditions = conditions
         self._ends_at = now + (conditions.lifetime or math.inf)
-        self._stop_requests = 0
+        self._stops = stops or StopRequests()
         self._drain_until: float | None = None
         self.join("", 0.0, now)
 
     def stop(self) -> None:
         """Request a stop: once to drain, twice to leave at once. Safe in a signal handler."""
-        self._stop_requests += 1
+        self._stops.count += 1
 
     def join(self, nonce: str, beat: float, now: float) -> None:
         """Record that a run welcomed this worker: its coordinator's life `nonce`, and the heartbeat interval `beat`."""
         self._beat = beat
         self._coordinators: set[str] = set()  # nonces of the coordinators in sight
         self._run_is_over = ""
+        self.ending = ""  # how the joined run ended by a limit, in words; empty: it has not
         self._no_coordinator_since: float | None = now  # `None` while one is in sight
         self._next_hello_at = now
         self._next_search_at = now + SEARCH_INTERVAL
@@ -81,9 +92,9 @@ class Membership:
         """Restart the silence: the coordinator sent something, or a slot did and the coordinator owes an answer."""
         self._silent_since = now
 
-    def end_run(self, why: str) -> None:
-        """Record that the joined run is over and its workers leave."""
-        self._run_is_over = why
+    def end_run(self, why: str, ending: str = "") -> None:
+        """Record that the joined run is over and its workers leave; `ending` is how a limit ended it."""
+        self._run_is_over, self.ending = why, ending
 
     def add_coordinator(self, nonce: str) -> bool:
         """Record that a coordinator came into sight; return whether it is the joined one that is back."""
@@ -105,13 +116,14 @@ class Membership:
 
     def is_leaving(self, now: float) -> bool:
         """Whether this worker accepts neither another job nor another run."""
-        return self._stop_requests > 0 or now >= self._ends_at
+        return self._stops.count > 0 or now >= self._ends_at
 
     @property
     def plan_without_coordinator(self) -> str:
         """What it does while its coordinator is out of sight, in words."""
         if self._conditions.serves_any:
-            return f"takes the next run after {NEXT_RUN_AFTER:g} s, with results after {NEXT_RUN_PATIENCE:g} s"
+            after = f"{NEXT_RUN_AFTER:g} s, with results of it after {NEXT_RUN_PATIENCE:g} s"
+            return f"leaves this run after {after}, and serves others"
         if self._conditions.leaves_with_run:
             return f"leaves unless it is back within {self._conditions.coordinator_timeout:g} s"
         return "waits for this run only, even under another name (--any takes the next run)"
@@ -120,6 +132,11 @@ class Membership:
     def run_is_over(self) -> bool:
         """Whether the joined run is over and its workers leave."""
         return bool(self._run_is_over)
+
+    @property
+    def drain_timeout(self) -> float:
+        """Seconds that draining may take."""
+        return self._conditions.drain_timeout
 
     @property
     def draining(self) -> bool:
@@ -142,14 +159,14 @@ class Membership:
         R24: a draining worker leaves once all is delivered, or when its time is up. A run ends by its coordinator's
         word; silence alone may be a cut link or a restart, so it needs long patience.
         """
-        if self._stop_requests > 1:
+        if self._stops.count > 1:
             return "stopped by two signals, without draining"
         if self._run_is_over:
             return self._run_is_over
         if self._drain_until is not None:
             if busy and now <= self._drain_until:
                 return ""
-            why = "drained after a stop signal" if self._stop_requests else "drained at the end of its lifetime"
+            why = "drained after a stop signal" if self._stops.count else "drained at the end of its lifetime"
             return f"{why}, but jobs or results were left when --drain-timeout was over" if busy else why
         if self.gives_up(now):
             return f"no coordinator was reachable for {self._conditions.coordinator_timeout:g} s"

@@ -18,14 +18,13 @@ import zenoh
 
 from dreamfleet.common.errors import ConnectionFailedError, RefusedError
 from dreamfleet.common.host.error_counter import ErrorCounter
-from dreamfleet.common.printable import plural
+from dreamfleet.common.printable import one_line, plural
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import CountingDecoder
 from dreamfleet.common.protocol.messages import MAX_LEASES, JobBatch, Result
 from dreamfleet.common.transport.session import enqueue_into
 from dreamfleet.worker.service.admission import Admission, find_names_of_run
 from dreamfleet.worker.service.backlog import Backlog
-from dreamfleet.worker.service.farewell import describe_failure
 from dreamfleet.worker.service.frame_publisher import FramePublisher
 from dreamfleet.worker.service.frame_sampler import SampledFrame
 from dreamfleet.worker.service.membership import Membership, WorkerLoad
@@ -33,6 +32,7 @@ from dreamfleet.worker.service.outbox import BURST_INTERVAL, Outbox, UploadQueue
 from dreamfleet.worker.service.sender import CoordinatorSender, StepRate
 from dreamfleet.worker.service.slot import SlotEvent
 from dreamfleet.worker.service.slot_pool import SlotPool
+from dreamfleet.worker.service.wording import describe_failure
 
 log = logging.getLogger(__name__)
 MAX_WAITING_BATCHES = 1024  # R26: more batches are dropped unread; the coordinator sends unconfirmed ones again
@@ -73,6 +73,12 @@ class RunSession:
         self._error_counter = ErrorCounter(log)
         self._next_heartbeat_at = 0.0
         self._finished = self._steps_finished = 0
+        self._said_alone = False
+
+    @property
+    def run(self) -> str:
+        """The run's name now."""
+        return self._admission.run
 
     def serve(self) -> None:
         """Work until this worker stops or the run is over. Closes neither the slots nor the session.
@@ -120,12 +126,14 @@ class RunSession:
             self._slots.check(now, gap=now - before if now - before > CLOCK_GAP else 0.0)
             if self._membership.start_draining_if_due(now):
                 self._return_unstarted_jobs()
-                log.info("draining: running episodes finish, queued jobs go back")
+                log.info("draining for at most %g s, a second signal leaves at once: running episodes finish, queued "
+                         "jobs go back", self._membership.drain_timeout)  # fmt: skip
             self._fill_slots(now)
             self._send(now)
             if self._membership.must_rejoin(now, self._load()):
                 self._rejoin(now)
             elif self._membership.start_search_if_due(now):
+                self._say_alone()
                 self._follow_run()
         return why
 
@@ -180,12 +188,20 @@ class RunSession:
             self._membership.remove_coordinator(nonce, monotonic())
             if self._membership.run_is_over:
                 return  # it ended the run and left, as it said
+            self._say_alone()
+            return
+        self._said_alone = False
+        if self._membership.add_coordinator(nonce):  # joining another life is logged by `_rejoin`
+            log.info("the coordinator of run %s is back; this worker continues", self._admission.run,
+                     extra={"facts": {"event": "coordinator back", "run": self._admission.run}})  # fmt: skip
+
+    def _say_alone(self) -> None:
+        """Log once that no coordinator is in sight. One that was killed as this worker joined was never in sight."""
+        if not self._said_alone:
+            self._said_alone = True
             log.info("the coordinator of run %s left or cannot be reached; this worker %s",
                      self._admission.run, self._membership.plan_without_coordinator,
                      extra={"facts": {"event": "coordinator gone", "run": self._admission.run}})  # fmt: skip
-        elif self._membership.add_coordinator(nonce):  # joining another life is logged by `_rejoin`
-            log.info("the coordinator of run %s is back; this worker continues", self._admission.run,
-                     extra={"facts": {"event": "coordinator back", "run": self._admission.run}})  # fmt: skip
 
     def _handle_batch(self, payload: bytes) -> None:
         """Handle jobs, cancellations and verdicts.
@@ -210,7 +226,8 @@ class RunSession:
             return
         self._membership.note_activity(monotonic())
         if batch.leave or batch.ended:
-            self._membership.end_run("the run has ended" if batch.ended else "the run dismissed its workers")
+            ending = f"ended{f' after {one_line(batch.why)}' if batch.why else ''}" if batch.ended else ""
+            self._membership.end_run(f"the run has {ending}" if ending else "the run dismissed its workers", ending)
         for digest in batch.cancels:
             self._slots.abandon(digest)
         for job, why in self._backlog.add_batch(batch, self._slots.wanted_digests):
@@ -225,9 +242,9 @@ class RunSession:
     def _handle_slot_event(self, event: SlotEvent) -> None:
         now = monotonic()
         self._membership.note_activity(now)
-        capacity = self._slots.capacity
+        ready = self._slots.ready_count
         results = self._slots.handle(event)
-        if self._slots.capacity > capacity:
+        if self._slots.ready_count > ready:
             self._next_heartbeat_at = 0.0  # report new capacity at once
         for result in results:
             self._finished += 1
@@ -245,7 +262,9 @@ class RunSession:
             self._frame_publisher.show(self._admission, event.slot, work, frame)
 
     def _fill_slots(self, now: float) -> None:
-        if not self._membership.is_leaving(now):
+        if self._membership.is_leaving(now):
+            self._slots.yield_idle_slots()
+        else:
             self._slots.fill(self._backlog, undelivered=len(self._outbox))
 
     def _return_unstarted_jobs(self) -> None:
@@ -282,7 +301,8 @@ class RunSession:
         )
 
     def _load(self) -> WorkerLoad:
-        return WorkerLoad(idle=self._slots.idle, awaits_verdict=len(self._outbox) > 0, uploading=len(self._uploads) > 0)
+        idle = self._slots.idle and not len(self._backlog)  # with jobs queued, other runs have the slots
+        return WorkerLoad(idle=idle, awaits_verdict=len(self._outbox) > 0, uploading=len(self._uploads) > 0)
 
     def _rejoin(self, now: float) -> None:
         """Say hello again.

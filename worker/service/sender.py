@@ -102,6 +102,7 @@ class CoordinatorSender:
             drawn_by=slots.drawn_by,
             host_class=self._host_class(slots),
             reason=reason if self._admission.reasons else "",
+            taken=min(slots.taken, capacity) if self._admission.taken else 0,
         )
         self._publish(keys.heartbeat(self._admission.run, self._identity), beat)
 

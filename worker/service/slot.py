@@ -70,10 +70,13 @@ class Slot:
         allowed_tasks: tuple[str, ...],
         memory_limit: int = 0,
         restore_bundle: Callable[[], object] = lambda: None,
+        *,
+        parked: bool = False,
     ) -> None:
         """`allowed_tasks` are those that the child may import; `memory_limit` is in bytes, 0 means none.
 
         `restore_bundle` fetches the file `bundle` again after a failed start, because others also write to the cache.
+        A `parked` slot has no child until `start`.
         """
         self.number = number
         self.ready = False
@@ -98,7 +101,15 @@ class Slot:
         self._given_up_at = math.inf  # when a child that was killed or has exited counts as gone in any case
         self._sent = 0  # groups sent to this child
         self._is_watched = False
-        self._start()
+        if parked:
+            self._clear_child(math.inf)
+        else:
+            self.start()
+
+    @property
+    def parked(self) -> bool:
+        """Whether it has no child, and gets none until `start`."""
+        return self._start_at == math.inf
 
     @property
     def running(self) -> list[Job]:
@@ -166,7 +177,7 @@ class Slot:
         """
         if self._child is None:
             if now >= self._start_at:
-                self._start()
+                self.start()
             return
         quiet = self._watch.quiet_seconds(self.steps, now, gap)
         if not self.ready:
@@ -205,6 +216,11 @@ class Slot:
         elif not isinstance(event.message, SampledFrame):
             return self._replace_child()
         return ()
+
+    def park(self) -> None:
+        """End the idle child, to free its memory."""
+        self.stop()
+        self._clear_child(math.inf)
 
     def kill(self) -> None:
         """Kill the child, without waiting for its end; the slot is of no use then."""
@@ -268,7 +284,7 @@ class Slot:
 
     def _restart(self) -> None:
         self.stop()
-        self._start()
+        self.start()
 
     def _replace_child(self) -> tuple[Result, ...]:
         """Replace a child that is gone; return errors for the jobs that it was scoring, if it was fresh.
@@ -291,7 +307,7 @@ class Slot:
         if not self.ready:
             self._count_failed_start(reason)
         if running and self._groups[0].number > 1:
-            self._start()  # with the same jobs
+            self.start()  # with the same jobs
             return ()
         if running:
             self._groups.popleft()
@@ -324,7 +340,7 @@ class Slot:
             0.0 if self._useless_children < 2 else min(2.0 ** (self._useless_children - 3), MAX_START_DELAY)
         )
         if self._useless_children < 2:
-            self._start()
+            self.start()
 
     def _clear_child(self, pause: float) -> None:
         self.ready = self._groups_are_short = False
@@ -333,7 +349,7 @@ class Slot:
         self._given_up_at = math.inf
         self._start_at = monotonic() + pause
 
-    def _start(self) -> None:
+    def start(self) -> None:
         """Start a child and send it the groups that waited for the last one."""
         self._clear_child(0.0)
         self._kill_reason, self._last_error = "", ""

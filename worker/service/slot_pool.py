@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import queue
 from collections.abc import Callable
 from pathlib import Path
@@ -18,26 +19,39 @@ from dreamfleet.worker.service.failure_log import FailureLog
 from dreamfleet.worker.service.frame_sampler import SampledFrame
 from dreamfleet.worker.service.job_group import JobWithVector
 from dreamfleet.worker.service.slot import Slot, SlotEvent
+from dreamfleet.worker.service.slot_budget import RunSlots
 from dreamfleet.worker.tasks.registry import check_task_allowed, find_task
 
 log = logging.getLogger(__name__)
 
 
+IDLE_CHILD = 60.0  # seconds without a job after which a child that is not the last one ends, beside other runs
+
+
 class SlotPool:
-    """The slots that score one task; `stop` kills their children."""
+    """The slots that score one run's task, as many at once as its part of the budget allows; `stop` kills the children.
+
+    A worker that may serve several runs starts one child, and further ones as jobs need them.
+    """
 
     def __init__(
         self,
-        count: int,
+        share: RunSlots,
         spec: TaskSpec,
         bundle: Path | None,
         events: queue.SimpleQueue[tuple[str, Any]],
         allowed_tasks: tuple[str, ...],
         memory_limit: int,
         restore_bundle: Callable[[], object] = lambda: None,
+        *,
+        all_at_once: bool = True,
     ) -> None:
-        """`RefusedError` for a task that is not in `allowed_tasks`; `memory_limit` is in bytes a slot, 0 means none."""
+        """`RefusedError` for a task that is not in `allowed_tasks`; `memory_limit` is in bytes a slot, 0 means none.
+
+        With `all_at_once` all children start now and stay.
+        """
         check_task_allowed(spec.task, allowed_tasks)
+        self._share, self._all_at_once = share, all_at_once
         self._task = spec.task
         self._batch_size = find_task(spec.task).batch_size
         self._failures = FailureLog()
@@ -45,9 +59,12 @@ class SlotPool:
         self._watched = False
         self._shown_slot: Slot | None = None
         self._slots: list[Slot] = []
+        self._used_at: dict[int, float] = {}  # when each slot last had a job, by number
         try:
-            for number in range(count):
-                self._slots.append(Slot(number, spec, bundle, events, allowed_tasks, memory_limit, restore_bundle))
+            for number in range(share.total):
+                parked = number > 0 and not all_at_once
+                slot = Slot(number, spec, bundle, events, allowed_tasks, memory_limit, restore_bundle, parked=parked)
+                self._slots.append(slot)
         except BaseException:
             self.stop()  # otherwise the interpreter would wait for these children at exit, and they for it
             raise
@@ -66,12 +83,26 @@ class SlotPool:
         return any(slot.ready for slot in self._slots) and not self.busy
 
     @property
+    def ready_count(self) -> int:
+        """How many slots can score, those included whose children start with their first job."""
+        ready = sum(slot.ready for slot in self._slots)
+        return ready + sum(slot.parked for slot in self._slots) if ready else 0
+
+    @property
     def capacity(self) -> int:
-        """How many jobs the ready slots score at once.
+        """How many jobs this run can count on to be scored at once, beside the worker's other runs.
 
         R14: the coordinator gives this worker at most twice as many jobs, so that little is lost with it.
         """
-        return min(sum(slot.ready for slot in self._slots) * self._batch_size, MAX_LEASES // 2)
+        return min(min(self.ready_count, self._share.allowance) * self._batch_size, MAX_LEASES // 2)
+
+    @property
+    def taken(self) -> int:
+        """How many jobs of its capacity would wait now, because the worker's other runs use the slots.
+
+        R17: such a slot is not idle, so it takes over no job of another worker and copies none.
+        """
+        return max(0, self.capacity - self._share.usable * self._batch_size)
 
     @property
     def steps(self) -> int:
@@ -98,18 +129,35 @@ class SlotPool:
         return next((slot.drawn_by for slot in self._slots if slot.ready), "-")
 
     def fill(self, backlog: Backlog, undelivered: int) -> None:
-        """Give jobs from the backlog to free slots.
+        """Give jobs from the backlog to free slots, as far as the other runs leave some.
 
         R26: nothing starts while too many results, `undelivered`, wait for a verdict, so the outbox stays bounded.
         """
         room = 4 * len(self._slots) * self._batch_size - undelivered
         idle = [slot for slot in self._slots if slot.idle and room >= 0]
+        groups = math.ceil(len(backlog) / self._batch_size)
+        self._settle(min(groups, len(idle)), has_jobs=groups > 0)
+        for slot in idle:
+            if not len(backlog) or not self._share.take():
+                break
+            if not self._submit(slot, backlog):
+                idle = []  # the jobs' vectors are not whole yet, so this run waits for none of the slots
+                break
         ahead = [slot for slot in self._slots if slot.can_queue_another and room > 0]
-        for slot in idle + ahead:
-            if work := backlog.take(self._batch_size):
-                slot.submit(work)
+        for slot in ahead:
+            if not (len(backlog) and self._share.goes_on() and self._submit(slot, backlog)):
+                break
+        groups = math.ceil(len(backlog) / self._batch_size)
+        self._settle(min(groups, sum(slot.idle for slot in idle)), has_jobs=groups > 0)
+        self._share.pass_on()
+        self._start_children(groups)
         if self._watched and self._shown_slot is not None and not self._shown_slot.running:
             self._switch_shown_slot()
+
+    def yield_idle_slots(self) -> None:
+        """Leave the slots that score nothing to the other runs."""
+        self._settle(0, has_jobs=False)
+        self._share.pass_on()
 
     def show(self, wanted: bool) -> None:
         """Have one slot send frames, or none."""
@@ -140,6 +188,8 @@ class SlotPool:
         """Kill children that hang; `gap` is for how many seconds before `now` this host was suspended."""
         for slot in self._slots:
             slot.check(now, gap)
+        if not self._all_at_once:
+            self._end_unused_child(now)
 
     @property
     def wanted_digests(self) -> set[bytes]:
@@ -157,12 +207,42 @@ class SlotPool:
             self.abandon(job.digest)
 
     def stop(self) -> None:
-        """Kill all children; wait at most about `EXIT_GRACE` seconds for their end."""
+        """Kill all children; wait at most about `EXIT_GRACE` seconds for their end. The other runs get the slots."""
+        self._share.close()
         for slot in self._slots:
             slot.kill()
         until = monotonic() + EXIT_GRACE
         for slot in self._slots:
             slot.stop(max(0.0, until - monotonic()))
+
+    def _submit(self, slot: Slot, backlog: Backlog) -> bool:
+        """Give a slot the next group, if one is whole."""
+        work = backlog.take(self._batch_size)
+        if work:
+            self._used_at[slot.number] = monotonic()
+            slot.submit(work)
+        return bool(work)
+
+    def _settle(self, wanted: int, *, has_jobs: bool) -> None:
+        self._share.settle(sum(bool(slot.running) for slot in self._slots), wanted, has_jobs=has_jobs)
+
+    def _start_children(self, groups: int) -> None:
+        """Start as many parked slots as `groups` more need, and the other runs leave room for."""
+        parked = [slot for slot in self._slots if slot.parked]
+        if not parked or not groups or not any(slot.ready for slot in self._slots):
+            return
+        started = len(self._slots) - len(parked)
+        busy = sum(bool(slot.running) for slot in self._slots)
+        for slot in parked[: max(0, min(self._share.allowance, busy + groups) - started)]:
+            slot.start()
+
+    def _end_unused_child(self, now: float) -> None:
+        """End the child of one slot that got no job for a while, unless it is the last."""
+        idle = [slot for slot in self._slots if slot.idle]
+        unused = [slot for slot in idle[1:] if now - self._used_at.setdefault(slot.number, now) > IDLE_CHILD]
+        if unused:
+            del self._used_at[unused[-1].number]
+            unused[-1].park()
 
     def _switch_shown_slot(self) -> None:
         """Let the first slot that scores send frames instead of one that idles."""

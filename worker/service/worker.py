@@ -1,4 +1,4 @@
-"""A worker process: it connects, joins a run, serves it, and leaves; with `--any`, it serves one run after another."""
+"""A worker process: it connects, joins a run, serves it, and leaves; with `--any`, it serves several side by side."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
+from threading import Thread
 from time import monotonic
-from typing import Any
 
 import zenoh
 
@@ -22,6 +22,7 @@ from dreamfleet.common.errors import (
     AccessError,
     ConnectionFailedError,
     DownloadError,
+    DreamfleetError,
     HandshakeRejectedError,
     RefusedError,
 )
@@ -29,26 +30,59 @@ from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import CountingDecoder
 from dreamfleet.common.security.credentials import add_seat_to_name
-from dreamfleet.common.transport.session import Network, open_session
-from dreamfleet.worker.service.admission import Admission, find_run_with_fewest_slots, make_request, request_admission
+from dreamfleet.common.transport.network import wait_for_listener
+from dreamfleet.common.transport.session import CONNECT_TIMEOUT, Network, open_session
+from dreamfleet.worker.service.admission import (
+    Admission,
+    find_live_names,
+    find_run_with_fewest_slots,
+    make_request,
+    request_admission,
+)
 from dreamfleet.worker.service.bundle_fetch import fetch_bundle
 from dreamfleet.worker.service.config import WorkerConfig
-from dreamfleet.worker.service.farewell import describe_failure
-from dreamfleet.worker.service.membership import LeaveConditions, Membership
+from dreamfleet.worker.service.membership import LeaveConditions, Membership, StopRequests
 from dreamfleet.worker.service.refusal_backoff import SINGLE_RUN_DELAYS, RefusalBackoff
-from dreamfleet.worker.service.run_session import CoordinatorLink, RunSession
+from dreamfleet.worker.service.run_session import CoordinatorLink, Events, RunSession
 from dreamfleet.worker.service.sender import CoordinatorSender
+from dreamfleet.worker.service.slot_budget import SharedSlots
 from dreamfleet.worker.service.slot_pool import SlotPool
+from dreamfleet.worker.service.wording import WaitingText, complete_commands, describe_failure
 from dreamfleet.worker.tasks.registry import check_world_allowed, find_task, known_tasks
 
 log = logging.getLogger(__name__)
 RETRY = 1.0  # seconds between attempts to connect or join
+FIRST_RETRY = 0.1  # the same after the first attempt to join, then doubled up to `RETRY`: a run may just begin
+NO_WAIT = 0.2  # seconds to connect where nothing listens
+MAX_RETRY = 4.0  # the longest pause between looks for another run beside those that it serves
+IDLE_RUN = 30.0  # seconds without a job after which a run does not count for `--runs`: it may be paused
+MAX_IDLE_RUNS = 16  # of these beside `--runs` others
+
+
+class ServedRun:
+    """A run that a worker has joined, with what belongs to it alone."""
+
+    def __init__(self, admission: Admission, membership: Membership) -> None:
+        self.admission, self.membership = admission, membership
+        self.events: Events = queue.SimpleQueue()  # its own, so that another run's late events are not taken for its
+        self.session: RunSession | None = None
+        self.thread = Thread()
+        self.error: Exception | None = None
+
+    @property
+    def name(self) -> str:
+        """The run's name now: its coordinator may have taken another one."""
+        return self.admission.run if self.session is None else self.session.run
 
 
 class Worker:
     """One worker process."""
 
-    def __init__(self, config: WorkerConfig, network: Network, tasks: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self, config: WorkerConfig, network: Network, tasks: tuple[str, ...] = (), typed: tuple[str, ...] = ()
+    ) -> None:
+        """`typed` is the command as its user wrote it, verb and flags, for remedies; empty in a program."""
+        self._typed = typed
         for name in tasks:
             find_task(name)  # fails now, rather than after a run has accepted this worker
         self.identity = keys.new_worker_identity(config.name)
@@ -64,17 +98,21 @@ class Worker:
             leaves_with_run=config.exit_when_done or config.any,
         )  # fmt: skip
         lifetime = min(config.lifetime or math.inf, self._seconds_until_expiry)
-        conditions = LeaveConditions(
+        self._conditions = LeaveConditions(
             lifetime, config.drain_timeout, config.exit_when_done, config.any, config.coordinator_timeout
         )
-        self._membership = Membership(conditions, monotonic())
+        self._started_at, self._stops = monotonic(), StopRequests()
+        self._membership = self._new_membership()  # of no run: it says when the whole worker leaves
         self._refusals = RefusalBackoff() if config.any else RefusalBackoff(*SINGLE_RUN_DELAYS)
-        self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+        self._events: Events = queue.SimpleQueue()
+        self._slots = SharedSlots(self._slot_count)
+        self._served: list[ServedRun] = []
 
     def stop(self) -> None:
         """The first call: finish running jobs and leave. The second: leave now. Safe in a signal handler."""
         self._membership.stop()
-        self._events.put(("wake", None))
+        for events in (self._events, *(each.events for each in self._served)):
+            events.put(("wake", None))
 
     def serve(self) -> None:
         """Work until stopped, or until the run is over if configured so; `AccessError` if the join file expired."""
@@ -100,58 +138,137 @@ class Worker:
             return math.inf
         return credentials.time_left(datetime.now(UTC)).total_seconds() - self._config.drain_timeout
 
+    def _new_membership(self) -> Membership:
+        return Membership(self._conditions, self._started_at, self._stops)
+
     def _startup(self) -> zenoh.Session | None:
         """A session, as soon as the router answers; `None` if this worker stops first."""
-        failures: Counter[str] = Counter()
+        rejections: Counter[str] = Counter()
+        waiting = self._waiting_text()
         while not self._is_leaving():
             try:
-                return open_session(self._network)
+                listens = wait_for_listener(self._network.connect, CONNECT_TIMEOUT, self._is_leaving)
+                return open_session(self._network, timeout=CONNECT_TIMEOUT if listens else NO_WAIT)
             except HandshakeRejectedError as error:
-                reason, logged_at = f"{error}; trying again", 2  # a coordinator that just started accepts the next try
+                rejections[str(error)] += 1
+                if rejections[str(error)] == 2:  # a coordinator that just started accepts the next try
+                    log.warning("%s; trying again", error)
             except ConnectionFailedError:
-                reason, logged_at = f"waiting for a coordinator at {', '.join(self._network.connect)}", 1
-            failures[reason] += 1
-            if failures[reason] == logged_at:
-                log.warning("%s", reason)
+                if text := waiting.next(monotonic(), answered=False):
+                    log.warning("%s", text)
             self._pause()
         return None
 
     def _main_loop(self, session: zenoh.Session) -> None:
-        """Serve one run, or one after another."""
+        """Serve one run, or several side by side."""
         link = CoordinatorLink(
             session, self.identity, self.inbox, lambda *of: self._request_admission(session, *of), _jittered_retry
         )
+        self._waiting = self._waiting_text()
+        if self._config.any:
+            self._serve_any(link)
+            return
         while (admission := self._join(session)) is not None:
+            served = self._register(admission)
             try:
-                self._serve_run(link, admission)
+                self._serve_run(link, served)
             except (RefusedError, DownloadError) as error:
+                self._waiting = self._waiting_text()
                 self._handle_refusal(admission.run, error)
             else:
-                if not self._config.any:
+                if self._config.exit_when_done or not served.membership.ending:
                     return
+                self._waiting = self._waiting_text(served)
+            finally:
+                self._served.clear()
 
-    def _serve_run(self, link: CoordinatorLink, admission: Admission) -> None:
+    def _serve_any(self, link: CoordinatorLink) -> None:
+        """Serve up to `--runs` runs, each in a thread of its own, so that none waits for another's coordinator."""
+        pause = RETRY
+        try:
+            while not self._is_leaving():
+                joined = self._has_room and self._start_next_run(link)
+                if not self._served and not joined:
+                    self._log_waiting(link.session)
+                pause = RETRY if joined or not self._served else min(2 * pause, MAX_RETRY)
+                if not joined and self._pause(pause):
+                    pause = RETRY
+        finally:
+            for each in self._served:  # after an error too: children end before their worker
+                each.events.put(("wake", None))
+                each.thread.join()
+
+    @property
+    def _has_room(self) -> bool:
+        """Whether this worker looks for another run: runs that had no job for a while do not count."""
+        served, most = len(self._served), self._config.runs
+        if most == 1:
+            return not served
+        return served < most or (served < most + MAX_IDLE_RUNS and self._slots.busy_runs(IDLE_RUN) < most)
+
+    def _start_next_run(self, link: CoordinatorLink) -> bool:
+        """Join another run, if one is live, and serve it in its thread."""
+        admission = self._request_any_run(link.session)
+        if admission is None:
+            return False
+        served = self._register(admission)
+        served.thread = Thread(target=self._serve_in_thread, args=(link, served), name=f"run {admission.run}")
+        served.thread.start()
+        return True
+
+    def _register(self, admission: Admission) -> ServedRun:
+        served = ServedRun(admission, self._new_membership())
+        self._served.append(served)
+        return served
+
+    def _serve_in_thread(self, link: CoordinatorLink, served: ServedRun) -> None:
+        """Serve a run; the main thread learns how it ended."""
+        try:
+            self._serve_run(link, served)
+        except Exception as error:
+            served.error = error
+        self._events.put(("over", served))
+
+    def _end_run(self, served: ServedRun) -> None:
+        """Forget a run that is over. An error ends a worker of one run at a time; beside others, the run waits."""
+        served.thread.join()
+        self._served.remove(served)
+        self._waiting, error = self._waiting_text(served), served.error
+        if error is not None and not isinstance(error, DreamfleetError):
+            log.error("run %s ended by an error of this worker", served.name, exc_info=error)
+        if isinstance(error, (RefusedError, DownloadError)) or (error is not None and self._config.runs > 1):
+            self._handle_refusal(served.name, error)
+        elif error is not None:
+            raise error
+
+    def _serve_run(self, link: CoordinatorLink, served: ServedRun) -> None:
         """Work for a run until it is over or this worker leaves."""
-        bundle = None
+        admission, bundle = served.admission, None
         with self._farewell(link.session, admission):
             if admission.spec.bundle and (bundle := self._fetch_bundle(link.session, admission)) is None:
                 return
-        # Each run has its own queue, so that late events of the last run are not taken for this one's.
-        self._events = queue.SimpleQueue()
         with ExitStack() as stack:
             with self._farewell(link.session, admission):
-                slots = self._open_slots(link.session, admission, bundle)
+                slots = self._open_slots(link.session, served, bundle)
             stack.callback(slots.stop)
-            self._refusals.forget(self._refusal_key(admission.run))
-            RunSession(link, admission, self._membership, slots, self._events).serve()
+            self._events.put(("serving", served))
+            served.session = RunSession(link, admission, served.membership, slots, served.events)
+            served.session.serve()
 
-    def _open_slots(self, session: zenoh.Session, admission: Admission, bundle: Bundle | None) -> SlotPool:
+    def _open_slots(self, session: zenoh.Session, served: ServedRun, bundle: Bundle | None) -> SlotPool:
         if bundle is not None:
             check_world_allowed(bundle, self._hello.tasks)
-        return SlotPool(
-            self._slot_count, admission.spec, bundle.path if bundle else None, self._events, self._hello.tasks,
-            self._config.slot_memory << 20, lambda: self._fetch_bundle(session, admission) if bundle else None,
-        )  # fmt: skip
+        admission, events = served.admission, served.events
+        share = self._slots.open(admission.share, lambda: events.put(("wake", None)))
+        try:
+            return SlotPool(
+                share, admission.spec, bundle.path if bundle else None, events, self._hello.tasks,
+                self._config.slot_memory << 20, lambda: self._fetch_bundle(session, admission) if bundle else None,
+                all_at_once=not self._config.any or self._config.runs == 1,
+            )  # fmt: skip
+        except BaseException:
+            share.close()
+            raise
 
     @contextmanager
     def _farewell(self, session: zenoh.Session, admission: Admission) -> Iterator[None]:
@@ -163,20 +280,34 @@ class Worker:
             sender.send_farewell(self._slot_count, describe_failure(error))
             raise
 
+    def _waiting_text(self, served: ServedRun | None = None) -> WaitingText:
+        """What to say while no run is served, after the last `served` one."""
+        ending = "" if served is None else served.membership.ending
+        ended = f"run {served.name} {ending}" if served is not None and ending else ""
+        return WaitingText(self._config, self._network, monotonic(), ended)
+
     def _join(self, session: zenoh.Session) -> Admission | None:
-        """A run that welcomed this worker; `None` if this worker stops first."""
-        logged = False
+        """The configured run, once it welcomed this worker; `None` if this worker stops first."""
+        pause = FIRST_RETRY
         while not self._is_leaving():
-            admission = self._request_any_run(session) if self._config.any else self._request_configured_run(session)
+            admission = self._request_configured_run(session)
             if admission is not None:
                 return admission
-            if not logged and not self._refusals.refusing_runs(monotonic()):
-                awaited = f"run {self._config.run}" if self._config.run else "a run"
-                revoked = "; if it is served already, this join file was revoked" if self._network.credentials else ""
-                log.warning("waiting for %s%s", awaited, revoked)
-            logged = True
-            self._pause()
+            if pause > FIRST_RETRY:
+                self._log_waiting(session)
+            self._pause(pause)
+            pause = min(2 * pause, RETRY)
         return None
+
+    def _log_waiting(self, session: zenoh.Session) -> None:
+        """Log, as is due, that no run is served."""
+        now = monotonic()
+        if not self._refusals.refusing_runs(now) and (
+            text := self._waiting.next(
+                now, answered=bool(session.info.routers_zid()), others=lambda: find_live_names(session)
+            )
+        ):
+            log.log(logging.INFO if self._waiting.ended else logging.WARNING, "%s", text)
 
     def _request_configured_run(self, session: zenoh.Session) -> Admission | None:
         if self._refusals.refusing_runs(monotonic()):
@@ -188,18 +319,21 @@ class Worker:
             return None
 
     def _request_any_run(self, session: zenoh.Session) -> Admission | None:
-        run = find_run_with_fewest_slots(session, self._refusals.refusing_runs(monotonic()))
+        excluded = self._refusals.refusing_runs(monotonic()) | {each.name for each in self._served}
+        run = find_run_with_fewest_slots(session, excluded)
         try:
             return None if run is None else self._request_admission(session, run)
         except RefusedError as error:
             self._handle_refusal(str(run), error)
             return None
 
-    def _handle_refusal(self, run: str, error: RefusedError | DownloadError) -> None:
+    def _handle_refusal(self, run: str, error: Exception) -> None:
         """Raise the error with `--exit-when-done`; otherwise log it and ask again later.
 
         R23: the reason may pass and anybody could have answered, so the worker asks again with growing pauses.
         """
+        if isinstance(error, RefusedError):
+            error = RefusedError(complete_commands(str(error), self._typed))
         if self._config.exit_when_done:
             raise error
         refuser = self._refusal_key(run)
@@ -224,14 +358,20 @@ class Worker:
     def _is_leaving(self) -> bool:
         return self._membership.is_leaving(monotonic())
 
-    def _pause(self) -> None:
-        """Wait about `RETRY` seconds, or until stopped."""
-        deadline = monotonic() + _jittered_retry()
+    def _pause(self, seconds: float = RETRY) -> bool:
+        """Wait about so many seconds, or until stopped, or until a run is over; return whether one is."""
+        deadline = monotonic() + seconds * random.uniform(0.5, 1.5)  # noqa: S311 - no secret
         while not self._is_leaving() and (left := deadline - monotonic()) > 0:
             try:
-                self._events.get(timeout=left)
+                kind, served = self._events.get(timeout=left)
             except queue.Empty:
-                return
+                return False
+            if kind == "serving":
+                self._refusals.forget(self._refusal_key(served.name))
+            elif kind == "over":
+                self._end_run(served)
+                return True
+        return False
 
 
 def _jittered_retry() -> float:

@@ -107,7 +107,7 @@ class TakeCoverTask(Task):
         """Sizes, packages and options of a run without a world model, whose controllers see a band of pixels."""
         text = self.parse_options(options)
         world = self.with_options(text).world
-        return Description(BAND, world.actions.outputs, world.packages, world.version, text)
+        return Description(BAND, world.actions.outputs, world.packages, world.version, text, world.horizon)
 
     def world_of(self, assignment: Assignment) -> World:
         """The world under the options of the world model, or of a run without one."""

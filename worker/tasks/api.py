@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import gymnasium
@@ -85,7 +86,7 @@ class PolicyWithOutputs(Protocol):
 
 @dataclass(frozen=True)
 class Score:
-    """Result of an episode: its fitness, and the number of environment steps.
+    """Result of an episode: its fitness, the number of environment steps, and the specification's measures.
 
     >>> Score(fitness=812.5, steps=1000).fitness
     812.5
@@ -93,6 +94,7 @@ class Score:
 
     fitness: float
     steps: int
+    measures: tuple[float, ...] = ()
 
 
 Episode = tuple[NDArray[np.float32], int]
@@ -322,6 +324,13 @@ class Task:
 
         It must give the same scores to the bit; its `render` gives pictures and changes nothing else. `None`: there is
         none, and observations are shown if they are pictures.
+        """
+        return None
+
+    def find_standalone_script(self, assignment: Assignment) -> Path | None:  # noqa: ARG002 - subclasses use it
+        """A script that acts by the files beside it, without dreamfleet (`dreamfleet card`); `None`: there is none.
+
+        With a world model these are `controller.onnx`, of one step; without one, `controller.npz`.
         """
         return None
 

@@ -9,6 +9,7 @@ import numpy as np
 import pygame
 from numpy.typing import NDArray
 
+from dreamfleet.common.worlds.profile import WorldProfile
 from dreamfleet.worker.scoring.disturbance import numbered_choices
 from dreamfleet.worker.tasks.api import Actions, Continuous, Discrete
 
@@ -73,6 +74,7 @@ class DriveFrame:
     step: int
     score: float
     pictures: ModelPictures | None = None
+    end: str = ""  # how the drive ended, after its last step
 
 
 class Board:
@@ -119,6 +121,11 @@ class Board:
     def _text(self, text: str, corner: Corner, font: pygame.font.Font, colour: tuple[int, int, int]) -> None:
         self._surface.blit(font.render(text, True, colour), corner)
 
+    def _draw_score(self, label: str, amount: str, corner: Corner) -> None:
+        """Draw a score's number after what it counts, so that the words stand still."""
+        self._text(f"{label} ", corner, self._large, FAINT)
+        self._text(amount, (corner[0] + self._large.size(f"{label} ")[0], corner[1]), self._large, INK)
+
     def _bar(
         self, name: str, colour: tuple[int, int, int], value_between: tuple[float, float, float], corner: Corner
     ) -> None:
@@ -131,7 +138,7 @@ class Board:
         pygame.draw.rect(self._surface, (45, 48, 56), box)
         start = box.left if from_left else box.centerx
         share = (value - low) / max(high - low, 1e-9) if from_left else value / max(-low, high, 1e-9)
-        length = round(float(np.clip(share, -1, 1)) * (box.width if from_left else box.width / 2))
+        length = round(float(np.clip(share, 0 if from_left else -1, 1)) * (box.width if from_left else box.width / 2))
         pygame.draw.rect(self._surface, colour, (min(start, start + length), box.top, abs(length), box.height))
 
 
@@ -139,11 +146,11 @@ class Canvas(Board):
     """Draws frames of a recorded drive."""
 
     def __init__(
-        self, seed: int, layout: FrameLayout = AWAKE, names: tuple[str, ...] = (), actions: Actions | None = None
-    ) -> None:
+        self, seed: int, profile: WorldProfile, layout: FrameLayout = AWAKE, names: tuple[str, ...] = (),
+        actions: Actions | None = None,
+    ) -> None:  # fmt: skip
         super().__init__(layout.size, names, actions)
-        self._seed = seed
-        self._layout = layout
+        self._seed, self._profile, self._layout = seed, profile, layout
 
     def draw(self, moment: DriveFrame) -> Frame:
         """The frame `(height, width, 3)`."""
@@ -152,10 +159,22 @@ class Canvas(Board):
         self._fitted(moment.track, (MARGIN, MARGIN), self._layout.track)
         if moment.pictures is not None:
             self._draw_model(moment.pictures)
-        self._text(f"score {moment.score:7.1f}", (12, height + 24), self._large, INK)
-        self._text(f"step {moment.step}   seed {self._seed}", (12, height + 52), self._small, FAINT)
+        if moment.end:
+            self._draw_end(moment.end)
+        profile = self._profile
+        self._draw_score(profile.score_label, profile.format_amount(moment.score), (12, height + 24))
+        self._text(f"step {moment.step}   {profile.score_word} {self._seed}", (12, height + 52), self._small, FAINT)
         self._draw_action(moment.action, width + 16, height + 26)
         return pixels(self._surface)
+
+    def _draw_end(self, text: str) -> None:
+        """Draw a text on a band across the top of the world's picture: games show their own figures below."""
+        width, _ = self._layout.track
+        drawn = self._large.render(text, True, INK)
+        band = pygame.Surface((width, drawn.get_height() + 2 * GAP), pygame.SRCALPHA)
+        band.fill((*BACKGROUND, 200))
+        band.blit(drawn, ((width - drawn.get_width()) // 2, GAP))
+        self._surface.blit(band, (MARGIN, MARGIN))
 
     def _draw_model(self, pictures: ModelPictures) -> None:
         column = [("what the model sees", pictures.seen), ("what it decodes", pictures.decoded)]
@@ -168,7 +187,7 @@ class Canvas(Board):
 
 
 def choice_name(action: NDArray[Any], names: tuple[str, ...], actions: Actions | None) -> str | None:
-    """The name of the choice that an action is, else its number; `None` if actions are no numbered choices.
+    """The name of the choice that an action is, else its number of so many; `None` if there are no numbered choices.
 
     A choice of several parts has the names of all of them.
 
@@ -179,13 +198,15 @@ def choice_name(action: NDArray[Any], names: tuple[str, ...], actions: Actions |
     if action.dtype.kind in "iu":
         number = int(action[0])
         index = number - actions.first if isinstance(actions, Discrete) else number
-        return names[index] if 0 <= index < len(names) else str(number)
+        if 0 <= index < len(names):
+            return names[index]
+        return f"{number} of {actions.outputs}" if isinstance(actions, Discrete) else str(number)
     if not isinstance(actions, Continuous) or not len(choices := numbered_choices(actions)):
         return None
     if len(names) == len(action):
         return " ".join(name for name, value in zip(names, action, strict=True) if value) or "none"
     found = np.flatnonzero((choices == action).all(axis=1))
-    return str(found[0]) if len(found) else "none"
+    return f"{found[0]} of {len(choices)}" if len(found) else "none"
 
 
 def pixels(surface: pygame.Surface) -> Frame:

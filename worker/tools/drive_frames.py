@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -12,9 +13,12 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.worlds.profile import End
+from dreamfleet.common.worlds.score_words import profile_of
 from dreamfleet.worker.dream.parallel_dream import ParallelDream, ParallelDreamConfig, can_dream
+from dreamfleet.worker.scoring.agents import Agent
+from dreamfleet.worker.scoring.episode import Transition
 from dreamfleet.worker.scoring.failure_cause import describe_exception
-from dreamfleet.worker.tasks.api import World
 from dreamfleet.worker.tools.canvas import (
     AWAKE,
     DREAMING,
@@ -53,7 +57,7 @@ class WorldModelView:
 
 
 class FilmedPolicy:
-    """Wraps a policy and paints frames of its steps, each before its action."""
+    """Wraps a policy and paints frames of its steps, each before its action, and of the episode's end."""
 
     def __init__(self, policy: Any, painter: FramePainter, model_view: WorldModelView | None) -> None:
         self._policy, self._painter, self._model_view = policy, painter, model_view
@@ -84,18 +88,25 @@ class FilmedPolicy:
         if report_reward is not None:
             report_reward(value)
 
+    def end(self, last: Transition) -> None:
+        """Paint the end of an episode that its environment ended; `last` is its last step."""
+        if last.ended:
+            self._painter.hold_end(last, self._score)
+
 
 class FramePainter:
     """Draws frames of one drive, all of the same size, and passes them to `on_frame`."""
 
     def __init__(
-        self, environment: gymnasium.Env[Any, Any], world: World, seed: int, on_frame: Callable[[Frame], None],
+        self, environment: gymnasium.Env[Any, Any], agent: Agent, seed: int, on_frame: Callable[[Frame], None],
         every: int = 1,
     ) -> None:  # fmt: skip
         """`every` is the number of steps between two frames."""
         self.every = every
-        self._environment, self._world, self._seed, self._on_frame = environment, world, seed, on_frame
+        self._environment, self._world, self._seed, self._on_frame = environment, agent.world, seed, on_frame
+        self._profile = replace(profile_of(agent.reality), score_word=agent.world.score_word)
         self._canvas: Canvas | None = None
+        self._last: DriveFrame | None = None
 
     def add(
         self, action: Any, step: int, score: float, pictures: ModelPictures | None, layout: FrameLayout | None
@@ -104,9 +115,26 @@ class FramePainter:
         picture = self._picture()
         if self._canvas is None:
             self._canvas = Canvas(
-                self._seed, layout or plain_layout(picture), self._world.action_names, self._world.actions
-            )
-        self._on_frame(self._canvas.draw(DriveFrame(picture, np.atleast_1d(np.asarray(action)), step, score, pictures)))
+                self._seed, self._profile, layout or plain_layout(picture), self._world.action_names,
+                self._world.actions,
+            )  # fmt: skip
+        self._last = DriveFrame(picture, np.atleast_1d(np.asarray(action)), step, score, pictures)
+        self._on_frame(self._canvas.draw(self._last))
+
+    def hold_end(self, last: Transition, score: float) -> None:
+        """Draw what was painted last as the episode's end, for a second: its last picture, score and how it ended."""
+        assert self._canvas is not None  # the first step was painted
+        assert self._last is not None
+        picture = self._last.track
+        with suppress(Exception):  # of an environment that draws no picture after its end
+            picture = self._picture()
+        end: End = "terminated" if last.terminal else "truncated"
+        if self._world.finish and last.info.get(self._world.finish):
+            end = "finished"
+        text = self._profile.describe_end(end, score, last.step)
+        frame = self._canvas.draw(replace(self._last, track=picture, step=last.step, score=score, end=text))
+        for _ in range(max(1, round(self._world.frames_per_second / self.every))):
+            self._on_frame(frame)
 
     def _picture(self) -> NDArray[np.uint8]:
         """The environment's picture `(height, width, 3)`; `UsageError` if it draws none."""

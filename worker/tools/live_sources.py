@@ -61,14 +61,15 @@ def _episode(
     policy.begin(agent.parameters)
     model_view = None if agent.bundle is None else WorldModelView(agent.bundle, policy, agent.parameters, dreaming)
     every = max(1, round(world.frames_per_second / rate))
-    painter = FramePainter(environment, world, seed, drawn.append, every)
+    filmed = FilmedPolicy(policy, FramePainter(environment, agent, seed, drawn.append, every), model_view)
     score = 0.0
-    for moment in run_episode(
-        environment, FilmedPolicy(policy, painter, model_view), EpisodeConfig(seed, world.horizon)
-    ):
+    for moment in run_episode(environment, filmed, EpisodeConfig(seed, world.horizon)):
         if drawn:
             yield CaptionedFrame(drawn.pop(), {**facts, "seed": seed, "step": moment.step - 1, "score": score})
         score += moment.reward
+    filmed.end(moment)
+    for picture in drawn:
+        yield CaptionedFrame(picture, {**facts, "seed": seed, "step": moment.step, "score": score})
 
 
 def limit_rate(pictures: Iterator[CaptionedFrame], rate: float) -> Iterator[CaptionedFrame]:

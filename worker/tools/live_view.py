@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.monitoring.live import LiveFrame
 from dreamfleet.common.printable import truncate
+from dreamfleet.common.worlds.score_words import profile_of
 from dreamfleet.worker.dream.parallel_dream import DreamContinuation, can_dream
 from dreamfleet.worker.tasks.api import Actions
-from dreamfleet.worker.tools.canvas import BACKGROUND, FAINT, INK, Board, Frame, pixels
+from dreamfleet.worker.tools.canvas import BACKGROUND, FAINT, Board, Frame, pixels
 from dreamfleet.worker.worldmodel.inference import Decoder
 
 SIZE = 720, 680  # pixels of a frame
@@ -74,11 +75,12 @@ class LiveCanvas(Board):
     """Draws live frames of one run, all of the same size."""
 
     def __init__(
-        self, run: str, names: tuple[str, ...] = (), dreamer: LiveDreamer | None = None, actions: Actions | None = None
-    ) -> None:
-        """`names` and `actions` are as in `Board`; without a `dreamer` only observations are drawn."""
+        self, run: str, names: tuple[str, ...] = (), dreamer: LiveDreamer | None = None, actions: Actions | None = None,
+        task: str = "",
+    ) -> None:  # fmt: skip
+        """`names` and `actions` are as in `Board`, `task` the world's; without a `dreamer` only observations show."""
         super().__init__(SIZE, names, actions)
-        self._run, self._dreamer = run, dreamer
+        self._run, self._dreamer, self._profile = run, dreamer, profile_of(task)
 
     def draw(self, live: LiveFrame) -> CaptionedFrame:
         """Draw a frame."""
@@ -117,9 +119,9 @@ class LiveCanvas(Board):
         lines = [
             f"generation {frame.generation}, {whose}",
             f"run {truncate(self._run, NAME)}   worker {truncate(live.worker.partition('/')[0], NAME)}",
-            f"seed {frame.seed}",
+            f"step {frame.step}   {self._profile.score_word} {frame.seed}",
         ]
-        self._text(f"score {frame.reward:7.1f}   step {frame.step}", (EDGE, FOOT), self._large, INK)
+        self._draw_score(self._profile.score_label, self._profile.format_amount(frame.reward), (EDGE, FOOT))
         for row, line in enumerate(lines):
             self._text(line, (EDGE, FOOT + 30 + 20 * row), self._small, FAINT)
         discrete = self._dreamer is None and len(frame.action) == 1 and frame.action[0].is_integer()

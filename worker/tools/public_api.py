@@ -12,6 +12,7 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.trained_agent import TrainedAgent
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.resource_limits import usable_cores
+from dreamfleet.common.host.trusted_modules import trust_meanwhile
 from dreamfleet.common.runs import lookup, run_paths
 from dreamfleet.common.runs.episode_results import EpisodeResults
 from dreamfleet.common.runs.seeds import TEST
@@ -54,7 +55,8 @@ def make_environment(
     (64, 64, 3)
     >>> environment.close()
     """
-    return _agent(controller, bundle).make_evaluation_environment(render_mode)
+    with trust_meanwhile():
+        return _agent(controller, bundle).make_evaluation_environment(render_mode)
 
 
 def make_policy(controller: Controller | TrainedAgent, bundle: Bundle | None = None) -> Policy:
@@ -70,8 +72,9 @@ def make_policy(controller: Controller | TrainedAgent, bundle: Bundle | None = N
     >>> policy.reward(reward)
     >>> environment.close()
     """
-    agent = _agent(controller, bundle)
-    policy = agent.make_policies()(0)
+    with trust_meanwhile():
+        agent = _agent(controller, bundle)
+        policy = agent.make_policies()(0)
     policy.begin(agent.parameters)
     return policy
 
@@ -94,7 +97,8 @@ def evaluate(
     if episodes < 1 or first_seed < 0 or (jobs is not None and jobs < 1):
         raise UsageError("episodes and jobs must be at least 1, first_seed at least 0")
     seeds = tuple(range(first_seed, first_seed + episodes))
-    return EpisodeResults.of(evaluation.evaluate(_agent(controller, bundle), seeds, jobs or usable_cores()))
+    with trust_meanwhile():
+        return EpisodeResults.of(evaluation.evaluate(_agent(controller, bundle), seeds, jobs or usable_cores()))
 
 
 def _agent(controller: Controller | TrainedAgent, bundle: Bundle | None) -> Agent:

@@ -32,8 +32,8 @@ def record(
 ) -> float:  # fmt: skip
     """Record one episode of an agent in its evaluation environment as an mp4; return its score.
 
-    With a world model, the video also shows what the model sees, decodes and, if it can, dreams. If `stop()` turns
-    true, the video ends early, after at least one step.
+    With a world model, the video also shows what the model sees, decodes and, if it can, dreams. An episode's end is
+    held for a second. If `stop()` turns true, the video ends early, after at least one step.
     """
     policy: Any = agent.make_policies()(seed)
     policy.begin(agent.parameters)
@@ -43,12 +43,13 @@ def record(
     environment = agent.make_evaluation_environment("rgb_array")
     try:
         with episode_errors(seed), Video(out, agent.world.frames_per_second) as video:
-            filmed = FilmedPolicy(policy, FramePainter(environment, agent.world, seed, video.add), model_view)
+            filmed = FilmedPolicy(policy, FramePainter(environment, agent, seed, video.add), model_view)
             for moment in run_episode(environment, filmed, EpisodeConfig(seed, steps)):
                 score += moment.reward
                 on_step(moment.step)
                 if stop():
                     break
+            filmed.end(moment)
     finally:
         close_environment(environment)
     return score

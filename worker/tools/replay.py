@@ -21,6 +21,7 @@ from dreamfleet.common.host.trusted_modules import check_trusted
 from dreamfleet.common.protocol.failures import failure_cause
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, class_from_fingerprint
 from dreamfleet.common.protocol.tasks import module_of
+from dreamfleet.common.runs.own_runs import trust_own_run
 from dreamfleet.common.runs.records import StoredFailure, StoredResult
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.scoring_params import ScoringParams, scoring_params_of
@@ -91,6 +92,7 @@ def replay(run: RunFolder, generation: int, candidate: int, stall: float = STALL
     episode that fails does so in a fresh process (R8). Left out are episodes of a vector that was drawn anew, and those
     on seeds that were replaced.
     """
+    trust_own_run(run.uid, run.spec.task, run.spec.options)
     if module := module_of(run.spec.task):
         check_trusted(module, f"task {run.spec.task!r}")
     with run.read_transaction():

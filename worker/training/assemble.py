@@ -37,6 +37,7 @@ from dreamfleet.common.files.regular_files import read_regular
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld
+from dreamfleet.worker.tasks.api import Preprocessing
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
 from dreamfleet.worker.training.data.data_folder import explain_write_errors
@@ -44,13 +45,14 @@ from dreamfleet.worker.training.data.dataset import (
     episode_paths,
     find_world,
     load_arrays,
+    preprocessing_of_drives,
     preprocessing_of_size,
     split_held_out,
     world_of_folder,
 )
+from dreamfleet.worker.training.data.recorded_states import compute_recorded_states
 from dreamfleet.worker.training.dream_facts import RecordedRewards, Source, describe_world, warn_of_unsure_ends
 from dreamfleet.worker.training.encode import ENCODED, latents_encoder_hash
-from dreamfleet.worker.training.recorded_states import compute_recorded_states
 from dreamfleet.worker.worldmodel.export import (
     Weights,
     export_controller,
@@ -110,14 +112,16 @@ def assemble(
     measurements = [(path, *_load_measurements(path)) for path in measured]
     vae, rnn, vae_config, rnn_config = _load_models(folder)
     configs = vae_config, rnn_config
+    paths = episode_paths(folder)
     provenance, world, facts = _make_provenance(folder), world_of_folder(folder), None
+    preprocessing = preprocessing_of_drives(paths, vae_config.picture, world)
     if world != OF_FIRST_WORLD:
-        rewards = RecordedRewards.load(episode_paths(folder))
+        rewards = RecordedRewards.load(paths)
         facts = describe_world(world, rewards, rnn_config, reward, end)
         provenance |= _describe_drives(folder, rewards, facts)
         warn_of_unsure_ends(facts.end, provenance["quality"])
     elif reward or end:
-        raise UsageError(f"{world} knows how its dreams pay and end: leave --reward and --end out")
+        raise UsageError(f"{world} knows how its dreams pay and end: omit --reward and --end")
     parts = export_graphs(vae, rnn, initial_latents(folder), *configs, facts)
     if recorded:
         found = compute_recorded_states(folder, recorded)
@@ -129,7 +133,7 @@ def assemble(
         parts[WEIGHTS] = save(tensors)  # without metadata, which it writes in any order: the manifest has the layers
     if measurements:
         with TemporaryDirectory() as aside:
-            manifest = make_manifest(name, provenance, *configs, world, facts)
+            manifest = make_manifest(name, provenance, *configs, world, facts, preprocessing)
             bare = write_bundle(Path(aside) / out.name, manifest, parts).sha256
         for path, of, _ in measurements:
             if of != bare:
@@ -139,7 +143,7 @@ def assemble(
                 )
         provenance["measured"] = [figures for *_, figures in measurements]
     with explain_write_errors(out):
-        return write_bundle(out, make_manifest(name, provenance, *configs, world, facts), parts)
+        return write_bundle(out, make_manifest(name, provenance, *configs, world, facts, preprocessing), parts)
 
 
 def _load_models(folder: Path) -> tuple[Weights, Weights, VAEConfig, MDNRNNConfig]:
@@ -196,10 +200,13 @@ def _load_measurements(path: Path) -> tuple[object, dict[str, Any]]:
 
 def make_manifest(
     name: str, provenance: dict[str, Any], vae: VAEConfig = PAPER, rnn: MDNRNNConfig = REWARDED,
-    world: DataWorld = OF_FIRST_WORLD, facts: WorldFacts | None = None,
+    world: DataWorld = OF_FIRST_WORLD, facts: WorldFacts | None = None, preprocessing: Preprocessing | None = None,
 ) -> BundleManifest:  # fmt: skip
-    """Make the manifest of these models of a data set's world, with what it says of that world."""
-    preprocessing = preprocessing_of_size(vae.picture, world)
+    """Make the manifest of these models of a data set's world, with what it says of that world.
+
+    `preprocessing` is that of its pictures, by default the world's of their size.
+    """
+    preprocessing = preprocessing or preprocessing_of_size(vae.picture, world)
     return BundleManifest(
         name=name,
         task=world.task,

@@ -23,11 +23,12 @@ from dreamfleet.worker.training.data.dataset import (
     check_pictures,
     check_whole,
     episode_paths,
+    existing_episodes,
     find_world,
     load_arrays,
     load_pictures,
     load_steps,
-    preprocessing_of_size,
+    preprocessing_of_drives,
     world_of_folder,
 )
 from dreamfleet.worker.training.train_vae import CHECKPOINT
@@ -93,7 +94,8 @@ def latents_encoder_hash(folder: Path) -> str:
 def encodes_mirrored(folder: Path) -> bool:
     """Whether mirrored pictures of the folder's VAE can occur in a drive."""
     size, world = load_config(folder / CHECKPOINT, VAEConfig).picture, world_of_folder(folder)
-    return preprocessing_of_size(size, world).mirrors and find_world(*world).world.mirror is not None
+    preprocessing = preprocessing_of_drives(existing_episodes(folder), size, world)
+    return preprocessing.mirrors and find_world(*world).world.mirror is not None
 
 
 def encoder_hash(folder: Path) -> str:

@@ -98,12 +98,12 @@ def output_bounds(controller: Controller, own: Bundle) -> tuple[Doubles, Doubles
     """The lower and upper bounds `(outputs,)` to which the first layer's target values are clipped.
 
     An action that is clipped, such as a brake below 0, does not depend on how far the value lies beyond the bound.
-    Values of discrete choices are compared with each other, so they are not clipped.
+    Values of discrete choices are compared with each other, and linear actions are the values, so neither are clipped.
     """
     outputs = controller.shape.layers[0][0]
     lowest, highest = np.full(outputs, -TANH_BOUND), np.full(outputs, TANH_BOUND)
     actions = own.driving_of(controller.options).controls
-    if actions.choices and not controller.shape.hidden:
+    if (actions.choices or not actions.squashed) and not controller.shape.hidden:
         return lowest * np.inf, highest * np.inf
     if controller.shape.hidden or actions.output_indices:
         return lowest, highest

@@ -34,7 +34,7 @@ class TrainingState:
         `extensible` (see `load_checkpoint`) may be added to `other`, and to `path` while it has made no update.
         """
         if new and other is not None and other.resolve() == path.resolve():
-            raise UsageError(f"--new replaces {path}, which --continue-from names: leave one of the two out")
+            raise UsageError(f"--new replaces {path}, which --continue-from names: omit one of the two")
         self._path, self._model, self._config, self._episodes, self._new = path, model, config, episodes, new
         self._best_path = path.with_suffix(".best.safetensors")
         disable_triton_after_mesa()

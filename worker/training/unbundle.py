@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,15 @@ import torch
 from safetensors import SafetensorError
 from safetensors.numpy import load
 
-from dreamfleet.common.artifacts.bundle import DECODER, DREAM_GRAPH, ENCODER, WEIGHTS, Bundle
+from dreamfleet.common.artifacts.bundle import (
+    DECODER,
+    DREAM_GRAPH,
+    ENCODER,
+    SINGLE_PRECISION,
+    WEIGHTS,
+    Bundle,
+    describe_bundle,
+)
 from dreamfleet.common.errors import BundleError, DatasetError, UsageError
 from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.printable import one_line
@@ -18,12 +27,15 @@ from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.checkpoint import save_checkpoint
 from dreamfleet.worker.training.data.data_folder import explain_folder_errors
 from dreamfleet.worker.training.encode import encoder_hash
+from dreamfleet.worker.worldmodel.eight_bits import Ranges
 from dreamfleet.worker.worldmodel.export import export_decoder, export_dream, export_encoder
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae import VAE
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from dreamfleet.worker.worldmodel.weights_from_graphs import Weights, mdnrnn_weights, vae_weights
+
+EIGHT_BITS = "eight_bits"  # ranges among a manifest's models
 
 
 def unbundle(bundle: Bundle, folder: Path) -> tuple[Path, Path]:
@@ -36,10 +48,7 @@ def unbundle(bundle: Bundle, folder: Path) -> tuple[Path, Path]:
     for path in paths:
         if path_exists(path):
             raise UsageError(f"{path} exists: choose another --data")
-    try:
-        vae, rnn = _rebuild_models(bundle)
-    except (BundleError, MalformedError, UsageError, RuntimeError, ValueError, TypeError, SafetensorError) as error:
-        raise BundleError(f"{bundle.path}: {one_line(str(error))}") from error
+    vae, rnn = _rebuild_models(bundle)
     with explain_folder_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -52,19 +61,48 @@ def unbundle(bundle: Bundle, folder: Path) -> tuple[Path, Path]:
     return paths
 
 
-def _rebuild_models(bundle: Bundle) -> tuple[VAE, MDNRNN]:
-    models = bundle.manifest.models
-    if not models:
+@dataclass(frozen=True)
+class Models:
+    """The configurations and weights of a bundle's models, and the ranges of eight-bit products."""
+
+    vae_config: VAEConfig
+    mdnrnn_config: MDNRNNConfig
+    vae: Weights
+    mdnrnn: Weights
+    ranges: Ranges | None
+
+
+def restore_models(bundle: Bundle) -> Models:
+    """The models of a bundle; `BundleError` if they cannot be restored to the bytes of its graphs."""
+    try:
+        return _restore(bundle)
+    except (BundleError, MalformedError, UsageError, RuntimeError, ValueError, TypeError, SafetensorError) as error:
+        raise BundleError(f"{bundle.path}: {one_line(str(error))}") from error
+
+
+def _restore(bundle: Bundle) -> Models:
+    plain = bundle.manifest.models
+    if not plain:
         raise BundleError("its manifest lacks its models' layers: it is too old to resume training from")
-    seeing, remembering = from_plain(VAEConfig, models.get("vae")), from_plain(MDNRNNConfig, models.get("mdnrnn"))
+    seeing, remembering = from_plain(VAEConfig, plain.get("vae")), from_plain(MDNRNNConfig, plain.get("mdnrnn"))
+    ranges = from_plain(Ranges, plain[EIGHT_BITS]) if EIGHT_BITS in plain else None
+    if ranges is not None and WEIGHTS not in bundle.manifest.parts:
+        whole = describe_bundle(str(bundle.manifest.provenance.get(SINGLE_PRECISION, "")))
+        raise BundleError(f"its weights are rounded to eight bits: take the bundle that it was made of, {whole}")
     weights = _weights(bundle, seeing, remembering)
     with torch.device("meta"):  # check shapes without memory: the manifest may be wrong
         for model, arrays in zip((VAE(seeing), MDNRNN(remembering)), weights, strict=True):
             model.load_state_dict(_tensors(arrays, "meta"))
-    vae, rnn = VAE(seeing), MDNRNN(remembering)
-    vae.load_state_dict(_tensors(weights[0]))
-    rnn.load_state_dict(_tensors(weights[1]))
-    _check_graphs(bundle, weights, seeing, remembering)
+    models = Models(seeing, remembering, *weights, ranges)
+    _check_graphs(bundle, models)
+    return models
+
+
+def _rebuild_models(bundle: Bundle) -> tuple[VAE, MDNRNN]:
+    found = restore_models(bundle)
+    vae, rnn = VAE(found.vae_config), MDNRNN(found.mdnrnn_config)
+    vae.load_state_dict(_tensors(found.vae))
+    rnn.load_state_dict(_tensors(found.mdnrnn))
     return vae, rnn
 
 
@@ -87,10 +125,11 @@ def _tensors(weights: Weights, device: str = "cpu") -> dict[str, torch.Tensor]:
     return {name: torch.from_numpy(array.copy()).to(device) for name, array in weights.items()}
 
 
-def _check_graphs(bundle: Bundle, weights: tuple[Weights, Weights], vae: VAEConfig, rnn: MDNRNNConfig) -> None:
+def _check_graphs(bundle: Bundle, models: Models) -> None:
     """`BundleError` unless exporting the weights gives the bundle's graphs again: manifest or weights may be wrong."""
-    again = {ENCODER: export_encoder(weights[0], vae), DECODER: export_decoder(weights[0], vae),
-             DREAM_GRAPH: export_dream(weights[1], rnn)}  # fmt: skip
+    again = {ENCODER: export_encoder(models.vae, models.vae_config, models.ranges),
+             DECODER: export_decoder(models.vae, models.vae_config),
+             DREAM_GRAPH: export_dream(models.mdnrnn, models.mdnrnn_config, models.ranges)}  # fmt: skip
     for name, graph in again.items():
         if graph != bundle.read(name):
             raise BundleError(f"its {name} does not match its weights and manifest, so training cannot resume from it")

@@ -15,7 +15,7 @@ from dreamfleet.common.errors import UsageError
 if TYPE_CHECKING:
     from dreamfleet.common.artifacts.bundle import Bundle
 
-SUMMARY = "measure how fast a part is: policy, dream, env, live or dispatch"
+SUMMARY = "measure how fast a part is: policy, dream, env, live, dispatch or batches"
 EXTRAS = ("worker",)
 BUNDLE, EPISODES = "tiny", 3
 
@@ -65,6 +65,13 @@ def measure_dispatch(args: argparse.Namespace) -> int:
     from dreamfleet.worker.bench.dispatch import bench_dispatch
 
     return _print_figures(args, bench_dispatch(max(0, args.workers or 0)))
+
+
+def measure_batches(args: argparse.Namespace) -> int:
+    """Measure how fast submitted batches are scored."""
+    from dreamfleet.worker.bench.batches import bench_batches
+
+    return _print_figures(args, bench_batches())
 
 
 def measure_live(args: argparse.Namespace) -> int:
@@ -163,4 +170,6 @@ PARTS = {
     "live": Part("what the live view costs a slot, unwatched and watched", measure_live),
     "dispatch": Part("jobs a second through real Zenoh, beside Dask and Ray where installed", measure_dispatch,
                      ("workers",)),
+    "batches": Part("evaluations a second that a search elsewhere reaches, over Zenoh and over HTTP",
+                     measure_batches),
 }  # fmt: skip

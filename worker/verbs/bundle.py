@@ -5,20 +5,29 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from dreamfleet.common.artifacts.bundle import MAX_RECORDED_STATES
+from dreamfleet.common.artifacts.bundle import MAX_RECORDED_STATES, Bundle
 from dreamfleet.common.artifacts.world_facts import EndRule
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path
 
-SUMMARY = "freeze a trained world model into one file that workers fetch by its hash; --extract takes one apart"
+SUMMARY = (
+    "freeze a trained world model into one file that workers fetch by its hash; --extract takes one apart, "
+    "--from rounds one to eight bits"
+)
 EXTRAS = ("train",)
 RECORDED = 512  # states of the default layers are 0.6 MB
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("--data", type=Path, required=True, help="folder of the data set and its trained models")
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--data", type=Path, help="folder of the data set and its trained models")
+    source.add_argument(
+        "--from", dest="eight_bits", metavar="BUNDLE",
+        help="round this world model, a file or one that ships, to eight bits: --out is faster, "
+        "and controllers that were evolved on it drive by both",
+    )  # fmt: skip
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--out", type=Path, metavar="FILE", help="the bundle to write, NAME.zip")
     what.add_argument(
@@ -54,12 +63,13 @@ def _end_rule(text: str) -> str:
 
 def run(args: argparse.Namespace) -> int:
     """Write the bundle and print its SHA-256, or write checkpoints and print their paths."""
-    if args.extract is None:
+    if args.extract is None and args.eight_bits is None:
         return _write_bundle(args)
     others = ("recorded", "reward", "end")
     if given := [name for name in others if getattr(args, name) is not None] + ["measured"] * bool(args.measured):
-        raise UsageError(f"--{given[0]} is of a bundle to write: leave it or --extract out")
-    return _write_checkpoints(args)
+        source = "--extract" if args.eight_bits is None else "--from"
+        raise UsageError(f"--{given[0]} is of a bundle to build from --data: omit it or {source}")
+    return _write_checkpoints(args) if args.eight_bits is None else _write_eight_bits(args)
 
 
 def _write_bundle(args: argparse.Namespace) -> int:
@@ -73,6 +83,20 @@ def _write_bundle(args: argparse.Namespace) -> int:
         args.data, args.out, args.out.stem, with_weights=args.with_weights, recorded=recorded,
         measured=args.measured, reward=args.reward, end=args.end,
     )  # fmt: skip
+    return _answer(args, bundle)
+
+
+def _write_eight_bits(args: argparse.Namespace) -> int:
+    from dreamfleet.common.artifacts.bundle_store import find_bundle
+    from dreamfleet.worker.training.eight_bits import write_eight_bit_bundle
+
+    if args.out is None:
+        raise UsageError("--from writes a bundle: give --out FILE")
+    check_output_path(args.out)
+    return _answer(args, write_eight_bit_bundle(find_bundle(args.eight_bits), args.out))
+
+
+def _answer(args: argparse.Namespace, bundle: Bundle) -> int:
     size = bundle.path.stat().st_size / 1e6
     parameters = bundle.controller_shape.size
     states = bundle.recorded_count

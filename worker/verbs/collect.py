@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         if hasattr(args, flag) and not args.controller:
             raise UsageError(f"--{flag} is on a controller's actions: give --controller too")
     if hasattr(args, "driver") and args.controller:
-        raise UsageError("--driver is who drives at random: leave it or --controller out")
+        raise UsageError("--driver is who drives at random: omit it or --controller")
     from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.common.host.stop_signals import stop_on_signals
     from dreamfleet.worker.training.config_flags import apply_flags
@@ -123,9 +123,9 @@ def _import_run(args: argparse.Namespace) -> int:
     from dreamfleet.worker.training.data.dataset import existing_episodes
 
     if args.controller:
-        raise UsageError("--from-run drives nothing: leave --controller out")
+        raise UsageError("--from-run drives nothing: omit --controller")
     if args.task or world_arguments(args):
-        raise UsageError("the drives of --from-run say their world: leave --task and its flags out")
+        raise UsageError("the drives of --from-run say their world: omit --task and its flags")
     with open_run(args.runs_dir, args.from_run) as stored:
         drives = stored.rollouts()
         if not drives:

@@ -7,7 +7,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
+from dreamfleet.common.cli.key_values import ENVIRONMENT_EXAMPLE, parse_arguments
 from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, open_output
 from dreamfleet.common.host.resource_limits import pin_thread_pools, usable_cores
@@ -22,14 +24,15 @@ if TYPE_CHECKING:
 SUMMARY = "judge a controller on unseen seeds, in whole episodes of the world itself"
 EXTRAS = ("worker",)
 CONTROLLER = (
-    "who drives: a controller's file, a run, one that ships, a trained agent's file or its training's folder, or "
-    "random or random-discrete, which act by chance"
+    "who drives: the file of a controller or agent, a training's folder, a run, one that ships, or random: uniform "
+    "random actions in --task (random-discrete: the default world's five)"
 )
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("--controller", help=CONTROLLER)
+    add_random_flags(parser)
     parser.add_argument(
         "--run", dest="run_name", metavar="RUN", help="judge this live run's reported controller instead"
     )
@@ -38,11 +41,41 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--episodes", type=int, default=100, help="whole episodes, one per seed (default 100)")
     parser.add_argument("--first-seed", type=int, default=TEST.start, help=f"the first seed (default {TEST.start})")
+    parser.add_argument(
+        "--cell",
+        help="judge the elite of this cell of the run's archive: its numbers, such as 3,7, or MEASURE=VALUE,...",
+    )
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
     parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one per core)")
     add_global_flags(parser, "runs_dir")
     parser.add_argument("--json", action="store_true", help="print every figure and drive as JSON")
     parser.add_argument("--out", type=Path, help="also write that JSON to this file, for `compare` and `verify report`")
+
+
+def add_random_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the world in which random actions are drawn."""
+    parser.add_argument(
+        "--task", metavar="TASK",
+        help=f"of --controller random: the world, a task without a world model, such as gym:ENVIRONMENT (default "
+        f"{FIRST_WORLD})",
+    )  # fmt: skip
+    parser.add_argument(
+        "--environment", nargs="+", default=[], metavar="KEY=VALUE",
+        help="of --controller random: arguments of its task, as a run's --environment",
+    )  # fmt: skip
+
+
+def named_agent(args: argparse.Namespace) -> Agent:
+    """The agent of `--controller`; a note on stderr names the world of random actions."""
+    from dreamfleet.worker.baselines.agents import find_driver, is_random
+
+    arguments = parse_arguments("--environment", args.environment, ENVIRONMENT_EXAMPLE)
+    options = {"environment": arguments} if arguments else {}
+    agent = find_driver(args.controller, args.runs_dir, args.bundle, args.task, options)
+    if is_random(args.controller, args.runs_dir):
+        remedy = "" if args.task else "; --task names another world"
+        print(f"{args.controller} actions in {agent.reality}{remedy}", file=sys.stderr)
+    return agent
 
 
 def run(args: argparse.Namespace) -> int:
@@ -97,13 +130,15 @@ def judge(name: str, agent: Agent, seeds: tuple[int, ...], jobs: int) -> Evaluat
 def _choose_agent(args: argparse.Namespace) -> tuple[str, Agent]:
     """The name and controller to judge: from this disk, or from a live run."""
     from dreamfleet.common.monitoring.client import Client
+    from dreamfleet.common.monitoring.elites import find_elite
     from dreamfleet.common.runs.lookup import find_bundle_of
-    from dreamfleet.worker.baselines.agents import find_driver
     from dreamfleet.worker.scoring.agents import make_agent
     from dreamfleet.worker.service.bundle_fetch import fetch_bundle_of
 
     live = bool(args.run_name) or bool({"connect", "join"} & args.given)
     if live and not args.controller:
+        if args.task or args.environment:
+            raise UsageError("--task and --environment are the world of --controller random: a live run has its own")
         with Client(resolve_network(args)) as client:
             run = args.run_name or client.status().run
             reported = client.controller(run)
@@ -112,4 +147,11 @@ def _choose_agent(args: argparse.Namespace) -> tuple[str, Agent]:
         return run, make_agent(reported, find_bundle_of(reported, args.bundle))
     if live or not args.controller:
         raise UsageError("give either --controller, or --run (and --connect) to judge what a live run reports")
-    return args.controller, find_driver(args.controller, args.runs_dir, args.bundle)
+    if args.cell is not None:
+        if args.task or args.environment:
+            raise UsageError("--task and --environment are the world of --controller random: a cell's run has its own")
+        controller, beside, found = find_elite(args.runs_dir, args.controller, args.cell)
+        name = f"{args.controller}, cell {args.cell}"
+        print(f"{args.controller}, {found}, as the run measured it", file=sys.stderr)
+        return name, make_agent(controller, find_bundle_of(controller, args.bundle, beside))
+    return args.controller, named_agent(args)

@@ -90,9 +90,9 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--end needs the dreams of --survival: give that too")
     if args.probe or args.losses or args.likeness or args.survival:
         if args.picture:
-            raise UsageError("--picture belongs to the page: leave --probe, --losses, --likeness and --survival out")
+            raise UsageError("--picture belongs to the page: omit --probe, --losses, --likeness and --survival")
         if args.action:
-            raise UsageError("--action belongs to the page: leave --probe, --losses, --likeness and --survival out")
+            raise UsageError("--action belongs to the page: omit --probe, --losses, --likeness and --survival")
         return _measure(args)
     if args.driver:
         raise UsageError("--driver drives for figures: give --probe too")
@@ -250,7 +250,7 @@ def _check_figure_flags(args: argparse.Namespace) -> None:
     if args.seed < 0 or not 0 <= args.noise <= 10:
         raise UsageError("--seed must be at least 0, --noise from 0 to 10")
     if args.driver and args.survival:
-        raise UsageError("--survival measures all drivers: leave --driver out")
+        raise UsageError("--survival measures all drivers: omit --driver")
     if args.controller and args.driver:
         raise UsageError("only one can drive: give --controller or --driver")
 

@@ -15,7 +15,7 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.runs.seeds import TEST
-from dreamfleet.worker.verbs.evaluate import CONTROLLER
+from dreamfleet.worker.verbs.evaluate import add_random_flags, named_agent
 
 if TYPE_CHECKING:
     from dreamfleet.common.artifacts.bundle import Bundle
@@ -40,7 +40,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     whom = parser.add_mutually_exclusive_group()
     whom.add_argument("--worker", metavar="NAME", help="what this worker scores (default: the busiest worker's)")
     whom.add_argument("--best", action="store_true", help="drive the run's best mean so far here, seed after seed")
-    whom.add_argument("--controller", help=f"needs no live run; {CONTROLLER}")
+    whom.add_argument("--controller", help="who drives, without a live run: as `evaluate --controller`")
+    add_random_flags(parser)
     parser.add_argument(
         "--generation", type=int, metavar="G", help="of the run that --controller names: the evaluated mean"
     )
@@ -51,8 +52,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help=f"end after so many seconds of pictures (default: {LONGEST} in files, else when you close it)",
     )
     parser.add_argument(
-        "--seed", type=int, default=TEST.start, help=f"of --best and --controller: first seed (default {TEST.start})"
-    )
+        "--seed", type=int,
+        help=f"of --best and --controller: first seed (default a shipped controller's median one, else {TEST.start})",
+    )  # fmt: skip
     parser.add_argument("--out", help="no window: an .mp4, a folder for PNGs, or - for a stream of JPEGs")
     parser.add_argument("--bundle", help="of --controller: the world model (default: the one that it names)")
     parser.add_argument("--temperature", type=float, default=1.0, help="of the dream (default 1.0)")
@@ -87,10 +89,12 @@ def run(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace) -> None:
     some = args.seconds is None or (args.seconds > 0 and math.isfinite(args.seconds))
-    if not 1 <= args.fps <= FASTEST or args.seed < 0 or not some:
+    if not 1 <= args.fps <= FASTEST or (args.seed or 0) < 0 or not some:
         raise UsageError(f"--fps must be 1 to {FASTEST}, --seconds above 0, --seed at least 0")
     if args.controller and args.run_name:
         raise UsageError("give either a live run to watch, or --controller, which needs none")
+    if (args.task or args.environment) and (not args.controller or args.generation is not None):
+        raise UsageError("--task and --environment are the world of --controller random")
     if args.generation is not None and not args.controller:
         raise UsageError("--generation needs a run on this disk: name it with --controller")
 
@@ -144,7 +148,7 @@ def _worker_pictures(args: argparse.Namespace, client: Client) -> Iterator[Itera
 
     with LiveView(client, args.run_name, args.worker) as view:
         spec = view.status.settings.task
-        glass = LiveCanvas(view.run)
+        glass = LiveCanvas(view.run, task=spec.task)
         if spec.bundle:
             bundle = fetch_bundle(
                 client.session, view.run, spec.bundle, BundleStore(default_cache()), CountingDecoder()
@@ -152,9 +156,10 @@ def _worker_pictures(args: argparse.Namespace, client: Client) -> Iterator[Itera
             assert bundle is not None  # it is never stopped
             fitting = bundle.with_options(spec.controller, spec.options)
             dreamer, world = LiveDreamer(fitting, args.temperature), _find_world(spec, fitting)
-            glass = LiveCanvas(view.run, dreamer=dreamer)
+            task = bundle.manifest.task
+            glass = LiveCanvas(view.run, dreamer=dreamer, task=task)
             if world is not None:
-                glass = LiveCanvas(view.run, world.action_names, dreamer, world.actions)
+                glass = LiveCanvas(view.run, world.action_names, dreamer, world.actions, task)
         print(f"watching run {view.run}; its workers: {view.status.workers.present}", file=sys.stderr)
         yield worker_frames(view, glass, args.fps)
         if view.is_over:
@@ -174,10 +179,16 @@ def _find_world(spec: TaskSpec, bundle: Bundle) -> World | WorldFacts | None:
 
 def _drive_pictures(args: argparse.Namespace, driver: Callable[[], Driver]) -> Iterator[CaptionedFrame]:
     """A controller's drives: into files as fast as possible, elsewhere at `--fps`."""
+    from dreamfleet.common.worlds.known_score import first_seed
     from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
     from dreamfleet.worker.tools.live_sources import driven_frames, limit_rate
 
-    pictures = driven_frames(driver, ParallelDreamConfig(args.temperature), args.fps, args.seed)
+    agent, _ = driver()
+    known, word = agent.known_score, agent.world.score_word
+    seed = args.seed if args.seed is not None else first_seed(known)
+    if known is not None:
+        print(f"first {word} {seed}{known.describe_beside(seed, word)}", file=sys.stderr)
+    pictures = driven_frames(driver, ParallelDreamConfig(args.temperature), args.fps, seed)
     return pictures if _writes_files(args) else limit_rate(pictures, args.fps)
 
 
@@ -194,13 +205,12 @@ def _best_driver(client: Client, run: str) -> Driver:
 def _named_driver(args: argparse.Namespace) -> Callable[[], Driver]:
     """The controller of `--controller`."""
     from dreamfleet.common.runs.lookup import find_bundle_of, find_evaluated_mean
-    from dreamfleet.worker.baselines.agents import find_driver
     from dreamfleet.worker.scoring.agents import make_agent
 
     if args.generation is not None:
         mean, folder = find_evaluated_mean(args.controller, args.runs_dir, args.generation)
         agent = make_agent(mean, find_bundle_of(mean, args.bundle, folder))
     else:
-        agent = find_driver(args.controller, args.runs_dir, args.bundle)
+        agent = named_agent(args)
     facts = {"controller": args.controller, "generation": args.generation}
     return lambda: (agent, facts)

@@ -7,8 +7,8 @@ import os
 from functools import partial
 
 from dreamfleet.common.cli.global_config import add_global_flags
-from dreamfleet.worker.tools.video_cli import add_video_flags, record_videos, video_paths
-from dreamfleet.worker.verbs.evaluate import CONTROLLER
+from dreamfleet.worker.tools.video_cli import add_video_flags, check_video_flags, record_videos
+from dreamfleet.worker.verbs.evaluate import CONTROLLER, add_random_flags, named_agent
 
 SUMMARY = "record drives as mp4s: the world, what the model sees, what it decodes, what it dreams"
 EXTRAS = ("worker", "views")
@@ -17,6 +17,7 @@ EXTRAS = ("worker", "views")
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("--controller", required=True, help=CONTROLLER)
+    add_random_flags(parser)
     add_video_flags(parser)
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
     parser.add_argument("--temperature", type=float, default=1.0, help="of the dream beside the drive (default 1.0)")
@@ -25,12 +26,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Record, and print the scores."""
-    videos = video_paths(args)
+    check_video_flags(args)
     os.environ["SDL_VIDEODRIVER"] = "dummy"
-    from dreamfleet.worker.baselines.agents import find_driver
     from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
     from dreamfleet.worker.tools.recording import record
 
-    agent = find_driver(args.controller, args.runs_dir, args.bundle)
+    agent = named_agent(args)
     film = partial(record, agent, steps=args.steps, dreaming=ParallelDreamConfig(args.temperature))
-    return record_videos(args, videos, film, agent.world)
+    return record_videos(args, agent, film)

@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     if args.model == VAE:
         return _train_vae(args)
     if args.decoder_only:
-        raise UsageError("--decoder-only is of the VAE: leave it out")
+        raise UsageError("--decoder-only is of the VAE: omit it")
     return _train_mdnrnn(args)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +16,7 @@ from dreamfleet.common.host.resource_limits import pin_thread_pools, usable_core
 if TYPE_CHECKING:
     from dreamfleet.common.runs.evaluation_report import EvaluationReport
     from dreamfleet.common.runs.reproduction import Reproduction
+    from dreamfleet.worker.scoring.agents import Agent
 
 SUMMARY = "drive recorded controllers again on their recorded seeds, and compare with what `evaluate --out` wrote"
 EXTRAS = ("worker",)
@@ -49,11 +51,21 @@ def run(args: argparse.Namespace) -> int:
 
 def _reproduce(args: argparse.Namespace, path: Path, recorded: EvaluationReport) -> Reproduction:
     """Drive one report's controller again."""
-    from dreamfleet.common.runs.lookup import find_agent, find_bundle_of
     from dreamfleet.common.runs.reproduction import Reproduction
-    from dreamfleet.worker.scoring.agents import make_agent
     from dreamfleet.worker.verbs.evaluate import judge
 
+    agent = _find_recorded_agent(args, path, recorded)
+    again = judge(recorded.name, agent, recorded.results.seeds[: args.episodes], args.jobs)
+    return Reproduction(recorded, again)
+
+
+def _find_recorded_agent(args: argparse.Namespace, path: Path, recorded: EvaluationReport) -> Agent:
+    from dreamfleet.common.runs.lookup import find_agent, find_bundle_of
+    from dreamfleet.worker.baselines.agents import is_random, make_random_agent
+    from dreamfleet.worker.scoring.agents import make_agent
+
+    if is_random(recorded.name, args.runs_dir):
+        return make_random_agent(recorded.name, recorded.task, json.loads(recorded.options or "{}"))
     controller, beside = find_agent(recorded.name, args.runs_dir)
     if controller.sha256 != recorded.controller:
         raise ControllerError(
@@ -66,9 +78,7 @@ def _reproduce(args: argparse.Namespace, path: Path, recorded: EvaluationReport)
             f"{path} records drives by the world model {recorded.bundle[:12] or 'of none'}, and this is "
             f"{bundle.sha256[:12]}: give that one by --bundle"
         )
-    seeds = recorded.results.seeds[: args.episodes]
-    again = judge(recorded.name, make_agent(controller, bundle), seeds, args.jobs)
-    return Reproduction(recorded, again)
+    return make_agent(controller, bundle)
 
 
 def _row(found: Reproduction) -> dict[str, object]:

@@ -6,6 +6,7 @@ import argparse
 
 from dreamfleet.common.cli.config import add_flags, load
 from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
+from dreamfleet.common.host.logs import label_logs
 from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking
 from dreamfleet.common.host.resource_limits import check_room_for_session, raise_open_file_limit
 from dreamfleet.common.host.stop_signals import END_LIMIT, call_on_signals, end_within
@@ -18,7 +19,9 @@ EXTRAS = ("worker",)
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     add_global_flags(parser, "connect")
-    parser.add_argument("--task", nargs="+", default=[], metavar="MODULE:NAME", help="tasks that no package registers")
+    parser.add_argument(
+        "--task", nargs="+", action="extend", default=[], metavar="MODULE:NAME", help="tasks that no package registers"
+    )
     add_flags(parser, WorkerConfig)
 
 
@@ -30,7 +33,9 @@ def run(args: argparse.Namespace) -> int:
     check_room_for_session()  # before anything else starts a thread
     make_stderr_nonblocking()
     config = load(WorkerConfig, "worker", **args.sources)
-    worker = Worker(config, resolve_network(args, "worker", "coordinator"), tuple(args.task))
+    if config.name is not None:
+        label_logs(f"worker {config.name}")
+    worker = Worker(config, resolve_network(args, "worker", "coordinator"), tuple(args.task), args.typed)
     call_on_signals(worker.stop)
     try:
         worker.serve()

@@ -6,6 +6,7 @@ initializers, and no node gathers, loops or reshapes by a traced batch size.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
@@ -14,21 +15,46 @@ from numpy.typing import NDArray
 from onnx import TensorProto
 
 from dreamfleet.common.artifacts.actions import Continuous
+from dreamfleet.worker.worldmodel.eight_bits import PIXEL_STEP, Ranges, add_convolution, add_product
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.mdnrnn_graph import RecurrentGraph, Weights, export_dream
 from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
 from dreamfleet.worker.worldmodel.vae_config import LEAK, ConvolutionLayer, VAEConfig
 
-__all__ = ["Weights", "export_controller", "export_decoder", "export_dream", "export_encoder", "export_policy"]
+__all__ = [
+    "Weights",
+    "export_controller",
+    "export_decoder",
+    "export_dream",
+    "export_encoder",
+    "export_policy",
+    "squash",
+]
 EPSILON = 1e-5  # of torch's batch normalisation
 
 
-def export_encoder(vae: Weights, config: VAEConfig) -> bytes:
-    """Export the encoder: `picture` (N, side, side, 3) uint8 to `mu` and `logvar` (N, latent)."""
+def export_encoder(vae: Weights, config: VAEConfig, ranges: Ranges | None = None) -> bytes:
+    """Export the encoder: `picture` (N, side, side, 3) uint8 to `mu` and `logvar` (N, latent).
+
+    With `ranges` its products are of eight-bit integers.
+    """
     graph = GraphBuilder("encoder")
-    flat = _encode(graph, graph.add_input("picture", TensorProto.UINT8, config.picture, config.picture, 3), vae, config)
+    picture = graph.add_input("picture", TensorProto.UINT8, config.picture, config.picture, 3)
+    encoded = _encode(graph, picture, vae, config, ranges)
     for name in ("mu", "logvar"):
-        graph.add_output(_linear(graph, flat, vae, name), name, TensorProto.FLOAT, config.latent)
+        graph.add_output(encoded(name), name, TensorProto.FLOAT, config.latent)
+    return graph.build()
+
+
+def export_activations(vae: Weights, config: VAEConfig) -> bytes:
+    """Export the encoder's convolutions: `picture` to the largest output of each, `layer0` (N, 1, 1, 1) and so on."""
+    graph = GraphBuilder("activations")
+    picture = graph.add_input("picture", TensorProto.UINT8, config.picture, config.picture, 3)
+    value = graph.node("Cast", graph.node("Transpose", picture, perm=[0, 3, 1, 2]), to=TensorProto.FLOAT)
+    for index in range(len(config.down)):
+        value = _convolve(graph, value, vae, config, index)
+        largest = graph.node("ReduceMax", value, axes=[1, 2, 3])
+        graph.add_output(largest, f"layer{index}", TensorProto.FLOAT, 1, 1, 1)
     return graph.build()
 
 
@@ -41,6 +67,7 @@ def export_decoder(vae: Weights, config: VAEConfig) -> bytes:
     latent = graph.add_input("latent", TensorProto.FLOAT, config.latent)
     kernel, bias = graph.weight(vae["dense.weight"]), graph.weight(vae["dense.bias"])
     value = graph.node("Gemm", latent, kernel, bias, transB=1)
+    value = _activate(graph, value, config) if config.activate_dense else value
     side, last = config.decoder_sides[0], len(config.up) - 1
     value = graph.node("Reshape", value, graph.shape(-1, config.up[0].inputs, side, side))
     for index, layer in enumerate(config.up):
@@ -55,23 +82,25 @@ def export_decoder(vae: Weights, config: VAEConfig) -> bytes:
 
 
 def export_policy(
-    vae: Weights, rnn: Weights, vae_config: VAEConfig, rnn_config: MDNRNNConfig, actions: Continuous
-) -> bytes:
+    vae: Weights, rnn: Weights, vae_config: VAEConfig, rnn_config: MDNRNNConfig, actions: Continuous,
+    ranges: Ranges | None = None,
+) -> bytes:  # fmt: skip
     """Export one policy step: `picture`, `parameters` and `state` to `action`, `next_state` and `latent`.
 
     The controller acts on (z_t, h_t), then the MDN-RNN advances on (z_t, a_t). Each row of `parameters` (N, size) is a
     linear controller, packed as in `common.artifacts.controller.ControllerShape`. z is the encoder's mean, h the first
-    columns of `state` (N, state).
+    columns of `state` (N, state). With `ranges` the products of encoder and LSTM are of eight-bit integers.
     """
     graph, count = GraphBuilder("policy"), rnn_config.actions
     size = count * (rnn_config.latent + rnn_config.hidden + 1)
     picture = graph.add_input("picture", TensorProto.UINT8, vae_config.picture, vae_config.picture, 3)
     parameters = graph.add_input("parameters", TensorProto.FLOAT, size)
-    recurrent = RecurrentGraph(graph, graph.add_input("state", TensorProto.FLOAT, rnn_config.state), rnn, rnn_config)
-    latent = _linear(graph, _encode(graph, picture, vae, vae_config), vae, "mu")
+    state = graph.add_input("state", TensorProto.FLOAT, rnn_config.state)
+    recurrent = RecurrentGraph(graph, state, rnn, rnn_config, ranges)
+    latent = _encode(graph, picture, vae, vae_config, ranges)("mu")
     weights, biases = graph.split(parameters, size - count, count)
     weights = graph.node("Reshape", weights, graph.shape(-1, count, rnn_config.latent + rnn_config.hidden))
-    action = _squash(graph, _layer(graph, graph.join(latent, recurrent.hidden), weights, biases), actions)
+    action = squash(graph, _layer(graph, graph.join(latent, recurrent.hidden), weights, biases), actions)
     recurrent.advance(latent, action)
     graph.add_output(action, "action", TensorProto.FLOAT, count)
     graph.add_output(recurrent.next_state(), "next_state", TensorProto.FLOAT, rnn_config.state)
@@ -90,19 +119,36 @@ def export_controller(actions: Continuous, *, hidden: bool) -> bytes:
     for index, (before, after) in enumerate(pairwise(sizes)):
         weights = graph.add_input(f"weights{index}", kind, after, before)
         value = _layer(graph, value, weights, graph.add_input(f"biases{index}", kind, after))
-    graph.add_output(_squash(graph, value, actions), "action", kind, actions.outputs)
+    graph.add_output(squash(graph, value, actions), "action", kind, actions.outputs)
     return graph.build()
 
 
-def _encode(graph: GraphBuilder, picture: str, vae: Weights, config: VAEConfig) -> str:
-    """Add the encoder's convolutions; the scale of 1/255 is folded into the first one's weights."""
-    value = graph.node("Cast", graph.node("Transpose", picture, perm=[0, 3, 1, 2]), to=TensorProto.FLOAT)
-    for index, layer in enumerate(config.down):
-        kernel, bias = _folded(vae, "encoder", index, config)
-        kernel = (kernel.astype(np.float64) / 255).astype(np.float32) if index == 0 else kernel
-        value = graph.node("Conv", value, graph.constant(kernel), graph.constant(bias), **_window(layer))
-        value = _activate(graph, value, config)
-    return str(graph.node("Reshape", value, graph.shape(-1, config.flat)))
+def _encode(
+    graph: GraphBuilder, picture: str, vae: Weights, config: VAEConfig, ranges: Ranges | None
+) -> Callable[[str], str]:
+    """Add the encoder's convolutions; the result adds the layer `mu` or `logvar` to them."""
+    value, layers = graph.node("Transpose", picture, perm=[0, 3, 1, 2]), range(len(config.down))
+    if ranges is None:
+        value = graph.node("Cast", value, to=TensorProto.FLOAT)
+        for index in layers:
+            value = _convolve(graph, value, vae, config, index)
+        flat = graph.node("Reshape", value, graph.shape(-1, config.flat))
+        return lambda name: _linear(graph, flat, vae, name)
+    step = PIXEL_STEP
+    for index in layers:
+        steps, window = (step, ranges.step_of(index)), _window(config.down[index])
+        value = add_convolution(graph, value, *_folded(vae, "encoder", index, config), steps, window)
+        step = steps[1]
+    whole = graph.node("Reshape", value, graph.shape(-1, config.flat))
+    return lambda name: add_product(graph, whole, vae[f"{name}.weight"].T, vae[f"{name}.bias"], step)
+
+
+def _convolve(graph: GraphBuilder, value: str, vae: Weights, config: VAEConfig, index: int) -> str:
+    """Add a convolution of the encoder and its activation; the first one divides by 255."""
+    kernel, bias = _folded(vae, "encoder", index, config)
+    kernel = (kernel.astype(np.float64) / 255).astype(np.float32) if index == 0 else kernel
+    value = graph.node("Conv", value, graph.constant(kernel), graph.constant(bias), **_window(config.down[index]))
+    return _activate(graph, value, config)
 
 
 def _window(layer: ConvolutionLayer) -> dict[str, Any]:
@@ -139,7 +185,7 @@ def _layer(graph: GraphBuilder, features: str, weights: str, biases: str) -> str
     return str(graph.node("Tanh", graph.node("Add", graph.node("Squeeze", product, graph.shape(2)), biases)))
 
 
-def _squash(graph: GraphBuilder, squashed: str, actions: Continuous) -> str:
+def squash(graph: GraphBuilder, squashed: str, actions: Continuous) -> str:
     """Scale tanh outputs to the ranges of `actions`; clipping at an unreachable bound is left out."""
     scale, shift, low, high = (
         np.array(each, np.float32) for each in (actions.scale, actions.shift, actions.low, actions.high)

@@ -20,6 +20,7 @@ from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig, Reward
 class Prediction(NamedTuple):
     """The mixtures of the next latents: log weights, means and log deviations `(..., latent, mixtures)`.
 
+    The log weights of a joint mixture are `(..., 1, mixtures)`.
     `reward` (logit or value) and `done` (logit) are `(...)`, and zero without such a head.
     """
 
@@ -64,9 +65,11 @@ class MDNRNN(nn.Module):
         """Apply the heads to hidden states `(..., hidden)`."""
         config = self.config
         out = self.heads(functional.dropout(hidden, config.dropout, self.training))
-        ends = 3 * config.mixtures * config.latent
-        shape = (*out.shape[:-1], config.latent, config.mixtures)
-        weights, means, deviations = (part.reshape(shape) for part in out[..., :ends].chunk(3, dim=-1))
+        rows = (config.weighted, config.latent, config.latent)
+        ends = config.mixtures * sum(rows)
+        parts = out[..., :ends].split([config.mixtures * count for count in rows], dim=-1)
+        shapes = [(*out.shape[:-1], count, config.mixtures) for count in rows]
+        weights, means, deviations = (part.reshape(shape) for part, shape in zip(parts, shapes, strict=True))
         none = out.new_zeros(out.shape[:-1])
         reward = out[..., ends] if config.has_reward_head else none
         done = out[..., -1] if config.done else none
@@ -120,7 +123,12 @@ def latent_loss(prediction: Prediction, targets: Tensor, mask: Tensor) -> Tensor
     """Negative log likelihood in nats per latent dimension of `targets` `(N, T, latent)` where `mask` `(N, T)` is 1."""
     scaled = (targets[..., None] - prediction.means) * torch.exp(-prediction.log_deviations)
     log_normal = -0.5 * scaled.square() - prediction.log_deviations - 0.5 * math.log(2 * math.pi)
-    likelihood = torch.logsumexp(prediction.log_weights + log_normal, dim=-1).mean(dim=-1)
+    latents = targets.shape[-1]
+    if prediction.log_weights.shape[-2] != latents:  # a joint mixture
+        log_normal = log_normal.sum(dim=-2, keepdim=True)
+        likelihood = torch.logsumexp(prediction.log_weights + log_normal, dim=-1).squeeze(-1) / latents
+    else:
+        likelihood = torch.logsumexp(prediction.log_weights + log_normal, dim=-1).mean(dim=-1)
     return -(likelihood * mask).sum() / mask.sum().clamp(min=1)
 
 

@@ -22,6 +22,8 @@ MOST_REWARD = 1000
 class MDNRNNConfig:
     """Inputs, an LSTM of `hidden` units, `mixtures` Gaussians per latent dimension, and heads.
 
+    A `joint` mixture has one weight per Gaussian, so that a draw takes all latents from the same one.
+
     The reward head predicts the logit of a positive reward, the logit of the `notebook`'s label (the reward is not
     positive and the episode goes on), or the reward's value. The done head predicts the logit of the episode's end.
     With `lost` a step also counts as an end if no reward follows for so many steps: dreams then end where the road is
@@ -52,6 +54,8 @@ class MDNRNNConfig:
     reward_scale: float = added_option(
         1.0, "what a reward is divided by before its value is learnt; 0: the rewards' standard deviation in the data"
     )
+
+    joint: bool = added_option(default=False, text="a mixture of all latents together, in place of one a latent")
 
     def __post_init__(self) -> None:
         check_sizes(self)
@@ -99,8 +103,13 @@ class MDNRNNConfig:
 
     @property
     def outputs(self) -> int:
-        """The number of head outputs: log weights, means, log deviations `(3, latent, mixtures)`, reward, done."""
-        return 3 * self.mixtures * self.latent + self.has_reward_head + self.done
+        """The number of head outputs: log weights, means, log deviations `(latent, mixtures)` each, reward, done."""
+        return self.mixtures * (self.weighted + 2 * self.latent) + self.has_reward_head + self.done
+
+    @property
+    def weighted(self) -> int:
+        """The number of mixtures with weights of their own: one of all latents, or one a latent."""
+        return 1 if self.joint else self.latent
 
     @property
     def state(self) -> int:

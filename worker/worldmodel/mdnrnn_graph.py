@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from onnx import TensorProto
 
+from dreamfleet.worker.worldmodel.eight_bits import Ranges, add_input_product, round_inputs
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
 
@@ -18,8 +19,11 @@ Weights = Mapping[str, NDArray[np.float32]]
 class RecurrentGraph:
     """The LSTM, and the attention before it, in a graph with an input `state` (N, state)."""
 
-    def __init__(self, graph: GraphBuilder, state: str, rnn: Weights, config: MDNRNNConfig) -> None:
+    def __init__(
+        self, graph: GraphBuilder, state: str, rnn: Weights, config: MDNRNNConfig, ranges: Ranges | None = None
+    ) -> None:
         self._graph, self._rnn, self._config = graph, rnn, config
+        self._ranges = () if ranges is None else ranges.inputs
         self._step = config.latent + config.actions
         parts = graph.split(
             state, config.hidden, config.hidden, int(config.previous_reward), config.window * self._step
@@ -35,7 +39,7 @@ class RecurrentGraph:
             _, kept = graph.split(self._window, self._step, (self._config.window - 1) * self._step)
             self._window = graph.join(kept, step)
             inputs.append(self._attend())
-        self.hidden, self._cell = lstm(graph, inputs, self.hidden, self._cell, self._rnn)
+        self.hidden, self._cell = lstm(graph, inputs, self.hidden, self._cell, self._rnn, self._ranges)
         return self.hidden
 
     def next_state(self, previous: str = "") -> str:
@@ -55,18 +59,29 @@ class RecurrentGraph:
         return str(graph.node("ReduceSum", weighted, graph.shape(1), keepdims=0))
 
 
-def lstm(graph: GraphBuilder, inputs: Sequence[str], hidden: str, cell: str, weights: Weights) -> tuple[str, str]:
+def lstm(
+    graph: GraphBuilder, inputs: Sequence[str], hidden: str, cell: str, weights: Weights, ranges: Sequence[float] = ()
+) -> tuple[str, str]:
     """Add a step of an LSTM with torch's names of `weights`; return its next hidden and cell state.
 
-    Each gate has its own matrix product: splitting a common one costs more copies than it saves (5 % of a step).
+    Each gate has its own matrix product: splitting a common one costs more copies than it saves (5 % of a step). With
+    the `ranges` of its inputs it is a product of eight-bit integers.
     """
     size = weights["lstm.weight_hh_l0"].shape[1]
     kernel = np.concatenate([weights["lstm.weight_ih_l0"], weights["lstm.weight_hh_l0"]], axis=1)
     bias = weights["lstm.bias_ih_l0"] + weights["lstm.bias_hh_l0"]
     rows = [slice(gate * size, (gate + 1) * size) for gate in range(4)]
     joined = graph.join(*inputs, hidden)
+    widths = np.array([*ranges, *[1.0] * size], np.float32)  # the hidden state is below 1
+    rounded = round_inputs(graph, joined, widths) if ranges else ""
+
+    def gate_product(gate: slice) -> str:
+        if ranges:
+            return add_input_product(graph, rounded, kernel[gate].T, bias[gate], widths)
+        return graph.linear(joined, kernel[gate].T, bias[gate])
+
     enter, forget, candidate, leave = (
-        graph.node(kind, graph.linear(joined, kernel[gate].T, bias[gate]))
+        graph.node(kind, gate_product(gate))
         for kind, gate in zip(("Sigmoid", "Sigmoid", "Tanh", "Sigmoid"), rows, strict=True)
     )
     kept = graph.node("Mul", forget, cell)
@@ -79,8 +94,8 @@ def window_input(graph: GraphBuilder, latent: str, action: str, config: MDNRNNCo
     return graph.join(latent, action) if config.window else ""
 
 
-def export_dream(rnn: Weights, config: MDNRNNConfig) -> bytes:
-    """Export a step of the dream.
+def export_dream(rnn: Weights, config: MDNRNNConfig, ranges: Ranges | None = None) -> bytes:
+    """Export a step of the dream; with `ranges` the LSTM's products are of eight-bit integers.
 
     Inputs: `latent` (N, latent), `action` (N, actions), `state` (N, state), the random numbers `uniform` and `normal`
     (N, latent), `temperature` (1,), and with dropout `mask` (N, hidden), a factor of the LSTM's output. Outputs:
@@ -88,14 +103,15 @@ def export_dream(rnn: Weights, config: MDNRNNConfig) -> bytes:
     `attention` (N, window).
 
     Sampling (Ha & Schmidhuber 2018): log weights divided by the temperature, deviations times its square root. The
-    mixture is the first whose cumulative weight exceeds `uniform`, selected by `Where` nodes rather than Gather.
+    mixture is the first whose cumulative weight exceeds `uniform`, selected by `Where` nodes rather than Gather. Of a
+    joint mixture the first number of each row draws for all latents.
     """
     graph, kind = GraphBuilder("dream"), TensorProto.FLOAT
     latent, action = graph.add_input("latent", kind, config.latent), graph.add_input("action", kind, config.actions)
     state = graph.add_input("state", kind, config.state)
     uniform, normal = graph.add_input("uniform", kind, config.latent), graph.add_input("normal", kind, config.latent)
     temperature = graph.add_scalar_input("temperature")
-    recurrent = RecurrentGraph(graph, state, rnn, config)
+    recurrent = RecurrentGraph(graph, state, rnn, config, ranges)
     hidden = recurrent.advance(latent, action)
     if config.dropout:
         hidden = graph.node("Mul", hidden, graph.add_input("mask", kind, config.hidden))
@@ -104,9 +120,12 @@ def export_dream(rnn: Weights, config: MDNRNNConfig) -> bytes:
     kernel, bias = graph.weight(rnn["heads.weight"][order].T), graph.constant(rnn["heads.bias"][order])
     heads = graph.node("Gemm", hidden, kernel, bias)
     columns = graph.split(
-        heads, *[config.latent] * (3 * config.mixtures), int(config.has_reward_head), int(config.done)
-    )
+        heads, *[config.weighted] * config.mixtures, *[config.latent] * (2 * config.mixtures),
+        int(config.has_reward_head), int(config.done),
+    )  # fmt: skip
     *mixtures, reward, done = columns
+    if config.joint:
+        uniform, _ = graph.split(uniform, 1, config.latent - 1)
     mean, deviation = _select_mixture(graph, mixtures, uniform, temperature)
     noise = graph.node("Mul", normal, graph.node("Sqrt", temperature))
     spread = graph.node("Mul", graph.node("Exp", deviation), noise)
@@ -125,9 +144,12 @@ def export_dream(rnn: Weights, config: MDNRNNConfig) -> bytes:
 
 def mixture_major_order(config: MDNRNNConfig) -> NDArray[Any]:
     """The heads' rows in the order (kind, mixture, latent) instead of (kind, latent, mixture), to slice mixtures."""
-    width = config.mixtures * config.latent
-    rows = np.arange(3 * width).reshape(3, config.latent, config.mixtures).transpose(0, 2, 1).ravel()
-    return np.concatenate([rows, np.arange(3 * width, config.outputs)])
+    rows, start = [], 0
+    for latents in (config.weighted, config.latent, config.latent):
+        count = latents * config.mixtures
+        rows.append(start + np.arange(count).reshape(latents, config.mixtures).T.ravel())
+        start += count
+    return np.concatenate([*rows, np.arange(start, config.outputs)])
 
 
 def _select_mixture(graph: GraphBuilder, mixtures: Sequence[str], uniform: str, temperature: str) -> tuple[str, str]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import onnx
+import onnx.utils
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
@@ -78,6 +80,21 @@ class GraphBuilder:
     def shape(self, *sizes: int) -> str:
         """Add a constant of integers: a shape, sizes or axes."""
         return self.constant(np.array(sizes, dtype=np.int64))
+
+    def embed(self, model: onnx.ModelProto, given: Mapping[str, str], wanted: str) -> str:
+        """Add what an output `wanted` of another model needs; `given` are the values of that model's inputs by name."""
+        part = onnx.utils.Extractor(model).extract_model(list(given), [wanted]).graph
+        names = {"": "", **given}
+        for each in part.initializer:
+            names[each.name] = f"c{len(self._constants)}"
+            self._constants.append(onnx.TensorProto.FromString(each.SerializeToString()))
+            self._constants[-1].name = names[each.name]
+        for node in part.node:
+            names |= {name: f"n{len(self._nodes)}_{index}" for index, name in enumerate(node.output)}
+            self._nodes.append(onnx.NodeProto.FromString(node.SerializeToString()))
+            self._nodes[-1].input[:] = [names[name] for name in node.input]
+            self._nodes[-1].output[:] = [names[name] for name in node.output]
+        return names[wanted]
 
     def build(self) -> bytes:
         """Serialise the model after ONNX's own check."""

@@ -92,7 +92,9 @@ class VAE(nn.Module):
 
     def decode(self, latents: Tensor) -> Tensor:
         """Decode latents `(N, latent)` to pictures `(N, 3, side, side)` in [0, 1]."""
-        pictures: Tensor = self.decoder(self.dense(latents).reshape(-1, *self._start))
+        dense = self.dense(latents)
+        dense = _activation(self.config)(dense) if self.config.activate_dense else dense
+        pictures: Tensor = self.decoder(dense.reshape(-1, *self._start))
         return pictures
 
     def loss(self, pictures: Tensor, noise: Tensor, pixels: PixelWeights | None = None) -> VAELoss:
@@ -118,5 +120,9 @@ class VAE(nn.Module):
 def _layers_after(config: VAEConfig, channels: int) -> list[nn.Module]:
     """The modules after a convolution: batch normalisation, activation and dropout, as configured."""
     modules: list[nn.Module] = [nn.BatchNorm2d(channels)] if config.batch_norm else []
-    modules.append(nn.ReLU() if config.activation == "relu" else nn.LeakyReLU(LEAK))
+    modules.append(_activation(config))
     return [*modules, nn.Dropout(config.dropout)] if config.dropout else modules
+
+
+def _activation(config: VAEConfig) -> nn.Module:
+    return nn.ReLU() if config.activation == "relu" else nn.LeakyReLU(LEAK)

@@ -62,6 +62,8 @@ class VAEConfig:
         (), "kernel of each of the decoder's transposed convolutions, else such that the picture's size results"
     )
 
+    activate_dense: bool = added_option(default=False, text="the activation after the decoder's dense layer too")
+
     def __post_init__(self) -> None:
         check_sizes(self)
         if self.picture not in (64, 96):

@@ -102,6 +102,34 @@ export const forget = () => {
   drawn.clear();
 };
 
+// The elites' fitness, a cell each; empty cells show the card.
+const drawArchive = (element, { x, y, z, cells, x_title, y_title }) => {
+  const [x_name, y_name] = [x_title, y_title].map((title) => title.split(" (")[0]);
+  const narrow = element.clientWidth < 480; // there is no room for what a measure means
+  draw(element, () => ({
+    traces: [{
+      type: "heatmap", x, y, z, customdata: cells, colorscale: "Viridis", hoverongaps: false, xgap: 1, ygap: 1,
+      hovertemplate: `${x_name} %{x:.4~g}<br>${y_name} %{y:.4~g}<br>fitness %{z:.4~g}<br>--cell %{customdata}<extra></extra>`,
+      colorbar: { title: { text: "fitness of the elite", side: "right" }, thickness: 14, outlinewidth: 0 },
+    }],
+    shape: {
+      hovermode: "closest", xaxis: below(narrow ? x_name : x_title, { showgrid: false, zeroline: false }),
+      yaxis: axis({ title: { text: narrow ? y_name : y_title.replace(" (", "<br>("), font: { size: 12 }, standoff: 6 }, showgrid: false, zeroline: false }),
+    },
+    keys: [],
+  }));
+};
+
+// Of a run with an archive alone.
+export const fillArchive = (page, { run, archive }) => {
+  page["archive-card"].hidden = !archive;
+  if (!archive) return;
+  say(page["archive-caption"], archive.caption);
+  page.archive.setAttribute("aria-label", `Elites of ${run}: ${archive.caption}`);
+  placeholder(page.archive, archive.filled ? "" : "No candidate was scored, so there is nothing to draw.");
+  if (archive.filled) drawArchive(page.archive, archive);
+};
+
 const line = (x, y, name, ink, more = {}) => ({
   type: "scatter", mode: x.length === 1 ? "markers" : "lines", x, y, name, line: { color: colour(ink), width: 2 },
   marker: { color: colour(ink), size: 7 }, hovertemplate: "%{y:.4~g}", ...more,
@@ -129,6 +157,14 @@ const star = (of, x, name, ink, more = {}) => ({
 });
 
 const [UPPER, LOWER] = [[0.54, 1], [0, 0.44]]; // two panels above each other
+
+// A function has values; any other task has a fitness.
+export const title = ({ score_word }) => (score_word === "value" ? "Value of the function" : "Fitness");
+
+// What a reader of the curve must know, below it.
+export const caption = ({ step, note }) => [step > 1 ? `Every ${step}th generation is drawn.` : "", note].filter(Boolean).join(" ");
+
+const logarithmic = { type: "log", exponentformat: "power", dtick: 1, minor: { showgrid: false } };
 
 // What candidates scored, and what their mean did in reality: of a dream in two panels, for these are two worlds.
 export const fitness = (element, curves) => {
@@ -158,7 +194,7 @@ export const fitness = (element, curves) => {
     }
     const shape = {
       xaxis: { ...generations(generation.at(-1) ?? 0), ...(apart && { anchor: "y2" }) },
-      yaxis: axis(apart ? { domain: UPPER } : {}),
+      yaxis: axis({ ...(apart && { domain: UPPER }), ...(curves.log && logarithmic) }),
       annotations: [heading(curves.fitness_axis)],
       shapes: curves.stages.map((since) => ({
         type: "line", x0: since - 0.5, x1: since - 0.5, y0: 0, y1: 1, yref: "paper",
@@ -166,7 +202,7 @@ export const fitness = (element, curves) => {
       })),
     };
     if (apart) {
-      shape.yaxis2 = axis({ domain: LOWER });
+      shape.yaxis2 = axis({ domain: LOWER, nticks: 6 });
       shape.annotations.push(heading(curves.score_axis, LOWER[1]));
     }
     if (curves.stages.length) keys.push({ kind: "dash", ink: "line-strong", name: "a stage begins" });
@@ -194,7 +230,7 @@ export const search = (element, curves) => {
     }
     if (apart) {
       traces.push(line(curves.generation, curves.temperature, "temperature", "red", { yaxis: "y2", line: { color: colour("red"), width: 1.6, shape: "hv" } }));
-      shape.yaxis2 = axis({ domain: LOWER, rangemode: "tozero" });
+      shape.yaxis2 = axis({ domain: LOWER, rangemode: "tozero", nticks: 6 });
       shape.annotations.push(heading("temperature of the dream", LOWER[1]));
     }
     return { traces, shape, keys: [] };
@@ -234,7 +270,7 @@ export const both = (element, runs, over, of) =>
       keys,
       shape: {
         xaxis: over === "generation" ? generations(last) : below(OVER[over], { rangemode: "tozero" }),
-        yaxis: axis(),
+        yaxis: axis(runs.every(({ curves }) => curves.log) ? logarithmic : {}),
         annotations: [heading(label)],
         hovermode: "closest",
       },
@@ -247,7 +283,7 @@ export const differences = (element, rows, title) =>
     traces: [{
       type: "scatter", mode: "markers", x: rows.map((each) => each.mean), y: rows.map((each) => each.of),
       error_x: { type: "data", array: rows.map((each) => each.half), color: colour("ink"), thickness: 1.6, width: 5 },
-      marker: { color: rows.map((each) => colour(each.mean > 0 ? PAIR[1] : PAIR[0])), size: 11 },
+      marker: { color: rows.map((each) => colour(each.better ? PAIR[1] : PAIR[0])), size: 11 },
       hovertemplate: "%{x:.4~g} ± %{error_x.array:.3~g}<extra></extra>",
     }],
     keys: [],

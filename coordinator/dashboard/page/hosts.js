@@ -42,7 +42,7 @@ const fillPage = (page, found) => {
   const { hosts, since, width } = found;
   const lives = hosts.reduce((sum, each) => sum + each.lives, 0);
   const count = (many, noun) => `${number(many, 0)} ${noun}${many === 1 ? "" : "s"}`;
-  say(page.sentence, `${count(hosts.length + found.more, "host")}, ${count(lives, "worker")}; ${found.classes}.`);
+  say(page.sentence, `${count(hosts.length + found.more, "host")}, ${count(lives, "worker")}; ${found.classes}.${found.checks && ` Checks: ${found.checks}.`}`);
   const series = (key) => {
     const shown = hosts.slice(0, INKS.length).map((each, index) => ({ name: each.host, ink: INKS[index], values: each[key] }));
     const rest = hosts.slice(INKS.length);

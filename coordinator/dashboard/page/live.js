@@ -5,7 +5,7 @@ import { ask, clock, colour, facts, fill, make, number, open, runLink, say, scor
 import * as view from "./view.js";
 
 const TONES = {
-  running: "good", evaluating: "busy", paused: "bad", "waiting for workers": "wait", "coordinator lost": "bad",
+  running: "good", evaluating: "busy", paused: "bad", "waiting for workers": "wait", "waiting for a batch": "wait", "coordinator lost": "bad",
   ended: "done", "left open": "wait", "no coordinator": "wait",
 };
 const COLUMNS = [
@@ -40,13 +40,15 @@ export const drawCurves = (document) => {
   if (page) view.drawCurves(curves);
   if (!page || page.body.hidden) return;
   const last = curves.generation.length - 1;
+  say(page["fitness-title"], charts.title(curves));
   charts.placeholder(page.fitness, last < 0 ? curves.coming : "");
   page.search.hidden = last < 0; // the figures below it are known from the start
   if (last < 0) return;
   charts.fitness(page.fitness, curves);
   charts.search(page.search, curves);
-  say(page["fitness-caption"], curves.step > 1 ? `Every ${curves.step}th generation is drawn.` : "");
-  page.fitness.setAttribute("aria-label", `Fitness by generation. Generation ${curves.generation[last]}: mean ${score(curves.mean[last])}, best ${score(curves.best[last])}.`);
+  charts.fillArchive(page, { ...curves, run: page.run.textContent });
+  say(page["fitness-caption"], charts.caption(curves));
+  page.fitness.setAttribute("aria-label", `${charts.title(curves)} by generation. Generation ${curves.generation[last]}: mean ${score(curves.mean[last])}, best ${score(curves.best[last])}.`);
   page.search.setAttribute("aria-label", `Step size by generation, now ${curves.sigma[last]}`);
 };
 
@@ -151,7 +153,7 @@ const CELLS = [[400, 9], [120, 14], [64, 22], [32, 30], [12, 40], [-1, 56]]; // 
 // A cell a candidate: it fills with its episodes, and its colour says how it does among the others. No episode is wanted of
 // a candidate that failed: its cell is crossed out.
 const fillPopulation = ({ candidates, evaluation }) => {
-  const { generation, total, done, wanted, fitness } = candidates;
+  const { generation, total, done, wanted, fitness, word, minimised } = candidates;
   const known = fitness.filter((each) => each !== null);
   const [low, high] = [Math.min(...known), Math.max(...known)];
   const failed = wanted.filter((each) => each === 0).length;
@@ -162,10 +164,10 @@ const fillPopulation = ({ candidates, evaluation }) => {
   page.cells.style.setProperty("--cell", `${CELLS.find(([least]) => total > least)[1]}px`);
   fill(page.cells, done, () => make("div", "", { class: "cell" }), (cell, episodes, index) => {
     const value = fitness[index];
-    const share = value === null ? 0 : high > low ? (value - low) / (high - low) : 1;
+    const share = value === null ? 0 : high > low ? (minimised ? high - value : value - low) / (high - low) : 1;
     const key = `${episodes}/${wanted[index]}/${value === null ? "" : share.toFixed(2)}`;
     const lost = wanted[index] === 0;
-    const scored = `${episodes} of ${wanted[index]} episodes${value === null ? "" : `, fitness ${score(value)}`}`;
+    const scored = `${episodes} of ${wanted[index]} episodes${value === null ? "" : `, ${word} ${score(value)}`}`;
     const text = `candidate ${generation}/${index}: ${lost ? "failed" : scored}`;
     if (cell.described !== text) cell.title = cell.described = text;
     if (cell.key === key) return;
@@ -175,7 +177,7 @@ const fillPopulation = ({ candidates, evaluation }) => {
     cell.style.setProperty("--fill", value === null ? "var(--line-strong)" : shade(share));
   });
   page.cells.setAttribute("aria-label", open ? `${finished} of ${total} candidates of generation ${generation} are scored` : "no generation is open");
-  say(page.scale, known.length ? `fitness so far: ${score(low)} to ${score(high)}` : "");
+  say(page.scale, known.length ? `${word} so far: ${score(low)} to ${score(high)}` : "");
   fill(page.evaluation, evaluation, beside, (each, row) => {
     say(each.firstChild, `${row.name}: ${row.done} of ${row.of}`);
     setBar(each.lastChild, row.done / row.wanted, row.name);

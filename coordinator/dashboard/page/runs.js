@@ -130,6 +130,7 @@ export const showRun = guarded(async (current, name) => {
   facts(page.facts, found.facts);
   fillSettings(page, found.settings);
   fillCurves(page, found);
+  charts.fillArchive(page, found);
   fillGenerations(page, found.generations);
   const others = (await ask("runs")).runs.filter((each) => !each.damaged && each.run !== found.run);
   if (!current()) return;
@@ -146,8 +147,9 @@ const fillCurves = (page, { run, curves }) => {
   if (none) return;
   charts.fitness(page.fitness, curves);
   charts.search(page.search, curves);
-  say(page["fitness-caption"], curves.step > 1 ? `Every ${curves.step}th generation is drawn.` : "");
-  page.fitness.setAttribute("aria-label", `Fitness of ${run} by generation`);
+  say(page["fitness-title"], charts.title(curves));
+  say(page["fitness-caption"], charts.caption(curves));
+  page.fitness.setAttribute("aria-label", `${charts.title(curves)} of ${run} by generation`);
   page.search.setAttribute("aria-label", `Step size of ${run} by generation`);
 };
 

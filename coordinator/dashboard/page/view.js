@@ -3,7 +3,7 @@
 import { facts, make, say } from "./dom.js";
 
 const MEASURED = 3000; // milliseconds over which a speed is measured
-const NONE = "This task shows no picture."; // in place of a picture; the figures follow
+const NONE = "Workers score this task without drawing it; `dreamfleet record` and `live` draw it."; // in place of a picture; the figures follow
 const KINDS = { score: "a candidate", evaluate: "the mean, in reality", collect: "the mean, to be kept" };
 
 let page = null; // the parts, once they stand

@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from dreamfleet.common.cli.model_commands import Words, split_flags
+from dreamfleet.common.cli.model_commands import Words, split_flags, with_settings
+from dreamfleet.common.cli.presets import default_run_preset
 from dreamfleet.common.errors import UsageError
 from dreamfleet.coordinator.experiments.iteration.config import RESERVED_FLAGS
 
 # Equal parameters: 422,625 and 421,277 of 32 latents and three actions.
-KINDS = (("plain", ""), ("attentive", "--window 8 --hidden 236"))
+KINDS = (("plain", ""), ("attentive", "--set window=8 hidden=236"))
 SEEDS = (1, 2, 3)
 RUN_FLAGS = "--generations 32"
 _NAME = re.compile(r"[a-z][a-z0-9-]{0,30}")
@@ -70,27 +71,36 @@ class Contrast:
         own = dict(self.kinds)[trial.kind]
         return (*split_flags("--mdnrnn-flags", self.mdnrnn_flags), *split_flags("--kind", own))
 
-    @property
-    def common_run_flags(self) -> Words:
-        """The flags that all trials' `coordinator` have in common."""
-        return ("--preset", "dream", *split_flags("--run-flags", self.run_flags))
+    def run_flags_in(self, world: str) -> Words:
+        """The flags that all trials' `coordinator` have in common, in the dream of this task's world."""
+        return ("--preset", default_run_preset(world), *split_flags("--run-flags", self.run_flags))
 
     def merge_settings(self, kept: dict[str, Any]) -> dict[str, Any]:
         """The settings that a folder begun with `kept` has from now on: kinds and seeds are added, none is changed.
 
         `UsageError` if its finished trials could not be compared with new ones.
         """
-        mine, kinds, known = asdict(self), dict(self.kinds), dict(kept.get("kinds", ()))
+        mine, kinds = asdict(self), dict(self.kinds)
+        known: dict[str, str] = dict(kept.get("kinds", ()))
         differing: list[str] = [
             name for name in ("mdnrnn_flags", "run_flags") if name in kept and kept[name] != mine[name]
         ]
-        differing += [f"kind {name}" for name, flags in known.items() if kinds.get(name, flags) != flags]
+        differing += [
+            f"kind {name}" for name, flags in known.items() if _settings(kinds.get(name, flags)) != _settings(flags)
+        ]
         if differing:
-            raise UsageError(
-                f"it was begun with other {', '.join(differing)}: leave that out, or begin in another --out"
-            )
+            raise UsageError(f"it was begun with other {', '.join(differing)}: omit that, or begin in another --out")
         seeds = tuple(dict.fromkeys((*kept.get("seeds", ()), *self.seeds)))
         return {**mine, "kinds": tuple((known | kinds).items()), "seeds": seeds}
+
+
+def _settings(flags: str) -> Words:
+    """What a kind's flags set, in whichever of their two forms.
+
+    >>> _settings("--window 8 --hidden 236") == _settings("--set window=8 hidden=236")
+    True
+    """
+    return tuple(word for word in with_settings(split_flags("--kind", flags)) if word != "--set")
 
 
 def parse_kinds(given: Sequence[Sequence[str]]) -> tuple[tuple[str, str], ...]:

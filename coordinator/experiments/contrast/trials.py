@@ -11,6 +11,7 @@ from typing import Any
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.cli import model_commands
 from dreamfleet.common.cli.model_commands import Words
+from dreamfleet.common.cli.presets import default_run_preset
 from dreamfleet.common.cli.verb_runner import ProcessRunner
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write
@@ -66,11 +67,11 @@ class Trials:
             words = model_commands.bundle(self._trial_folder(trial), model)
             self._runner.run_for_json(words, self._log_path(trial, "bundle"))
         if not has_ended(self._runs, trial.name):
-            on_step(f"{trial.name}: evolve")
             local_fleet = self._local_fleet()
-            own = task_flags(Bundle.open(model).manifest.task)
-            local_fleet = replace(local_fleet, worker=(*local_fleet.worker, *own))
-            words = self._run_command(trial, local_fleet)
+            world = Bundle.open(model).manifest.task
+            on_step(f"{trial.name}: evolve in the dream of {world}, from the preset {default_run_preset(world)}")
+            local_fleet = replace(local_fleet, worker=(*local_fleet.worker, *task_flags(world)))
+            words = self._run_command(trial, local_fleet, world)
             evolve(trial.name, words, local_fleet, self._trial_folder(trial) / "logs", self._stop)
         return self._outcome(trial)
 
@@ -103,11 +104,11 @@ class Trials:
             "mdnrnn", self._trial_folder(trial), *self._contrast.training_flags(trial), seed=trial.seed
         )
 
-    def _run_command(self, trial: Trial, local_fleet: LocalFleet) -> Words:
+    def _run_command(self, trial: Trial, local_fleet: LocalFleet, world: str) -> Words:
         if has_begun(self._runs, trial.name):
             return model_commands.resume_run(trial.name, self._runs, local_fleet.listen)
         return model_commands.begin_run(
-            trial.name, self._runs, local_fleet.listen, *local_fleet.coordinator, *self._contrast.common_run_flags,
+            trial.name, self._runs, local_fleet.listen, *local_fleet.coordinator, *self._contrast.run_flags_in(world),
             world_model=self._model_path(trial), seed=trial.seed,
         )  # fmt: skip
 

@@ -53,7 +53,9 @@ class IterateConfig:
     skip: int | None = option(None, "steps of the world for which an action is held")
     difference: bool = option(False, "show movement: grey now, grey before, their difference")
     preset: str | None = option(
-        None, f"training preset to begin with: {', '.join(NAMES['training'])} (default the world's, such as tiny)"
+        None,
+        f"training preset, whose settings flags may change: {', '.join(NAMES['training'])} (default the world's, such "
+        "as tiny)",
     )
     drives: int | None = option(None, "random drives that the first round learns from (default the preset's)")
     more_drives: int = option(0, "random drives that each later round adds")
@@ -73,7 +75,7 @@ class IterateConfig:
     mdnrnn_flags: str = option("", "flags of `train mdnrnn` in every round")
     bundle_flags: str = option("", "flags of `bundle` in every round, such as --reward value")
     run_flags: str = option(
-        "--generations 32", "flags of each round's `coordinator`, whose preset is dream unless another is named"
+        "--generations 32", "flags of each round's `coordinator`, whose preset is the world's unless another is named"
     )
     later_run_flags: str = option("", "flags that follow these wherever a world model came before: --temperature 1")
     go_on: bool = option(

@@ -115,9 +115,7 @@ class IterationLedger:
         known = {name: value for name, value in run.items() if name in self.run}
         differing = [*_differing(begun, wanted, CHANGEABLE), *_differing(self.run, known)]
         if differing:
-            raise UsageError(
-                f"{folder} was begun with {'; '.join(differing)}: leave that out, or begin in another --data"
-            )
+            raise UsageError(f"{folder} was begun with {'; '.join(differing)}: omit that, or begin in another --data")
         return replace(self, settings=wanted)
 
     def to_json(self) -> str:

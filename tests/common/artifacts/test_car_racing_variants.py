@@ -5,6 +5,7 @@ import pytest
 
 from dreamfleet.common.artifacts.actions import STEERING_AND_HALVES, STEERING_GAS_BRAKE
 from dreamfleet.common.artifacts.car_racing_variants import DEFAULT_VARIANT, OPTION_HELP, Variant
+from dreamfleet.common.artifacts.world_facts import WorldFacts
 from dreamfleet.common.errors import UsageError
 
 
@@ -14,6 +15,7 @@ from dreamfleet.common.errors import UsageError
         '{"pedals": "one"}',
         '{"pedals": "half"}',
         '{"actions": "discrete"}',
+        '{"actions": "linear"}',
         '{"actions": "discrete", "decide_every": 4}',
         '{"pedal_shift": 0.25, "pedals": "one"}',
         '{"decide_every": 4}',
@@ -54,6 +56,14 @@ def test_half_pedals_press_gas_and_brake_halfway_at_zero():
         [-1, 0, 0],
     ]
     assert Variant(pedals="half", feedback="last").extra_features == 6
+
+
+def test_linear_outputs_are_the_action():
+    outputs = np.array([[0, 0.5, -2], [3, 1, 0.25]], np.float32)
+    assert np.array_equal(Variant(actions="linear").controls.to_action(outputs), outputs)
+    assert Variant(actions="linear").controls.low == (-1, 0, 0)
+    with pytest.raises(UsageError, match="squashed"):
+        WorldFacts.of(Variant(actions="linear").controls, packages=(), horizon=10, frames_per_second=30)
 
 
 def test_equal_numbers_give_equal_options():

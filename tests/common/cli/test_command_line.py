@@ -34,6 +34,8 @@ def points(*more):
     [
         (("coordinator", "--populaton", "8"), "unrecognized arguments: --populaton 8; did you mean --population?"),
         (("coordinator", "--evaluate-evry=3"), "did you mean --evaluate-every?"),
+        (("record", "--controler", "real"), "unrecognized arguments: --controler; did you mean --controller?"),
+        (("coordinator", "--workers", "2"), "coordinator has no --workers: workers are programs of their own"),
         (("coordinator", "--popsize", "8"), "unrecognized arguments: --popsize 8; did you mean --population?"),
         (("evaluate", "drqn", "--data", "x"), "--data is gone: name the training's folder as --controller FOLDER"),
         (("runs", "export", "dream", "--csv", "out.csv"), "--csv takes no value, and 'out.csv' stands behind it"),
@@ -90,7 +92,14 @@ def test_every_verb_has_the_flags_for_config_and_logs():
         assert "--log-level" in text, name
 
 
-SILENT = {"completion", "dashboard", "demo", "router", "worker"}  # these work for a person who watches, or for nobody
+SILENT = {
+    "completion",
+    "dashboard",
+    "demo",
+    "router",
+    "serve",
+    "worker",
+}  # these work for a person who watches, or for nobody
 
 
 def test_every_verb_with_output_has_json():
@@ -296,8 +305,9 @@ def test_the_overview_fits_a_terminal_and_loads_no_verb(capsys, monkeypatch):
         command_line.main(["--help"])
     lines = capsys.readouterr().out.splitlines()
     assert left.value.code == 0
-    assert max(map(len, lines)) <= WIDTH
+    assert max(map(len, lines[: lines.index("Documents")])) <= WIDTH
     assert len(lines) <= 75
+    assert Path(lines[-1].strip()).read_text().startswith("# ")  # the documents are in the wheel
 
 
 @pytest.mark.parametrize("old", sorted(REMOVED_VERBS))

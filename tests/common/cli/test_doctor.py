@@ -49,8 +49,8 @@ def doctor(bare, tmp_path, *words):
 def test_each_role_is_listed_with_its_remedy(bare, tmp_path):
     code, out = doctor(bare, tmp_path)
     assert code == 0
-    assert "coordinator\tcan be played" in out
-    assert "worker\tcannot be played: gymnasium, pygame-ce, box2d, onnxruntime missing" in out
+    assert "coordinator  can be played" in out
+    assert "worker       cannot be played: gymnasium, pygame-ce, box2d, onnxruntime missing" in out
     assert "pip install 'dreamfleet[worker]'" in out
 
 

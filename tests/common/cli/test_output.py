@@ -1,4 +1,4 @@
-"""Output of verbs: tables in a terminal, tab-separated lines in a pipe, JSON with `--json`."""
+"""Output of verbs: aligned tables, JSON with `--json`."""
 
 import fcntl
 import json
@@ -43,9 +43,13 @@ def test_a_narrow_terminal_truncates_nothing_and_keeps_brackets():
     assert "…" not in output
 
 
-def test_a_pipe_gets_tab_separated_lines(capsys):
-    print_rows([{"a": "x y", "b": 1}, {"a": "line\nbreak\ttab", "b": None}])
-    assert capsys.readouterr().out == "a\tb\nx y\t1\nline break tab\t-\n"
+def test_a_pipe_gets_an_aligned_table_whatever_its_width(capsys):
+    print_rows([{"a": "x y", "n": 1, "z": LONG * 9}, {"a": "line\nbreak\t日本", "n": None, "z": ""}], right=["n"])
+    assert capsys.readouterr().out.splitlines() == [
+        "a                n  z",
+        f"x y              1  {LONG * 9}",
+        "line break 日本  -",
+    ]
 
 
 def test_output_is_text_or_json(capsys, tmp_path):

@@ -11,6 +11,7 @@ from time import monotonic, sleep
 
 import pytest
 
+from dreamfleet.common.cli import dry_run_process
 from dreamfleet.common.cli.task_check import try_task
 from tests.support.environments import DAEMON_FILE, ODD
 from tests.support.processes import DEADLINE, environment
@@ -50,7 +51,7 @@ def test_the_old_api_is_found_without_gymnasiums_wrappers_too():
 
 
 def test_a_hang_ends_at_the_limit():
-    assert dry_run("hang", limit=20).fault.endswith("cannot be scored: reset(seed=0) took longer than 20 s")
+    assert dry_run("hang", limit=8).fault.endswith("cannot be scored: reset(seed=0) took longer than 8 s")
 
 
 @pytest.mark.parametrize(
@@ -130,7 +131,8 @@ def test_a_daemon_that_keeps_the_pipes_ends_and_changes_no_finding(fault, says, 
         ("flood", "making it printed more than 16 MiB"),
     ],
 )
-def test_an_environment_that_spoils_the_pipes_is_one_line(fault, says):
+def test_an_environment_that_spoils_the_pipes_is_one_line(fault, says, monkeypatch):
+    monkeypatch.setattr(dry_run_process, "EXIT_GRACE", 1.0)
     found = dry_run(fault)
     assert found.fault.startswith(f"{ODD} cannot be scored: {says}")
     assert "\n" not in found.fault

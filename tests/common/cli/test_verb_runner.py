@@ -55,6 +55,6 @@ def test_command_lines_hold_words_only_and_leave_out_what_is_none():
 
 @pytest.mark.parametrize("text", ["--seed 3", "--see=3", "--x --seed"])
 def test_flags_that_the_caller_sets_are_refused_even_shortened(text):
-    with pytest.raises(UsageError, match="--vae-flags: leave out --seed, which iterate sets itself"):
+    with pytest.raises(UsageError, match="--vae-flags: omit --seed, which iterate sets itself"):
         model_commands.split_flags("--vae-flags", text, "iterate", ("--data", "--seed"))
     assert model_commands.split_flags("--vae-flags", text) == tuple(text.split())

@@ -1,10 +1,15 @@
 """Logs as text and as JSON."""
 
 import json
+import logging
+import re
 import subprocess
 import sys
+from datetime import datetime
 
 import pytest
+
+from dreamfleet.common.host.logs import TextFormatter, label_logs
 
 BEGIN = (
     "import logging; from dreamfleet.common.host.logs import configure_logging, set_log_format, report_failure; "
@@ -25,8 +30,47 @@ def said(wanted):
 
 def test_text_is_the_default_format():
     first, *_, last = said("text")
-    assert first.endswith("WARNING dreamfleet.x: said by a\\x1b[2J")
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d WARNING x: said by a\\x1b\[2J", first)
     assert last == "dreamfleet: why"
+
+
+@pytest.fixture
+def formatter(monkeypatch):
+    monkeypatch.setattr(TextFormatter, "label", "")
+    return TextFormatter()
+
+
+def line(formatter, logger, created, level=logging.INFO):
+    record = logging.LogRecord(logger, level, "", 0, "generation %d", (3,), None)
+    record.created = created
+    return formatter.format(record)
+
+
+def test_a_line_has_the_time_of_day_and_a_days_first_one_the_date(formatter):
+    noon = datetime(2026, 11, 26, 12, 0, 5).timestamp()
+    lines = [line(formatter, "dreamfleet.coordinator.service.run_log", noon + hours * 3600) for hours in (0, 1, 12, 13)]
+    assert lines == [
+        "2026-11-26 12:00:05 coordinator: generation 3",
+        "13:00:05 coordinator: generation 3",
+        "2026-11-27 00:00:05 coordinator: generation 3",
+        "01:00:05 coordinator: generation 3",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("logger", "label", "speaker"),
+    [
+        ("dreamfleet.worker.service.slot", "", "worker"),
+        ("dreamfleet.worker.service.slot", "worker core-1", "worker core-1"),
+        ("dreamfleet.coordinator", "run night", "run night"),
+        ("dreamfleet.router", "run night", "router"),
+        ("matplotlib.font_manager", "run night", "matplotlib.font_manager"),
+        ("dreamfleet", "run night", "dreamfleet"),
+    ],
+)
+def test_processes_that_share_a_log_are_told_apart(logger, label, speaker, formatter):
+    label_logs(label)
+    assert line(formatter, logger, 0.0).endswith(f" {speaker}: generation 3")
 
 
 @pytest.mark.parametrize("wanted", ["json", "auto"])

@@ -207,6 +207,14 @@ def test_a_run_without_workers_shows_how_to_start_one():
     assert "no workers yet; start one with" in drawn(new, 80)
 
 
+def test_a_functions_run_counts_calls():
+    task = dataclasses.replace(STATUS.settings.task, task="function:mine:cost", horizon=1)
+    panel = drawn(dataclasses.replace(STATUS, settings=dataclasses.replace(STATUS.settings, task=task)), 120)
+    assert "calls/s" in panel
+    assert "calls in all" in panel
+    assert "steps" not in panel.partition("throughput")[2].partition("\n")[0]
+
+
 HOSTILE = "[/bold][red]\x1b[2J\x1b]0;owned\x07\u202e\ud800[link=x]\n2026"
 
 
@@ -269,9 +277,9 @@ def test_a_driven_stage_is_described_and_its_curve_dims_earlier_ones():
         STATUS, settings=dataclasses.replace(STATUS.settings, task=task), recent=history, generation=generation
     )
     text = drawn(status, 100)
-    assert "dream, 1000 driven steps" in text
+    assert "dream, 1,000 driven steps" in text
     assert "temperature" not in text
     assert "0 to 6, stage 2 since 5" in text
     mixed = dataclasses.replace(generation.stage, driven=0.5)
     text = drawn(dataclasses.replace(status, generation=dataclasses.replace(generation, stage=mixed)), 100)
-    assert "dream, 1000 steps, 50% driven, temperature 1.5" in text
+    assert "dream, 1,000 steps, 50% driven, temperature 1.5" in text

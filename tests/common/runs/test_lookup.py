@@ -5,9 +5,11 @@ import pytest
 
 from dreamfleet.common.artifacts.bundle_store import find_bundle, pretrained_folder
 from dreamfleet.common.artifacts.subspace import Subspace
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.errors import ConnectionFailedError, UsageError
 from dreamfleet.common.runs import lookup
-from dreamfleet.common.runs.lookup import find_subspace
+from dreamfleet.common.runs.lookup import find_subspace, naming_the_stored_run
+from dreamfleet.coordinator.settings.config import RunConfig
+from dreamfleet.coordinator.storage.journal import Journal
 
 
 @pytest.fixture
@@ -37,3 +39,20 @@ def test_a_subspace_is_a_shipped_one_or_a_file(subspace, tmp_path, monkeypatch):
     (tmp_path / "broken.npz").write_text("rubbish")
     with pytest.raises(UsageError, match=r"broken\.npz is not a subspace"):
         find_subspace("broken.npz")
+
+
+def test_where_no_coordinator_answers_the_stored_run_is_named(tmp_path, random_bundle):
+    def refused(name):
+        with pytest.raises(ConnectionFailedError) as caught, naming_the_stored_run(tmp_path, name):
+            raise ConnectionFailedError("no one answers")
+        return str(caught.value)
+
+    assert refused("night") == refused(None) == "no one answers"
+    (tmp_path / "night").mkdir()
+    journal = Journal.create(tmp_path / "night", RunConfig().settings(random_bundle), random_bundle.path)
+    assert "run night on this disk was stopped or killed: `" in refused("night")
+    journal.set_fact("ended", "3 generations")
+    journal.commit()
+    journal.close()
+    assert "run night on this disk has ended after 3 generations: `dreamfleet runs show night`" in refused("night")
+    assert "for the 1 run on this disk: `dreamfleet runs list`" in refused(None)

@@ -55,9 +55,9 @@ def test_a_status_says_where_the_run_is():
     found, line = status(), repr(status())
     for part in (found.run, found.state, f"generation {found.generation.number}", str(found.generation.episodes)):
         assert part in line
-    caption, facts = table_of(found)
-    assert caption == line[1:-1]
-    assert facts["task"] == found.settings.task.task
+    card = "".join(ET.fromstring(found._repr_html_()).itertext())
+    for part in (found.run, found.state, found.settings.task.task, f"generation {found.generation.number}"):
+        assert part in card
 
 
 @pytest.mark.parametrize("shown", [CONTROLLER, RESULTS, WORKER, AGENT, TaskSpec("t", "", 5, 0), find_bundle("tiny")])

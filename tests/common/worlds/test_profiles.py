@@ -1,13 +1,21 @@
 """What hosts without a simulator know of a shipped world is what its task says."""
 
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 
-from dreamfleet.common.cli.presets import default_training_preset
+from dreamfleet import find_controller
+from dreamfleet.common.artifacts.bundle_store import pretrained_folder
+from dreamfleet.common.artifacts.controller import Controller, ControllerShape
+from dreamfleet.common.cli.presets import default_run_preset, default_training_preset
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import DREAM, is_shipped
-from dreamfleet.common.worlds.score_words import score_word_of_run
+from dreamfleet.common.runs.evaluation_report import read_evaluation_report
+from dreamfleet.common.runs.seeds import TEST
+from dreamfleet.common.worlds.known_score import KnownScore, find_known_score, first_seed
+from dreamfleet.common.worlds.score_words import profile_of, score_word_of_run
 from dreamfleet.common.worlds.shipped import WORLDS
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.worker.tasks.registry import find_world
@@ -25,6 +33,8 @@ def test_a_profile_agrees_with_its_task(profile):
     assert PRESETS[profile.default_training].task == profile.task
     assert profile.score_word == world.score_word
     assert profile.demo.preset in profile.run_presets
+    assert profile.dream_preset == default_run_preset(profile.task)
+    assert profile.run_presets[profile.dream_preset]["task"] == DREAM
 
 
 @pytest.mark.parametrize("profile", WORLDS.values(), ids=WORLDS)
@@ -44,3 +54,62 @@ def test_a_run_calls_a_seed_what_its_bundles_world_does(tmp_path, random_bundle)
         assert score_word_of_run(spec, bundle.path) == word
         assert score_word_of_run(spec, tmp_path / "gone.zip") == "seed"
     assert score_word_of_run(TaskSpec("takecover", "", 9, 0), tmp_path / "none.zip") == "game"
+
+
+RESULTS = Path(__file__).parents[3] / "docs" / "lab" / "results"
+
+
+def test_the_scores_of_shipped_controllers_are_those_of_the_reports():
+    known = {}
+    for path in RESULTS.glob("*.json"):
+        report = read_evaluation_report(path)
+        drives = sorted(report.drives, key=lambda each: (each.score, each.seed))
+        middle = drives[(len(drives) - 1) // 2].seed
+        found = report.results
+        known[report.world, report.controller[:12]] = round(found.mean, 1), round(found.error, 1), len(drives), middle
+    shipped = {
+        (world.task, each.sha256): (each.mean, each.error, each.episodes, each.median_seed)
+        for world in WORLDS.values()
+        for each in world.shipped_scores
+    }
+    assert shipped == known
+    names = [path.stem for path in pretrained_folder().glob("*.npz")]
+    assert {find_controller(name).sha256[:12] for name in names} == {sha256 for _, sha256 in shipped}
+
+
+@pytest.mark.parametrize(
+    ("facts", "known"),
+    [
+        ({"validation_mean": 173.0, "validation_error": 1.0, "validation_episodes": 64}, KnownScore(173.0, 1.0, 64)),
+        ({"validation_mean": 173.0, "validation_error": None, "validation_episodes": 1}, KnownScore(173.0, None, 1)),
+        ({"validation_mean": None, "validation_error": None, "validation_episodes": None}, None),
+        ({"validation_mean": "much", "validation_episodes": 64}, None),
+        ({"validation_mean": float("nan"), "validation_episodes": 64}, None),
+        ({"validation_mean": 3.0, "validation_episodes": True}, None),
+        ({}, None),
+    ],
+)
+def test_what_a_controllers_file_says_of_its_mean_is_read_with_care(facts, known):
+    own = Controller(ControllerShape(4, 2), np.ones(10, np.float32), "gym:CartPole-v1", "", facts)
+    assert find_known_score(own) == known
+    assert first_seed(known) == TEST.start
+
+
+@pytest.mark.parametrize(
+    ("task", "score", "text", "ends"),
+    [
+        (
+            "takecover",
+            2100.0,
+            "2,100 tics survived (60 s)",
+            ("hit after 2,100 tics", "survived to the limit, 2,100 tics"),
+        ),
+        ("car-racing", 909.39, "909.4 points", ("left the track", "time's up")),
+        ("gym:CartPole-v1", -1.5, "reward -1.5", ("ended after 9 steps", "the limit of 9 steps is reached")),
+    ],
+)
+def test_a_score_and_an_end_are_in_the_words_of_the_world(task, score, text, ends):
+    profile = profile_of(task)
+    assert profile.format_score(score) == text
+    assert tuple(profile.describe_end(end, score, 9) for end in ("terminated", "truncated")) == ends
+    assert profile_of("car-racing").describe_end("finished", score, 9) == "lap finished"

@@ -11,6 +11,7 @@ from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.common.runs.records import StoredConfirmation
 from dreamfleet.common.runs.run_folder import CONFIRMED, RunFolder, open_run
 from dreamfleet.common.runs.seeds import CONFIRMING_OFFSET, VALIDATION
+from tests.support.tables import cells
 
 
 def confirm(runs, name, scores):
@@ -89,7 +90,7 @@ def test_the_verb_prints_the_difference_as_text_and_as_json(runs, capsys):
 def test_runs_without_scores_are_compared_by_their_settings(runs, capsys):
     assert command_line.main(["compare", "reality", "hidden", "--runs-dir", str(runs)]) == 0
     text = capsys.readouterr().out
-    assert "covariance\tdiagonal\tfull" in text
+    assert ["covariance", "diagonal", "full"] in [cells(line) for line in text.splitlines()]
     assert "less" not in text
     assert command_line.main(["compare", "reality", "--runs-dir", str(runs)]) == 2
     assert "two runs or more" in capsys.readouterr().err

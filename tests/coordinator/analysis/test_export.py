@@ -21,6 +21,7 @@ from dreamfleet.coordinator.verbs.compare import SAME_SEEDS
 from tests.support.disks import small_disk
 from tests.support.events import scalars
 from tests.support.processes import DEADLINE
+from tests.support.tables import cells
 
 RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
 
@@ -193,7 +194,7 @@ def test_a_generation_without_a_mean_is_shown_as_a_dash(runs, capsys):
         journal.commit()
     words = ["runs", "show", "reality", "--runs-dir", str(runs)]
     assert command_line.main(words) == 0
-    rows = [line.split("\t") for line in capsys.readouterr().out.splitlines()]
+    rows = [cells(line) for line in capsys.readouterr().out.splitlines()]
     shown = {row[0]: row[1:5] for row in rows if len(row) > 5}
     assert shown["1"] == ["-"] * 4
     assert "-" not in shown["0"]

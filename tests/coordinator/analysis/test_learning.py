@@ -59,13 +59,18 @@ def test_a_run_without_evaluations_has_no_curve(runs):
         curve_of(runs, "hidden")
 
 
-def test_one_run_without_evaluations_is_drawn_by_its_fitness_and_the_file_is_named_so(
-    runs, tmp_path, monkeypatch, capsys
+@pytest.mark.parametrize(
+    ("words", "made"),
+    [(("hidden",), "hidden-fitness.png"), (("reality",), "reality-fitness.png"),
+     (("reality", "--kind", "learning"), "reality-learning.png")],
+)  # fmt: skip
+def test_one_run_is_drawn_by_its_fitness_or_what_is_named_and_the_file_is_named_so(
+    runs, tmp_path, monkeypatch, capsys, words, made
 ):
     monkeypatch.chdir(tmp_path)
-    assert command_line.main(["runs", "plot", "hidden", "--runs-dir", str(runs)]) == 0
-    assert capsys.readouterr().out == "hidden-fitness.png\n"
-    assert (tmp_path / "hidden-fitness.png").read_bytes().startswith(b"\x89PNG")
+    assert command_line.main(["runs", "plot", *words, "--runs-dir", str(runs)]) == 0
+    assert capsys.readouterr().out == f"{made}\n"
+    assert (tmp_path / made).read_bytes().startswith(b"\x89PNG")
 
 
 def test_runs_of_several_worlds_are_drawn_with_a_note_and_short_ones_without_marks(runs, tmp_path, capsys):
@@ -102,7 +107,7 @@ def test_a_published_score_whose_steps_are_unknown_is_a_line_across_both_picture
     assert "night: 290k steps in reality" in text
 
 
-@pytest.mark.parametrize("words", [("reality", "dream"), ("reality", "--fitness")])
+@pytest.mark.parametrize("words", [("reality", "dream"), ("reality", "--kind", "fitness")])
 def test_the_verb_draws(runs, tmp_path, capsys, words):
     out = tmp_path / "pictures" / "curve.png"
     assert command_line.main(["runs", "plot", *words, "--runs-dir", str(runs), "--out", str(out)]) == 0
@@ -114,7 +119,7 @@ def test_the_verb_draws(runs, tmp_path, capsys, words):
     ("words", "says"),
     [
         (("reality", "--out", "a.gif"), "ends in .png or .svg"),
-        (("reality", "dream", "--fitness"), "--fitness draws one run"),
+        (("reality", "dream", "--kind", "fitness"), "--kind fitness draws one run"),
         (("nowhere",), "no run 'nowhere'"),
     ],
 )

@@ -41,6 +41,8 @@ def test_tables_are_data_frames(reality, package):
 def test_a_wrong_table_names_those_that_there_are(reality):
     with pytest.raises(UsageError, match="table must be one of generations, candidates, evaluations, confirmation"):
         reality.to_pandas("candidate")
+    with pytest.raises(UsageError, match="has no archive"):
+        reality.to_pandas("elites")
 
 
 @pytest.mark.parametrize(
@@ -60,7 +62,23 @@ def test_without_the_package_the_error_names_what_to_install(tmp_path, call, pac
 
 
 def test_it_plots_what_the_verb_plots(reality, tmp_path):
-    for words, kind in (((), None), (("--fitness",), "fitness"), ((), "learning")):
+    for words, kind in (
+        ((), "fitness"),
+        (
+            (
+                "--kind",
+                "fitness",
+            ),
+            "fitness",
+        ),
+        (
+            (
+                "--kind",
+                "learning",
+            ),
+            "learning",
+        ),
+    ):
         out = tmp_path / "verb.png"
         assert command_line.main(["runs", "plot", "reality", *words, "--runs-dir", str(RUNS), "--out", str(out)]) == 0
         reality.plot(kind).savefig(tmp_path / "own.png", dpi=120)
@@ -70,10 +88,10 @@ def test_it_plots_what_the_verb_plots(reality, tmp_path):
 def test_a_run_without_evaluations_has_its_fitness_plotted(tmp_path):
     with open_run("hidden", RUNS) as run:
         figure = run.plot()
-        assert "fitness over" in figure.axes[0].get_ylabel()
+        assert "fitness" in figure.axes[0].get_ylabel()
         with pytest.raises(UsageError, match="no evaluated mean"):
             run.plot("learning")
-        with pytest.raises(UsageError, match="kind must be learning or fitness, not 'curve'"):
+        with pytest.raises(UsageError, match="kind must be fitness or learning or archive, not 'curve'"):
             run.plot("curve")
         plot_fitness(run, tmp_path / f"own{KINDS[1]}")
 

@@ -40,7 +40,7 @@ def test_columns_are_equally_long_and_the_band_says_what_it_is():
     lengths = {len(drawn[name]) for name in ("generation", "mean", "best", "low", "high", "sigma")}
     assert lengths == {10}
     assert drawn["band"] == "± 1 standard deviation"
-    assert (drawn["low"][3], drawn["high"][3]) == (3.0 - CLOSED.std, 3.0 + CLOSED.std)
+    assert (drawn["low"][3], drawn["high"][3]) == (max(3.0 - CLOSED.std, CLOSED.worst), 3.0 + CLOSED.std)
     drawn = curves(data(10), {number: (number - 1.0, number + 2.0) for number in range(10)})
     assert drawn["band"] == "the middle half of the candidates"
     assert (drawn["low"][3], drawn["high"][3]) == (2.0, 5.0)
@@ -48,12 +48,12 @@ def test_columns_are_equally_long_and_the_band_says_what_it_is():
 
 def test_only_a_dream_has_a_temperature_and_two_axes():
     plain = curves(data(3), None)
-    assert (plain["temperature"], plain["dreamt"], plain["fitness_axis"]) == (None, False, "fitness over 1000 steps")
+    assert (plain["temperature"], plain["dreamt"], plain["fitness_axis"]) == (None, False, "fitness over 1,000 steps")
     task = dataclasses.replace(STATUS.settings.task, task="dream", temperature=1.5)
     dream = curves(data(3, settings=dataclasses.replace(STATUS.settings, task=task)), None)
     assert (dream["temperature"], dream["dreamt"]) == ([1.5, 1.5, 1.5], True)
     assert (dream["fitness_axis"], dream["score_axis"]) == (
-        "fitness over 1000 dreamt steps", "score in reality, mean of 16 seeds",
+        "fitness over 1,000 dreamt steps", "score in reality, mean of 16 seeds",
     )  # fmt: skip
 
 

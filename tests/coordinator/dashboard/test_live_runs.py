@@ -2,11 +2,17 @@
 
 import json
 import time
+from collections import Counter
+from dataclasses import replace
 from types import SimpleNamespace
 
+from dreamfleet.common.monitoring.status import ArchiveStatus
+from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.dashboard import live_runs
 from dreamfleet.coordinator.dashboard.lanes import STRETCH, UNKNOWN
+from dreamfleet.coordinator.service.snapshot import take_snapshot
+from tests.coordinator.run.test_run import SETTINGS, Bench
 from tests.support.processes import free_port
 from tests.support.served import serving, snapshot
 
@@ -40,3 +46,37 @@ def test_a_run_by_name_is_followed_among_more_runs_than_the_page_holds(tmp_path,
         while watcher.poll().find("night") is None:
             pass  # a busy host may answer late
         assert watcher.poll().find("day") is None
+
+
+def test_a_live_runs_archive_is_drawn_from_its_journal_and_goes_on_after_a_restart(tmp_path, random_bundle):
+    axes = ("steps=0:4:4", "action0=0:1:2")
+    spec = replace(SETTINGS.task, measures=("steps", "action0"))
+    settings = replace(SETTINGS, task=spec, population=4, episodes=1, collect_every=0, archive=axes)
+    bench = Bench(tmp_path / "night", random_bundle.path, settings, generations=3)
+
+    def score(generations):
+        while len(bench.run.history) < generations:
+            for send in bench.run.fleet.dispatch(bench.now):
+                for work in send.content.work:
+                    place = work.job.candidate + work.job.generation
+                    bench.answer(Result(work.job.digest, float(place), 10, 0.1, None, None, measures=(place, 0.7)))
+
+    score(1)
+    bench.restart()  # what was found before is read from the journal
+    score(2)
+    looked = take_snapshot(bench.run, "night", Counter(), 0.0, bench.now)
+    assert looked.status.archive == ArchiveStatus(8, 4, 0.0 + 1 + 2 + 4, 4.0, (3, 1))
+    bench.journal.commit()
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    watcher = live_runs.Watcher(Network(connect=(endpoint,)), "night", tmp_path)
+    with serving(endpoint, looked):
+        while (shown := watcher.poll().find("night")) is None:
+            pass  # a busy host may answer late
+        watcher.suspend()
+    bench.journal.close()
+    drawn = json.loads(shown.curves.decode().split("data: ")[1])["archive"]
+    assert drawn["z"] == [[None] * 4, [0.0, 1.0, 2.0, 4.0]]
+    assert "4 of 8 cells filled" in drawn["caption"]
+    (tile,) = [each for each in json.loads(shown.page_state.decode().split("data: ")[1])["tiles"]
+               if each["name"] == "archive"]  # fmt: skip
+    assert tile["value"] == "4 of 8"

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from dreamfleet.common.monitoring.elites import Elite, EliteArchive
+from dreamfleet.common.protocol.measures import parse_axes
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.coordinator.dashboard import stored_runs
 
@@ -37,3 +39,16 @@ def test_a_run_whose_candidates_are_too_much_to_read_has_none(run, monkeypatch):
 
 def test_an_open_generation_has_no_quartiles(run):
     assert run.quartiles([len(run.history()), -1, 2**62]) == {}
+
+
+def test_an_archive_is_described_for_its_heat_map_and_other_runs_have_none(runs):
+    assert stored_runs.describe_run(runs, "reality")["archive"] is None
+    axes = parse_axes(("speed=0:100:2", "braking=0:1:3"))
+    elites = {(1, 2): Elite((1, 2), 4, 5, 7.5, (60.0, 0.9))}
+    found = stored_runs.describe_archive(EliteArchive(axes, elites))
+    assert (found["x"], found["filled"]) == ([25.0, 75.0], 1)
+    assert found["z"] == [[None, None], [None, None], [None, 7.5]]
+    assert found["cells"] == [["", ""], ["", ""], ["", "1,2"]]
+    assert "1 of 6 cells filled" in found["caption"]
+    one = stored_runs.describe_archive(EliteArchive(axes[:1], {}))
+    assert (one["z"], one["y_title"], one["filled"]) == ([[None, None]], "", 0)

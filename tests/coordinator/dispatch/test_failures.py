@@ -27,6 +27,7 @@ def attempts(*rows):
         ([(A, SHORTAGE), (B, SHORTAGE)], False, False),
         ([(A, SHORTAGE)] * 9, False, False),
         ([(A, SHORTAGE)] * 10, False, True),
+        ([(A, "ObjectiveError: cost returned nan")], False, False),
         ([(A, SHORTAGE), (B, "NaN score"), (A, SHORTAGE), (A, "NaN score")], False, True),
     ],
 )

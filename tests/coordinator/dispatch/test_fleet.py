@@ -435,6 +435,25 @@ def test_a_straggler_on_a_slow_host_is_copied_once_and_the_loser_cancelled():
     assert fleet.counts["discarded_steps"] == 100
 
 
+def test_a_slot_that_another_run_uses_copies_nothing():
+    fleet, job = tail_of_two(pace_a=10.0, pace_b=1000.0, steps_a=100)
+    fleet.handle_heartbeat(B, replace(beat(seen=1), taken=1), 1.0)
+    assert digests(fleet.dispatch(1.0), B) == []
+    fleet.handle_heartbeat(B, beat(seen=1), 1.1)
+    assert digests(fleet.dispatch(1.1), B) == [job]
+
+
+def test_what_waits_for_a_slot_that_another_run_uses_is_taken_over_and_not_copied():
+    fleet = fleet_of(A, capacity=2, jobs=2)
+    given = digests(fleet.dispatch(0.0), A)
+    fleet.handle_heartbeat(A, replace(beat(2, seen=1, queued=given), taken=2), 0.1)
+    fleet.add_worker(B, 1, "f", 0.1)
+    fleet.handle_heartbeat(B, beat(1), 0.1)
+    sends = fleet.dispatch(0.2)
+    assert digests(sends, B) == [given[-1]]
+    assert cancelled(sends, A) == [given[-1]]
+
+
 def test_a_job_that_is_nearly_done_is_not_copied():
     fleet, _ = tail_of_two(pace_a=1000.0, pace_b=1000.0, steps_a=100)
     assert digests(fleet.dispatch(1.0), B) == []

@@ -13,7 +13,7 @@ import pytest
 from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
 from dreamfleet.common.monitoring.client import Client
 from dreamfleet.coordinator.analysis.stored_run import open_run
-from dreamfleet.coordinator.experiments.started_run import check_settings, evolve, start_run
+from dreamfleet.coordinator.experiments.started_run import _claim, _free_name, check_settings, evolve, start_run
 from tests.support.processes import DEADLINE, ROOT, environment
 from tests.support.tasks import RAISING
 
@@ -52,21 +52,21 @@ def wait_until(reached):
 
 
 def test_generations_come_as_they_close_and_the_journal_stays(alive, tmp_path):
-    with start_run(run="pole", generations=4, runs_dir=tmp_path, **SMALL) as run:
+    with start_run(run="pole", generations=40, runs_dir=tmp_path, **SMALL) as run:
         assert alive()
         with Client(run.address) as client:
             assert client.runs() == ["pole"]
         assert run.address in run._repr_html_()
         seen = [next(iter(run)).number]
         seen += [generation.number for generation in run]  # goes on where the first loop stopped
-    assert seen == [0, 1, 2, 3]
+    assert seen == list(range(40))
     wait_until(lambda: not alive())
-    assert (run.state, len(run.history()), run.controller().task) == ("ended: 4 generations", 4, "gym:CartPole-v1")
+    assert (run.state, len(run.history()), run.controller().task) == ("ended: 40 generations", 40, "gym:CartPole-v1")
     assert {each.name for each in tmp_path.joinpath("pole").glob("*.log")} == {"coordinator.log", "core-0.log"}
     run.close()
-    with evolve(resume="pole", generations=6, workers=1, runs_dir=tmp_path) as run:
-        assert [each.number for each in run.history()] == list(range(6))
-    assert evolve(resume="pole", workers=1, runs_dir=tmp_path).ended == "6 generations"  # nothing was left to do
+    with evolve(resume="pole", generations=42, workers=1, runs_dir=tmp_path) as run:
+        assert [each.number for each in run.history()] == list(range(42))
+    assert evolve(resume="pole", workers=1, runs_dir=tmp_path).ended == "42 generations"  # nothing was left to do
 
 
 def leave(_generation, _run):
@@ -137,7 +137,7 @@ def test_a_worker_that_dies_is_named_and_so_is_a_stop_from_elsewhere(alive, tmp_
 
 
 def test_a_pause_is_no_endless_wait(alive, tmp_path, random_bundle):
-    rough = {"task": RAISING, "bundle": random_bundle.path, "on_failure": "pause"}
+    rough = {"task": RAISING, "bundle": random_bundle.path, "on_failure": "pause", "population": 3, "episodes": 1}
     with (
         start_run(runs_dir=tmp_path, **{**SMALL, **rough}) as run,
         pytest.raises(DreamfleetError, match=r"is paused: .*its logs are in"),
@@ -149,7 +149,7 @@ def test_a_wrong_setting_starts_nothing(alive, tmp_path):
     for settings, says in (
         ({"tsak": "gym:CartPole-v1"}, "unknown setting 'tsak': did you mean 'task'?"),
         ({"population": "many"}, "argument --population: invalid int value: 'many'"),
-        ({"workers": -1}, "workers must not be negative"),
+        ({"workers": -1}, "workers must be a whole number from 0 to 1024, not -1"),
         ({"join": "me.join"}, "unknown setting 'join'"),
         ({"run": "No Name"}, "cannot name a run"),
         ({"task": "gym:Nowhere-v1"}, "gymnasium makes no environment 'Nowhere-v1'"),  # the coordinator's words
@@ -165,6 +165,20 @@ def test_a_name_that_a_run_has_is_refused(tmp_path):
     (tmp_path / "pole" / "journal.sqlite").touch()
     with pytest.raises(UsageError, match=r"run 'pole' exists in .*: continue it with resume='pole'"):
         start_run(run="pole", runs_dir=tmp_path, **SMALL)
+
+
+def test_two_programs_that_start_one_name_at_once_share_nothing(alive, tmp_path):
+    with start_run(run="pole", generations=10**6, runs_dir=tmp_path, **SMALL) as run:
+        log = (tmp_path / "pole" / "coordinator.log").read_text()
+        for again in ({"run": "pole"}, {"resume": "pole"}):
+            with pytest.raises(UsageError, match=r"another program has started run pole|run 'pole' exists"):
+                start_run(runs_dir=tmp_path, **{**SMALL, **again})
+        assert (tmp_path / "pole" / "coordinator.log").read_text().startswith(log)
+        next(iter(run))
+    with _claim(tmp_path / "new"), pytest.raises(UsageError, match="another program has started run new"):
+        start_run(run="new", generations=1, runs_dir=tmp_path, **SMALL)
+    assert evolve(run="new", generations=1, runs_dir=tmp_path, **SMALL).ended == "1 generation"
+    assert len({_free_name(tmp_path) for _ in range(3)}) == 3
 
 
 def test_settings_are_the_flags_of_the_coordinator():

@@ -1,5 +1,7 @@
 """Every optimiser that ships, and one of a third party, against the same contract."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,13 +11,16 @@ from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConf
 from dreamfleet.coordinator.optimisers.registry import known_optimisers
 
 OWN = "tests.support.optimisers:ParentsAndChildren"
-OPTIMISERS = [(name, "diagonal") for name in (*known_optimisers(), OWN)] + [("cma", "full")]
+OPTIMISERS = [(name, "diagonal") for name in (*known_optimisers(), OWN)] + [("cma", "full"), ("cma-me", "full")]
+ARCHIVE = ("first=-2:3:10", "second=-2:3:10")
+FILLS_AN_ARCHIVE = ("cma-me", "map-elites")
 SIZES = [(2, 4), (3, 64), (12, 5), (31, 7), pytest.param(50, 16, marks=pytest.mark.slow)]
 EVERY_OPTIMISER = pytest.mark.parametrize(("optimiser", "covariance"), OPTIMISERS)
 
 
 def config(optimiser, covariance="diagonal", dimension=12, population=8):
-    return EvolutionConfig(dimension, population, 0.1, covariance, 3, optimiser)
+    archive = ARCHIVE if optimiser in FILLS_AN_ARCHIVE else ()
+    return EvolutionConfig(dimension, population, 0.1, covariance, 3, optimiser, archive=archive)
 
 
 def fitness(candidates, generation):
@@ -25,7 +30,7 @@ def fitness(candidates, generation):
 
 def step(evolution, generation):
     asked = evolution.ask()
-    evolution.tell(fitness(asked, generation))
+    evolution.tell(fitness(asked, generation), asked[:, :2])
     return asked
 
 
@@ -68,6 +73,7 @@ def test_it_can_be_interrupted_between_any_two_generations(optimiser, covariance
     assert interrupted.state().packed() == uninterrupted.state().packed()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("optimiser", ["cmaes-lra", "cmaes-sep"])
 @pytest.mark.parametrize(("dimension", "population"), [(2, 4), (2, 16), (5, 8), (12, 16)])
 def test_it_continues_up_to_convergence_and_beyond(optimiser, dimension, population):
@@ -82,15 +88,16 @@ def test_it_continues_up_to_convergence_and_beyond(optimiser, dimension, populat
     assert np.abs(uninterrupted.mean - 1).max() < 1e-9
 
 
-@pytest.mark.parametrize("optimiser", ["cma", "cmaes-sep", OWN])
+@pytest.mark.parametrize("optimiser", ["cma", "cmaes-sep", "cma-me", "map-elites", OWN])
 @pytest.mark.parametrize(("dimension", "population"), [(299, 4), (300, 4), (867, 16), (900, 64)])
 def test_it_continues_at_the_real_size(optimiser, dimension, population):
     assert_continues(config(optimiser, "diagonal", dimension, population), (0, 1, 5), 8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("optimiser", ["cma", "cmaes-lra"])
 def test_a_full_matrix_continues_at_hundreds_of_parameters(optimiser):
-    assert_continues(config(optimiser, "full" if optimiser == "cma" else "diagonal", 300, 4), (0, 2), 4)
+    assert_continues(config(optimiser, "full" if optimiser == "cma" else "diagonal", 200, 4), (0, 2), 4)
 
 
 @pytest.mark.long
@@ -106,7 +113,7 @@ def test_it_maximises_and_the_seed_makes_its_run(optimiser, covariance):
     for generation in range(200):
         assert np.array_equal(step(one, generation), step(same, generation))
     assert fitness(one.mean[None], 0) > first + 5
-    other = Evolution(EvolutionConfig(12, 8, 0.1, covariance, 4, optimiser))
+    other = Evolution(replace(config(optimiser, covariance), seed=4))
     assert not np.array_equal(other.ask(), Evolution(config(optimiser, covariance)).ask())
 
 

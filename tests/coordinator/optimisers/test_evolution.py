@@ -65,6 +65,7 @@ def test_a_checkpoint_continues_at_the_real_size(checkpoint):
     assert np.array_equal(second.mean, uninterrupted.mean)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("covariance", ["diagonal", "full"])
 @pytest.mark.parametrize(
     ("dimension", "population"),

@@ -19,7 +19,7 @@ def build(optimiser, *options, covariance="diagonal", dimension=12, population=8
 
 
 def test_what_ships_is_registered():
-    assert set(registry.known_optimisers()) >= {"cma", "cmaes-lra", "cmaes-sep"}
+    assert set(registry.known_optimisers()) >= {"cma", "cmaes-lra", "cmaes-sep", "openes", "pepg", "snes", "xnes"}
 
 
 def test_an_optimiser_of_ones_own_is_found_by_entry_point(tmp_path):
@@ -41,7 +41,12 @@ def test_an_optimiser_of_ones_own_is_found_by_entry_point(tmp_path):
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("cmea", "known are cma, cmaes-lra, cmaes-sep"),
+        ("cmea", "did you mean cma.* known are cma, cma-me, cmaes-lra"),
+        ("openai-es", "did you mean openes"),
+        ("OpenES", "did you mean openes"),
+        ("cmaes", "did you mean cma"),
+        ("PGPE", "did you mean pepg"),
+        ("adam", "'adam': known are cma"),
         ("nowhere:Optimiser", "--trust nowhere"),
         ("tests.support.nowhere:Optimiser", "cannot be loaded"),
         (f"{MODULE}:Nothing", "cannot be loaded"),

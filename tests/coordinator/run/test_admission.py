@@ -185,8 +185,11 @@ def test_a_journal_without_classes_continues_with_fingerprints(bench):
     bench.journal.close()
     before = sqlite3.connect(bench.path / "journal.sqlite")
     before.executescript(
-        "DROP TABLE failure; DROP TABLE redraw; DROP TABLE event; ALTER TABLE generation DROP COLUMN failed; "
+        "DROP TABLE verification; DROP TABLE barred; DROP TABLE recalled; "
+        "DROP TABLE batch; DROP TABLE failure; DROP TABLE redraw; DROP TABLE event; "
+        "ALTER TABLE generation DROP COLUMN failed; "
         "ALTER TABLE evaluation DROP COLUMN failed; "
+        "ALTER TABLE result DROP COLUMN measures; ALTER TABLE candidate DROP COLUMN measures; "
         "ALTER TABLE result DROP COLUMN host_class; DELETE FROM run WHERE key = 'host_class'; PRAGMA user_version = 2"
     )
     before.close()

@@ -566,3 +566,34 @@ def test_a_host_that_replaces_its_scoring_process_counts_as_here(tmp_path, rando
     bench.run.tick(bench.now)
     assert bench.run.work_clock.seconds > worked
     bench.journal.close()
+
+
+@pytest.mark.parametrize("on_failure", ["worst", "pause"])
+@pytest.mark.parametrize("is_broken", [False, True])
+def test_a_run_ends_though_a_suspect_failed_on_the_only_host_that_has_scored(
+    tmp_path, random_bundle, on_failure, is_broken
+):
+    """Another host has scored nothing: it gets a job that was scored before, and the suspect does not wait for it."""
+    settings = replace(SETTINGS, on_failure=on_failure)
+    bench = Failing(tmp_path / "night", random_bundle.path, settings, fails=lambda job: False)
+    bench.run.fleet.handle_departure(B, bench.now)
+    bench.hosts, answer, failed = [A], bench.answer_one, set()
+    for each in bench.run.fleet.jobs.values():
+        each.lost_with += ["x/1", "y/2"] if each.work.job.candidate == 3 else []
+
+    def answer_one(name, job):
+        is_first = job.candidate == 3 and job.generation == 0 and job.digest not in failed
+        if is_first or (is_broken and name == B):
+            failed.add(job.digest)
+            bench.deliver(name, Result(job.digest, None, 0, 0.1, f"OSError: on {name}", None))
+        else:
+            answer(name, job)
+
+    bench.answer_one = answer_one
+    bench.serve(stop=lambda run: run.fleet.jobs.failures)
+    bench.hosts = [A, B]
+    bench.run.admission.admit(bench.request(B), bench.now)
+    bench.serve()
+    assert bench.run.ended
+    assert [each.failed for each in bench.run.history.rows] == [0] * GENERATIONS
+    bench.journal.close()

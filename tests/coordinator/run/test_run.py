@@ -147,6 +147,10 @@ def bench(tmp_path, random_bundle):
     made.journal.close()
 
 
+def test_a_run_that_checks_nothing_says_nothing_of_checks(bench):
+    assert bench.run.verification.summary is None
+
+
 def test_a_kill_between_dispatch_and_commit_loses_nothing(bench):
     results = []
     for send in bench.run.fleet.dispatch(bench.now):

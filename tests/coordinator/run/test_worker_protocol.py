@@ -36,10 +36,10 @@ def test_an_exception_before_a_result_counts_loses_no_other_result(bench, monkey
     (worker, first), (_, second) = given_jobs(bench)
     judge = bench.run.fleet.handle_result
 
-    def stumble(identity, result, now):
+    def stumble(identity, result, now, host_class):
         if result.digest == first.digest:
             raise ZeroDivisionError
-        return judge(identity, result, now)
+        return judge(identity, result, now, host_class)
 
     monkeypatch.setattr(bench.run.fleet, "handle_result", stumble)
     with pytest.raises(ZeroDivisionError):

@@ -3,6 +3,7 @@
 import pytest
 
 from dreamfleet.common.protocol import keys
+from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.service.control import DISBAND_TIMEOUT, Control
 from tests.coordinator.run.test_run import A, B, Bench
 
@@ -18,8 +19,8 @@ class Controlled(Bench):
     def stop(self):
         self.stopped = True
 
-    def obey(self, verb):
-        return self.control.obey(keys.control("night", verb), AGAIN, self.now)
+    def obey(self, verb, host=""):
+        return self.control.obey(keys.control("night", verb), AGAIN, self.now, host)
 
 
 @pytest.fixture
@@ -76,3 +77,45 @@ def test_a_disbanded_run_asks_its_workers_to_leave_at_each_beat_until_they_have_
     assert not bench.stopped
     bench.control.advance(bench.now + DISBAND_TIMEOUT + 1.0)
     assert bench.stopped
+
+
+def test_the_operator_bars_a_host_and_lets_it_in_again_and_a_misspelt_one_changes_nothing(bench):
+    assert "no worker of host c scored in this run or is here: there are a, b" in bench.obey("bar", "c").why
+    assert bench.obey("bar").why
+    assert "host a is not barred" in bench.obey("unbar", "a").why
+    assert not bench.run.is_rewound
+    assert bench.obey("bar", "a").accepted
+    assert bench.run.is_rewound
+    assert "results are being recalled" in bench.obey("bar", "b").why
+    bench.run.commit()
+    bench.restart()
+    assert [*bench.run.admission.barred] == ["a"]
+    why, remedy = bench.run.admission.find_refusal(bench.request(A))
+    assert "barred from this run: the operator says so" in why
+    assert "--no-longer" in remedy
+    summary = bench.run.verification.summary
+    assert (summary.barred, summary.by_operator) == (("a",), ("a",))
+    assert "barred: a (by the operator)" in summary.description
+    assert "host a is barred already" in bench.obey("bar", "a").why
+    assert bench.obey("unbar", "a").accepted
+    assert not bench.run.is_rewound
+    assert bench.run.admission.find_refusal(bench.request(A)) is None
+    bench.run.commit()
+    bench.restart()
+    assert bench.run.admission.find_refusal(bench.request(A)) is None
+    texts = [each.text for each in events_of(bench)]
+    assert any("0 results of a recalled" in each for each in texts), texts
+    assert any("host a may join this run again: the operator says so" in each for each in texts)
+
+
+def test_a_coordinator_that_leaves_bars_nobody(bench):
+    bench.run.fleet.dispatch(bench.now)
+    bench.obey("drain")
+    assert "the coordinator leaves" in bench.obey("bar", "a").why
+
+
+def events_of(bench):
+    bench.run.take_notes()
+    bench.run.commit()
+    with RunFolder(bench.path) as run:
+        return run.events()

@@ -81,7 +81,7 @@ def test_a_share_of_recorded_states_is_frozen_with_a_dream_and_can_be_configured
     [
         ({"task": "dream", "recorded": -0.1}, "--recorded must be from 0 to 1, not -0.1"),
         ({"task": "dream", "recorded": 1.5}, "--recorded must be from 0 to 1, not 1.5"),
-        ({"recorded": 0.5}, "--recorded needs task dream, not car-racing: leave it out, or pass 0"),
+        ({"recorded": 0.5}, "--recorded needs task dream, not car-racing: omit it, or pass 0"),
         ({"task": "gym:CartPole-v1", "recorded": 0.5}, "--recorded needs task dream, not gym:CartPole-v1"),
         ({"task": "dream", "recorded": 0.5}, "holds no recorded states that dreams could begin at: build it again"),
     ],
@@ -146,13 +146,13 @@ def test_a_variant_that_there_is_not_is_refused_in_one_line(random_bundle, chang
 
 def test_a_start_that_drives_otherwise_is_refused_and_one_that_pays_otherwise_is_not(random_bundle):
     one_pedal = StartPoint(np.zeros(578), random_bundle.sha256, "run night", '{"pedals": "one"}')
-    one_pedal.check(RunConfig(variant=("pedals=one", "time_cost=1")).settings(random_bundle))
+    one_pedal.check(RunConfig(variant=("pedals=one", "time_cost=1")).settings(random_bundle), random_bundle)
     for variant in ((), ("pedals=one", "decide_every=4")):
-        with pytest.raises(ControllerError, match=r'run night drives with {"pedals": "one"}, this .* --variant out'):
-            one_pedal.check(RunConfig(variant=variant).settings(random_bundle))
+        with pytest.raises(ControllerError, match=r'run night drives with {"pedals": "one"}, this .* omit --variant'):
+            one_pedal.check(RunConfig(variant=variant).settings(random_bundle), random_bundle)
     with pytest.raises(ControllerError, match="drives the plain way"):
         StartPoint(np.zeros(867), random_bundle.sha256, "run night").check(
-            RunConfig(variant=("decide_every=4",)).settings(random_bundle)
+            RunConfig(variant=("decide_every=4",)).settings(random_bundle), random_bundle
         )
     assert one_pedal.apply_to(RunConfig()).settings(random_bundle).task.options == one_pedal.options
 
@@ -193,15 +193,15 @@ def test_a_start_keeps_its_way_of_driving_whatever_a_preset_does(random_bundle, 
     config = RunConfig(preset="article", variant=texts, preset_variant=("pedals=half",))
     start = StartPoint(np.zeros(867), random_bundle.sha256, "run night", own)
     settings = start.apply_to(config).settings(random_bundle)
-    start.check(settings)
+    start.check(settings, random_bundle)
     assert settings.task.options == options
 
 
 def test_a_start_of_another_length_is_refused(random_bundle):
     start = StartPoint(np.zeros(867), random_bundle.sha256, "run night")
-    start.check(RunConfig().settings(random_bundle))
+    start.check(RunConfig().settings(random_bundle), random_bundle)
     with pytest.raises(ControllerError, match="867 parameters, this run's controllers 99"):
-        start.check(RunConfig(features="z").settings(random_bundle))
+        start.check(RunConfig(features="z").settings(random_bundle), random_bundle)
 
 
 @pytest.mark.parametrize("temperature", [0.0, -1.0, 5000.0, float("nan"), float("inf")])

@@ -131,7 +131,7 @@ def test_the_log_says_when_a_stage_begins_and_why(staged):
     bench.drive(lambda _: 0)
     said = [note for note in bench.run.take_notes() if "stage" in note]
     assert said == [
-        "generation 0 is in stage 1 of 4 (1000 steps, patience 100, 6 x 1 episode, a new search with step size 0.1)",
+        "generation 0 is in stage 1 of 4 (1,000 steps, patience 100, 6 x 1 episode, a new search with step size 0.1)",
         "stage 2 of 4 (400 steps, 6 x 2 episodes, racing, the search continues) begins with generation 2 after "
         "2 generations",
         "stage 3 of 4 (600 steps, 8 x 2 episodes, racing, a new search with step size 0.1) begins with generation 8 "

@@ -37,7 +37,7 @@ def settings_of(bundle, **flags):
 def test_a_run_begins_without_the_worlds_package_and_can_be_configured_again(bundle, tmp_path):
     config = RunConfig(bundle=str(bundle.path), task="dream", variant=("decide_every=4", "feedback=last"))
     request = RunRequest("run", tmp_path, config, LimitsConfig(), NetworkConfig())
-    settings, found = _resolve_settings(request, tmp_path / "run")
+    settings, found, *_ = _resolve_settings(request, tmp_path / "run")
     assert found.sha256 == bundle.sha256
     assert settings.packages == ("numpy", "onnxruntime", "absent-simulator")
     assert settings.task.version == 3
@@ -105,7 +105,7 @@ def test_a_gymnasium_environment_is_scored_with_a_world_model_of_its_own(tmp_pat
         ({"variant": ("decide_every=0",)}, "decide_every must be a whole number from 1 to 50"),
         ({"task": "dream", "end": "soon"}, "a dream ends at a probability from 0 to 1, or 'drawn', not 'soon'"),
         ({"task": "dream", "end": "1.5"}, "a dream ends at a probability from 0 to 1"),
-        ({"end": "drawn"}, "--end needs task dream, not the world that it dreams of: leave it out, or pass ''"),
+        ({"end": "drawn"}, "--end needs task dream, not the world that it dreams of: omit it, or pass ''"),
     ],
 )
 def test_what_the_world_does_not_have_is_refused(bundle, flags, says):
@@ -135,10 +135,10 @@ def test_a_start_that_drives_otherwise_is_refused_in_any_world(bundle):
     settings = settings_of(bundle, task="dream", variant=("decide_every=4",))
     shape = settings.controller
     held = StartPoint([0.0] * shape.size, bundle.sha256, "run night", '{"decide_every": 4}')
-    held.check(settings)
+    held.check(settings, bundle)
     assert held.apply_to(RunConfig(bundle=str(bundle.path))).variant == ("decide_every=4",)
     with pytest.raises(ControllerError, match="its parameters mean something else"):
-        held.check(settings_of(bundle, task="dream"))
+        held.check(settings_of(bundle, task="dream"), bundle)
 
 
 @pytest.mark.parametrize("name", ["takecover", "takecover-real", "pixels"])

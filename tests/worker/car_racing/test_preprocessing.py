@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.car_racing.preprocessing import BOX, RAW, find_preprocessing
+from dreamfleet.worker.car_racing.preprocessing import BOX, RAW, WHOLE, find_preprocessing
 from dreamfleet.worker.training.data.dataset import preprocessing_of_size
 
 
@@ -50,3 +50,25 @@ def test_a_preprocessing_is_found_by_name_and_by_size():
         find_preprocessing("bilinear-64")
     with pytest.raises(UsageError, match="64 or 96 pixels wide, not 32"):
         preprocessing_of_size(32)
+
+
+@pytest.mark.parametrize("levels", [256, 2])
+def test_the_whole_picture_is_pillows_to_the_bit(levels):
+    image = pytest.importorskip("PIL.Image")
+    random = np.random.default_rng(levels)
+    for _ in range(20):
+        observation = (random.integers(0, levels, (96, 96, 3)) * (255 // (levels - 1))).astype(np.uint8)
+        wanted = image.fromarray(observation).resize((64, 64), image.Resampling.BILINEAR)
+        assert np.array_equal(WHOLE.picture(observation), np.asarray(wanted))
+
+
+def test_the_environment_draws_the_whole_picture():
+    from dreamfleet.worker.car_racing.environment import CarRacing
+
+    seen = []
+    for name in (RAW.name, WHOLE.name):
+        environment = CarRacing(preprocessing=name)
+        observation, _ = environment.reset(seed=3)
+        seen.append(observation)
+        environment.close()
+    assert np.array_equal(WHOLE.picture(seen[0]), seen[1])

@@ -86,7 +86,7 @@ def test_an_action_is_a_vector_that_the_simulator_gets_as_its_own(kind, outputs,
         (f"{pixel_fakes.MODULE}:Grey-v0", {"observation": "screen"}, "'screen' is no picture"),
         (f"{pixel_fakes.MODULE}:Grey-v0", {"crop": "0:49,0:40"}, "0:49,0:40 is not within a picture of 48 rows"),
         (f"{pixel_fakes.MODULE}:Grey-v0", {"crop": "0:1,0:1"}, "with at least 8 of each"),
-        (f"{pixel_fakes.MODULE}:Grey-v0", {"environment": {"render_mode": "human"}}, "opens a window.*leave it out"),
+        (f"{pixel_fakes.MODULE}:Grey-v0", {"environment": {"render_mode": "human"}}, "opens a window.*omit it"),
         ("CartPole-v1", {"observation": "render", "environment": {"wings": 2}}, "takes no such arguments"),
         ("no_such_module:X-v0", {}, "--trust no_such_module"),
         ("CartPole-v1", {"environment": {"inner": "no_such_module:X-v0"}}, "--trust no_such_module"),
@@ -204,7 +204,7 @@ def test_controllers_are_scored_in_the_world_of_their_world_models_options(bundl
 
 def test_a_worker_scores_in_a_world_models_module_only_if_that_was_named(bundle):
     check_world_allowed(bundle, ("dream", "gym", GREY))
-    with pytest.raises(RefusedError, match=f"start it with --task {GREY}"):
+    with pytest.raises(RefusedError, match=f"start it with `dreamfleet worker --task {GREY}`"):
         check_world_allowed(bundle, ("dream", "gym"))
 
 
@@ -238,6 +238,7 @@ def test_minigrid(monkeypatch):
     seen = task.with_options('{"environment": {"agent_pov": true, "tile_size": 8}, "observation": "render"}')
     check_world(seen)
     assert "minigrid" in seen.world.packages
+    assert seen.world.action_names == ("left", "right", "forward")
 
 
 @needs_package("ale_py")

@@ -14,6 +14,7 @@ from dreamfleet.worker.inspection.disturbed_rollouts import DisturbedDriveConfig
 from dreamfleet.worker.inspection.measurements import DriverChoice, measure_dream_losses
 from dreamfleet.worker.inspection.road_losses import RoadLossConfig
 from dreamfleet.worker.verbs import inspect
+from tests.support.tables import cells
 
 FOUND = {"z_linear", "z_network", "zh_linear", "zh_network"}
 
@@ -37,10 +38,10 @@ def call(tmp_path, capsys, monkeypatch):
 
 def test_a_probe_prints_a_row_a_quantity(call):
     lines = call("tiny", "--probe", "--controller", "tiny", "--episodes", "2").splitlines()
-    assert lines[0].split("\t") == [
+    assert cells(lines[0]) == [
         "quantity", "deviation", "z, linear", "z, network", "[z, h], linear", "[z, h], network",
     ]  # fmt: skip
-    assert {"lateral_offset", "speed", "curvature_40m"} < {line.split("\t")[0] for line in lines}
+    assert {"lateral_offset", "speed", "curvature_40m"} < {cells(line)[0] for line in lines}
     assert lines[-1].startswith("R² ± standard error on held-out drives; 2 drives, ")
 
 
@@ -52,13 +53,14 @@ def test_a_driver_drives_without_a_controller(call):
 
 def test_likeness_prints_how_often_dreams_come_to_what_is_rare(call):
     lines = call("tiny", "--likeness", "--controller", "tiny", "--episodes", "3", "--noise", "0.1").splitlines()
-    assert lines[0].split("\t") == ["quantity", "rare", "reality", "reality, foreseen", "dream"]
-    rows = {line.split("\t")[0]: line.split("\t")[2:] for line in lines[1:-1]}
+    assert cells(lines[0]) == ["quantity", "rare", "reality", "reality, foreseen", "dream"]
+    rows = {cells(line)[0]: cells(line)[2:] for line in lines[1:-1]}
     assert "off_road" not in rows
     assert rows["curvature_20m"][0].startswith("0.1")
     assert lines[-1].startswith("shares of steps ± standard errors over drives")
 
 
+@pytest.mark.slow
 def test_as_json_both_have_counts_values_and_errors(call):
     found = json.loads(call("--controller", "tiny", "--probe", "--losses", "--episodes", "4", "--json"))
     assert found["bundle"] == find_bundle("tiny").sha256

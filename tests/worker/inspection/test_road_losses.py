@@ -128,6 +128,7 @@ def test_a_world_model_knows_yaw_from_what_it_remembers_not_from_a_picture(drive
     assert [row["quantity"] for row in knowledge_rows(knowledge)] == list(known)
 
 
+@pytest.mark.slow
 def test_a_dream_is_held_to_what_is_rare_in_reality(drives, tiny, controller):
     found = {
         each.quantity: each for each in likeness.compare_frequencies(drives, tiny, controller, DRIVEN.opening, 2, 1.0)
@@ -142,6 +143,7 @@ def test_a_dream_is_held_to_what_is_rare_in_reality(drives, tiny, controller):
         likeness.compare_frequencies(drives[:1], tiny, controller, DRIVEN.opening, 2, 1.0)
 
 
+@pytest.mark.slow
 def test_dreams_that_all_end_as_they_begin_are_refused(drives, tiny, controller, monkeypatch):
     monkeypatch.setattr(likeness, "_before_ends", lambda features: features[0, :0])
     with pytest.raises(UsageError, match="end as they begin"):

@@ -46,6 +46,7 @@ def runs_dir(tmp_path, random_bundle):
     return tmp_path / "runs"
 
 
+@pytest.mark.slow
 def test_a_run_that_goes_on_is_driven_at_random_and_shows_its_fitness(runs_dir, tmp_path):
     with find_subject("night", runs_dir) as subject:
         page = write_page(subject, tmp_path / "out", DriveConfig(steps=4)).read_text()
@@ -53,6 +54,7 @@ def test_a_run_that_goes_on_is_driven_at_random_and_shows_its_fitness(runs_dir, 
     assert "a fresh drive by a random driver" in page
 
 
+@pytest.mark.slow
 def test_a_run_that_has_ended_is_driven_by_its_controller(runs_dir, random_bundle, tmp_path):
     shape = random_bundle.controller_shape
     parameters = np.random.default_rng(0).normal(size=shape.size).astype(np.float32)

@@ -25,6 +25,7 @@ from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle, write_world_bundle
 from tests.support.pixel_world import Dodge, DodgeTask
+from tests.support.tables import cells
 from tests.worker.inspection.test_figures import call  # noqa: F401 - a fixture
 
 VAE, ENDING = VAEConfig(latent=5, channels=(4, 4, 4, 8)), MDNRNNConfig(latent=5, hidden=8, reward="none", done=True)
@@ -106,8 +107,8 @@ def test_a_model_without_ends_and_a_stranger_are_refused(dodge, tmp_path):
 
 def test_the_verb_prints_a_row_a_policy_or_json(dodge, call):  # noqa: F811
     lines = call(str(dodge.path), "--survival", "--episodes", "2").splitlines()
-    assert lines[0].split("\t") == ["policy", "reality", "dream", "dream / reality", "cut, reality", "cut, dream"]
-    assert [line.split("\t")[0] for line in lines[1:-1]] == NAMES
+    assert cells(lines[0]) == ["policy", "reality", "dream", "dream / reality", "cut, reality", "cut, dream"]
+    assert [cells(line)[0] for line in lines[1:-1]] == NAMES
     assert "2 real and 2 dreamt episodes each, cut at 200; temperature 1, end drawn; agreement -" in lines[-1]
     found = json.loads(call(str(dodge.path), "--survival", "--episodes", "2", "--end", "0.5", "--json"))["survival"]
     assert (found["episodes"], found["end"], found["temperature"]) == (2, "0.5", 1.0)
@@ -115,6 +116,7 @@ def test_the_verb_prints_a_row_a_policy_or_json(dodge, call):  # noqa: F811
     assert set(found["policies"][0]["ratio"]) == {"value", "error"}
 
 
+@pytest.mark.slow
 def test_a_page_shows_a_world_of_choices(dodge, tmp_path, closed):
     page = write_page(InspectionSubject(dodge, controller_of(dodge)), tmp_path / "page", DriveConfig(steps=12))
     text = page.read_text()

@@ -45,6 +45,7 @@ def trained(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_a_completed_training_shows_batches_and_held_out_drives_of_every_loss(trained):
     vae, rnn = load_trainings([trained])
     assert (vae.model, list(vae.curves)) == ("vae", ["error", "kl"])
@@ -58,6 +59,7 @@ def test_a_completed_training_shows_batches_and_held_out_drives_of_every_loss(tr
     assert [each.name for each in curve_sections.loss_sections([vae, rnn])] == ["loss-vae", "loss-mdnrnn"]
 
 
+@pytest.mark.slow
 def test_every_line_of_a_curve_is_in_the_chart(trained, monkeypatch):
     drawn = []
     monkeypatch.setattr(curve_sections, "render_png", drawn.append)
@@ -80,6 +82,7 @@ def test_every_line_of_a_curve_is_in_the_chart(trained, monkeypatch):
         assert labels == [str(trained), str(trained), "batches", "held-out drives"]
 
 
+@pytest.mark.slow
 def test_trainings_stand_side_by_side_each_under_its_folders_name(trained, tmp_path):
     other = write(tmp_path / "attentive" / "mdnrnn.jsonl", {"update": 10, "latent": 1.0}, {"update": 20, "latent": 0.5})
     found = load_trainings([trained, other])
@@ -141,6 +144,7 @@ def test_a_folder_without_a_training_is_reported(tmp_path):
         load_trainings([tmp_path])
 
 
+@pytest.mark.slow
 def test_the_verb_takes_trainings_with_a_bundle_or_without(trained, tmp_path, capsys):
     def call(*words):
         parser = argparse.ArgumentParser()
@@ -163,6 +167,7 @@ def test_the_verb_takes_trainings_with_a_bundle_or_without(trained, tmp_path, ca
         call()
 
 
+@pytest.mark.slow
 def test_held_out_losses_lie_where_they_were_looked_at(trained):
     points = [json.loads(line) for line in (trained / "vae.jsonl").read_text().splitlines()]
     held = {point["update"]: point["held_out_error"] for point in points if "held_out_error" in point}

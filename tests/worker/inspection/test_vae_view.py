@@ -40,6 +40,7 @@ def sections(page):
     return re.findall(r'<section id="([^"]+)"', page.read_text())
 
 
+@pytest.mark.slow
 def test_a_vae_alone_shows_what_it_keeps_of_a_held_out_drive_beside_how_it_learnt(folder, tmp_path):
     page = write_page(InspectionSubject(None), tmp_path, DriveConfig(steps=8), [folder])
     assert sections(page) == ["reconstructions", "traversals", "latents", "samples", "loss-vae"]
@@ -48,6 +49,7 @@ def test_a_vae_alone_shows_what_it_keeps_of_a_held_out_drive_beside_how_it_learn
     assert len(drive) == len(drive.mu) == 8
 
 
+@pytest.mark.slow
 def test_of_several_folders_each_shows_its_pictures_and_one_without_drives_its_losses_alone(folder, tmp_path):
     bare = tmp_path / "bare"
     bare.mkdir()
@@ -62,6 +64,7 @@ def test_of_several_folders_each_shows_its_pictures_and_one_without_drives_its_l
         write_page(InspectionSubject(None), tmp_path / "none", DriveConfig(), [bare])
 
 
+@pytest.mark.slow
 def test_without_torch_the_losses_are_drawn_and_the_extra_is_named(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "find_spec", lambda _name: None)
     page = write_page(InspectionSubject(None), tmp_path / "page", DriveConfig(), [folder])
@@ -77,6 +80,7 @@ def test_without_torch_the_losses_are_drawn_and_the_extra_is_named(folder, tmp_p
         )
 
 
+@pytest.mark.slow
 def test_own_pictures_are_looked_at_by_a_bundle_or_a_training(folder, tmp_path):
     hostile = "<b>x.png"
     files = [write_picture(tmp_path / name, *size)

@@ -64,7 +64,7 @@ def test_a_job_that_a_slot_has_is_not_queued_again():
 def test_a_job_with_another_jobs_digest_is_refused():
     backlog = Backlog(SPEC)
     wrong = dataclasses.replace(job(0), seeds=(5,))
-    assert backlog.add_batch(batch(1, (wrong,))) == [(wrong, "the job's digest is not of its content")]
+    assert backlog.add_batch(batch(1, (wrong,))) == [(wrong, "host: the job's digest is not of its content")]
     assert not backlog.take(1)
 
 

@@ -170,7 +170,9 @@ def test_a_task_that_it_did_not_announce_is_never_imported(stage, cached, tmp_pa
     stage.hand(task)
     _, served = stage.worker(exit_when_done=True)
     assert isinstance(error := served.exception(DEADLINE), RefusedError)
-    assert f"{task!r}, which this worker did not announce: start it with --task {task}" in str(error)
+    assert f"{task!r}, which this worker did not announce: start it with `dreamfleet worker --task {task}`" in str(
+        error
+    )
     assert not mark.exists()
 
 

@@ -157,3 +157,17 @@ def test_late_events_of_the_last_runs_slots_do_not_reach_the_next_run(stage, sai
     other.send(1, other.job())
     assert other.result(other.job()).fitness is not None
     assert not [line for line in drained(said) if "starting another" in line]
+
+
+def test_without_a_flag_it_says_why_its_run_ended_and_waits_for_the_next_one(stage, said, cached):
+    hand = stage.hand(tasks.SLOW_TOY)
+    _, served = stage.worker()
+    assert hand.hello().reads_end
+    hand.beat(lambda beat: beat.capacity > 0)
+    hand.answer_no_hello()  # as a run that has ended
+    hand.send(0, vectors=(), ended=True, why="2 generations")
+    assert hand.beat(lambda beat: beat.reason).reason == "the run has ended after 2 generations"
+    hand.vanish()
+    wait_for(said, f"run test ended after 2 generations; waiting for the next run at {hand.endpoint}")
+    stage.also(hand, tasks.SLOW_TOY).ready()
+    assert not served.done()

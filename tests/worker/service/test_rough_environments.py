@@ -13,6 +13,7 @@ import pytest
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.service.slot import Slot
+from dreamfleet.worker.service.slot_budget import SharedSlots
 from dreamfleet.worker.service.slot_pool import SlotPool
 from tests.support import rough_tasks, tasks
 from tests.support.processes import DEADLINE
@@ -252,7 +253,9 @@ def test_whatever_is_raised_as_a_slot_starts_is_one_clear_error(harness, monkeyp
 
 def test_many_children_that_cannot_end_do_not_delay_the_end_of_a_pool(random_bundle, monkeypatch):
     spec = TaskSpec(task=tasks.TOY, bundle=random_bundle.sha256, horizon=1, patience=0)
-    pool = SlotPool(3, spec, random_bundle.path, queue.SimpleQueue(), (tasks.TOY,), 0)
+    pool = SlotPool(
+        SharedSlots(3).open(1.0, lambda: None), spec, random_bundle.path, queue.SimpleQueue(), (tasks.TOY,), 0
+    )
     kills = []
     for slot in pool._slots:
         kills.append(slot._child.kill)

@@ -1,7 +1,10 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, Continuous, Discrete, one_hot
+from dreamfleet.common.worlds.score_words import profile_of
 from dreamfleet.worker.tools.canvas import (
     AWAKE,
     BACKGROUND,
@@ -16,7 +19,7 @@ from dreamfleet.worker.tools.canvas import (
     plain_layout,
 )
 
-SEED = 10_003
+SEED, WORLD = 10_003, profile_of("car-racing")
 RED, GREEN, BLUE, WHITE = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)
 ACTION = np.array([0.0, 0.5, 1.0], np.float32)
 
@@ -28,7 +31,7 @@ def plain(colour):
 def test_a_frame_shows_the_track_the_observation_and_the_decoded_latent():
     green = plain(GREEN)
     green[:, ::2] = 0  # an edge a pixel: enlarging must not blur it
-    frame = Canvas(SEED).draw(DriveFrame(plain(RED), ACTION, 7, 12.5, ModelPictures(green, plain(BLUE))))
+    frame = Canvas(SEED, WORLD).draw(DriveFrame(plain(RED), ACTION, 7, 12.5, ModelPictures(green, plain(BLUE))))
     assert frame.shape[1::-1] == AWAKE.size
     assert (frame[200, 300] == RED).all()
     assert {tuple(pixel) for pixel in frame[100, 620:812].tolist()} == {GREEN, (0, 0, 0)}
@@ -36,12 +39,21 @@ def test_a_frame_shows_the_track_the_observation_and_the_decoded_latent():
     assert not (frame[420:, :240] == BACKGROUND).all(), "score, step and track are written there"
 
 
+def test_the_end_stands_on_the_top_of_the_worlds_picture_and_leaves_the_rest():
+    moment = DriveFrame(plain(RED), ACTION, 7, 12.5, ModelPictures(plain(GREEN), plain(BLUE)))
+    before, after = (Canvas(SEED, WORLD).draw(replace(moment, end=end)) for end in ("", "lap finished"))
+    rows = np.flatnonzero((before != after).any(axis=(1, 2)))
+    columns = np.flatnonzero((before != after).any(axis=(0, 2)))
+    assert MARGIN <= rows[0] <= rows[-1] < MARGIN + AWAKE.track[1] / 6
+    assert MARGIN <= columns[0] <= columns[-1] < MARGIN + AWAKE.track[0]
+
+
 @pytest.mark.parametrize("since", [0, 9900])
 def test_a_dreamt_picture_and_its_label_fit_into_the_frame(since):
     moment = DriveFrame(
         plain(RED), ACTION, 7, 12.5, ModelPictures(plain(GREEN), plain(BLUE), DreamPicture(plain(WHITE), since))
     )
-    frame = Canvas(SEED, DREAMING).draw(moment)
+    frame = Canvas(SEED, WORLD, DREAMING).draw(moment)
     assert frame.shape[1::-1] == DREAMING.size
     column = frame[:, DREAMING.track[0] + 20 :][:, :SIDE]
     heights = [int((column == colour).all(axis=(1, 2)).sum()) for colour in (GREEN, BLUE, WHITE)]
@@ -52,7 +64,9 @@ def test_a_dreamt_picture_and_its_label_fit_into_the_frame(since):
 
 def bar(action, actions, names=("push",)):
     """The columns of the first bar that are filled, of its 106."""
-    frame = Canvas(SEED, AWAKE, names, actions).draw(DriveFrame(plain(RED), np.array(action, np.float32), 0, 0.0))
+    frame = Canvas(SEED, WORLD, AWAKE, names, actions).draw(
+        DriveFrame(plain(RED), np.array(action, np.float32), 0, 0.0)
+    )
     width, height = AWAKE.track
     left = width + 16 - len(action) * 122
     row = frame[height + 26 + 22 + 7, left : left + 106]
@@ -78,7 +92,8 @@ def test_the_cars_bars_need_no_names_of_pedals():
     ("action", "names", "actions", "name"),
     [
         (np.array([0, 1, 0], np.float32), ("stay", "left", "right"), one_hot(3), "left"),
-        (np.array([0, 1, 0], np.float32), (), one_hot(3), "1"),
+        (np.array([0, 1, 0], np.float32), (), one_hot(3), "1 of 3"),
+        (np.array([2]), (), Discrete(4), "2 of 4"),
         (np.array([2]), (), None, "2"),
         (np.array([2]), ("up", "down"), Discrete(2, first=1), "down"),
         (np.array([0.2], np.float32), ("push",), Continuous.between([-1], [1]), None),
@@ -88,7 +103,8 @@ def test_the_cars_bars_need_no_names_of_pedals():
 def test_a_choice_is_shown_by_its_name(action, names, actions, name):
     assert choice_name(action, names, actions) == name
     frames = [
-        Canvas(SEED, AWAKE, names, actions).draw(DriveFrame(plain(RED), each, 0, 0.0)) for each in (action, action * 0)
+        Canvas(SEED, WORLD, AWAKE, names, actions).draw(DriveFrame(plain(RED), each, 0, 0.0))
+        for each in (action, action * 0)
     ]
     assert (name is None) or not np.array_equal(*frames)
 
@@ -98,7 +114,7 @@ def test_a_world_keeps_its_shape_beside_the_small_pictures(height, width):
     picture = np.full((height, width, 3), RED, np.uint8)
     models = ModelPictures(plain(GREEN), plain(BLUE))
     for layout, more in ((AWAKE, models), (plain_layout(picture), None)):
-        red = (Canvas(SEED, layout).draw(DriveFrame(picture, ACTION, 0, 0.0, more)) == RED).all(axis=2)
+        red = (Canvas(SEED, WORLD, layout).draw(DriveFrame(picture, ACTION, 0, 0.0, more)) == RED).all(axis=2)
         rows, columns = np.flatnonzero(red.any(axis=1)), np.flatnonzero(red.any(axis=0))
         assert len(columns) / len(rows) == pytest.approx(width / height, rel=0.02)
         assert len(columns) == layout.track[0] or len(rows) == layout.track[1]

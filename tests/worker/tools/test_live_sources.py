@@ -2,13 +2,13 @@
 
 import io
 import json
-from itertools import islice
+from itertools import islice, takewhile
 
 import av
 import numpy as np
 import pytest
 
-from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.monitoring.live import LiveFrame
 from dreamfleet.common.monitoring.mjpeg import read_parts
@@ -20,6 +20,7 @@ from dreamfleet.worker.scoring import episode
 from dreamfleet.worker.scoring.agents import make_agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig
 from dreamfleet.worker.scoring.scorer import Scorer
+from dreamfleet.worker.tools.canvas import Canvas
 from dreamfleet.worker.tools.frame_sinks import encode_picture, open_sink
 from dreamfleet.worker.tools.live_sources import driven_frames
 from dreamfleet.worker.tools.live_view import AHEAD, SIZE, CaptionedFrame, LiveCanvas, LiveDreamer
@@ -113,6 +114,17 @@ def test_a_controller_is_shown_in_real_time_and_scores_the_same(random_bundle, m
     assert shown[7].facts["score"] == pytest.approx(plain.fitness)
     assert shown[0].facts["seed"] == SEED
     assert len({each.picture.tobytes() for each in shown}) == 8
+
+
+def test_the_end_of_an_episode_is_shown_for_a_second(monkeypatch):
+    ends = []
+    monkeypatch.setattr(Canvas, "_draw_end", lambda _self, text: ends.append(text))
+    falling = make_agent(Controller(ControllerShape(4, 2), np.zeros(10, np.float32), "gym:CartPole-v1", ""))
+    pictures = driven_frames(lambda: (falling, {}), ParallelDreamConfig(), 10, SEED)
+    shown = [each.facts for each in takewhile(lambda each: each.facts["seed"] == SEED, pictures)]
+    last = shown[-1]
+    assert [each for each in shown if each["step"] == last["step"]] == [last] * 10
+    assert (last["score"], ends) == (last["step"], [f"ended after {last['step']} steps"])
 
 
 PICTURES = [CaptionedFrame(np.full((40, 60, 3), value, np.uint8), {"step": value}) for value in (10, 200, 90)]

@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 from functools import partial
 
@@ -14,7 +15,7 @@ from dreamfleet.worker.scoring.agents import make_agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task
-from dreamfleet.worker.tools.canvas import AWAKE, DREAMING
+from dreamfleet.worker.tools.canvas import AWAKE, DREAMING, Canvas
 from dreamfleet.worker.tools.recording import record, record_in_process
 
 SEED, STEPS = 10_003, 8
@@ -41,6 +42,24 @@ def test_a_video_has_one_frame_a_step_and_the_drives_score(controller, random_bu
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
         assert (stream.width, stream.height, stream.average_rate) == (*DREAMING.size, 50)
         assert len(list(container.decode(stream))) == STEPS
+
+
+@pytest.mark.parametrize(
+    ("limit", "end"), [(3, "the limit of 3 steps is reached"), (50, "ended after 8 steps")], ids=["limit", "death"]
+)
+def test_the_end_of_an_episode_is_held_for_a_second_and_named(limit, end, tmp_path, monkeypatch):
+    ends = []
+    monkeypatch.setattr(Canvas, "_draw_end", lambda _self, text: ends.append(text))
+    arguments = json.dumps({"environment": {"max_episode_steps": limit}})
+    falling = Controller(ControllerShape(4, 2), np.zeros(10, np.float32), "gym:CartPole-v1", "", {}, arguments)
+    steps = []
+    score = record(make_agent(falling), SEED, 1000, tmp_path / "drive.mp4", on_step=steps.append)
+    assert (ends, score) == ([end], steps[-1])
+    with av.open(str(tmp_path / "drive.mp4")) as container:
+        stream = container.streams.video[0]
+        *_, one, last = container.decode(stream)
+        assert stream.frames == steps[-1] + stream.average_rate
+    np.testing.assert_allclose(*(each.to_ndarray(format="rgb24").astype(int) for each in (one, last)), atol=8)
 
 
 @pytest.mark.parametrize("after", [0, 3])

@@ -44,6 +44,17 @@ def test_each_track_has_its_own_video(verb, tmp_path, capsys):
         np.testing.assert_allclose(pictures(tmp_path / "alone.mp4"), pictures(video), atol=8)  # x264 differs by a bit
 
 
+@pytest.mark.slow  # whole laps: a mean is shown beside nothing less
+def test_without_a_seed_a_shipped_controllers_median_game_is_shown_beside_its_mean(tmp_path, capsys):
+    words = ("record", "--controller", "tiny", "--out", str(tmp_path / "drive.mp4"))
+    for given, says in (
+        ((), "points on track 10060, the median of 100 tracks, whose mean is 832.1 ± 14.3\n"),
+        (("--seed", "10000", "--steps", "2"), "points on track 10000 in its first 2 steps (--steps)\n"),
+    ):
+        assert command_line.main([*words, *given]) == 0
+        assert says in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [

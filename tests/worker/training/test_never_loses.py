@@ -265,7 +265,7 @@ def test_new_begins_from_a_kept_checkpoint_and_never_from_what_it_replaces(data)
     train(data, replace(SHORT, keep_every=2))
     last, kept = data / train_vae.CHECKPOINT, numbered_path(data / train_vae.CHECKPOINT, 4)
     before = last.read_bytes()
-    with pytest.raises(UsageError, match="leave one of the two out"):
+    with pytest.raises(UsageError, match="omit one of the two"):
         train(data, continue_from=data / "." / last.name, new=True)
     with pytest.raises(UsageError, match="needs an encoder that was trained"):
         train(data, decoder_only=True, new=True)

@@ -236,9 +236,9 @@ def test_a_share_of_every_amount_is_rounded_up():
     [
         (("--scale", "0"), "--scale must be above 0, to 1, not 0"),
         (("--scale", "2"), "--scale must be above 0, to 1, not 2"),
-        (("--vae-flags", "--dat other"), "--vae-flags: leave out --data, which pipeline sets itself"),
+        (("--vae-flags", "--dat other"), "--vae-flags: omit --data, which pipeline sets itself"),
         (("--collect-flags", "'"), "--collect-flags"),
-        (("--bundle-flags", "--out b.zip"), "--bundle-flags: leave out --out, which pipeline sets itself"),
+        (("--bundle-flags", "--out b.zip"), "--bundle-flags: omit --out, which pipeline sets itself"),
         (("--bundle-flags", "--end 7"), "a dream ends at a probability from 0 to 1"),
         (("--preset", "dream"), "'dream' is a preset of run"),
     ],

@@ -68,8 +68,11 @@ def test_what_lies_behind_an_actions_bound_is_kept_near_it(bundles):
     for other in (controller(bundles[0], hidden=5), controller(bundles[0], variant=Variant(pedals="one"))):
         lowest, highest = output_bounds(other, bundles[0])
         assert (set(lowest), set(highest)) == ({-2.5}, {2.5})
-    choices = output_bounds(controller(bundles[0], variant=Variant(actions="discrete")), bundles[0])
-    assert np.isinf(choices).all(), "values that are compared mean something wherever they lie"
+    for actions in ("discrete", "linear"):
+        unbounded = output_bounds(controller(bundles[0], variant=Variant(actions=actions)), bundles[0])
+        assert np.isinf(unbounded).all(), (
+            "values that are compared, or are the action, mean something wherever they lie"
+        )
 
 
 @pytest.mark.parametrize("features", ["z", "zh"])

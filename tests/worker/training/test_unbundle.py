@@ -40,6 +40,7 @@ def parts_again(folder):
         replace(EYES, picture=96, padding="same"),
         replace(EYES, dropout=0.1, activation="leaky_relu"),
         replace(EYES, dense=8),
+        replace(EYES, activate_dense=True),
     ],
 )
 def test_the_same_eyes_are_bundled_from_it_again(tmp_path, eyes):
@@ -55,6 +56,7 @@ def test_the_same_eyes_are_bundled_from_it_again(tmp_path, eyes):
         MEMORY,
         replace(MEMORY, done=True, lost=9),
         replace(MEMORY, reward="none", mixtures=1),
+        replace(MEMORY, joint=True, done=True),
         replace(MEMORY, reward="value", previous_reward=True, dropout=0.1),
         replace(ATTENTIVE, latent=4, hidden=6, window=3, attention_units=5),
     ],

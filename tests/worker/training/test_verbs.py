@@ -104,9 +104,9 @@ def test_a_set_goes_on_with_drives_of_controllers(tmp_path, capsys):
     [
         (("--noise", "0.1"), "give --controller"),
         (("--spells", "0.1"), "give --controller"),
-        (("--driver", "network", "--controller", "tiny"), "leave it or --controller out"),
+        (("--driver", "network", "--controller", "tiny"), "omit it or --controller"),
         (("--driver", "ghost"), "one of random, held, .*network, not 'ghost'"),
-        (("--from-run", "r", "--controller", "tiny"), "leave --controller out"),
+        (("--from-run", "r", "--controller", "tiny"), "omit --controller"),
     ],
 )
 def test_flags_of_controllers_that_do_not_drive_are_refused(tmp_path, flags, said):

@@ -26,6 +26,8 @@ VARIANTS = {
     "done": MDNRNNConfig(done=True, reward="none"),
     "everything": MDNRNNConfig(reward="value", done=True, previous_reward=True, dropout=0.2, window=3),
     "one mixture": MDNRNNConfig(mixtures=1),
+    "joint": MDNRNNConfig(joint=True, reward="value", done=True),
+    "joint latent": MDNRNNConfig(joint=True, latent=1),
 }
 
 
@@ -48,7 +50,9 @@ def dreamt_in_torch(model, feed, temperature, mask):
         hidden, state = model.advance(torch.cat([tensors["latent"], tensors["action"]], dim=1), tensors["state"])
         predicted = model.predict(hidden * torch.as_tensor(mask))
     weights = torch.softmax(predicted.log_weights / temperature, dim=-1)
-    index = (weights.cumsum(dim=-1) <= tensors["uniform"][..., None]).sum(dim=-1).clamp(max=config.mixtures - 1)
+    uniform = tensors["uniform"][:, :1] if config.joint else tensors["uniform"]
+    index = (weights.cumsum(dim=-1) <= uniform[..., None]).sum(dim=-1).clamp(max=config.mixtures - 1)
+    index = index.expand(-1, config.latent)
     mean, deviation = (
         each.gather(-1, index[..., None])[..., 0] for each in (predicted.means, predicted.log_deviations)
     )
@@ -64,12 +68,13 @@ def dreamt_in_torch(model, feed, temperature, mask):
 @pytest.mark.parametrize("temperature", [0.5, 1.15])
 def test_the_dream_is_what_torch_dreams(tmp_path, name, temperature):
     config = VARIANTS[name]
-    bundle, feed = write_random_bundle(tmp_path / "b.zip", rnn=config), chance(config)
+    eyes = VAEConfig(latent=config.latent)
+    bundle, feed = write_random_bundle(tmp_path / "b.zip", vae=eyes, rnn=config), chance(config)
     mask = np.float32(1)
     if config.dropout:
         mask = (np.random.default_rng(1).random((ROWS, config.hidden)) > config.dropout) / np.float32(0.8)
     dream = DreamStep(bundle).imagine(**feed, temperature=temperature, mask=mask if config.dropout else None)
-    expected = dreamt_in_torch(random_models(0, rnn=config)[1], feed, temperature, mask)
+    expected = dreamt_in_torch(random_models(0, eyes, config)[1], feed, temperature, mask)
     for one, other in zip((dream.latent, dream.state, dream.reward, dream.done), expected, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-4)
     assert dream.reward.shape == dream.done.shape == (ROWS,)

@@ -35,6 +35,8 @@ VAES = {
         decoder_channels=(4, 3, 3, 2),
     ),
     "from 3x3": VAEConfig(picture=96, decoder_kernels=(5, 5, 6, 6), **TINY),
+    "active dense": VAEConfig(activate_dense=True, **TINY),
+    "leaky dense": VAEConfig(activate_dense=True, activation="leaky_relu", dense=6, **TINY),
     "everything": VAEConfig(activation="leaky_relu", batch_norm=True, dropout=0.1, **TINY),
     "everything same": VAEConfig(activation="leaky_relu", batch_norm=True, padding="same", picture=96, **TINY),
 }
@@ -97,7 +99,7 @@ def test_an_exported_vae_computes_what_torch_does(tmp_path, name):
     np.testing.assert_allclose(policy.step(pictures, parameters, policy.zero_state(3)).latent, mu.numpy(), atol=1e-4)
 
 
-@pytest.mark.parametrize("config", [mdnrnn.REWARDED, mdnrnn.NOTEBOOK, mdnrnn.ATTENTIVE])
+@pytest.mark.parametrize("config", [mdnrnn.REWARDED, mdnrnn.NOTEBOOK, mdnrnn.ATTENTIVE, MDNRNNConfig(joint=True)])
 def test_step_by_step_is_the_same_as_a_whole_drive(config):
     torch.manual_seed(0)
     model = MDNRNN(config).eval()
@@ -163,6 +165,7 @@ def test_sizes_that_make_no_model_are_refused(make):
 
 def test_a_model_of_the_paper_is_written_as_it_was_before_every_layer_had_a_flag():
     later = {"error_factor", "kernels", "strides", "decoder_channels", "decoder_kernels", "pixel_weight"}
+    later |= {"activate_dense"}
     assert set(to_dict(vae.PAPER)) == set(asdict(vae.PAPER)) - later
     assert not {"lost", "first_reward", "done_factor", "done_weight", "reward_scale"} & set(to_dict(mdnrnn.REWARDED))
 

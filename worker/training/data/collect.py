@@ -69,9 +69,10 @@ def collect(
     fails, ends its process, or makes no step for `stall` seconds.
     """
     config.check_for(world)
-    check_pictures(existing_episodes(folder), config.picture, world)
+    preprocessing = preprocessing_of_size(config.picture, world)
+    check_pictures(existing_episodes(folder), config.picture, world, preprocessing)
     for pilot in pilots:
-        pilot.check(preprocessing_of_size(config.picture, world).name, world)
+        pilot.check(preprocessing.name, world)
     numbers = missing_numbers(folder, config)
     with explain_folder_errors(folder):
         (folder / "episodes").mkdir(parents=True, exist_ok=True)

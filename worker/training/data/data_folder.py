@@ -73,7 +73,7 @@ def resolve_world(folder: Path, task: str | None, arguments: Mapping[str, Any]) 
     if isinstance(found, TaskWithOptions):
         options = found.parse_options(arguments)
     elif arguments:
-        raise UsageError(f"task {name} has no options: leave {', '.join(f'--{each}' for each in arguments)} out")
+        raise UsageError(f"task {name} has no options: omit {', '.join(f'--{each}' for each in arguments)}")
     given = DataWorld(name, options)
     if own not in (None, given):
         raise UsageError(f"{folder} holds data of {own}, and this is {given}: a data set has one world; {REMEDY}")

@@ -46,8 +46,17 @@ def preprocessing_of_size(size: int, world: DataWorld = OF_FIRST_WORLD) -> Prepr
     for each in known:
         if each.size == size:
             return each
-    sizes = " or ".join(str(each.size) for each in known)
+    sizes = " or ".join(dict.fromkeys(str(each.size) for each in known))
     raise UsageError(f"pictures are {sizes} pixels wide, not {size}: give --picture {sizes}")
+
+
+def preprocessing_of_drives(paths: Sequence[Path], size: int, world: DataWorld = OF_FIRST_WORLD) -> Preprocessing:
+    """The preprocessing of the first drive, if its pictures have `size` pixels; else the world's of that size.
+
+    Drives of other programs may have another one than those that are collected here.
+    """
+    found = find_world(*world).preprocessings.get(kind_of(paths[0])[1]) if paths else None
+    return found if found is not None and found.size == size else preprocessing_of_size(size, world)
 
 
 def load_begun(folder: Path) -> dict[str, Any]:
@@ -104,6 +113,11 @@ def episode_paths(folder: Path, kind: str = "episodes") -> list[Path]:
     paths = sorted((folder / kind).glob("[0-9]*.npz"))
     if len(paths) < 2:
         verb = "dreamfleet collect" if kind == "episodes" else "dreamfleet encode"
+        others = (each for each in folder.glob("*/*.npz") if each.parent.name not in ("episodes", "encoded"))
+        if not paths and (any(folder.glob("*.npz")) or any(others)):
+            raise DatasetError(
+                f"{folder} holds drives of another program: `dreamfleet import {folder} --out DATA` makes a data set"
+            )
         raise DatasetError(f"{folder} holds {len(paths)} {kind}; at least 2 are needed: run `{verb} --data {folder}`")
     return paths
 
@@ -177,14 +191,16 @@ def check_whole(paths: Sequence[Path], *names: str) -> None:
             raise DatasetError(f"{path} lacks {', '.join(sorted(missing))}; {_remedy(path)}")
 
 
-def check_pictures(paths: Sequence[Path], size: int, world: DataWorld | None = None) -> None:
-    """`DatasetError` names the first episode of another world, or with other pictures than its world's of `size`.
+def check_pictures(
+    paths: Sequence[Path], size: int, world: DataWorld | None = None, preprocessing: Preprocessing | None = None
+) -> None:
+    """`DatasetError` names the first episode of another world, or with other pictures than the first one's of `size`.
 
-    The world is that of the first episode, unless one is given.
+    The world and the preprocessing are those of the first episode, unless they are given.
     """
     kinds = {path: kind_of(path) for path in paths}
     world = world or next((own for own, _ in kinds.values()), OF_FIRST_WORLD)
-    wanted = preprocessing_of_size(size, world).name
+    wanted = (preprocessing or preprocessing_of_drives(paths, size, world)).name
     for path, (own, found) in kinds.items():
         if own != world:
             raise DatasetError(f"{path} is of {own}, and the data are of {world}: a data set has one world; {REMEDY}")

@@ -64,7 +64,7 @@ def test_flags_of_bundle_are_of_every_round():
         said(made.bundle(number)).endswith(f"round-{number}.zip --json --reward value --end 0.3") for number in (1, 2)
     ]
     assert ends == [True, True]
-    with pytest.raises(UsageError, match="--bundle-flags: leave out --out, which iterate sets itself"):
+    with pytest.raises(UsageError, match="--bundle-flags: omit --out, which iterate sets itself"):
         IterateConfig(bundle_flags="--out b.zip")
 
 

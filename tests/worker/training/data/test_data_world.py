@@ -233,15 +233,15 @@ def test_a_data_set_keeps_the_world_that_it_was_begun_in(tmp_path):
     for other in (("--task", "car-racing"), ("--task", "gym:CartPole-v1"), ("--skip", "3")):
         with pytest.raises(UsageError, match=r"holds data of gym:CartPole-v1 with {.*}, and this is .*: a data"):
             call(*words, *other)
-    with pytest.raises(UsageError, match="leave --task and its flags out"):
+    with pytest.raises(UsageError, match="omit --task and its flags"):
         call(*words, "--from-run", "night", "--task", "car-racing")
 
 
 @pytest.mark.parametrize(
     ("task", "arguments", "error"),
     [
-        (None, {"skip": 2}, "task car-racing has no options: leave --skip out"),
-        (DODGE_TASK, {"size": 96, "crop": "0:9,0:9"}, "has no options: leave --size, --crop out"),
+        (None, {"skip": 2}, "task car-racing has no options: omit --skip"),
+        (DODGE_TASK, {"size": 96, "crop": "0:9,0:9"}, "has no options: omit --size, --crop"),
         ("takecover", {"size": 96}, "knows no option size"),
         ("gym:CartPole-v1", {"crop": "half"}, "a crop is top:bottom,left:right"),
         ("ghost", {}, "ghost"),

@@ -1,0 +1,58 @@
+"""The key by which a worker shows that it is on the coordinator's own host: a file that only their user can read."""
+
+from __future__ import annotations
+
+import hmac
+import os
+import secrets
+import stat
+from contextlib import suppress
+from pathlib import Path
+
+from dreamfleet.common.artifacts.bundle_store import default_cache
+from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.files.regular_files import open_regular
+
+NAME, BYTES = "anchor.key", 32
+
+
+def make_anchor_key() -> bytes:
+    """This user's key on this host, made if there is none; empty if the cache folder cannot hold it."""
+    with suppress(OSError, DreamfleetError):
+        path = _path()
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with (
+            suppress(FileExistsError),
+            os.fdopen(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb") as f,
+        ):
+            f.write(secrets.token_bytes(BYTES))
+    return _read()
+
+
+def anchor_proof(worker: str) -> str:
+    """What shows that `worker`, a name with its life, runs on this host as this user; empty if there is no key."""
+    return proof_for(_read(), worker)
+
+
+def proof_for(key: bytes, worker: str) -> str:
+    """The proof that a worker sends, 64 hexadecimal digits; empty without a key."""
+    return hmac.digest(key, worker.encode(), "sha256").hex() if len(key) == BYTES else ""
+
+
+def is_proof(key: bytes, worker: str, proof: str) -> bool:
+    """Whether a proof is that of this key and worker."""
+    expected = proof_for(key, worker)
+    return bool(expected) and hmac.compare_digest(expected.encode(), proof.encode())
+
+
+def _path() -> Path:
+    return default_cache() / NAME
+
+
+def _read() -> bytes:
+    """The key; empty if there is none, or if another user made or may read it, as in a cache that users share."""
+    with suppress(OSError, DreamfleetError), open_regular(_path(), BYTES) as file:
+        found = os.fstat(file.fileno())
+        if found.st_uid == os.geteuid() and not found.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+            return file.read()
+    return b""

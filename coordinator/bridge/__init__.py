@@ -1,0 +1,1 @@
+"""The bridge: batches over HTTP with JSON, for searches in any language."""

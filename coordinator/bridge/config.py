@@ -1,0 +1,57 @@
+"""The bridge's settings: address and tokens."""
+
+from __future__ import annotations
+
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+
+from dreamfleet.common.cli.config import option
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.transport.network import is_loopback_host
+
+LEAST_TOKEN = 16  # characters: anyone who reaches the port can guess
+MOST_TOKENS = 1000
+
+
+@dataclass(frozen=True)
+class BridgeConfig:
+    """Where the bridge listens, and the file of its tokens."""
+
+    host: str = option("127.0.0.1", "listen here; addresses that others can reach need --token-file")
+    port: int = option(8700, "port; 0: any that is free")
+    token_file: str | None = option(None, "file with a token in each line; every request must bear one of them")
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.port <= 65535:
+            raise UsageError(f"--port must be from 0 to 65535, not {self.port}")
+        if self.token_file is None and not self.is_loopback:
+            raise UsageError(f"--host {self.host} lets others submit batches: give a --token-file, or leave --host out")
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only this computer can reach the bridge."""
+        return is_loopback_host(self.host)
+
+    def address(self, port: int) -> str:
+        """The URL of the bridge."""
+        return f"http://{f'[{self.host}]' if ':' in self.host else self.host}:{port}"
+
+    def read_tokens(self) -> tuple[str, ...]:
+        """The tokens, none without a file; `UsageError` if others may read the file, or a token is short."""
+        if self.token_file is None:
+            return ()
+        path = Path(self.token_file)
+        make = f"(umask 077; openssl rand -hex 32 > {path})"
+        try:
+            if path.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+                raise UsageError(f"other users may read {path}: chmod 600 {path}")
+            lines = path.read_text().splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            raise UsageError(f"--token-file {path} cannot be read ({error}); make one: {make}") from error
+        tokens = tuple(filter(None, (line.strip() for line in lines if not line.startswith("#"))))
+        if not tokens or len(tokens) > MOST_TOKENS:
+            raise UsageError(f"{path} must hold 1 to {MOST_TOKENS} tokens, one a line; make one: {make}")
+        if any(len(each) < LEAST_TOKEN or not each.isascii() for each in tokens):
+            raise UsageError(f"each token in {path} must have at least {LEAST_TOKEN} ASCII characters: {make}")
+        return tokens

@@ -1,0 +1,114 @@
+"""A Python function by a name under which other processes find it: functions never travel as pickles."""
+
+from __future__ import annotations
+
+import inspect
+import os
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.trusted_modules import PLACES, check_module_name, join_places, module_folder
+from dreamfleet.common.protocol.tasks import FUNCTION, module_of
+
+REMEDY = "write it as `def` at the top level of a module, and pass that"
+IMPORTED_FOR = "DREAMFLEET_FUNCTION"  # the task for which a process of a fleet imports modules
+
+
+@dataclass(frozen=True)
+class FunctionName:
+    """The task `function:MODULE:NAME`, and the folder in which its module lies; `None` if that is installed."""
+
+    task: str
+    folder: Path | None
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """Variables by which processes of this host find the module, and know why they import it."""
+        return {IMPORTED_FOR: self.task, **_path_with(self.folder)}
+
+
+def environment_for(names: Iterable[object]) -> dict[str, str]:
+    """The variables by which processes of this host find the modules in these names of tasks and optimisers.
+
+    `UsageError` for a module that is called like one of Python's own.
+    """
+    modules = [module_of(name) for name in names if isinstance(name, str)]
+    for module in filter(None, modules):
+        check_module_name(module)
+    return _path_with(*(module_folder(module) for module in modules if module))
+
+
+def _path_with(*folders: Path | None) -> dict[str, str]:
+    more = [str(each) for each in folders if each is not None]
+    return {PLACES: join_places(*more)} if more else {}
+
+
+def name_function(function: Callable[..., Any] | str) -> FunctionName:
+    """The name of a function of a module, or of a script's own if its file can be imported as a module.
+
+    `function` may also be the text `MODULE:NAME`. `UsageError` says what to do about lambdas, nested functions, methods
+    of objects, and functions of a notebook; also where a script searches as it is imported.
+
+    >>> import numpy as np
+    >>> name_function(np.linalg.norm).task
+    'function:numpy.linalg:norm'
+    """
+    if isinstance(function, str):
+        found = FunctionName(
+            f"{FUNCTION}:{function.removeprefix(f'{FUNCTION}:')}", module_folder(function.partition(":")[0])
+        )
+    else:
+        found = _name_object(function)
+    check_module_name(found.task.split(":")[1])
+    if os.environ.get(IMPORTED_FOR) == found.task:
+        raise UsageError(
+            "a process of the fleet imports this module to call its function, and the module then searches again: put "
+            'the search under `if __name__ == "__main__":`'
+        )
+    return found
+
+
+def _name_object(function: Callable[..., Any]) -> FunctionName:
+    module, name = getattr(function, "__module__", None), getattr(function, "__qualname__", None)
+    if not callable(function) or not module or not name:
+        raise UsageError(f"{type(function).__name__} is no function of a module: {REMEDY}")
+    if "<lambda>" in name or "<locals>" in name:
+        kind = "a lambda" if "<lambda>" in name else "a function inside of another"
+        raise UsageError(f"{kind} has no name by which other processes find it: {REMEDY}")
+    if inspect.ismethod(function) and not inspect.isclass(function.__self__):
+        raise UsageError(
+            f"{name} is a method of an object, that other processes lack: {REMEDY}; it may make the object itself"
+        )
+    if module == "__main__":
+        return _name_of_script(name)
+    found = _look_up(sys.modules.get(module), name)
+    if found is not function and not (inspect.ismethod(function) and found == function):
+        raise UsageError(f"{name} of {module} is another object than this function: {REMEDY}")
+    return FunctionName(f"{FUNCTION}:{module}:{name}", module_folder(module))
+
+
+def _name_of_script(name: str) -> FunctionName:
+    """The name of a function of the running program: its file is imported as a module, as `multiprocessing` does."""
+    main = sys.modules["__main__"]
+    spec, file = getattr(main, "__spec__", None), getattr(main, "__file__", None)
+    if spec is not None:  # python -m package.module
+        return FunctionName(f"{FUNCTION}:{spec.name}:{name}", Path.cwd())
+    if file is None or Path(file).suffix != ".py" or not Path(file).stem.isidentifier():
+        where = "a notebook or a prompt" if file is None else f"{Path(file).name}, which cannot be imported"
+        raise UsageError(
+            f"{name} is defined in {where}, where other processes do not find it: write it into a file such as "
+            f"objectives.py, and pass `objectives.{name}` after `import objectives`"
+        )
+    path = Path(file).resolve()
+    return FunctionName(f"{FUNCTION}:{path.stem}:{name}", path.parent)
+
+
+def _look_up(module: object, name: str) -> Any:
+    found = module
+    for part in name.split("."):
+        found = getattr(found, part, None)
+    return found

@@ -1,0 +1,231 @@
+"""The batches that others submit to a run: they arrive in parts, wait, are scored as generations, and are read by id.
+
+No transport: the service hands over what a query says, and sends the reply once the journal has committed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from dreamfleet.common.printable import plural, truncate
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.batches import (
+    FINAL,
+    MAX_BATCH,
+    MAX_LISTED,
+    PAGE_CANDIDATES,
+    BatchError,
+    BatchEvent,
+    BatchHeader,
+    BatchReply,
+    CandidateError,
+    check_batch_id,
+    check_vectors,
+    read_count,
+    unpack_seeds,
+)
+from dreamfleet.common.protocol.messages import MAX_PART, UploadPart
+from dreamfleet.common.runs.seeds import training_seed
+from dreamfleet.coordinator.jobs.upload_assembler import UploadAssembler
+from dreamfleet.coordinator.run.external_generations import CANCELLED, ExternalGenerations
+from dreamfleet.coordinator.run.run import Run
+from dreamfleet.coordinator.storage.batch_records import StoredBatch
+from dreamfleet.coordinator.storage.journal import Journal
+
+MAX_WAITING = 256  # batches
+MAX_WAITING_SIZE = 8 * MAX_BATCH  # bytes of their vectors
+PAGE_BYTES = 30_000  # of a reply's scores and errors
+LONGEST_ERROR = 300  # characters
+Parameters = Callable[[str], str | None]
+
+
+class Batches:
+    """Takes, reads and cancels the batches of a `run` named `name`, whose journal is `journal`."""
+
+    def __init__(self, run: Run, journal: Journal, name: str) -> None:
+        self._run = run
+        self._journal = journal
+        self._name = name
+        self._uploads = UploadAssembler()
+        self._announced: tuple[str, int] | None = None  # the open batch's id and its candidates that were done
+
+    def answer(self, verb: str, get: Parameters, payload: bytes, now: float) -> BatchReply:
+        """The reply to a query `submit`, `read`, `cancel` or `list`, whose parameters `get` returns."""
+        verbs: dict[str, Callable[[], BatchReply]] = {
+            "submit": lambda: self._submit(BatchHeader.from_parameters(get), read_count(get, "offset"), payload, now),
+            "read": lambda: self._describe(self._find(get), read_count(get, "offset")),
+            "cancel": lambda: self._cancel(self._find(get)),
+            "list": lambda: replace(self._head(), batches=tuple(self._journal.list_batches(MAX_LISTED))),
+        }
+        try:
+            if not self._run.settings.is_external:
+                raise BatchError(
+                    "not external",
+                    f"run {self._name} has a search of its own ({self._run.settings.optimiser}): submit to one that "
+                    "was started with --optimiser external",
+                )
+            if verb not in verbs:
+                raise BatchError("malformed", f"{truncate(verb, 60)!r} is no verb of batches: {', '.join(verbs)}")
+            return verbs[verb]()
+        except BatchError as error:
+            return replace(self._head(), refused=error.refusal, why=truncate(str(error), 1000))
+
+    def tick(self, now: float) -> None:
+        """Forget uploads without progress: their senders begin again."""
+        self._uploads.tick(now)
+
+    def take_events(self, closed: Iterable[int], *, progress: bool) -> list[BatchEvent]:
+        """An event for each closed generation, and with `progress` one for the open batch if it has new scores."""
+        if not self._run.settings.is_external:
+            return []
+        found = [batch for number in closed if (batch := self._journal.batch_of(number)) is not None]
+        events = [self._event(batch, batch.population) for batch in found]
+        generation = self._run.generation
+        batch = self._journal.batch_of(generation.number) if progress and generation.population else None
+        if batch is not None:
+            *_, done = self._page(batch, 0)
+            if (batch.id, done) != self._announced:
+                self._announced = batch.id, done
+                events.append(self._event(batch, done))
+        return events
+
+    def _event(self, batch: StoredBatch, done: int) -> BatchEvent:
+        return BatchEvent(v=keys.PROTOCOL_VERSION, run=self._name, incarnation=self._run.incarnation, id=batch.id,
+                          state=batch.state, done=done, population=batch.population)  # fmt: skip
+
+    def _find(self, get: Parameters) -> StoredBatch:
+        batch_id = check_batch_id(get("id") or "")
+        batch = self._journal.batch(batch_id)
+        if batch is None:
+            raise BatchError("unknown", f"run {self._name} has no batch {batch_id}: submit it")
+        return batch
+
+    def _submit(self, header: BatchHeader, offset: int, data: bytes, now: float) -> BatchReply:
+        """Take a part of a batch; the last missing one makes the batch wait to be scored.
+
+        R30: an id names one content, so a repeated submission changes nothing.
+        """
+        stored = self._journal.batch(header.id)
+        if stored is not None:
+            if stored.content != header.content:
+                raise BatchError(
+                    "conflict",
+                    f"batch {header.id} was submitted with other vectors or seeds: choose another id, such as a random "
+                    "one",
+                )
+            return self._describe(stored, 0)
+        self._check(header)
+        body = self._assemble(header, offset, data, now)
+        if body is None:
+            return replace(self._head(), id=header.id, state="uploading", population=header.population)
+        return self._accept(header, body)
+
+    def _check(self, header: BatchHeader) -> None:
+        """R31: what waits is bounded, and a refused batch leaves its id free."""
+        size = self._run.settings.controller.size
+        if header.size != size:
+            raise BatchError(
+                "malformed",
+                f"the vectors have {plural(header.size, 'number')}, and a candidate of run {self._name} has {size}",
+            )
+        header.check_episodes(self._episodes(header))
+        count, waiting = self._journal.waiting_batches()
+        if count >= MAX_WAITING or waiting + header.total > MAX_WAITING_SIZE:
+            raise BatchError("busy", f"{plural(count, 'batch', 'batches')} wait already: submit it again later")
+
+    def _episodes(self, header: BatchHeader) -> int:
+        return header.seeds or header.episodes or self._run.settings.episodes
+
+    def _assemble(self, header: BatchHeader, offset: int, data: bytes, now: float) -> bytes | None:
+        """The whole body, once all its parts are here."""
+        key, sha256 = hashlib.sha256(header.id.encode() + header.content).digest(), bytes.fromhex(header.sha256)
+        if offset % MAX_PART or len(data) != min(MAX_PART, header.total - offset) or not data:
+            raise BatchError(
+                "malformed",
+                f"a part begins at a multiple of {MAX_PART} and has {MAX_PART} bytes, or those that are left",
+            )
+        before = self._uploads.dropped.copy()
+        part = UploadPart(run_uid=self._run.uid, incarnation=self._run.incarnation, digest=key, sha256=sha256,
+                          offset=offset, total=header.total, data=data)  # fmt: skip
+        self._uploads.add(header.id, part, now)
+        body = self._uploads.get_complete(header.id, key, sha256)
+        if body is not None:
+            self._uploads.forget(key)
+        elif dropped := self._uploads.dropped - before:
+            if "too many uploads" in dropped:
+                raise BatchError("busy", "too many batches are being sent at once: submit it again later")
+            raise BatchError("malformed", "the body has another SHA-256 than sha256 says: submit it again")
+        return body
+
+    def _accept(self, header: BatchHeader, body: bytes) -> BatchReply:
+        vectors = body[8 * header.seeds :]
+        seeds: Sequence[int] = unpack_seeds(header, body)
+        check_vectors(vectors, header.size)
+        if not seeds:
+            first, number = self._run.settings.seed, self._journal.batch_count()
+            seeds = [training_seed(first, number, each) for each in range(self._episodes(header))]
+        self._journal.add_batch(header.id, header.content, seeds, header.population, vectors)
+        batch = self._journal.batch(header.id)
+        assert batch is not None
+        return replace(self._describe(batch, 0), is_new=True)
+
+    def _cancel(self, batch: StoredBatch) -> BatchReply:
+        """Cancel a batch that waits or is being scored; a finished one stays as it is."""
+        if batch.state not in FINAL:
+            self._journal.cancel_batch(batch.id)
+            if batch.generation is not None:
+                self._run.cancel_generation()
+        return self._describe(self._journal.batch(batch.id) or batch, 0)
+
+    def _describe(self, batch: StoredBatch, offset: int) -> BatchReply:
+        fitness, errors, done = self._page(batch, offset)
+        return replace(
+            self._head(), id=batch.id, state=batch.state, population=batch.population, episodes=len(batch.seeds),
+            done=done, generation=batch.generation, offset=offset, **_fit(fitness, errors, offset),
+        )  # fmt: skip
+
+    def _page(self, batch: StoredBatch, offset: int) -> tuple[list[float | None], dict[int, str], int]:
+        """Fitness from `offset` on, why some candidates have none, and how many candidates are done."""
+        generations, generation = self._run.generations, self._run.generation
+        limit = min(PAGE_CANDIDATES, max(batch.population - offset, 0))
+        if batch.generation is None:
+            if batch.state != "cancelled":
+                return [None] * limit, {}, 0
+            return [None] * limit, dict.fromkeys(range(offset, offset + limit), CANCELLED), batch.population
+        if batch.generation != generation.number:
+            fitness = self._journal.fitness_page(batch.generation, offset, limit)
+            return fitness, dict(batch.errors), batch.population
+        assert isinstance(generations, ExternalGenerations)
+        scores = generation.candidate_scores()
+        is_done = [done == wanted for done, wanted in zip(scores.done, scores.wanted, strict=True)]
+        page = slice(offset, offset + limit)
+        columns = zip(scores.fitness[page], is_done[page], strict=True)
+        fitness = [value if done else None for value, done in columns]
+        failed = [each for each in generation.failed if offset <= each < offset + limit]
+        for each in failed:
+            fitness[each - offset] = None
+        return fitness, generations.find_errors(generation, failed) if failed else {}, sum(is_done)
+
+    def _head(self) -> BatchReply:
+        run = self._run
+        why = truncate(run.paused or run.stalled or "", 1000)
+        return BatchReply(v=keys.PROTOCOL_VERSION, run=self._name, size=run.settings.controller.size,
+                          run_state=run.state, run_why=why)  # fmt: skip
+
+
+def _fit(fitness: Sequence[float | None], errors: Mapping[int, str], offset: int) -> dict[str, Any]:
+    """As much of a page as fits into a reply, one candidate at least."""
+    left, kept, named = PAGE_BYTES, 0, []
+    for index, value in enumerate(fitness, offset):
+        found = None if index not in errors else CandidateError(index, truncate(errors[index], LONGEST_ERROR))
+        left -= len(repr(value)) + 2 + (0 if found is None else 40 + len(json.dumps(found.error)))
+        if left < 0 and kept:
+            break
+        kept += 1
+        if found is not None:
+            named.append(found)
+    return {"fitness": tuple(fitness[:kept]), "errors": tuple(named)}

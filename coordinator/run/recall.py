@@ -1,0 +1,104 @@
+"""Rewinding a run: what barred hosts brought is taken back, and the run goes on from the first generation with any.
+
+A check finds a host wrong (R32), or the operator names it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from contextlib import closing
+from pathlib import Path
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.printable import plural, printable
+from dreamfleet.common.runs.records import RunSettings
+from dreamfleet.common.runs.run_lock import run_lock
+from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL
+from dreamfleet.common.runs.scoring_params import ScheduleState
+from dreamfleet.coordinator.dispatch.failures import host_of
+from dreamfleet.coordinator.jobs.history import History
+from dreamfleet.coordinator.run.generations import Generations
+from dreamfleet.coordinator.storage.journal import Journal
+from dreamfleet.coordinator.storage.verification_records import StoredBar
+
+BAR_BY_OPERATOR = StoredBar("the operator says so", by_operator=True)
+
+
+def recall(journal: Journal, settings: RunSettings, hosts: Collection[str]) -> str:
+    """Take back what these hosts brought; what was done, in words. Nothing is durable before the journal's commit.
+
+    R33: the first generation with a result of theirs opens again with the other hosts' results, and later ones are
+    dropped, because their candidates follow from a wrong state of the strategy. The strategy's state is computed again
+    from the fitness that the journal holds of the generations before.
+    """
+    if settings.is_external:
+        return f"{plural(journal.recall_results(hosts), 'result')} of {', '.join(sorted(hosts))} recalled; what was " \
+               "handed out of complete batches stays"  # fmt: skip
+    closed, evaluations = journal.read_closed()
+    first = _first_affected(journal.first_brought(hosts), settings)
+    words = f"{plural(journal.recall_results(hosts), 'result')} of {', '.join(sorted(hosts))} recalled"
+    last = journal.last_generation()
+    if last is None or first is None or first > last.number:
+        return words
+    finished = {each.generation: each for each in evaluations}
+    replayed = Generations(journal, settings, ScheduleState(settings), History(closed), finished)
+    stored = journal.generation(first)  # only of the last two
+    state = replayed.replay(first) if stored is None else stored.state
+    journal.rewind(first, state, replayed.first_seeds(first))
+    return f"{words}: the run goes on from generation {first}" + (f" (of {last.number})" if last.number > first else "")
+
+
+def _first_affected(brought: dict[str, int], settings: RunSettings) -> int | None:
+    """The first generation that would be another; `None` if no candidate depends on what was brought.
+
+    An evaluation decides about candidates only where a stage ends at a score, and from the next generation on.
+    """
+    found = [brought["score"]] if "score" in brought else []
+    is_decided = settings.heat != 1 or any(each.score is not None for each in settings.stages)
+    if "evaluate" in brought and is_decided:
+        found.append(brought["evaluate"] + 1)
+    return min(found, default=None)
+
+
+def find_bar_problem(host: str, barred: Collection[str], known: Collection[str], *, is_barred: bool) -> str:
+    """Why the operator cannot bar a host, or with `is_barred` false let it in again; empty if nothing is in the way.
+
+    `known` are the hosts that scored or are here: a misspelt name is none of them.
+    """
+    if (host in barred) == is_barred:
+        return f"host {printable(host)} is {'barred already' if is_barred else 'not barred'}"
+    if is_barred and host not in known:
+        there = ", ".join(sorted(known)) or "none"
+        return f"no worker of host {printable(host)} scored in this run or is here: there are {there}"
+    return ""
+
+
+def bar_stored(folder: Path, host: str, *, is_barred: bool) -> str:
+    """Bar a host from the run in `folder`, which nobody serves, or let it in again; what was done, in words.
+
+    R33: what it brought is taken back, so an ended run is open again. `UsageError` if the run is served, or if there is
+    nothing to do.
+    """
+    with run_lock(folder), closing(Journal(folder / JOURNAL)) as journal:
+        known = {*map(host_of, journal.workers(recalled=True))}
+        if problem := find_bar_problem(host, journal.barred(), known, is_barred=is_barred):
+            raise UsageError(problem)
+        incarnation = journal.begin_incarnation()
+        if is_barred:
+            journal.bar(host, BAR_BY_OPERATOR, incarnation)
+            words = recall(journal, RunSettings.from_json(journal.fact("settings") or ""), {host})
+            text = f"host {printable(host)} is barred from this run: {BAR_BY_OPERATOR.why}; {words}"
+        else:
+            journal.unbar(host)
+            text = unbar_words(host)
+        journal.add_event(text)
+        journal.end_incarnation()
+        journal.commit()
+        if is_barred:  # the reported controller follows from what was recalled; a resumed run writes it again
+            (folder / CONTROLLER).unlink(missing_ok=True)
+    return text
+
+
+def unbar_words(host: str) -> str:
+    """That the operator lets a host in again."""
+    return f"host {printable(host)} may join this run again: the operator says so"

@@ -1,0 +1,50 @@
+"""Queries about batches, answered by the service's thread once the journal has committed what they changed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import zenoh
+
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.batches import BatchReply
+from dreamfleet.common.protocol.codec import encode_json
+from dreamfleet.coordinator.run.batches import Batches
+
+PROGRESS_INTERVAL = 0.1  # seconds between two events about the open batch
+
+
+class BatchQueries:
+    """Holds the replies of `batches` back until `send`."""
+
+    def __init__(self, batches: Batches, name: str) -> None:
+        self._batches = batches
+        self._name = name
+        self._replies: list[tuple[zenoh.Query, BatchReply]] = []
+        self._progress_at = 0.0
+
+    def handle(self, query: zenoh.Query, now: float) -> None:
+        """Do what a query says; its reply waits."""
+        key = str(query.key_expr)
+        verb = key.rsplit("/", 1)[-1]
+        payload = query.payload.to_bytes() if query.payload is not None else b""
+        reply = self._batches.answer(verb if key == keys.batch(self._name, verb) else key, query.parameters.get,
+                                     payload, now)  # fmt: skip
+        self._replies.append((query, reply))
+
+    def send(self, session: zenoh.Session, closed: Iterable[int], now: float, *, durable: bool) -> None:
+        """Reply, and publish what changed, if the journal is `durable`; else drop the queries, which are repeated.
+
+        R29: nobody hears of a batch or a score that is not on disk, so no crash takes back what an answer said.
+        """
+        self._batches.tick(now)
+        replies, self._replies = self._replies, []
+        for query, reply in replies:
+            with query:
+                if durable:
+                    query.reply(query.key_expr, encode_json(reply), encoding="application/json")
+        if durable:
+            progress = now - self._progress_at >= PROGRESS_INTERVAL
+            self._progress_at = now if progress else self._progress_at
+            for event in self._batches.take_events(closed, progress=progress):
+                session.put(keys.event_batch(self._name), encode_json(event), encoding="application/json")

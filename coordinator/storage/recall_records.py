@@ -1,0 +1,178 @@
+"""Taking back in a journal what barred hosts brought, and what followed from it."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Collection, Sequence
+from math import nan
+from time import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.runs.effort import Effort
+from dreamfleet.common.runs.run_folder import CONFIRMED, ENDED_AT, ENDING
+from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
+from dreamfleet.coordinator.storage.batch_records import MOST_VARIABLES
+from dreamfleet.coordinator.storage.verification_records import VerificationRecords
+
+BARRED, REWOUND = "barred", "rewound"  # why a result does not count: its host is barred, or its generation was dropped
+COLUMNS = (
+    "digest, kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, fingerprint, incarnation, "
+    "host_class, measures"
+)
+HOST = "substr(worker, 1, instr(worker || '/', '/') - 1)"
+
+
+class RecallRecords(VerificationRecords):
+    """Takes results back, and rewinds to an earlier generation; nothing is durable before the caller's commit.
+
+    What is taken back stays in the table `recalled`. Results of honest hosts in dropped generations count again once a
+    generation wants the same jobs, unless their host is barred later: a job's digest names its content (R1).
+    """
+
+    _effort: Effort | None  # of every result, once somebody asked
+    _counted: Counter[tuple[str, str]] | None  # results by class and fingerprint, likewise
+    _has_set_aside: bool | None = None  # whether `recalled` may hold results that could count again
+
+    def first_brought(self, hosts: Collection[str]) -> dict[str, int]:
+        """The first generation to which these hosts brought a result or a lasting failure, by kind."""
+        marks = ", ".join("?" * len(hosts))
+        query = f"SELECT kind, min(generation) FROM result WHERE {HOST} IN ({marks}) GROUP BY 1"  # noqa: S608
+        first: dict[str, int] = dict(self._read(query, *hosts))
+        for _, kind, generation in self._failures_of(hosts):
+            first[kind] = min(generation, first.get(kind, generation))
+        return first
+
+    def recall_results(self, hosts: Collection[str]) -> int:
+        """Take back all that these hosts brought, and reopen the evaluations that it was part of; returns how much."""
+        marks = ", ".join("?" * len(hosts))
+        reopened = (
+            "UPDATE evaluation SET mean = NULL, std = NULL, failed = 0 WHERE vector IN (SELECT vector FROM evaluation "
+            "WHERE generation IN "
+        )
+        failed = self._failures_of(hosts)
+        mine = f"(SELECT generation FROM result WHERE kind = 'evaluate' AND {HOST} IN ({marks}))"  # noqa: S608
+        self._write(f"{reopened} {mine})", *hosts)
+        self._write_all(f"{reopened} (?))", [(number,) for _, kind, number in failed if kind == "evaluate"])
+        self._write_all("DELETE FROM failure WHERE digest = ?", [(digest,) for digest, *_ in failed])
+        (count,) = self._read_row(f"SELECT count(*) FROM result WHERE {HOST} IN ({marks})", *hosts)  # noqa: S608
+        self._set_aside(BARRED, f"{HOST} IN ({marks})", *hosts)
+        earlier = f"UPDATE recalled SET because = ? WHERE because = ? AND {HOST} IN ({marks})"  # noqa: S608
+        self._write(earlier, BARRED, REWOUND, *hosts)  # of generations that an earlier recall dropped
+        self._write(f"UPDATE verification SET stands = 0 WHERE checker IN ({marks})", *hosts)  # noqa: S608
+        self._settle_recall()
+        return int(count)
+
+    def rewind(self, number: int, state: Checkpoint | bytes, seeds: Sequence[int]) -> None:
+        """Open generation `number` again as it was first asked for, and drop what came after it.
+
+        `state` is the strategy's before that `ask`. Results of the generation itself stay.
+        """
+        self._set_aside(REWOUND, "generation > ? OR (generation = ? AND kind != 'score')", number, number)
+        self._write("DELETE FROM failure WHERE generation > ? OR (generation = ? AND kind != 'score')", number, number)
+        for table in ("evaluation", "collection"):
+            self._write(f"DELETE FROM {table} WHERE generation >= ?", number)  # noqa: S608
+        first = "SELECT vector FROM redraw WHERE redraw.generation = ? AND redraw.candidate = candidate.number"
+        self._write(
+            f"UPDATE candidate SET vector = ({first} ORDER BY round LIMIT 1) WHERE generation = ? "  # noqa: S608
+            f"AND EXISTS ({first})",
+            number, number, number,
+        )  # fmt: skip
+        self._write("DELETE FROM redraw WHERE generation >= ?", number)
+        self._write("DELETE FROM candidate WHERE generation > ?", number)
+        self._write("UPDATE candidate SET fitness = NULL, measures = NULL WHERE generation = ?", number)
+        self._write("DELETE FROM strategy")
+        self._write("DELETE FROM generation WHERE number > ?", number)
+        self._write(
+            "UPDATE generation SET closed = NULL, mean = NULL, std = NULL, best = NULL, worst = NULL, steps = NULL, "
+            "failed = 0, seeds = ? WHERE number = ?",
+            json.dumps(list(seeds)), number,
+        )  # fmt: skip
+        self._write("INSERT INTO strategy (generation, state) VALUES (?, ?)", number, state)
+        self._opened = number
+        self._settle_recall()
+
+    def take_back(self, digests: Sequence[bytes]) -> bool:
+        """Count results of dropped generations again that these jobs want; whether there may have been any."""
+        if self._has_set_aside is None:
+            row = self._read_row("SELECT 1 FROM recalled WHERE because = ? LIMIT 1", REWOUND)
+            self._has_set_aside = row is not None
+        if not self._has_set_aside:
+            return False
+        for start in range(0, len(digests), MOST_VARIABLES):
+            some = digests[start : start + MOST_VARIABLES]
+            where = f"because = ? AND digest IN ({', '.join('?' * len(some))})"
+            self._write(
+                f"INSERT OR IGNORE INTO result ({COLUMNS}) SELECT {COLUMNS} FROM recalled WHERE {where}",  # noqa: S608
+                REWOUND, *some,
+            )  # fmt: skip
+            self._write(f"DELETE FROM recalled WHERE {where}", REWOUND, *some)  # noqa: S608
+        standing = (
+            "UPDATE verification SET stands = 1 WHERE digest = ? AND outcome = 'equal' "
+            "AND digest IN (SELECT digest FROM result)"
+        )
+        self._write_all(standing, [(each,) for each in digests])
+        self._effort = self._counted = None
+        return True
+
+    def recalled_rollouts(self) -> list[tuple[int, int]]:
+        """Generation and episode of the rollouts that count no more, and that were not collected again."""
+        query = (
+            "SELECT DISTINCT generation, episode FROM recalled WHERE kind = 'collect' "
+            "EXCEPT SELECT generation, episode FROM result WHERE kind = 'collect'"
+        )
+        return [(int(generation), int(episode)) for generation, episode in self._read(query)]
+
+    def vectors_of(self, number: int) -> tuple[bytes, ...]:
+        """The population of a generation, the latest vectors of candidates that were drawn anew."""
+        rows = self._read("SELECT vector FROM candidate WHERE generation = ? ORDER BY number", number)
+        return tuple(vector for (vector,) in rows)
+
+    def redraws_of(self, number: int) -> list[list[int]]:
+        """The candidates of a generation that were drawn anew, by round."""
+        rounds: dict[int, list[int]] = {}
+        query = "SELECT round, candidate FROM redraw WHERE generation = ? ORDER BY round, candidate"
+        for each, candidate in self._read(query, number):
+            rounds.setdefault(each, []).append(candidate)
+        return list(rounds.values())
+
+    def seeds_of(self, number: int) -> list[int]:
+        """The seeds of a generation."""
+        (seeds,) = self._read_row("SELECT seeds FROM generation WHERE number = ?", number)
+        return list(json.loads(seeds))
+
+    def scores_of(self, number: int, axes: int) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+        """Fitness of a closed generation, as the strategy took it, and measures if it has `axes` of them."""
+        query = "SELECT fitness, measures FROM candidate WHERE generation = ? ORDER BY number"
+        rows = self._read(query, number)
+        fitness = np.array([nan if each is None else each for each, _ in rows], dtype=np.float64)
+        if not axes:
+            return fitness, None
+        return fitness, np.array([[nan] * axes if each is None else json.loads(each) for _, each in rows])
+
+    def _failures_of(self, hosts: Collection[str]) -> list[tuple[bytes, str, int]]:
+        """Digest, kind and generation of the lasting failures to which any of these hosts contributed."""
+        rows = self._read("SELECT digest, kind, generation, workers FROM failure")
+        return [
+            (digest, kind, generation)
+            for digest, kind, generation, workers in rows
+            if set(hosts) & {each.partition("/")[0] for each in workers.split(",")}
+        ]
+
+    def _set_aside(self, because: str, where: str, *values: object) -> None:
+        """Move results into the table of those that do not count."""
+        self._write(
+            f"INSERT INTO recalled ({COLUMNS}, because, happened) SELECT {COLUMNS}, '{because}', ? "  # noqa: S608
+            f"FROM result WHERE {where}",
+            time(), *values,
+        )  # fmt: skip
+        self._write(f"DELETE FROM result WHERE {where}", *values)  # noqa: S608
+
+    def _settle_recall(self) -> None:
+        """Let checks of results that do not count any more stand no longer, and no end or confirmation follow."""
+        self._write("UPDATE verification SET stands = 0 WHERE digest NOT IN (SELECT digest FROM result)")
+        for fact in (ENDING, "ended", ENDED_AT, CONFIRMED):
+            self.drop_fact(fact)
+        self._effort = self._counted = self._has_set_aside = None

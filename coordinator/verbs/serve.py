@@ -1,0 +1,32 @@
+"""`dreamfleet serve`: batches over HTTP, for searches in any language."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from dreamfleet.common.cli.config import add_flags, load
+from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
+from dreamfleet.coordinator.bridge.config import BridgeConfig
+
+SUMMARY = "let a search in any language score batches over HTTP"
+EXTRAS = ("dashboard",)
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    add_global_flags(parser, "connect")
+    add_flags(parser, BridgeConfig)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve until Ctrl-C."""
+    config = load(BridgeConfig, "serve", **args.sources)
+    from dreamfleet.coordinator.bridge.server import serve
+
+    serve(config, resolve_network(args, "operator", "coordinator"), _print_address)
+    return 0
+
+
+def _print_address(address: str) -> None:
+    print(f"the bridge is at {address}", file=sys.stderr, flush=True)

@@ -1,0 +1,35 @@
+import os
+
+import pytest
+
+from dreamfleet.common.artifacts.bundle_store import default_cache
+from dreamfleet.common.security.anchor_key import BYTES, anchor_proof, is_proof, make_anchor_key
+
+
+@pytest.fixture
+def path():
+    default_cache().mkdir(parents=True, exist_ok=True)
+    return default_cache() / "anchor.key"
+
+
+def test_a_worker_of_the_same_user_and_folder_proves_it(path):
+    key = make_anchor_key()
+    assert is_proof(key, "w/1", anchor_proof("w/1"))
+    assert not is_proof(key, "w/2", anchor_proof("w/1"))
+    assert make_anchor_key() == key
+
+
+@pytest.mark.parametrize("mode", [0o644, 0o640, 0o604])
+def test_a_key_that_others_may_read_proves_nothing(path, mode):
+    path.write_bytes(b"k" * BYTES)
+    path.chmod(mode)
+    assert make_anchor_key() == b""
+    assert anchor_proof("w/1") == ""
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
+def test_a_key_of_another_user_proves_nothing(path):
+    path.write_bytes(b"k" * BYTES)
+    path.chmod(0o600)
+    os.chown(path, 65534, 65534)
+    assert make_anchor_key() == b""

@@ -1,0 +1,172 @@
+"""Searching a function's minimum on processes of this host."""
+
+import numpy as np
+import pytest
+
+import dreamfleet
+from dreamfleet.common.errors import UsageError
+from dreamfleet.coordinator.experiments import minimise as module
+from dreamfleet.coordinator.experiments.search_arguments import read_bounds, read_objective
+from tests.support import objectives
+
+FEW = {"workers": 1, "popsize": 8}
+
+
+def test_it_finds_the_minimum_and_the_run_can_be_read(tmp_path):
+    seen = []
+    found = dreamfleet.minimise(
+        objectives.sphere, [0, 3], 0.5, bounds=[(None, 5), (0, 4)], ftarget=1e-6, callback=seen.append,
+        run="mine", runs_dir=tmp_path, **FEW,
+    )  # fmt: skip
+    assert found.success
+    assert found.message.startswith("reached ftarget")
+    assert found.fun == objectives.sphere(found.x) <= 1e-6
+    assert found.history == tuple(seen)
+    assert [each.fun for each in seen] == sorted((each.fun for each in seen), reverse=True)
+    with dreamfleet.open_run(found.run, tmp_path) as run:
+        assert found.nfev == run.result_count() >= 8 * found.nit
+        assert -run.history()[-1].best == objectives.sphere(found.xbest) >= found.fun
+        assert run.spec.horizon == 1
+
+
+def test_a_noisy_function_gives_the_mean_that_was_judged(tmp_path):
+    found = dreamfleet.minimise(
+        objectives.noisy, [1, 1], 0.3, generations=6, evaluate_every=3, evaluation_episodes=4, confirm_episodes=4,
+        runs_dir=tmp_path, **FEW,
+    )  # fmt: skip
+    assert np.array_equal(found.x, found.xfavorite)
+    assert not np.array_equal(found.x, found.xbest)
+    assert found.message == "6 generations"
+
+
+def test_a_noisy_search_has_no_more_calls_than_maxfevals(tmp_path):
+    found = dreamfleet.minimise(objectives.noisy, [1, 1], 0.3, maxfevals=400, run="mine", runs_dir=tmp_path, **FEW)
+    assert found.message == "maxfevals=400 is reached"
+    with dreamfleet.open_run("mine", tmp_path) as run:
+        generation = run.settings.population * run.settings.episodes
+        assert len(run.evaluations()) > 1
+        assert run.confirmation() is not None
+        assert 400 - 2 * generation - run.settings.evaluation_episodes < found.nfev == run.result_count() <= 400
+
+
+def test_restarts_are_runs_of_larger_populations_and_share_the_budget(tmp_path):
+    found = dreamfleet.maximise(
+        objectives.sphere, [0, 0], 1.0, bounds=(-2, 2), maxfevals=60, restarts=3, generations=2, runs_dir=tmp_path,
+        run="mine", **FEW,
+    )  # fmt: skip
+    assert found.runs == ("mine", "mine-restart-1", "mine-restart-2")
+    sizes = []
+    for name in found.runs:
+        with dreamfleet.open_run(name, tmp_path) as run:
+            sizes.append((run.settings.population, len(run.history())))
+    assert sizes == [(8, 2), (16, 2), (32, 1)]
+    assert found.fun == max(each.fun for each in found.history) > 2
+
+
+def test_a_function_that_varies_without_a_seed_is_warned_of(tmp_path):
+    with pytest.warns(RuntimeWarning, match="not deterministic.* second parameter `seed`"):
+        dreamfleet.minimise(objectives.varying, [0, 0], 1.0, generations=1, runs_dir=tmp_path, **FEW)
+
+
+def test_failed_candidates_are_tried_in_a_fresh_process_and_said_once(tmp_path):
+    with pytest.warns(RuntimeWarning, match="holed returned nan") as warned:
+        found = dreamfleet.minimise(
+            objectives.holed, [1, 1], 1.0, generations=4, run="mine", runs_dir=tmp_path, **FEW
+        )  # fmt: skip
+    assert [each.filename for each in warned] == [__file__]
+    with dreamfleet.open_run("mine", tmp_path) as run:
+        failed, failures = sum(each.failed for each in run.history()), run.failures()
+    assert len(failures) == failed > 1
+    assert {each.attempts for each in failures} == {2}  # what a process did before may be the reason
+    says = f"{failed} candidates failed, first: holed returned nan"
+    assert found.message.startswith(f"4 generations; {says}")
+    assert says in (tmp_path / "mine" / "coordinator.log").read_text()
+
+
+def test_a_search_without_any_value_ends_with_its_first_failure(tmp_path):
+    with pytest.raises(UsageError, match="no candidate has a value, first: narrow raised ZeroDivisionError"):
+        dreamfleet.minimise(objectives.narrow, [0, 0], 30.0, runs_dir=tmp_path, **FEW)
+
+
+def test_a_search_that_loses_all_values_returns_what_it_found(tmp_path, monkeypatch):
+    lost = tmp_path / "lost"
+    monkeypatch.setenv("LOST", str(lost))
+    with pytest.warns(RuntimeWarning, match="losing returned nan"):
+        found = dreamfleet.minimise(
+            objectives.losing, [0, 0], 1.0, callback=lambda _: lost.touch(), runs_dir=tmp_path / "runs", **FEW
+        )
+    assert found.fun == found.history[-1].fun
+    assert f"all candidates of generation {found.nit} failed; " in found.message
+    assert "failed, first: losing returned nan" in found.message
+
+
+def test_a_callback_ends_the_search(tmp_path):
+    def stop(progress):
+        if progress.generation == 1:
+            raise StopIteration
+
+    found = dreamfleet.minimise(objectives.sphere, [0, 0], 1.0, callback=stop, restarts=2, runs_dir=tmp_path, **FEW)
+    assert (found.nit, found.message, found.success) == (2, "stopped by the callback", False)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"bounds": [(0, 1)]}, "a pair"),
+        ({"bounds": (3, 4)}, "outside of its bounds"),
+        ({"restart": "cma"}, "'ipop' or 'bipop'"),
+        ({"sigma0": 0}, "sigma0 must be above 0"),
+        ({"sigma0": None}, "sigma0 is missing.* parameter 0 has none"),
+        ({"bounds": (0.2, 0.8), "x0": [0.5, 0.5], "integer": True}, "no whole number is within"),
+        ({"nothing": 3}, "unknown setting 'nothing'"),
+        ({"budget": 3}, "unknown setting 'budget': did you mean 'maxfevals'?"),
+        ({"evaluations": 3}, "did you mean 'maxfevals'?"),
+        ({"maxiter": 3}, "did you mean 'generations'?"),
+        ({"maxfun": 3}, "did you mean 'maxfevals'?"),
+        ({"n_calls": 3}, "did you mean 'maxfevals'?"),
+        ({"sigma": 3}, "did you mean 'sigma0'?"),
+        ({"n_jobs": 3}, "did you mean 'workers'?"),
+        ({"tol": 3}, "'ftarget' ends it by a value"),
+        ({"disp": True}, "`callback=print` prints each generation"),
+        ({"seed": "x"}, "seed must be a whole number, not 'x'"),
+        ({"function": objectives.raising}, "raising raised ZeroDivisionError"),
+        ({"function": "tests.support.objectives:nowhere"}, "no function nowhere"),
+    ],
+)
+def test_what_cannot_be_searched_is_said_before_a_run_exists(change, says, tmp_path):
+    given = {"function": objectives.sphere, "x0": [0, 0], "sigma0": 1.0, "runs_dir": tmp_path, **FEW, **change}
+    with pytest.raises(UsageError, match=says):
+        dreamfleet.minimise(given.pop("function"), given.pop("x0"), given.pop("sigma0"), **given)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_first_step_is_a_share_of_the_range_where_bounds_are_finite():
+    given = {"integer": (), "log": [1]}
+    found = read_objective([1, 1], None, [(0, 10), (np.exp(-1), np.exp(1))], given)
+    assert found.scale == pytest.approx((3.0, 0.6))
+    with pytest.raises(UsageError, match="parameter 1 has none"):
+        read_objective([1, 1], None, [(0, 10), (0, None)], given)
+
+
+def test_bounds_are_scipys_or_one_pair():
+    class Bounds:
+        lb, ub = np.array([0.0, -np.inf]), np.array([1.0, 2.0])
+
+    assert read_bounds(Bounds(), 2) == ([0.0, None], [1.0, 2.0])
+    assert read_bounds((0, None), 2) == ([0.0, 0.0], [None, None])
+    assert read_bounds([(0, 1), (2, 3)], 2) == ([0.0, 2.0], [1.0, 3.0])
+    assert read_bounds(None, 2) == (None, None)
+
+
+def test_bipop_alternates_large_populations_and_small_ones_of_as_many_calls():
+    objective = module.Objective.of({"x0": [0.0]})
+    searches = module._Searches(module.FunctionName("function:m:f", None), objective, False, None, None, None, 1, None)
+    plans = []
+    for plan in searches._plans(8, 1, 6, "bipop"):
+        plans.append(plan)
+        searches._calls += plan.popsize * 10 if not plan.calls else min(plan.calls, plan.popsize * 10)
+    assert [each.popsize for each in plans[:2]] == [8, 16]
+    assert len({each.seed for each in plans}) == 7
+    small = [each for each in plans if each.calls]
+    assert small
+    assert all(each.sigma < 1 for each in small)

@@ -1,0 +1,234 @@
+"""Submitted batches without a transport: parts in any order, ids, bounds, restarts anywhere, cancels."""
+
+import hashlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.protocol.batches import MAX_BATCH, BatchError, BatchHeader, BatchReply, pack_batch
+from dreamfleet.common.protocol.codec import encode_json
+from dreamfleet.common.protocol.messages import MAX_MESSAGE, MAX_PART, Result
+from dreamfleet.common.runs.records import RunSettings
+from dreamfleet.coordinator.run import batches as batches_module
+from dreamfleet.coordinator.run.batches import Batches
+from dreamfleet.coordinator.run.run import Run
+from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
+from dreamfleet.coordinator.storage.journal import Journal
+from tests.support.samples import SPEC
+
+SHAPE = ControllerShape(1, 3)
+SIZE = SHAPE.size
+SETTINGS = RunSettings(
+    SPEC, SHAPE, 2, 2, 0.1, "diagonal", 1, evaluate_every=0, evaluation_episodes=1, optimiser="external",
+    on_failure="worst",
+)  # fmt: skip
+
+
+class Door:
+    """A run in a folder and the queries to it; the test itself is the worker."""
+
+    def __init__(self, path):
+        self.path, self.now, self.scored = path, 0.0, []
+        path.mkdir(parents=True)
+        self.journal = Journal.create(path, SETTINGS, None)
+        self.begin()
+
+    def begin(self):
+        self.run = Run(self.journal, SETTINGS, LimitsConfig(), NetworkConfig(), self.now)
+        self.batches = Batches(self.run, self.journal, "search")
+        self.step()
+
+    def restart(self):
+        """Lose what is not committed."""
+        self.journal.close()
+        self.journal = Journal(self.path / "journal.sqlite")
+        self.begin()
+
+    def step(self):
+        self.run.advance(self.now)
+        assert self.run.commit()
+
+    def query(self, verb, payload=b"", **parameters) -> BatchReply:
+        texts = {name: str(value) for name, value in parameters.items()}
+        reply = self.batches.answer(verb, texts.get, payload, self.now)
+        assert len(encode_json(reply)) <= MAX_MESSAGE
+        return reply
+
+    def submit(self, batch_id, count=2, seeds=(1, 2), first=0.0, **changes):
+        header, body = pack_batch(batch_id, vectors(count, first), seeds or None, changes.pop("episodes", 0))
+        return self.send(replace(header, **changes), body)
+
+    def send(self, header, body, order=None):
+        offsets = range(0, len(body), MAX_PART)
+        for place in order or range(len(offsets)):
+            part = body[offsets[place] : offsets[place] + MAX_PART]
+            reply = self.query("submit", part, **vars(header), offset=offsets[place])
+        return reply
+
+    def work(self, most=10**9):
+        """Score wanted jobs of the open generation: the sum of the vector plus the seed."""
+        for work in self.run.generation.missing[:most]:
+            fitness = float(np.frombuffer(work.vector, "<f4").sum()) + work.job.seeds[0]
+            self.scored.append(work.job.digest)
+            self.run.fleet.withdraw([work.job.digest])
+            self.run.record_result(work, Result(work.job.digest, fitness, 7, 0.1, None, None), "a/1", "f", "c")
+        self.step()
+
+
+def vectors(count, first=0.0):
+    return first + np.arange(count * SIZE, dtype=np.float32).reshape(count, SIZE)
+
+
+@pytest.fixture
+def door(tmp_path):
+    return Door(tmp_path / "search")
+
+
+def test_a_batch_waits_is_scored_and_is_read(door):
+    assert door.run.state == "waiting for workers"
+    reply = door.submit("a")
+    assert (reply.state, reply.is_new, reply.population, reply.episodes) == ("waiting", True, 2, 2)
+    door.step()
+    assert door.query("read", id="a").state == "running"
+    door.work(3)
+    reply = door.query("read", id="a")
+    assert (reply.done, reply.fitness[1]) == (1, None)
+    door.work()
+    reply = door.query("read", id="a")
+    expected = vectors(2).sum(axis=1) + 1.5
+    assert (reply.state, reply.done, reply.generation) == ("complete", 2, 0)
+    assert reply.fitness == tuple(expected.tolist())
+    assert door.submit("a") == replace(reply, is_new=False)
+    assert door.run.history.last.mean == expected.mean()
+
+
+def test_batches_are_listed_open_ones_first(door):
+    for each in "abcd":
+        door.submit(each, first=ord(each))
+    door.step()
+    assert door.run.generations.open_batches == 4
+    door.work()
+    door.query("cancel", id="c")
+    listed = [(each.id, each.state, each.generation) for each in door.query("list").batches]
+    assert listed == [("b", "running", 1), ("d", "waiting", None), ("c", "cancelled", None), ("a", "complete", 0)]
+    assert door.run.generations.open_batches == 2
+
+
+def test_parts_arrive_in_any_order_and_again(door):
+    header, body = pack_batch("large", vectors(2000), [1])
+    order = [*range(len(range(0, len(body), MAX_PART)))]
+    assert len(order) > 1
+    reply = door.send(header, body, [order[-1], *order[:-1][::-1], order[0]])
+    assert reply.state == "waiting"
+    door.step()
+    assert [len(each.vector) for each in door.run.generation.missing] == [4 * SIZE] * 2000
+    damaged, wrong = pack_batch("damaged", vectors(1), [1])
+    assert door.send(damaged, wrong[:-1] + b"\x7f").refused == "malformed"
+    assert door.send(damaged, wrong).state == "waiting"
+
+
+def test_an_id_names_one_content_and_a_refused_batch_leaves_it_free(door):
+    door.submit("a")
+    for other in ({"first": 1.0}, {"seeds": (1, 3)}, {"seeds": (), "episodes": 2}, {"count": 3}):
+        assert door.submit("a", **other).refused == "conflict"
+    assert door.submit("b", size=SIZE + 1).refused == "malformed"
+    header, body = pack_batch("b", vectors(1), [1])
+    spoilt = body[:8] + np.full(SIZE, np.nan, "<f4").tobytes()
+    assert door.send(pack_header("b", 1, spoilt), spoilt).refused == "malformed"
+    negative = np.array([-1], "<i8").tobytes() + body[8:]
+    assert door.send(pack_header("b", 1, negative), negative).refused == "malformed"
+    assert door.send(header, body).is_new
+    for verb, name, refused in (("read", "c", "unknown"), ("cancel", "c", "unknown"), ("read", "a/b", "malformed"),
+                                ("steal", "a", "malformed")):  # fmt: skip
+        assert door.query(verb, id=name).refused == refused
+    assert door.query("read", id="a", offset="x").refused == "malformed"
+    assert door.query("read", id="a", offset=10**9).fitness == ()
+
+
+def pack_header(batch_id, seeds, body):
+    population = (len(body) - 8 * seeds) // 4 // SIZE
+    return BatchHeader(batch_id, population, SIZE, seeds, 0, hashlib.sha256(body).hexdigest())
+
+
+def test_what_waits_is_bounded(door, monkeypatch):
+    monkeypatch.setattr(batches_module, "MAX_WAITING", 3)
+    door.submit("open")
+    door.step()
+    assert [door.submit(f"w{each}").refused for each in range(4)] == ["", "", "", "busy"]
+    assert door.submit("w0").state == "waiting"  # known ones are found all the same
+    with pytest.raises(BatchError, match="split it"):
+        BatchHeader("large", MAX_BATCH, 2, 0, 1, 64 * "0")
+    for _ in range(200):  # uploads that never end
+        header, _ = pack_batch(f"half-{_}", vectors(3000, _), [1])
+        door.query("submit", bytes(MAX_PART), **vars(header), offset=0)
+    assert door.query("submit", bytes(MAX_PART), **vars(header), offset=0).refused == "busy"
+    door.now += 61.0
+    door.batches.tick(door.now)
+
+
+def test_a_job_of_two_batches_is_scored_once(door):
+    door.submit("a")
+    door.submit("b", count=3, seeds=(2, 3))  # shares two jobs with it
+    door.step()
+    door.work()
+    door.work()
+    assert len(door.scored) == len(set(door.scored)) == 4 + 4
+    assert [each.steps for each in door.run.history.rows] == [4 * 7, 4 * 7]
+    assert door.query("read", id="b").fitness == tuple((vectors(3).sum(axis=1) + 2.5).tolist())
+
+
+@pytest.mark.parametrize("done", range(9))
+def test_a_restart_anywhere_loses_no_batch_and_no_score(door, done):
+    door.submit("a", count=2)
+    door.submit("b", count=2, first=9.0)
+    door.step()
+    for _ in range(done):
+        door.work(1)
+    door.restart()
+    while door.run.generation.population:
+        door.work(1)
+    assert len(door.scored) == len(set(door.scored)) == 8
+    assert door.query("read", id="a").fitness == tuple((vectors(2).sum(axis=1) + 1.5).tolist())
+    assert door.query("read", id="b").fitness == tuple((vectors(2, 9.0).sum(axis=1) + 1.5).tolist())
+    assert door.run.generations.mean == bytes(4 * SIZE)
+    assert door.run.background_jobs.report.current is None
+
+
+def test_what_was_not_committed_is_submitted_again(door):
+    door.submit("a")
+    door.restart()
+    assert door.query("read", id="a").refused == "unknown"
+    assert door.submit("a").is_new
+
+
+@pytest.mark.parametrize("is_killed", [False, True])
+def test_a_cancelled_batch_keeps_its_scores(door, is_killed):
+    door.submit("a", count=3)
+    door.submit("b")
+    door.submit("c", first=5.0)
+    door.step()
+    door.work(2)
+    assert door.query("cancel", id="b").state == "cancelled"
+    assert door.query("cancel", id="a").state == "cancelled"
+    if is_killed:
+        door.run.commit()
+        door.restart()
+    door.step()
+    reply = door.query("read", id="a")
+    assert (reply.done, reply.fitness[1:]) == (3, (None, None))
+    assert [(each.candidate, each.error) for each in reply.errors] == [(1, "cancelled"), (2, "cancelled")]
+    assert door.run.generation.number == 1
+    door.work()
+    assert door.query("cancel", id="c").state == "complete"
+    assert door.submit("b").state == "cancelled"
+
+
+def test_fresh_seeds_differ_from_batch_to_batch(door):
+    first, second, third = (
+        door.submit(each, seeds=(), episodes=number) for each, number in (("a", 3), ("b", 3), ("c", 0))
+    )
+    assert (first.episodes, second.episodes, third.episodes) == (3, 3, SETTINGS.episodes)
+    seeds = [door.journal.batch(each).seeds for each in "abc"]
+    assert len({each for some in seeds for each in some}) == 8

@@ -1,0 +1,60 @@
+"""R8: only suspects are open, and no scored job is left that could show whether a new host can score."""
+
+from dataclasses import replace
+
+import pytest
+
+from dreamfleet.common.protocol.messages import Result
+from dreamfleet.coordinator.run.recall import recall
+from tests.coordinator.run.test_failures import SETTINGS, Failing
+from tests.coordinator.run.test_run import A, B
+
+NEW = "new/1"
+
+
+def serve_alone(bench, name, until):
+    """Let one host score until a generation is open; the other is gone."""
+    for other in [each for each in bench.run.fleet.members if each != name]:
+        bench.run.fleet.remove_worker(other)
+    bench.hosts = [name]
+    bench.run.admission.admit(bench.request(name), bench.now)
+    bench.serve(stop=lambda run: run.generation.number == until)
+
+
+@pytest.fixture
+def left(tmp_path, random_bundle):
+    """The host of generation 0 lost two workers with all jobs of generation 1, whose former scores were recalled."""
+    settings = replace(SETTINGS, population=2, episodes=1)
+    bench = Failing(tmp_path / "night", random_bundle.path, settings, fails=lambda job: False)
+    serve_alone(bench, A, 1)
+    serve_alone(bench, B, 2)
+    recall(bench.journal, settings, {"b"})
+    bench.journal.commit()
+    bench.restart()
+    bench.run.fleet.remove_worker(B)
+    for life in (A, "a/00000009"):
+        bench.run.admission.admit(bench.request(life), bench.now)
+        bench.handle_heartbeat(life, host_class=bench.host_class)
+        assert len(bench.run.fleet.dispatch(bench.now)[0].content.work) == 2
+        bench.run.fleet.handle_departure(life, bench.now)
+        bench.now += 1.0
+        bench.run.tick(bench.now)
+        bench.run.advance(bench.now)
+    assert all(each.is_suspect for each in bench.run.fleet.jobs.values())
+    bench.hosts = [NEW]
+    bench.run.admission.admit(bench.request(NEW), bench.now)
+    yield bench
+    bench.journal.close()
+
+
+def test_a_new_host_gets_the_suspects_when_the_only_host_that_has_scored_is_gone(left):
+    left.serve()
+    assert left.run.ended
+    assert [each.failed for each in left.run.history.rows] == [0, 0, 0]
+
+
+def test_a_new_host_that_fails_them_all_pauses_the_run(left):
+    left.answer_one = lambda name, job: left.deliver(name, Result(job.digest, None, 0, 0.1, "OSError: sick", None))
+    left.serve()
+    assert "no present host has ever scored" in left.run.paused
+    assert left.run.generation.failed == []

@@ -1,0 +1,191 @@
+"""A run that is taken back to an earlier generation, in a real journal and with real optimisers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.run_paths import CONTROLLER
+from dreamfleet.common.runs.scoring_params import ScheduleState
+from dreamfleet.common.runs.stages import stages_of
+from dreamfleet.coordinator.jobs.history import History
+from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
+from dreamfleet.coordinator.run.generations import Generations
+from dreamfleet.coordinator.run.recall import bar_stored, recall
+from dreamfleet.coordinator.storage.journal import Journal
+from tests.coordinator.run.test_failures import GENERATIONS, SETTINGS, Failing
+from tests.coordinator.run.test_run import B, Bench, result_of
+
+OPTIMISERS = ["cma", "full", "cmaes-lra", "openes", "pepg", "snes", "xnes"]
+
+
+def settings_of(optimiser):
+    named = {"covariance": "full"} if optimiser == "full" else {"optimiser": optimiser}
+    return replace(SETTINGS, evaluate_every=1, evaluation_episodes=2, **named)
+
+
+def ended(path, bundle, settings, fails=lambda job: False):
+    bench = Failing(path / "run", bundle, settings, fails=fails)
+    bench.serve()
+    assert bench.run.ended
+    return bench
+
+
+def outcome(bench):
+    with RunFolder(bench.path) as run:
+        vectors = [run.candidate(each, 0).tolist() for each in range(GENERATIONS + 1)]
+        return [replace(each, seconds=0.0) for each in run.history()], run.evaluations(), vectors
+
+
+def new_generations(bench):
+    closed, evaluations = bench.journal.read_closed()
+    finished = {each.generation: each for each in evaluations}
+    return Generations(bench.journal, bench.settings, ScheduleState(bench.settings), History(closed), finished)
+
+
+def next_population(settings, state):
+    evolution = Evolution(EvolutionConfig.of(settings, stages_of(settings)[0]))
+    evolution.restore(state)
+    return evolution.ask()
+
+
+@pytest.mark.parametrize("optimiser", OPTIMISERS)
+def test_a_replayed_strategy_asks_for_what_the_stored_one_asks_for(tmp_path, random_bundle, optimiser):
+    bench = ended(tmp_path, random_bundle.path, settings_of(optimiser))
+    for number in (GENERATIONS - 1, GENERATIONS):
+        stored = bench.journal.generation(number).state
+        replayed = new_generations(bench).replay(number).packed()
+        asked = [next_population(bench.settings, state) for state in (stored, replayed)]
+        np.testing.assert_array_equal(*asked)
+
+
+@pytest.mark.parametrize("optimiser", OPTIMISERS)
+def test_a_run_of_which_all_is_recalled_comes_to_the_same(tmp_path, random_bundle, optimiser):
+    bench = ended(tmp_path, random_bundle.path, settings_of(optimiser))
+    before = outcome(bench)
+    words = recall(bench.journal, bench.settings, {"a"})
+    assert "the run goes on from generation 0" in words
+    bench.journal.commit()
+    bench.restart()
+    assert bench.run.generation.number < GENERATIONS
+    bench.serve()
+    assert bench.run.ended
+    assert outcome(bench) == before
+
+
+def test_candidates_that_were_drawn_anew_are_drawn_anew_again(tmp_path, random_bundle):
+    settings = replace(settings_of("cma"), on_failure="redraw")
+    bench = ended(tmp_path, random_bundle.path, settings, lambda job: job.kind == "score" and job.digest[0] % 8 == 0)
+    before = outcome(bench)
+    recall(bench.journal, bench.settings, {"b"})
+    bench.journal.commit()
+    bench.restart()
+    bench.serve()
+    assert bench.run.ended
+    assert outcome(bench) == before
+
+
+def test_what_other_hosts_scored_in_dropped_generations_is_not_scored_again(tmp_path, random_bundle):
+    bench = ended(tmp_path, random_bundle.path, settings_of("cma"))
+    mine = {digest for (digest,) in bench.journal._read("SELECT digest FROM result WHERE worker LIKE 'b/%'")}
+    recall(bench.journal, bench.settings, {"a"})
+    bench.journal.commit()
+    aside = {digest for (digest,) in bench.journal._read("SELECT digest FROM recalled WHERE because = 'rewound'")}
+    assert aside
+    assert aside <= mine
+    bench.restart()
+    bench.serve()
+    assert bench.run.ended
+    again = "SELECT digest FROM result WHERE worker LIKE 'b/%' AND incarnation = 1"
+    assert {digest for (digest,) in bench.journal._read(again)} == mine
+
+
+def test_what_a_host_brought_to_dropped_generations_counts_no_more_once_it_is_barred(tmp_path, random_bundle):
+    bench = ended(tmp_path, random_bundle.path, settings_of("cma"))
+    before = outcome(bench)
+    for host in ("a", "b"):
+        recall(bench.journal, bench.settings, {host})
+    bench.journal.commit()
+    assert set(bench.journal._read("SELECT because FROM recalled")) == {("barred",)}
+    bench.restart()
+    bench.serve()
+    assert bench.run.ended
+    assert not bench.journal._read("SELECT 1 FROM result WHERE incarnation = 1")
+    assert outcome(bench) == before
+
+
+def test_a_journal_of_another_host_is_not_rewound(tmp_path, random_bundle):
+    bench = ended(tmp_path, random_bundle.path, settings_of("cma"))
+    bench.journal._write("UPDATE candidate SET vector = ? WHERE generation = 0 AND number = 0", bytes(24))
+    with pytest.raises(JournalError, match="cannot be rewound"):
+        new_generations(bench).replay(2)
+
+
+def test_files_of_recalled_rollouts_are_removed_and_those_that_are_collected_again_stay(tmp_path, random_bundle):
+    bench = Bench(tmp_path / "run", random_bundle.path)
+
+    def collect():
+        for name, job in bench.reach_collection():
+            for part in bench.parts(job):
+                bench.upload(name, part)
+            bench.deliver(name, result_of(job))
+        assert bench.run.ended
+        with RunFolder(bench.path) as run:
+            return run.rollouts()
+
+    files = collect()
+    whole = [path.read_bytes() for path in files]
+    recall(bench.journal, bench.settings, {"a"})
+    bench.journal.commit()
+    assert all(path.exists() for path in files)
+    bench.restart()
+    assert not any(path.exists() for path in files)
+    assert collect() == files
+    assert [path.read_bytes() for path in files] == whole
+    bench.restart()
+    assert all(path.exists() for path in files)
+    bench.journal.close()
+
+
+def test_a_host_is_barred_from_a_run_that_has_ended_and_comes_again(tmp_path, random_bundle):
+    bench = ended(tmp_path, random_bundle.path, settings_of("cma"))
+    before = outcome(bench)
+    bench.journal.close()
+    with pytest.raises(UsageError, match="no worker of host c scored in this run or is here: there are a, b"):
+        bar_stored(bench.path, "c", is_barred=True)
+    with pytest.raises(UsageError, match="host a is not barred"):
+        bar_stored(bench.path, "a", is_barred=False)
+    assert "the run goes on from generation 0" in bar_stored(bench.path, "a", is_barred=True)
+    with RunFolder(bench.path) as run:
+        assert run.ended is None
+        assert (run.checks.barred, run.checks.by_operator) == (("a",), ("a",))
+        assert run.checks.recalled > 0
+    bench.journal = Journal(bench.path / "journal.sqlite")
+    bench.hosts = [B]
+    bench.begin()
+    bench.serve()
+    assert outcome(bench) == before
+    assert {worker for (worker,) in bench.journal._read("SELECT DISTINCT worker FROM result")} == {B}
+    bench.journal.close()
+    bar_stored(bench.path, "a", is_barred=False)
+    with RunFolder(bench.path) as run:
+        assert (run.checks.barred, run.checks.by_operator) == ((), ())
+        assert "may join this run again" in run.events()[-2].text
+
+
+def test_of_an_external_run_complete_batches_stay_and_what_the_host_brought_is_known_no_more(tmp_path, random_bundle):
+    settings = replace(SETTINGS, optimiser="external", evaluate_every=0)
+    journal = Journal.create(tmp_path, settings, random_bundle.path)
+    journal.begin_incarnation()
+    assert "handed out of complete batches stays" in recall(journal, settings, {"a"})
+    journal.close()
+
+
+def test_a_barred_run_has_no_reported_controller_until_it_goes_on(tmp_path, random_bundle):
+    bench = ended(tmp_path, random_bundle.path, settings_of("cma"))
+    bench.journal.close()
+    (bench.path / CONTROLLER).write_bytes(b"of what the host brought")
+    bar_stored(bench.path, "a", is_barred=True)
+    assert not (bench.path / CONTROLLER).exists()

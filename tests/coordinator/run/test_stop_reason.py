@@ -1,0 +1,57 @@
+"""Limits that read the candidates' fitness: a target of one candidate, and generations without a better one."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+from dreamfleet.common.artifacts.objective import Objective
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.runs.records import StoredGeneration
+from dreamfleet.coordinator.jobs.history import History
+from dreamfleet.coordinator.run.stop_reason import find_stop_reason
+from dreamfleet.coordinator.settings.config import LimitsConfig
+from tests.support.samples import SPEC
+
+NO_JOBS = SimpleNamespace(evaluations=SimpleNamespace(best=None))
+OPEN = SimpleNamespace(is_one_point=False, number=9)
+
+
+def reason(limits, *best, task="gym:CartPole-v1", options=""):
+    rows = (StoredGeneration(number, each - 1, 1.0, each, each - 2, 0.1, 10, 1.0) for number, each in enumerate(best))
+    return find_stop_reason(limits, History(rows), NO_JOBS, OPEN, replace(SPEC, task=task, options=options))
+
+
+def test_a_run_ends_when_a_candidate_reaches_the_target():
+    assert reason(LimitsConfig(candidate_target=3.0), 1, 2.9) is None
+    assert reason(LimitsConfig(candidate_target=3.0), 1, 3, 2) == "a candidate reached 3.0"
+    assert reason(LimitsConfig(candidate_target=0.0), -1e-13, 0.0) == "a candidate reached 0.0"
+
+
+def test_a_run_ends_after_so_many_generations_without_a_better_candidate():
+    limits = LimitsConfig(stagnation=3)
+    assert reason(limits) is None
+    assert reason(limits, 1, 2, 1, 2) is None
+    assert reason(limits, 1, 2, 1, 2, 2) == "no candidate beat generation 1's best for 3 generations"
+    assert reason(limits, 1, 2, 1, 2, 2.5) is None
+    creeping = [1 + 1e-12 * number for number in range(20)]
+    assert reason(limits, *creeping[:4]) is not None, "less than any use"
+    assert reason(limits, *(1 + 4e-12 * number for number in range(20))) is None, "but many small steps count"
+
+
+def test_a_functions_steps_are_its_evaluations():
+    assert reason(LimitsConfig(steps=20), 1, 2) == "20 environment steps"
+    assert reason(LimitsConfig(steps=20), 1, 2, task="function:mine:cost") == "20 evaluations"
+
+
+def test_a_minimised_functions_target_is_told_as_its_value():
+    options = Objective.of({"x0": [0.0], "minimise": True}).options
+    assert reason(LimitsConfig(candidate_target=-0.5), -2, -0.25, task="function:mine:cost", options=options) == (
+        "a candidate reached 0.25"
+    )
+
+
+@pytest.mark.parametrize("wrong", [{"stagnation": -1}, {"candidate_target": float("nan")}])
+def test_what_is_no_limit_is_refused(wrong):
+    with pytest.raises(UsageError):
+        LimitsConfig(**wrong)

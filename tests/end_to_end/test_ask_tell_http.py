@@ -1,0 +1,265 @@
+"""Batches over HTTP: the bridge's answers to good and bad requests, and to connections that stop."""
+
+import base64
+import json
+import math
+import re
+import socket
+import threading
+import urllib.error
+import urllib.request
+
+import pytest
+
+from tests.support import tasks
+from tests.support.access import begin as begin_secured
+from tests.support.batches import begin, count_results, resume, vectors
+from tests.support.processes import DEADLINE
+
+TOKEN = "0123456789abcdef0123456789abcdef"
+
+
+class Bridge:
+    """A bridge in a process of its own, and requests to it."""
+
+    def __init__(self, processes, *more, token=None):
+        self.process = processes.start("serve", "--connect", processes.endpoint, "--port", 0, *more)
+        self.process.wait_for("the bridge is at")
+        self.address = "".join(self.process.lines).split("the bridge is at ")[1].split()[0]
+        self.port = int(self.address.rpartition(":")[2])
+        self.token = token
+
+    def ask(self, method, path, body=None, **headers):
+        """Status and parsed body of an answer."""
+        data = body if body is None or isinstance(body, bytes) else json.dumps(body).encode()
+        named = {"Content-Type": "application/json"} if data is not None else {}
+        if self.token:
+            named["Authorization"] = f"Bearer {self.token}"
+        request = urllib.request.Request(self.address + path, data, {**named, **headers}, method=method)
+        try:
+            with urllib.request.urlopen(request, timeout=DEADLINE) as answer:
+                return answer.status, json.loads(answer.read())
+        except urllib.error.HTTPError as error:
+            with error:
+                return error.code, json.loads(error.read())
+
+    def submit(self, body, run="test", **headers):
+        return self.ask("POST", f"/v1/runs/{run}/batches", body, **headers)
+
+    def batch(self, name, run="test"):
+        return self.ask("GET", f"/v1/runs/{run}/batches/{name}")
+
+    def events(self, name, run="test"):
+        """Yield kind and data of a batch's events."""
+        named = {"Authorization": f"Bearer {self.token}"} if self.token else {}
+        request = urllib.request.Request(f"{self.address}/v1/runs/{run}/batches/{name}/events", headers=named)
+        with urllib.request.urlopen(request, timeout=DEADLINE) as answer:
+            kind = None
+            for line in answer:
+                name, _, value = line.decode().rstrip("\n").partition(": ")
+                if name == "event":
+                    kind = value
+                elif name == "data":
+                    yield kind, json.loads(value)
+
+
+@pytest.fixture
+def bridge(processes, random_bundle):
+    begin(processes, random_bundle)
+    processes.worker("--task", tasks.TOY)
+    return Bridge(processes)
+
+
+def rows(count, first=0.0):
+    return vectors(count, first).tolist()
+
+
+def test_a_batch_is_submitted_followed_read_and_kept(processes, bridge):
+    assert bridge.ask("GET", "/v1/health")[1]["status"] == "ok"
+    [run] = bridge.ask("GET", "/v1/runs")[1]["runs"]
+    assert (run["run"], run["external"], run["size"]) == ("test", True, 867)
+    wanted = {"id": "a", "vectors": rows(3), "seeds": [1, 2]}
+    status, made = bridge.submit(wanted)
+    assert (status, made["population"], made["episodes"]) == (201, 3, 2)
+    events = list(bridge.events("a"))
+    assert [kind for kind, _ in events] == ["candidate"] * 3 + ["end"]
+    assert events[-1][1]["state"] == "complete"
+    status, found = bridge.batch("a")
+    assert status == 200
+    assert found["fitness"] == [each["fitness"] for _, each in sorted(events[:3], key=lambda each: each[1]["index"])]
+    assert all(map(math.isfinite, found["fitness"]))
+    again = {**made, "state": "complete", "done": 3, "generation": 0, "run_state": "waiting for a batch"}
+    assert bridge.submit(wanted) == (200, again)
+    assert bridge.ask("DELETE", "/v1/runs/test/batches/a")[1]["state"] == "complete"
+    assert bridge.submit({"id": "a", "vectors": rows(3), "seeds": [1, 3]})[0] == 409
+    assert count_results(processes)[0] == 6
+    packed = {"float32": base64.b64encode(vectors(3).tobytes()).decode(), "size": 867}
+    assert bridge.submit({"id": "b", "vectors": packed, "seeds": [1, 2]})[0] == 201
+    assert bridge.submit({"id": "b", "vectors": rows(3), "seeds": [1, 2]})[0] == 200  # the same content
+    assert [*bridge.events("b")][-1][1]["done"] == 3
+    assert bridge.batch("b")[1]["fitness"] == found["fitness"]
+    assert count_results(processes)[0] == 6
+    listed = bridge.ask("GET", "/v1/runs/test/batches")[1]["batches"]
+    assert [(each["id"], each["state"], each["population"]) for each in listed] == [
+        ("b", "complete", 3), ("a", "complete", 3),
+    ]  # fmt: skip
+    status, drawn = bridge.submit({"vectors": rows(2)})
+    assert status == 201
+    assert drawn["id"]
+
+
+def test_bad_requests_are_refused_with_a_reason_and_lose_nothing(bridge):
+    def refused(wanted, body, text="", **headers):
+        status, answer = bridge.submit(body, **headers)
+        assert status == wanted, answer
+        assert text in answer["text"]
+
+    good = {"id": "b", "vectors": rows(1), "seeds": [1]}
+    refused(400, b"{", "not JSON")
+    refused(400, b"[" * 100_000, "not JSON")
+    refused(400, b"\xff\xfe", "not JSON")
+    refused(400, b'{"vectors": [[NaN]]}', "NaN is not a number in JSON")
+    refused(400, [], "a JSON object")
+    refused(400, {**good, "vectors": []}, "at least 1")
+    refused(400, {**good, "vectors": [[1.0] * 12]}, "have 12 numbers, and a candidate of run test has 867")
+    refused(400, {**good, "vectors": [["a"] * 867]}, "rows of numbers")
+    refused(400, {**good, "vectors": [[1e39] * 867]}, "not finite")
+    refused(400, {**good, "vectors": "a"}, "list of rows")
+    for wrong in ({"float32": "?", "size": 1}, {"float32": "AAAA", "size": 867}, {"float32": "AAAAAA==", "size": "a"},
+                  {"float32": 7, "size": 1}, {"float32": "AAAAAA==", "size": 0}):  # fmt: skip
+        refused(400, {**good, "vectors": wrong}, "float32 must be base64")
+    refused(400, {**good, "vectors": {"float32": "AAAAAA=="}}, "list of rows")
+    refused(400, {**good, "seeds": [-1]}, "seeds are whole numbers")
+    refused(400, {**good, "seeds": "1"}, "seeds must be a list")
+    refused(400, {**good, "episodes": 2}, "not both")
+    refused(400, {**good, "id": "a/b"}, "cannot name a batch")
+    refused(400, {**good, "id": 7}, "id must be a text")
+    refused(400, {**good, "more": 1}, "unknown field 'more'")
+    refused(413, {**good, "vectors": [[0] * 1000] * 10_000}, "split it into smaller batches")
+    refused(413, b" " * (65 << 20), "split the batch")
+    refused(415, good, "Content-Type: application/json", **{"Content-Type": "text/plain"})
+    assert bridge.submit(good, run="nobody")[0] == 404
+    assert bridge.submit(good, run="NO")[0] == 400
+    assert bridge.batch("other")[0] == 404
+    assert bridge.ask("GET", "/v1/runs/test/batches/other/events")[0] == 404
+    assert bridge.ask("DELETE", "/v1/runs/test/batches/other")[0] == 404
+    assert bridge.ask("PUT", "/v1/runs/test/batches", {})[0] == 405
+    assert bridge.ask("GET", "/v2")[0] == 404
+    assert bridge.submit(good, Host="evil.example")[0] == 421
+    assert bridge.submit(good, **{"Sec-Fetch-Site": "cross-site"})[0] == 403
+    assert bridge.submit(good)[0] == 201  # none of these took its id
+
+
+@pytest.mark.slow  # a silent connection is kept for a minute
+def test_garbage_and_half_open_connections_hold_nobody_up(bridge):
+    def connect(data):
+        made = socket.create_connection(("127.0.0.1", bridge.port), timeout=DEADLINE)
+        made.sendall(data)
+        return made
+
+    head = b"POST /v1/runs/test/batches HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\n"
+    stalled = [
+        connect(head + b"Content-Length: 1000\r\n\r\n{"),
+        connect(head),
+        connect(b""),
+        connect(b"\x16\x03\x01\xff"),
+    ]
+    broken = connect(head + b"Content-Length: 1000\r\n\r\n{")
+    broken.close()
+    assert bridge.submit({"id": "a", "vectors": rows(1), "seeds": [1]})[0] == 201
+    assert [kind for kind, _ in bridge.events("a")][-1] == "end"
+    answers = []
+    for each in stalled:  # each is closed from the other side, in time
+        received = b""
+        while part := each.recv(4096):
+            received += part
+        answers.append(received.split(b"\r\n")[0])
+        each.close()
+    assert b"408" in answers[0]
+    assert b"400" in answers[3]
+    assert bridge.batch("a")[1]["state"] == "complete"
+
+
+def test_a_token_is_needed_where_there_is_one(processes, random_bundle, tmp_path):
+    begin(processes, random_bundle)
+    file = tmp_path / "tokens"
+    file.write_text(f"# for tests\n{TOKEN}\n{TOKEN[::-1]}\n")
+    code, _, err = processes.call("serve", "--connect", processes.endpoint, "--token-file", file, "--port", 0)
+    assert code == 2
+    assert "chmod 600" in err
+    file.chmod(0o600)
+    assert processes.call("serve", "--host", "0.0.0.0")[0] == 2
+    bridge = Bridge(processes, "--token-file", file)
+    for wrong in (None, TOKEN[:-1], TOKEN + "0", "x"):
+        bridge.token = wrong
+        for method, path in (("GET", "/v1/runs"), ("GET", "/openapi.json"), ("POST", "/v1/runs/test/batches"),
+                             ("GET", "/v1/runs/test/batches/a"), ("DELETE", "/v1/runs/test/batches/a"),
+                             ("GET", "/v1/runs/test/batches/a/events")):  # fmt: skip
+            assert bridge.ask(method, path)[0] == 401
+        assert bridge.ask("GET", "/v1/health")[0] == 200
+    for right in (TOKEN, TOKEN[::-1]):
+        bridge.token = right
+        assert bridge.ask("GET", "/v1/runs")[0] == 200
+
+
+def test_the_description_fits_the_answers(bridge):
+    status, described = bridge.ask("GET", "/openapi.json")
+    assert status == 200
+    assert described["openapi"] == "3.1.0"
+    schemas = described["components"]["schemas"]
+
+    named = re.findall(r"#/components/schemas/(\w+)", json.dumps(described))
+    assert set(named) | {"Submission"} == schemas.keys()
+    bridge.submit({"id": "a", "vectors": rows(1), "seeds": [1]})
+    assert bridge.batch("a")[1].keys() == schemas["Scores"]["properties"].keys()
+    assert bridge.ask("GET", "/v1/runs")[1]["runs"][0].keys() == schemas["Run"]["properties"].keys()
+
+
+@pytest.mark.slow
+def test_a_killed_coordinator_answers_503_and_its_batches_go_on(processes, random_bundle):
+    coordinator = begin(processes, random_bundle, task=tasks.SLOW_TOY)
+    processes.worker("--task", tasks.SLOW_TOY)
+    bridge = Bridge(processes)
+    wanted = {"id": "mine", "vectors": rows(12), "seeds": [1, 2]}
+    assert bridge.submit(wanted)[0] == 201
+    events = bridge.events("mine")
+    first = next(events)
+    coordinator.end()
+    assert bridge.submit(wanted)[0] == 503
+    resume(processes)
+    found = [first, *events]
+    assert sorted(each["index"] for kind, each in found if kind == "candidate") == [*range(12)]
+    assert found[-1][0] == "end"
+    assert bridge.submit(wanted)[0] == 200
+    assert count_results(processes) == (24, 240)
+
+
+@pytest.mark.slow
+def test_a_secured_fleet_needs_an_operators_file(processes, access, endpoint, random_bundle):
+    begin_secured(processes, access, endpoint, random_bundle, "--optimiser", "external")
+    processes.start("worker", "--join", access.path("first"), "--connect", endpoint, "--run", "safe", "--slots", 1,
+                    "--task", tasks.SLOW_TOY)  # fmt: skip
+    for who in ("viewer", "second"):
+        code, _, err = processes.call("serve", "--join", access.path(who), "--connect", endpoint, "--port", 0)
+        assert code == 1
+        assert "this needs operator" in err
+    processes.endpoint = endpoint
+    bridge = Bridge(processes, "--join", access.path("operator"))
+    assert bridge.submit({"id": "a", "vectors": rows(2), "seeds": [1]}, run="safe")[0] == 201
+    assert [*bridge.events("a", run="safe")][-1][1]["state"] == "complete"
+
+
+@pytest.mark.slow
+def test_many_callers_at_once(processes, bridge):
+    def search(name):
+        for turn in range(5):
+            assert bridge.submit({"id": f"{name}-{turn}", "vectors": rows(4, float(name)), "seeds": [1]})[0] == 201
+            assert [*bridge.events(f"{name}-{turn}")][-1][1]["state"] == "complete"
+
+    threads = [threading.Thread(target=search, args=(each,)) for each in range(4)]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join()
+    assert bridge.ask("GET", "/v1/runs")[1]["runs"][0]["state"] in ("waiting for a batch", "running")
+    assert count_results(processes)[0] == 16

@@ -1,0 +1,207 @@
+"""A share of the results is scored again on another host: who lies, or whose memory fails, is barred and recalled."""
+
+import signal
+import sqlite3
+from contextlib import closing
+
+import pytest
+
+from dreamfleet.common.runs.run_folder import open_run
+from tests.support.lying_tasks import FLIPS, LIES, WATCHED
+from tests.support.processes import DEADLINE, ROOT
+
+
+@pytest.fixture
+def settings(random_bundle):
+    return ("--bundle", random_bundle.path, "--task", WATCHED, "--population", 8, "--episodes", 2,
+            "--evaluate-every", 2, "--evaluation-episodes", 4, "--generations", 5)  # fmt: skip
+
+
+DYING = """
+import os, signal
+from dreamfleet.coordinator.run.run import Run
+from dreamfleet.coordinator.storage.journal import Journal
+
+recall, commit = Journal.recall_results, Run.commit
+
+def dies_before(self, hosts):
+    recall(self, hosts)
+    self.flush()
+    os.kill(os.getpid(), signal.SIGKILL)
+
+def dies_after(self):
+    done = commit(self)
+    if self.is_rewound:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return done
+
+if os.environ["DIES"] == "before":
+    Journal.recall_results = dies_before
+else:
+    Run.commit = dies_after
+"""  # Python imports it as `sitecustomize` before the verb begins
+
+
+def worker(processes, name, set_there=()):
+    inside = ("env", *(f"{key}={value}" for key, value in dict(set_there).items())) if set_there else ()
+    return processes.worker("--task", WATCHED, "--name", name, inside=inside)
+
+
+def gathered(processes, coordinator, **hosts):
+    """Workers on these hosts, which begin to score at one moment; what is set there makes a host lie."""
+    assert processes.call("pause", "--connect", processes.endpoint)[0] == 0
+    started = {name: worker(processes, name, set_there) for name, set_there in hosts.items()}
+    coordinator.wait_for(" joined", times=len(hosts))
+    assert processes.call("resume", "--connect", processes.endpoint)[0] == 0
+    return started
+
+
+def outcome(processes, name):
+    """All that a run came to, whoever scored it."""
+    with open_run(processes.runs, name) as run:
+        history = [(each.number, each.mean, each.best, each.sigma, each.steps) for each in run.history()]
+        return history, run.evaluations(), run.confirmation()
+
+
+@pytest.fixture
+def honest(processes, settings):
+    """What the run comes to on one honest host."""
+    coordinator = processes.coordinator(*settings, name="honest")
+    with_it = worker(processes, "alone")
+    assert coordinator.finish()[0] == 0
+    with_it.end()
+    return outcome(processes, "honest")
+
+
+def query(processes, text):
+    with closing(sqlite3.connect(processes.runs / "test" / "journal.sqlite")) as connection:
+        return connection.execute(text).fetchall()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("set_there", [{LIES: 0.5}, {FLIPS: 16}], ids=["a liar", "bad memory"])
+def test_a_host_whose_results_differ_is_barred_and_the_run_has_the_bits_of_an_honest_one(
+    processes, settings, honest, set_there
+):
+    coordinator = processes.coordinator(*settings, "--verify", 0.5)
+    workers = gathered(processes, coordinator, own={}, other={}, bad=set_there)
+    assert coordinator.finish()[0] == 0
+    workers["bad"].wait_for("barred from this run")
+    assert outcome(processes, "test") == honest
+    with open_run(processes.runs, "test") as run:
+        checks = run.checks
+    assert checks.barred == ("bad",)
+    assert checks.recalled > 0
+    assert checks.differing > 0
+    assert query(processes, "SELECT count(*) FROM result WHERE worker LIKE 'bad/%'") == [(0,)]
+    _, shown, _ = processes.call("runs", "show", "test", "--runs-dir", processes.runs)
+    assert "barred: bad" in shown
+
+
+@pytest.mark.slow
+def test_the_coordinators_own_host_decides_against_a_single_other_one(processes, settings, honest, tmp_path):
+    """The own host's worker shows the key in the cache folder that it shares with the coordinator."""
+    coordinator = processes.coordinator(*settings, "--verify", 1)
+    gathered(processes, coordinator, own={}, bad={LIES: 0.5, "DREAMFLEET_CACHE": tmp_path / "elsewhere"})
+    coordinator.wait_for("the coordinator's own host confirms that bad is wrong")
+    assert coordinator.finish()[0] == 0
+    assert outcome(processes, "test") == honest
+
+
+@pytest.mark.slow
+def test_two_strangers_that_differ_are_held_until_a_third_host_decides(processes, settings, honest, tmp_path):
+    elsewhere = {"DREAMFLEET_CACHE": tmp_path / "elsewhere"}
+    coordinator = processes.coordinator(*settings, "--verify", 1)
+    gathered(processes, coordinator, good=elsewhere, bad={LIES: 0.5, **elsewhere})
+    coordinator.wait_for("neither gets further jobs until another host of their class scores it")
+    status = processes.status()
+    assert status["state"] == "paused"
+    assert "hosts differ in" in status["why"]
+    worker(processes, "third", elsewhere)
+    assert coordinator.finish()[0] == 0
+    assert outcome(processes, "test") == honest
+    with open_run(processes.runs, "test") as run:
+        assert run.checks.barred == ("bad",)
+
+
+@pytest.mark.slow
+def test_an_honest_fleet_is_checked_and_nobody_is_accused(processes, settings, honest):
+    coordinator = processes.coordinator(*settings, "--verify", 1)
+    gathered(processes, coordinator, own={}, other={})
+    assert coordinator.finish()[0] == 0
+    assert outcome(processes, "test") == honest
+    with open_run(processes.runs, "test") as run:
+        checks = run.checks
+    assert checks.checked > 0
+    assert (checks.differing, checks.recalled, checks.barred) == (0, 0, ())
+
+
+@pytest.mark.slow
+def test_a_host_alone_in_its_class_is_said_to_be_unchecked_and_the_run_ends(processes, settings, honest):
+    coordinator = processes.coordinator(*settings, "--verify", 1)
+    worker(processes, "own")
+    assert coordinator.finish()[0] == 0
+    assert outcome(processes, "test") == honest
+    with open_run(processes.runs, "test") as run:
+        assert run.checks.checked == 0
+        assert "unchecked for want of another host" in run.checks.description
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", ["before", "after"])
+def test_a_coordinator_that_is_killed_amid_a_recall_goes_on_as_if_it_had_not_been(
+    processes, settings, honest, moment, tmp_path
+):
+    """It dies with the recall written and not committed, or committed and not continued."""
+    (tmp_path / "sitecustomize.py").write_text(DYING)
+    inside = "env", f"PYTHONPATH={ROOT}:{tmp_path}", f"DIES={moment}"
+    dying = processes.start(
+        "coordinator", "--run", "test", "--runs-dir", processes.runs, "--listen", processes.endpoint, "--beat", 0.2,
+        *settings, "--verify", 1, inside=inside,
+    )  # fmt: skip
+    dying.wait_for("incarnation")
+    gathered(processes, dying, own={}, other={}, bad={LIES: 0.5})
+    assert dying.popen.wait(DEADLINE) == -signal.SIGKILL
+    recalled = query(processes, "SELECT count(*) FROM recalled") + query(processes, "SELECT count(*) FROM barred")
+    assert (recalled == [(0,), (0,)]) == (moment == "before")
+    again = processes.start("coordinator", "--resume", "test", "--runs-dir", processes.runs)
+    assert again.finish()[0] == 0
+    assert outcome(processes, "test") == honest
+    with open_run(processes.runs, "test") as run:
+        assert run.checks.barred == ("bad",)
+
+
+@pytest.mark.slow
+def test_a_host_that_the_operator_bars_is_recalled_live_and_after_the_end(processes, settings, honest):
+    """Nothing is checked: the operator knows it from elsewhere."""
+    liars = {"bad": {LIES: 0.5}, "worse": {LIES: 0.9}}
+    coordinator = processes.coordinator(*settings, "--generations", 2)
+    first = gathered(processes, coordinator, own={}, **liars)
+    assert coordinator.finish()[0] == 0
+    for each in first.values():
+        each.end()
+    resumed = "coordinator", "--resume", "test", "--runs-dir", processes.runs
+    coordinator = processes.start(*resumed, "--generations", 5)
+    coordinator.wait_for("incarnation")
+    code, out, err = processes.call("bar", "bad", "--connect", processes.endpoint)
+    assert code == 0, err
+    assert "host bad is barred" in out
+    coordinator.wait_for("the run goes on from generation 0")
+    worker(processes, "bad", liars["bad"]).wait_for("barred from this run: the operator says so")
+    gathered(processes, coordinator, own={}, worse=liars["worse"])
+    assert coordinator.finish()[0] == 0
+    assert outcome(processes, "test") != honest
+    where = "test", "--runs-dir", processes.runs, "--connect", processes.endpoint
+    code, _, err = processes.call("bar", "bed", *where)
+    assert code == 2
+    assert "there are bad, own, worse" in err
+    code, out, err = processes.call("bar", "worse", *where)
+    assert code == 0, err
+    assert "dreamfleet coordinator --resume test" in out
+    again = processes.start(*resumed)
+    assert again.finish()[0] == 0
+    assert outcome(processes, "test") == honest
+    _, shown, _ = processes.call("runs", "show", "test", "--runs-dir", processes.runs)
+    assert "barred: bad (by the operator), worse (by the operator)" in shown
+    _, story, _ = processes.call("story", "test", "--journal", "--runs-dir", processes.runs)
+    assert "host worse is barred from this run: the operator says so" in story

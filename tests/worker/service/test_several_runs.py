@@ -1,0 +1,149 @@
+"""A worker that serves several runs side by side."""
+
+from concurrent.futures import wait
+from dataclasses import replace
+
+import pytest
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.service.config import WorkerConfig
+from dreamfleet.worker.service.slot_pool import SlotPool
+from tests.support import tasks
+from tests.support.hand import DEADLINE
+from tests.support.stage import drained, wait_for
+
+
+@pytest.fixture
+def both(stage, cached):
+    """Two runs on one router, and a worker of one slot that serves both."""
+    one = stage.hand(tasks.SLOW_TOY, run="one")
+    two = stage.also(one, tasks.SLOW_TOY, run="two")
+    one.answers = two.answers = True  # or it says hello again while its jobs wait for the other run's
+    made, served = stage.worker(run=None, any=True)
+    one.ready()
+    two.ready()
+    return one, two, made, served
+
+
+def test_it_serves_both_and_each_has_the_whole_worker_while_the_other_idles(both):
+    one = both[0]
+    for hand in both[:2]:
+        hand.send(1, hand.job())
+        assert hand.result(hand.job()).fitness is not None
+        assert hand.beat().capacity == 1, "the run that idles has the slot too, once it has a job"
+    one.send(2, one.job(1), accepted=(one.job(),))
+    assert one.result(one.job(1)).fitness is not None
+
+
+def test_jobs_of_both_share_the_one_slot_and_none_fails(both):
+    one, two, *_ = both
+    jobs = [one.job(episode) for episode in range(3)]
+    one.send(1, *jobs)
+    two.send(1, *jobs)
+    one.beat(lambda beat: len(beat.running) == 1)
+    assert {job.digest for job in jobs} <= one.results(*jobs)
+    assert {job.digest for job in jobs} <= two.results(*jobs)
+
+
+def test_a_run_waits_for_budget_without_counting_as_hung(both, said):
+    one, two, *_ = both
+    job, other = replace(one.job(), stall=0.2), one.job(1)
+    one.send(1, one.job(2), one.job(3))
+    two.send(1, job, other)
+    assert two.result(other).fitness is not None
+    assert not [line for line in drained(said) if "starting another" in line]
+
+
+def test_a_run_whose_coordinator_vanished_holds_up_no_other(both):
+    one, two, *_ = both
+    one.send(1, *(one.job(episode) for episode in range(2)))
+    one.vanish()
+    two.send(1, two.job())
+    assert two.result(two.job()).fitness is not None
+
+
+def test_a_run_that_ends_makes_room_for_the_next(stage, cached):
+    one = stage.hand(run="one")
+    stage.worker(run=None, any=True, runs=1)
+    one.ready()
+    two = stage.also(one, run="two")
+    one.send(1, ended=True)
+    one.leave()
+    two.ready()
+
+
+def test_no_more_than_runs_are_served_at_once(stage, said, cached):
+    first = stage.hand(run="r0")
+    second = stage.also(first, run="r1")
+    stage.worker(run=None, any=True, runs=2)
+    first.ready()
+    second.ready()
+    third = stage.also(first, run="r2")
+    first.send(1, ended=True)
+    first.leave()
+    third.ready()
+    lines = [" ".join(line.split()[:3]) for line in drained(said) if line.startswith(("joined run", "leaving run"))]
+    assert sorted(lines[:2]) == ["joined run r0", "joined run r1"]
+    assert lines[2:] == ["leaving run r0", "joined run r2"]
+
+
+def test_stopped_once_it_drains_every_run(both):
+    one, two, made, served = both
+    one.send(1, one.job())
+    two.send(1, two.job())
+    for hand in (one, two):
+        hand.beat(lambda beat: beat.running or beat.queued)
+    one.beat(lambda beat: beat.running or beat.unacked)
+    made.stop()
+    for hand in (one, two):
+        hand.beat(lambda beat: beat.capacity == 0)
+    one.result(one.job())
+    one.send(2, accepted=(one.job(),))
+    two.send(2, accepted=(two.job(),))
+    assert served.result(DEADLINE) is None
+
+
+def test_stopped_twice_it_leaves_every_run_at_once(both):
+    one, _, made, served = both
+    one.send(1, one.job())
+    one.beat(lambda beat: beat.running)
+    made.stop()
+    made.stop()
+    assert served.result(DEADLINE) is None
+
+
+def test_a_run_that_cannot_be_scored_ends_no_other(stage, said, cached, monkeypatch):
+    """One run's slots cannot start; the worker says why, asks that run later, and serves the other."""
+    bad = stage.hand(tasks.SECOND_TOY, run="bad")
+    good = stage.also(bad, run="good")
+    good.slots = 1
+    real = SlotPool.__init__
+
+    def fails(self, share, spec, *rest, **more):
+        if spec.task == tasks.SECOND_TOY:
+            raise OSError("no room on this device")
+        real(self, share, spec, *rest, **more)
+
+    monkeypatch.setattr(SlotPool, "__init__", fails)
+    _, served = stage.worker(run=None, any=True, announced=(*tasks.ALL, tasks.SECOND_TOY))
+    wait_for(said, "asking again in 15 s")
+    good.ready()
+    good.send(1, good.job())
+    assert good.result(good.job()).fitness is not None
+    assert not wait([served], timeout=0).done
+
+
+def test_children_start_as_jobs_need_them(stage, cached):
+    one = stage.hand(tasks.SECOND_TOY, run="one")
+    one.answers = True
+    made, _ = stage.worker(run=None, any=True, slots=3, announced=(tasks.SECOND_TOY,))
+    assert one.ready().capacity == 3
+    (served,) = made._served
+    assert sum(slot.parked for slot in served.session._slots._slots) == 2
+    one.send(1, *(one.job(episode) for episode in range(12)))
+    one.beat(lambda beat: len(beat.running) > 1)
+
+
+def test_as_many_runs_as_given_are_checked():
+    with pytest.raises(UsageError, match="--runs must be from 1 to 64, not 0"):
+        WorkerConfig(any=True, runs=0)

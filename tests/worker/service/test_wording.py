@@ -1,0 +1,70 @@
+"""What a worker that waits or is refused says."""
+
+import pytest
+
+from dreamfleet.common.host import processes
+from dreamfleet.common.transport.session import Network
+from dreamfleet.worker.service.config import WorkerConfig
+from dreamfleet.worker.service.wording import WAIT_LIMIT, WaitingText, complete_commands
+
+ADDRESS = "tcp/home.example:7447"
+TASK = "start it with `dreamfleet worker --task my:World`, if you trust that"
+
+
+@pytest.fixture(autouse=True)
+def program(monkeypatch):
+    """The program's name in printed commands."""
+    monkeypatch.setattr(processes.sys, "argv", ["dreamfleet"])
+
+
+@pytest.mark.parametrize(
+    ("typed", "whole"),
+    [
+        (("--run", "night", "--connect", ADDRESS), f"--run night --connect {ADDRESS} --task my:World"),
+        (("--task", "a:A", "b:B", "--any"), "--any --task a:A b:B my:World"),
+        (("--task=a:A", "--slots=2"), "--slots=2 --task a:A my:World"),
+        (("--name", "it's"), "--name 'it'\"'\"'s' --task my:World"),
+    ],
+)
+def test_a_refusals_command_has_all_flags_that_were_typed(typed, whole):
+    assert complete_commands(TASK, ("worker", *typed)) == TASK.replace("--task my:World", whole)
+
+
+def test_a_command_that_chooses_a_run_replaces_the_one_that_was_named():
+    text = "choose one with `dreamfleet worker --run day`"
+    assert complete_commands(text, ("worker", "--run", "old", "--join", "f")) == text.replace("--run", "--join f --run")
+
+
+@pytest.mark.parametrize("text", ["nothing to do", "start `dreamfleet worker --task a` `rm -r x`"])
+def test_other_text_stays(text):
+    assert complete_commands(text, ("worker",)).startswith(text[:20])
+    assert complete_commands(text, ()) == text
+
+
+def said(texts, times, **how):
+    return [text for now in times if (text := texts.next(now, **how))]
+
+
+@pytest.mark.parametrize(
+    ("answered", "awaited", "flag"), [(True, "run night", "--connect"), (False, "a coordinator", "--listen")]
+)
+def test_a_waiting_worker_names_the_address_at_once_and_what_to_start_later(answered, awaited, flag):
+    texts = WaitingText(WorkerConfig(run="night"), Network(connect=(ADDRESS,)), 5.0)
+    first, second = said(texts, (5.0, 6.0, 5.0 + WAIT_LIMIT, 500.0), answered=answered)
+    assert first == f"waiting for {awaited} at {ADDRESS}"
+    assert second == (
+        f"no coordinator of run night at {ADDRESS}; tried for 30 s; start one by: dreamfleet coordinator --run night "
+        f"{flag} {ADDRESS}"
+    )
+
+
+def test_a_worker_whose_run_has_ended_says_so_once():
+    texts = WaitingText(WorkerConfig(), Network(connect=(ADDRESS,)), 0.0, "run night ended after 2 generations")
+    (text,) = said(texts, (0.0, 1.0, 500.0), answered=False)
+    assert text == f"run night ended after 2 generations; waiting for the next run at {ADDRESS}"
+
+
+def test_a_worker_that_waits_for_its_run_names_those_that_are_served_there():
+    waiting = WaitingText(WorkerConfig(run="mine"), Network(connect=("tcp/a:1",)), 0.0)
+    said = waiting.next(0.0, answered=True, others=lambda: ["mine", "night"])
+    assert said == "waiting for run mine at tcp/a:1; what is served there: night"

@@ -1,0 +1,146 @@
+"""World models whose encoder and LSTM multiply eight-bit integers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, ENCODER
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.cli.command_line import main
+from dreamfleet.common.errors import BundleError, ControllerError
+from dreamfleet.common.serialization.validation import from_plain
+from dreamfleet.worker.training.eight_bits import write_eight_bit_bundle
+from dreamfleet.worker.training.unbundle import restore_models, unbundle
+from dreamfleet.worker.worldmodel.eight_bits import PIXEL_STEP, Ranges
+from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, PolicyStep
+from dreamfleet.worker.worldmodel.mdnrnn_config import ATTENTIVE, MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+from tests.support.bundles import write_random_bundle
+
+EYES = VAEConfig(latent=4, channels=(4, 6, 8, 8))
+MEMORY = MDNRNNConfig(latent=4, hidden=6)
+
+
+@pytest.fixture
+def whole(tmp_path):
+    return write_random_bundle(tmp_path / "whole.zip", 3, EYES, MEMORY)
+
+
+@pytest.fixture
+def rounded(whole, tmp_path):
+    return write_eight_bit_bundle(whole, tmp_path / "rounded.zip")
+
+
+def pictures(count):
+    return np.random.default_rng(1).integers(0, 256, (count, 64, 64, 3), np.uint8)
+
+
+def convolve(value, kernel, stride):
+    """Integers (N, C, H, W) with a kernel (O, C, K, K), summed in 64 bits."""
+    size = kernel.shape[-1]
+    windows = np.lib.stride_tricks.sliding_window_view(value, (size, size), axis=(2, 3))[:, :, ::stride, ::stride]
+    return np.einsum("nchwij,ocij->nohw", windows.astype(np.int64), kernel.astype(np.int64))
+
+
+def round_rows(kernel):
+    rows = kernel.reshape(len(kernel), -1)
+    steps = (np.abs(rows).max(axis=1) / 63).astype(np.float32)
+    return np.rint(rows / steps[:, None]).astype(np.int64).reshape(kernel.shape), steps
+
+
+def test_the_encoder_sums_integers_exactly(whole, rounded):
+    models, seen = restore_models(whole), pictures(3)
+    ranges = from_plain(Ranges, rounded.manifest.models["eight_bits"])
+    value, step = seen.transpose(0, 3, 1, 2).astype(np.int64), PIXEL_STEP
+    for index, layer in enumerate(EYES.down):
+        kernel, bias = (models.vae[f"encoder.{index * EYES.modules_a_layer}.{part}"] for part in ("weight", "bias"))
+        weights, steps = round_rows(kernel)
+        whole_bias = np.rint(bias / (steps.astype(np.float64) * step)).astype(np.int64)
+        total = convolve(value, weights, layer.stride) + whole_bias[:, None, None]
+        scale = (steps * np.float32(step) / ranges.step_of(index)).astype(np.float32)
+        value = np.clip(np.rint(total.astype(np.float32) * scale[:, None, None]), 0, 255).astype(np.int64)
+        step = ranges.step_of(index)
+    weights, steps = round_rows(models.vae["mu.weight"])
+    scale = (steps.astype(np.float64) * step).astype(np.float32)
+    expected = (value.reshape(3, -1) @ weights.T).astype(np.float32) * scale + models.vae["mu.bias"]
+    assert np.abs(Encoder(rounded).encode(seen)[0] - expected).max() < 1e-6
+
+
+def test_it_sees_and_dreams_nearly_as_before(whole, rounded):
+    seen, rng = pictures(8), np.random.default_rng(2)
+    before, after = (Encoder(each).encode(seen)[0] for each in (whole, rounded))
+    assert np.abs(after - before).max() < 0.05 * np.abs(before).max()
+    action, state = rng.uniform(-1, 1, (8, 3)).astype(np.float32), DreamStep(whole).zero_state(8)
+    kept = [DreamStep(each).advance(before, action, state) for each in (whole, rounded)]
+    assert 0 < np.abs(kept[1] - kept[0]).max() < 0.02
+
+
+@pytest.mark.parametrize("memory", [MEMORY, replace(MEMORY, done=True)])
+def test_a_row_has_the_bits_that_it_has_alone_and_reality_those_of_dreams(tmp_path, memory):
+    rounded = write_eight_bit_bundle(write_random_bundle(tmp_path / "a.zip", 3, EYES, memory), tmp_path / "b.zip")
+    policy, seen = PolicyStep(rounded), pictures(7)
+    parameters = np.random.default_rng(2).normal(0, 1, (7, rounded.controller_shape.size)).astype(np.float32)
+    state = policy.step(seen, parameters, policy.zero_state(7)).state
+    together = policy.step(seen, parameters, state)
+    for row in range(7):
+        alone = policy.step(*(np.ascontiguousarray(each[row : row + 1]) for each in (seen, parameters, state)))
+        assert all((one[0] == all_[row]).all() for one, all_ in zip(alone, together, strict=True))
+    assert (DreamStep(rounded).advance(together.latent, together.action, state) == together.state).all()
+    assert (Encoder(rounded).encode(seen)[0] == together.latent).all()
+
+
+@pytest.mark.parametrize(
+    "memory",
+    [replace(MEMORY, reward="value", previous_reward=True), replace(ATTENTIVE, latent=4, hidden=6, window=3)],
+)
+def test_an_lstm_with_inputs_of_unknown_size_stays_as_it_is(tmp_path, memory):
+    whole = write_random_bundle(tmp_path / "whole.zip", 3, EYES, memory)
+    rounded = write_eight_bit_bundle(whole, tmp_path / "rounded.zip")
+    assert rounded.read(DREAM_GRAPH) == whole.read(DREAM_GRAPH)
+    assert rounded.read(ENCODER) != whole.read(ENCODER)
+
+
+def test_controllers_of_the_whole_world_model_drive_by_the_rounded_one_and_not_the_other_way(whole, rounded):
+    vector = np.zeros(whole.controller_shape.size, np.float32)
+    old, new = (Controller(each.controller_shape, vector, "car-racing", each.sha256) for each in (whole, rounded))
+    assert rounded.for_controller(old).sha256 == rounded.sha256
+    with pytest.raises(ControllerError, match="belongs to the world model"):
+        whole.for_controller(new)
+
+
+def test_training_resumes_from_what_was_rounded_alone(whole, rounded, tmp_path):
+    with pytest.raises(BundleError, match=f"rounded to eight bits: take .* {whole.sha256[:12]}"):
+        unbundle(rounded, tmp_path / "data")
+    with pytest.raises(BundleError, match="rounded to eight bits"):
+        write_eight_bit_bundle(rounded, tmp_path / "again.zip")
+
+
+def test_other_activations_are_refused(tmp_path):
+    leaky = write_random_bundle(tmp_path / "a.zip", 3, replace(EYES, activation="leaky_relu"), MEMORY)
+    with pytest.raises(BundleError, match="activation relu"):
+        write_eight_bit_bundle(leaky, tmp_path / "b.zip")
+    assert not (tmp_path / "b.zip").exists()
+
+
+def test_the_verb_writes_the_same_file_twice(whole, tmp_path, capsys):
+    files = [tmp_path / name / "fast.zip" for name in "ab"]
+    for file in files:
+        file.parent.mkdir()
+        assert main(["bundle", "--from", str(whole.path), "--out", str(file)]) == 0
+    assert files[0].read_bytes() == files[1].read_bytes()
+    assert "controllers of" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--out", "x.zip", "--recorded", "3"], "--recorded is of a bundle to build from --data"),
+        (["--extract", "tiny"], "give --out"),
+    ],
+)
+def test_flags_that_do_not_fit_are_refused(more, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["bundle", "--from", "tiny", *more]) == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,1 @@
+"""Any Python function of a vector as a task: `function:MODULE:NAME`."""

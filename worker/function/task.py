@@ -1,0 +1,155 @@
+"""A Python function of a vector as a task: an environment of one step, whose reward is the function's value.
+
+The task's name is `function:MODULE:NAME`. There is no controller: a candidate's numbers are the coordinates of the
+function's arguments. What the coordinates mean stands in the task's options (`common/artifacts/objective.py`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.artifacts.objective import KEY, Objective, takes_seed
+from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.host.packages import find_distributions
+from dreamfleet.common.host.trusted_modules import import_trusted
+from dreamfleet.common.printable import one_line
+from dreamfleet.common.protocol.tasks import FUNCTION
+from dreamfleet.common.runs.seeds import fold_seed
+from dreamfleet.worker.tasks.api import Assignment, Continuous, Description, Policy, Task, World
+
+Floats = NDArray[np.float64]
+
+
+class ObjectiveError(DreamfleetError):
+    """A function raised, or returned what is not one finite number; the text says which.
+
+    Its name is the cause `OF_FUNCTION` of `common/protocol/failures.py`.
+    """
+
+
+class FunctionTask(Task):
+    """The task `function:MODULE:NAME`: a function of a vector, and of a seed if a parameter of it has that name.
+
+    >>> FunctionTask("math:fsum").describe({"environment": {"x0": [1, 2]}}).outputs
+    2
+    """
+
+    probe_steps: ClassVar[int] = 1
+
+    def __init__(self, place: str = "") -> None:
+        self.name = f"{FUNCTION}:{place}"
+        self.function = _find_function(place)
+        self._takes_seed = takes_seed(self.function)
+        self._packages = tuple(dict.fromkeys(("numpy", *find_distributions(self.function.__module__)[:1])))
+
+    def world_of(self, assignment: Assignment) -> World:
+        """A world of one step."""
+        size = assignment.controller.size
+        return World(Continuous.between([-1.0] * size, [1.0] * size), self._packages, horizon=1)
+
+    def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
+        """The environment whose step calls the function."""
+        objective = Objective.parse(assignment.spec.options)
+        return FunctionEnvironment(self.name.rpartition(":")[2], self.function, objective, takes_seed=self._takes_seed)
+
+    def make_policy(self, assignment: Assignment) -> Policy:
+        """What turns a candidate's coordinates into the function's arguments."""
+        return CoordinatePolicy(Objective.parse(assignment.spec.options))
+
+    def describe(self, options: Mapping[str, Any]) -> Description:
+        """As many outputs as parameters, without observations; `UsageError` for a wrong option."""
+        if unknown := set(options) - {KEY}:
+            raise UsageError(f"task {self.name} knows no option {', '.join(sorted(unknown))}: {KEY}")
+        objective = Objective.of(options.get(KEY) or {})
+        return Description(0, objective.dimension, self._packages, options=objective.options)
+
+
+class CoordinatePolicy:
+    """Its action is the vector of the function's arguments, whatever it observes."""
+
+    def __init__(self, objective: Objective) -> None:
+        self._objective = objective
+
+    def begin(self, parameters: NDArray[np.float32]) -> None:
+        """Start an episode with a candidate's coordinates `(size,)`."""
+        self._arguments = self._objective.decode(parameters)
+
+    def act(self, _observation: Any) -> Floats:
+        """The arguments `(dimension,)`, a new array each time: a function may change it."""
+        return self._arguments.copy()
+
+
+class FunctionEnvironment(gymnasium.Env[Any, Any]):
+    """One step: the action is the function's vector, the reward its value or the negative of it."""
+
+    def __init__(self, name: str, function: Callable[..., Any], objective: Objective, *, takes_seed: bool) -> None:
+        self._name, self._function, self._objective, self._takes_seed = name, function, objective, takes_seed
+        self._seed = 0
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (0,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-np.inf, np.inf, (objective.dimension,), np.float64)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Keep the seed for the next step, folded to 31 bits; nothing is observed."""
+        super().reset(seed=seed, options=options)
+        self._seed = fold_seed(seed or 0)
+        return np.zeros(0, np.float32), {}
+
+    def step(self, action: Floats) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Call the function; `ObjectiveError` if it raises or returns no finite number."""
+        value = self._call(action)
+        if not math.isfinite(value):
+            if self._objective.penalty is None:
+                raise ObjectiveError(
+                    f"{self._name} returned {value}: it needs a finite value, or a penalty in its place"
+                )
+            value = self._objective.penalty
+        return np.zeros(0, np.float32), self._objective.value(value), True, False, {}
+
+    def _call(self, action: Floats) -> float:
+        try:
+            returned = self._function(action, seed=self._seed) if self._takes_seed else self._function(action)
+        except (Exception, SystemExit) as error:
+            raise ObjectiveError(f"{self._name} raised {one_line(f'{type(error).__name__}: {error}')}") from error
+        return _to_number(self._name, returned)
+
+
+def _to_number(name: str, returned: Any) -> float:
+    """What a function returned as a float; `ObjectiveError` if it is not one number."""
+    if isinstance(returned, (str, bytes)) or returned is None or np.size(returned) != 1:
+        shape = getattr(returned, "shape", ())
+        what = f"an array of shape {shape}" if shape else f"{type(returned).__name__} {one_line(repr(returned))[:60]}"
+        raise ObjectiveError(f"{name} returned {what}: it must return one number")
+    try:
+        return float(np.asarray(returned).reshape(()))
+    except (TypeError, ValueError) as error:
+        raise ObjectiveError(f"{name} returned {type(returned).__name__}: it must return one number") from error
+
+
+def _find_function(place: str) -> Callable[..., Any]:
+    """The function at `MODULE:NAME`; `UsageError` if there is none, errors of the import as they are."""
+    module, colon, name = place.partition(":")
+    if not (module and colon and name):
+        raise UsageError(f"task {FUNCTION}:{place} names no function: write {FUNCTION}:MODULE:NAME")
+    try:
+        found: Any = import_trusted(module, f"task '{FUNCTION}:{place}'")
+    except (ImportError, DreamfleetError):
+        raise
+    except (Exception, SystemExit) as error:  # a module may raise anything
+        what = one_line(f"{type(error).__name__}: {error}")
+        raise UsageError(f"task {FUNCTION}:{place}: importing {module} raised {what}") from error
+    for part in name.split("."):
+        if not hasattr(found, part):
+            raise UsageError(f"task {FUNCTION}:{place}: {module} has no function {name}")
+        found = getattr(found, part)
+    if not callable(found):
+        raise UsageError(f"task {FUNCTION}:{place}: {name} of {module} is no function but {type(found).__name__}")
+    function: Callable[..., Any] = found
+    return function

@@ -1,0 +1,1 @@
+"""Controllers, world models and drives of other projects, read as data and never executed."""

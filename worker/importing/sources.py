@@ -1,0 +1,47 @@
+"""What a file or folder of another project holds, by the names in it; nothing is read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+PLACES = {  # in a folder of hardmaru/WorldModelsExperiments
+    "vae.json": ("vae.json", "vae/vae.json"),
+    "rnn.json": ("rnn.json", "rnn/rnn.json"),
+    "initial_z.json": ("initial_z.json", "initial_z/initial_z.json"),
+}
+CHECKPOINTS = ("best.tar", "checkpoint.tar")  # of ctallec/world-models; the second has the last epoch's weights
+VAE, MDRNN, CONTROLLER = "vae", "mdrnn", "ctrl"  # the folders with these
+
+
+def find_json(folder: Path, name: str) -> Path | None:
+    """The file of this name of WME's program in a folder or where its program puts it."""
+    return next((folder / place for place in PLACES[name] if (folder / place).is_file()), None)
+
+
+def holds_json_model(folder: Path) -> bool:
+    """Whether a folder looks like WME's: it has a VAE or an MDN-RNN as JSON."""
+    return any(find_json(folder, name) is not None for name in ("vae.json", "rnn.json"))
+
+
+def find_checkpoint(folder: Path, part: str) -> Path | None:
+    """The checkpoint of `vae`, `mdrnn` or `ctrl` in a folder that ctallec's programs call `--logdir`."""
+    return next((folder / part / name for name in CHECKPOINTS if (folder / part / name).is_file()), None)
+
+
+def holds_checkpoints(folder: Path) -> bool:
+    """Whether a folder looks like ctallec's `--logdir`: it has the checkpoint of a VAE or an MDN-RNN."""
+    return any(find_checkpoint(folder, part) is not None for part in (VAE, MDRNN))
+
+
+def checkpoint_of(source: Path) -> Path | None:
+    """The checkpoint that a path names: a `.tar`, or the one in a folder such as `ctrl`; `None` for other sources."""
+    if source.is_dir():
+        return next((source / name for name in CHECKPOINTS if (source / name).is_file()), None)
+    return source if source.suffix.lower() == ".tar" else None
+
+
+def drive_paths(source: Path) -> list[Path]:
+    """The `.npz` files of a folder, or of the folders in it: ctallec's has one a process. A file is its only one."""
+    if not source.is_dir():
+        return [source]
+    return sorted(source.glob("*.npz")) or sorted(source.glob("*/*.npz"))

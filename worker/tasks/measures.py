@@ -1,0 +1,132 @@
+"""Measures of an episode beside its fitness: its length, what the controller did, and what the world reported.
+
+| name | meaning |
+|---|---|
+| `steps` | steps of the episode |
+| `ACTION` | mean of an action's component over the steps; of a numbered action the share of steps that took it |
+| `ACTION.abs` | mean of its magnitude |
+| `ACTION.share` | share of the steps in which it was above 0 |
+| `info.KEY` | a number in the `info` of the last step |
+| `truth.KEY` | mean over the steps of a number of the task's true state, such as a speed |
+
+The first four are there in a dream too. Components have the names of the world's actions, else action0, action1, ...
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.artifacts.actions import Actions, Discrete
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.protocol.measures import INFO, STEPS, TRUTH
+
+KINDS = ("", ".abs", ".share")  # of an action's measures, in the order of the tally's sums
+Truth = Callable[[gymnasium.Env[Any, Any]], dict[str, float]]
+
+
+class ActionTally:
+    """Sums over the steps of what actions are, a row an episode; a row's bits do not depend on other rows."""
+
+    def __init__(self, rows: int, actions: Actions) -> None:
+        self._actions = actions
+        self._sums = np.zeros((rows, len(KINDS), action_count(actions)))
+
+    def add(self, rows: NDArray[np.intp], actions: Any) -> None:
+        """Add a step: the actions `(rows, actions)` of these rows, or their numbers `(rows,)`."""
+        values = np.asarray(actions, dtype=np.float64)
+        if isinstance(self._actions, Discrete):
+            values = np.eye(self._actions.outputs)[values.astype(np.int64) - self._actions.first]
+        self._sums[rows] += np.stack([values, np.abs(values), values > 0], axis=1)
+
+    def mean(self, row: int, column: tuple[int, int], steps: int) -> float:
+        """A measure's mean over the steps of a row."""
+        return float(self._sums[row][column]) / steps
+
+
+class Measurer:
+    """Computes the measures of these `names` in a world with these actions; `UsageError` for an unknown one."""
+
+    def __init__(
+        self, names: Sequence[str], actions: Actions, action_names: Sequence[str], truth: Truth | None = None
+    ) -> None:  # fmt: skip
+        self.names, self._actions, self._truth = tuple(names), actions, truth
+        words = action_names or [f"action{number}" for number in range(action_count(actions))]
+        self._columns = {
+            f"{word}{kind}": (place, number) for number, word in enumerate(words) for place, kind in enumerate(KINDS)
+        }
+        for name in self.names:
+            if name.startswith(TRUTH) and truth is None:
+                raise UsageError(f"measure {name!r}: this task reports no true state")
+            if name != STEPS and name not in self._columns and not name.startswith((INFO, TRUTH)):
+                known = ", ".join((STEPS, *self._columns))
+                raise UsageError(f"unknown measure {name!r}: known are {known}, info.KEY and truth.KEY")
+
+    def begin(self, rows: int) -> ActionTally:
+        """A tally for so many episodes."""
+        return ActionTally(rows, self._actions)
+
+    def values(self, tally: ActionTally, row: int, steps: int) -> tuple[float, ...]:
+        """The measures of a tally's row, after so many steps."""
+        return tuple(
+            float(steps) if name == STEPS else tally.mean(row, self._columns[name], steps) for name in self.names
+        )
+
+    def watch(self, environment: gymnasium.Env[Any, Any]) -> EpisodeMeasurer:
+        """What measures one episode in an environment."""
+        return EpisodeMeasurer(self.names, self._columns, self.begin(1), environment, self._truth)
+
+
+class EpisodeMeasurer:
+    """Measures one episode in an environment."""
+
+    def __init__(
+        self, names: Sequence[str], columns: dict[str, tuple[int, int]], tally: ActionTally,
+        environment: gymnasium.Env[Any, Any], truth: Truth | None,
+    ) -> None:  # fmt: skip
+        self._names, self._columns, self._tally = names, columns, tally
+        self._environment, self._truth = environment, truth
+        self._true_names = [name.removeprefix(TRUTH) for name in names if name.startswith(TRUTH)]
+        self._true_sums = dict.fromkeys(self._true_names, 0.0)
+        self._info: dict[str, Any] = {}
+        self._steps = 0
+
+    def on_transition(self, action: Any, info: dict[str, Any]) -> None:
+        """Add a step; `ValueError` if the task's true state lacks a number."""
+        self._steps += 1
+        self._tally.add(np.zeros(1, dtype=np.intp), np.asarray(action)[None])
+        self._info = info
+        if self._true_names and self._truth is not None:
+            state = self._truth(self._environment)
+            for name in self._true_names:
+                self._true_sums[name] += _number(state, name, "task's true state")
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """The measures of the episode; `ValueError` if the last `info` lacks a number."""
+        return tuple(map(self._value, self._names))
+
+    def _value(self, name: str) -> float:
+        if name == STEPS:
+            return float(self._steps)
+        if name.startswith(INFO):
+            return _number(self._info, name.removeprefix(INFO), "environment's last info")
+        if name.startswith(TRUTH):
+            return self._true_sums[name.removeprefix(TRUTH)] / self._steps
+        return self._tally.mean(0, self._columns[name], self._steps)
+
+
+def action_count(actions: Actions) -> int:
+    """Numbered actions, or components of a vector of actions."""
+    return actions.outputs if isinstance(actions, Discrete) else actions.actions
+
+
+def _number(values: dict[str, Any], name: str, where: str) -> float:
+    try:
+        return float(values[name])
+    except (KeyError, TypeError, ValueError):
+        raise ValueError(f"the {where} has no number {name!r}, which the run measures") from None

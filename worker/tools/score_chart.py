@@ -1,0 +1,44 @@
+"""The scores of an evaluation as a picture: one point a seed, the mean with its standard error, and a histogram."""
+
+from __future__ import annotations
+
+import io
+
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from dreamfleet.common.runs.evaluation_report import EvaluationReport
+from dreamfleet.common.runs.standard_error import format_with_error
+from dreamfleet.common.worlds.score_words import score_word
+
+COLOUR, MEAN = "#3b6ea5", "#c0392b"
+
+
+def draw_scores(report: EvaluationReport, name: str) -> bytes:
+    """Draw a report's scores as PNG; equal reports give equal bytes."""
+    found, word = report.results, score_word(report.world)
+    figure = Figure(figsize=(8, 3.6), dpi=120, layout="constrained")
+    points, counts = figure.subplots(1, 2, sharey=True, width_ratios=(4, 1))
+    points.plot(found.seeds, found.scores, "o", color=COLOUR, markersize=4, alpha=0.7)
+    counts.hist(found.scores, bins=20, orientation="horizontal", color=COLOUR, alpha=0.7)
+    error = found.error or 0.0
+    for axes in (points, counts):
+        axes.axhspan(found.mean - error, found.mean + error, color=MEAN, alpha=0.25, linewidth=0)
+        mean = axes.axhline(found.mean, color=MEAN, linewidth=1, label="mean and its standard error")
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="y", alpha=0.3)
+    lines = [mean]
+    if report.threshold is not None:
+        label = f"threshold of {report.threshold:g}"
+        lines.append(points.axhline(report.threshold, color="black", linewidth=1, linestyle=":", label=label))
+    points.ticklabel_format(useOffset=False)
+    for axes in (points, counts):
+        axes.xaxis.set_major_locator(MaxNLocator(nbins="auto", integer=True))
+    points.set(xlabel=f"seed of the {word}" if word != "seed" else "seed", ylabel="score")
+    counts.set(xlabel=f"{word}s")
+    figure.legend(handles=lines, loc="outside lower right", ncols=2, frameon=False, fontsize=9)
+    title = f"{name}: {format_with_error(found.mean, found.error)} (standard error) on {len(found.drives)} {word}s"
+    figure.suptitle(title, fontsize=11, x=0.01, ha="left")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None})
+    return buffer.getvalue()

@@ -1,0 +1,91 @@
+"""Eight-bit encoders and LSTMs: their weights and inputs are integers, whose products have the same sum in any order.
+
+An input has eight bits without a sign, a weight seven bits with one: the sums of two products, which some processors
+form in sixteen bits, then never overflow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from onnx import TensorProto
+
+from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
+
+HIGHEST_WEIGHT = 63
+CENTRE = 128  # an LSTM's input is an integer from -127 to 127, plus 128
+PIXEL_STEP = np.float32(1 / 255)  # of a picture, whose bytes are a convolution's inputs as they are
+INPUT_STEP = np.float32(1 / 127)  # of an input that is divided by its range
+HIGHEST_OUTPUT = 255  # of a convolution, whose outputs are not negative
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """The largest values that are not cut, from which the steps between integers follow."""
+
+    layers: tuple[float, ...]  # of each convolution's outputs
+    inputs: tuple[float, ...] = ()  # magnitudes of the LSTM's inputs; empty: it computes in single precision
+
+    def step_of(self, layer: int) -> np.float32:
+        """The step between a convolution's outputs."""
+        return np.float32(self.layers[layer] / HIGHEST_OUTPUT)
+
+
+def add_convolution(
+    graph: GraphBuilder, value: str, kernel: Floats, bias: Floats, steps: tuple[np.float32, np.float32],
+    window: dict[str, Any],
+) -> str:  # fmt: skip
+    """Add a convolution and its rectifier to `value`: integers of the first step become integers of the second."""
+    before, after = (graph.constant(np.array(step)) for step in steps)
+    weights, scales = _round_weights(kernel.reshape(len(kernel), -1).T)
+    weights, zeros = weights.T.reshape(kernel.shape), np.zeros(len(kernel), np.int8)
+    whole_bias = np.rint(bias / (scales.astype(np.float64) * steps[0])).astype(np.int32)
+    factor = [graph.constant(each) for each in (weights, scales, zeros)]
+    inputs = [value, before, _zero(graph), *factor, after, _zero(graph), graph.constant(whole_bias)]
+    return str(graph.node("QLinearConv", *inputs, **window))
+
+
+def round_inputs(graph: GraphBuilder, value: str, ranges: Floats) -> str:
+    """Round the columns of `value`, whose magnitudes are up to `ranges`, to integers for `add_input_product`."""
+    scaled = graph.node("Mul", value, graph.constant(1 / ranges))
+    return str(graph.node("QuantizeLinear", scaled, graph.constant(np.array(INPUT_STEP)), _centre(graph)))
+
+
+def add_product(graph: GraphBuilder, value: str, kernel: Floats, bias: Floats, step: np.float32) -> str:
+    """Multiply `value`, integers of this step, by `kernel` (inputs, outputs), and add `bias` in single precision."""
+    return _add_product(graph, [value], kernel, bias, step)
+
+
+def add_input_product(graph: GraphBuilder, value: str, kernel: Floats, bias: Floats, ranges: Floats) -> str:
+    """The same for a value of `round_inputs`."""
+    return _add_product(graph, [value, _centre(graph)], kernel * ranges[:, None], bias, INPUT_STEP)
+
+
+def _add_product(graph: GraphBuilder, factor: Sequence[str], kernel: Floats, bias: Floats, step: np.float32) -> str:
+    weights, scales = _round_weights(kernel)
+    value, *centre = factor
+    whole = graph.node("MatMulInteger", value, graph.constant(weights), *centre)
+    scale = graph.constant((scales.astype(np.float64) * step).astype(np.float32))
+    product = graph.node("Mul", graph.node("Cast", whole, to=TensorProto.FLOAT), scale)
+    return str(graph.node("Add", product, graph.constant(bias)))
+
+
+def _zero(graph: GraphBuilder) -> str:
+    return graph.constant(np.array(0, np.uint8))
+
+
+def _centre(graph: GraphBuilder) -> str:
+    return graph.constant(np.array(CENTRE, np.uint8))
+
+
+def _round_weights(kernel: Floats) -> tuple[NDArray[np.int8], Floats]:
+    """The integers of a kernel (inputs, outputs), and the step of each output."""
+    steps = (np.abs(kernel).max(axis=0) / HIGHEST_WEIGHT).astype(np.float32)
+    steps[steps == 0] = 1
+    return np.rint(kernel / steps).astype(np.int8), steps
