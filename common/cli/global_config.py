@@ -28,7 +28,7 @@ ARRAYS = ("stage", "host")  # arrays of tables
 # The tables of every verb: all verbs may share one file.
 TABLES = ("run", "limits", "network", "worker", "dashboard", "serve", "demo", "iterate", "router", "spawn", "vae",
           "mdnrnn", "baseline")  # fmt: skip
-OTHER_VARIABLES = ("DREAMFLEET_CACHE", "DREAMFLEET_CONFIG", PLACES)
+OTHER_VARIABLES = ("DREAMFLEET_CACHE", "DREAMFLEET_CONFIG", "DREAMFLEET_PICTURES", PLACES)
 PREFIX = "DREAMFLEET_"
 SIMILARITY_CUTOFF = 0.75  # similarity to a known name from which an unknown variable counts as a typing error
 

@@ -95,7 +95,7 @@ class EvaluationReport:
     def _describe_score(self, word: str) -> str:
         found = self.results
         score = format_with_error(found.mean, found.error)
-        judged = "by gymnasium's own environment" if self.judge == GYMNASIUM else f"in {self.judge}"
+        judged = "in gymnasium's environment" if self.judge == GYMNASIUM else f"in {self.judge}"
         if found.std is None:
             return f"{score} on one {word}; judged {judged}"
         digits = score_digits(found.mean, found.error)

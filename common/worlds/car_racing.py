@@ -125,7 +125,7 @@ PROFILE = WorldProfile(
         quick_steps=700_000,
         # To drive on grass predicts losses that one track may not show.
         variant="offroad_cost=2",
-        judge="gymnasium's own environment",
+        judge="gymnasium's environment",
         video_steps=1000,
     ),
 )

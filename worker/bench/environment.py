@@ -20,7 +20,12 @@ from dreamfleet.common.errors import ControllerError
 from dreamfleet.common.runs.seeds import VALIDATION
 from dreamfleet.worker.car_racing.native_check import ActionSource, Mismatch, compare, make_car_racing, random_action
 from dreamfleet.worker.car_racing.preprocessing import BOX
-from dreamfleet.worker.car_racing.task import CarRacingPolicy, CarRacingTask, PictureObservation
+from dreamfleet.worker.car_racing.task import (
+    CarRacingPolicy,
+    CarRacingTask,
+    PictureObservation,
+    make_reference_environment,
+)
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.api import Assignment
 
@@ -73,7 +78,7 @@ def _cases(bundle: Bundle) -> tuple[dict[str, Callable[[RecordedDrive], float]],
     notes = []
     if find_spec("torch"):
         cases["torch_fitness_step"] = lambda recorded_drive: seconds_a_step(
-            task.make_evaluation_environment(assignment), recorded_drive, make_torch_controller(bundle)
+            make_reference_environment(BOX), recorded_drive, make_torch_controller(bundle)
         )
     else:
         notes.append("ratio_fitness_step needs torch: pip install 'dreamfleet[train]'")

@@ -15,7 +15,7 @@ from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
 from dreamfleet.common.artifacts.trained_agent import NETWORK, TrainedAgent
 from dreamfleet.common.errors import ControllerError
 from dreamfleet.worker.car_racing.preprocessing import PREPROCESSINGS, find_preprocessing
-from dreamfleet.worker.car_racing.task import WORLD, CarRacingTask, make_reference_environment
+from dreamfleet.worker.car_racing.task import WORLD, CarRacingTask, make_judging_environment
 from dreamfleet.worker.tasks.api import Policy, World
 from dreamfleet.worker.tasks.frame_skip_policy import FrameSkipPolicy
 from dreamfleet.worker.tasks.policy import NO_PARAMETERS
@@ -51,8 +51,8 @@ class PictureAgent(ABC):
         """Return a function from an episode's seed to a policy."""
 
     def make_evaluation_environment(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
-        """Gymnasium's unmodified environment, observing this agent's pictures."""
-        return make_reference_environment(find_preprocessing(self.preprocessing), render_mode)
+        """The environment that scores come from, observing this agent's pictures."""
+        return make_judging_environment(find_preprocessing(self.preprocessing), render_mode)
 
     @property
     def truth(self) -> Callable[[gymnasium.Env[Any, Any]], dict[str, float]]:

@@ -1,7 +1,7 @@
 """gymnasium's CarRacing-v3 with its own track, physics and rewards; our native module draws only the observation.
 
 `rgb_array` and `human` rendering are gymnasium's. If the native module was not built, `native_check` logs that and
-gymnasium draws.
+gymnasium draws. Environments that judge draw some pictures both ways, and stop at a difference.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from gymnasium.envs.box2d import car_dynamics, car_racing
 from gymnasium.error import InvalidAction
 from numpy.typing import NDArray
 
+from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.printable import plural
 from dreamfleet.worker.car_racing.car import Car
 from dreamfleet.worker.car_racing.preprocessing import BOX, RAW, find_preprocessing
 
@@ -26,6 +28,7 @@ try:
 except ImportError:  # no compiler when this was installed
     _native = None  # type: ignore[assignment]
 
+PICTURES = "DREAMFLEET_PICTURES"  # "gymnasium" lets gymnasium draw, in this process and those that it starts
 TEXT_WIDTH = 125  # pixels at the window's left edge that hold the score
 _Base: Any = car_racing.CarRacing  # untyped upstream
 
@@ -36,11 +39,16 @@ class CarRacing(_Base):  # type: ignore[misc]
     `preprocessing` names its pictures: `raw-96`, gymnasium's own, or another of `car_racing.preprocessing`. With
     `native` False, or without the native module, gymnasium draws. Like gymnasium's, it is not thread-safe:
     environments of one process share one canvas.
+
+    With `checked` N, gymnasium draws the first and then every Nth picture too; `DreamfleetError` if one differs.
     """
 
-    def __init__(self, *arguments: Any, preprocessing: str = RAW.name, native: bool = True, **more: Any) -> None:
+    def __init__(
+        self, *arguments: Any, preprocessing: str = RAW.name, native: bool = True, checked: int = 0, **more: Any
+    ) -> None:
         super().__init__(*arguments, **more)
         self._native = native and is_native_available()
+        self._checked, self._drawn = checked, 0
         self._preprocessing = find_preprocessing(preprocessing)
         self._fixtures = np.zeros(0)
         self.observation_space = gymnasium.spaces.Box(0, 255, self._preprocessing.shape, np.uint8)
@@ -78,7 +86,21 @@ class CarRacing(_Base):  # type: ignore[misc]
     def _render(self, mode: str) -> Any:
         if mode != "state_pixels":
             return super()._render(mode)
-        return self._draw() if self._native else self._preprocessing.picture(super()._render(mode))
+        if not self._native:
+            return self._preprocessing.picture(super()._render(mode))
+        picture = self._draw()
+        if self._checked and self._drawn % self._checked == 0:
+            self._compare(picture, self._preprocessing.picture(super()._render(mode)))
+        self._drawn += 1
+        return picture
+
+    def _compare(self, ours: NDArray[np.uint8], theirs: NDArray[np.uint8]) -> None:
+        if not np.array_equal(ours, theirs):
+            pixels = plural(int((ours != theirs).any(axis=-1).sum()), "pixel")
+            raise DreamfleetError(
+                f"the native picture differs from gymnasium's by {pixels}, so its scores would be others: set "
+                f"{PICTURES}=gymnasium, and gymnasium draws; please report this, with pygame's and gymnasium's version"
+            )
 
     def _draw(self) -> NDArray[np.uint8]:
         """The picture `(size, size, 3)` of the preprocessing."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -15,13 +16,14 @@ from gymnasium.envs.box2d import car_racing
 from numpy.typing import NDArray
 
 from dreamfleet.worker.car_racing import ENVIRONMENT
-from dreamfleet.worker.car_racing.environment import CarRacing, is_native_available
+from dreamfleet.worker.car_racing.environment import PICTURES, CarRacing, is_native_available
 from dreamfleet.worker.car_racing.preprocessing import BOX
 
 _Reference: Any = car_racing.CarRacing  # untyped upstream
 log = logging.getLogger(__name__)
 QUICK_SEEDS = (20_001,)
 QUICK_STEPS = 24
+CHECK_INTERVAL = 50  # pictures; of an environment that judges, gymnasium draws one in so many too
 ActionSource = Callable[[int, NDArray[np.uint8], np.random.Generator], Any]  # step, 64x64 picture
 
 
@@ -36,7 +38,12 @@ class Mismatch:
 
 @cache
 def native_is_exact() -> bool:
-    """Whether the native picture equals gymnasium's on this machine; checked once per process, in under a second."""
+    """Whether the native picture equals gymnasium's on this machine; checked once per process, in under a second.
+
+    False also where the environment variable `DREAMFLEET_PICTURES` is `gymnasium`.
+    """
+    if os.environ.get(PICTURES) == "gymnasium":
+        return False
     if not is_native_available():
         log.warning("no native picture was built (no C compiler at installation): gymnasium draws, 15 times slower")
         return False

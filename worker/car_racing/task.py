@@ -17,7 +17,7 @@ from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, Mirror
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.worker.car_racing.drivers import DRIVERS, PushedDriver, UniformDriver
-from dreamfleet.worker.car_racing.native_check import make_car_racing
+from dreamfleet.worker.car_racing.native_check import CHECK_INTERVAL, make_car_racing, native_is_exact
 from dreamfleet.worker.car_racing.preprocessing import PREPROCESSINGS
 from dreamfleet.worker.car_racing.random_network import RandomNetworkPolicy
 from dreamfleet.worker.car_racing.true_state import read_true_state
@@ -87,9 +87,9 @@ class CarRacingTask(Task):
     def make_evaluation_environment(
         self, assignment: Assignment, render_mode: str | None = None
     ) -> gymnasium.Env[Any, Any]:
-        """Gymnasium's unmodified environment in the bundle's preprocessing, computed by NumPy."""
+        """Gymnasium's world in the bundle's preprocessing; `make_judging_environment` says who draws."""
         return _with_off_road_info(
-            make_reference_environment(self.preprocessing(assignment.world_model), render_mode), assignment
+            make_judging_environment(self.preprocessing(assignment.world_model), render_mode), assignment
         )
 
     def make_policy(self, assignment: Assignment) -> ModelPolicy:
@@ -132,6 +132,17 @@ class CarRacingTask(Task):
     def preprocessing(self, bundle: Bundle) -> Preprocessing:
         """The preprocessing of the bundle's pictures; `BundleError` if this task has no such pictures."""
         return preprocessing_for(bundle, self)
+
+
+def make_judging_environment(preprocessing: Preprocessing, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+    """Make the environment that reported scores come from, observing the pictures of a preprocessing.
+
+    It is gymnasium's unmodified one, unless the native picture is exact here and nobody watches. Gymnasium then draws
+    the first and every 50th picture too, and an episode ends with an error at the first difference.
+    """
+    if render_mode is None and native_is_exact():
+        return make_car_racing(preprocessing=preprocessing.name, checked=CHECK_INTERVAL)
+    return make_reference_environment(preprocessing, render_mode)
 
 
 def make_reference_environment(preprocessing: Preprocessing, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:

@@ -38,7 +38,7 @@ def test_statistics_weight_episodes_by_their_steps():
 
 
 def test_one_episode_has_no_standard_error():
-    assert scored(839.0).description.startswith("839.0 on one seed; judged by")
+    assert scored(839.0).description.startswith("839.0 on one seed; judged in")
 
 
 def test_figures_that_an_environment_does_not_report_are_left_out():
@@ -251,5 +251,5 @@ def test_a_report_of_another_world_names_its_judge_and_its_marks(tmp_path):
 
 def test_the_first_worlds_report_says_what_it_always_said():
     assert "marks" not in json.loads(JUDGEMENT.to_json())
-    assert "judged by gymnasium's own environment" in JUDGEMENT.description
+    assert "judged in gymnasium's environment" in JUDGEMENT.description
     assert "above" not in scored(700, 800).description, "a report without laps was never compared with marks"

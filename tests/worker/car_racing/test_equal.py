@@ -11,10 +11,20 @@ from gymnasium.error import InvalidAction
 
 import dreamfleet.worker.car_racing  # noqa: F401 - registers the environment
 from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.worker.bench.environment import drive_lap, make_random_controller, random_discrete_action
-from dreamfleet.worker.car_racing.environment import GRASS, WHEEL, CarRacing, _native, is_native_available, render_score
+from dreamfleet.worker.car_racing.environment import (
+    GRASS,
+    PICTURES,
+    WHEEL,
+    CarRacing,
+    _native,
+    is_native_available,
+    render_score,
+)  # fmt: skip
 from dreamfleet.worker.car_racing.native_check import compare, make_car_racing, native_is_exact, random_action
-from dreamfleet.worker.car_racing.preprocessing import BOX
+from dreamfleet.worker.car_racing.preprocessing import BOX, PREPROCESSINGS
+from dreamfleet.worker.car_racing.task import make_judging_environment
 
 needs_native = pytest.mark.skipif(not is_native_available(), reason="no native module was built")
 
@@ -134,6 +144,35 @@ def test_a_car_that_cannot_be_drawn_is_a_clear_error(x):
             np.empty((96, 96, 3), np.uint8), environment._road, environment._road_colours, GRASS, environment._palette,
             np.array([16.2, 0, x, 0, 333]), np.zeros((5, 4)), environment._fixtures, WHEEL,
         )  # fmt: skip
+
+
+@needs_native
+@pytest.mark.parametrize("name", PREPROCESSINGS)
+def test_a_judging_environment_goes_on_while_pictures_are_equal(name):
+    environment = CarRacing(preprocessing=name, checked=1)
+    drive_all([environment], [3], 60)  # the score's text and the bars change too
+
+
+@needs_native
+def test_a_wrong_picture_ends_an_evaluation(monkeypatch):
+    environment = make_judging_environment(BOX)
+    environment.reset(seed=1)
+    right = CarRacing._draw
+    monkeypatch.setattr(CarRacing, "_draw", lambda self: right(self) ^ (np.indices(BOX.shape).sum(axis=0) == 0))
+    still = np.zeros(3, np.float32)
+    with pytest.raises(DreamfleetError, match=r"gymnasium's by 1 pixel,.*PICTURES=gymnasium"):
+        [environment.step(still) for _ in range(50)]
+
+
+@pytest.mark.parametrize(("said", "by"), [("", "native"), ("gymnasium", "gymnasium")])
+def test_a_user_may_let_gymnasium_draw(monkeypatch, said, by):
+    monkeypatch.setenv(PICTURES, said)
+    native_is_exact.cache_clear()
+    try:
+        assert make_car_racing().unwrapped.drawn_by == by if is_native_available() else "gymnasium"
+    finally:
+        native_is_exact.cache_clear()
+    assert getattr(make_judging_environment(BOX, "rgb_array").unwrapped, "drawn_by", "-") == "-"
 
 
 def test_where_it_was_not_built_gymnasium_draws():
