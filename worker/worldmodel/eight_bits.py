@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from onnx import TensorProto
 
-from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
+from dreamfleet.worker.worldmodel.onnx_graph import RUNTIME, GraphBuilder
 
 HIGHEST_WEIGHT = 63
 CENTRE = 128  # an LSTM's input is an integer from -127 to 127, plus 128
@@ -70,10 +69,11 @@ def add_input_product(graph: GraphBuilder, value: str, kernel: Floats, bias: Flo
 def _add_product(graph: GraphBuilder, factor: Sequence[str], kernel: Floats, bias: Floats, step: np.float32) -> str:
     weights, scales = _round_weights(kernel)
     value, *centre = factor
-    whole = graph.node("MatMulInteger", value, graph.constant(weights), *centre)
     scale = graph.constant((scales.astype(np.float64) * step).astype(np.float32))
-    product = graph.node("Mul", graph.node("Cast", whole, to=TensorProto.FLOAT), scale)
-    return str(graph.node("Add", product, graph.constant(bias)))
+    one, no_zero = graph.constant(np.array(1, np.float32)), ""
+    # The runtime's own operator is MatMulInteger, Cast, Mul and Add in one: the same bits, in less time.
+    factor = [value, graph.constant(weights), one, scale, *(centre or [no_zero]), no_zero, graph.constant(bias)]
+    return str(graph.node("MatMulIntegerToFloat", *factor, domain=RUNTIME))
 
 
 def _zero(graph: GraphBuilder) -> str:

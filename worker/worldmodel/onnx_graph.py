@@ -13,6 +13,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 OPSET = 17
 IR_VERSION = 8
+RUNTIME = "com.microsoft"  # domain of ONNX Runtime's own operators
 
 
 class GraphBuilder:
@@ -100,6 +101,8 @@ class GraphBuilder:
         """Serialise the model after ONNX's own check."""
         graph = helper.make_graph(self._nodes, self._name, self._inputs, self._outputs, self._constants)
         opsets = [helper.make_opsetid("", OPSET)]
+        if any(node.domain == RUNTIME for node in self._nodes):
+            opsets.append(helper.make_opsetid(RUNTIME, 1))
         model = helper.make_model(graph, opset_imports=opsets, ir_version=IR_VERSION, producer_name="dreamfleet")
         onnx.checker.check_model(model, full_check=True)
         data: bytes = model.SerializeToString(deterministic=True)
