@@ -22,7 +22,9 @@ from dreamfleet.coordinator.bridge.config import BridgeConfig
 from dreamfleet.coordinator.dashboard.config import DashboardConfig
 from dreamfleet.coordinator.experiments.demo import DemoConfig
 from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
-from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig, RunConfig
+from dreamfleet.coordinator.settings.config import RunConfig
+from dreamfleet.coordinator.settings.limits import LimitsConfig
+from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.spawn.config import SpawnConfig
 from dreamfleet.worker.baselines.agent_config import AgentConfig
 from dreamfleet.worker.baselines.learning_config import LearningConfig

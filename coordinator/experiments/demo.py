@@ -48,7 +48,7 @@ from dreamfleet.common.worlds.profile import DemoPlan
 from dreamfleet.common.worlds.score_words import profile_of
 from dreamfleet.coordinator.experiments.demo_plans import PLANS, find_plan, plan_defaults
 from dreamfleet.coordinator.experiments.local_run import START_SECONDS, LocalRun, has_begun
-from dreamfleet.coordinator.settings.config import NO_SUBSPACE
+from dreamfleet.coordinator.settings.run_checks import NO_SUBSPACE
 
 REFRESH = 0.5
 LOG_INTERVAL = 30.0  # seconds between two lines where no panel can be drawn, such as in a log

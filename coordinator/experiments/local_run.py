@@ -24,7 +24,8 @@ from dreamfleet.common.monitoring.client import Client
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.common.transport.network import wait_for_listener
-from dreamfleet.coordinator.settings.config import LimitsConfig, RunConfig
+from dreamfleet.coordinator.settings.config import RunConfig
+from dreamfleet.coordinator.settings.limits import LimitsConfig
 
 # Variables of a process that stays on this host, even if its user is in a fleet.
 ALONE = {"DREAMFLEET_JOIN": "", "DREAMFLEET_CONNECT": ""}

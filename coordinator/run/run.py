@@ -36,7 +36,8 @@ from dreamfleet.coordinator.run.recall import BAR_BY_OPERATOR, find_bar_problem,
 from dreamfleet.coordinator.run.stop_reason import find_stop_reason
 from dreamfleet.coordinator.run.verification import Verification
 from dreamfleet.coordinator.run.work_clock import WorkClock
-from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
+from dreamfleet.coordinator.settings.limits import LimitsConfig
+from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 
 OTHER_SEEDS = "; if the seeds of the first generation are bad for every candidate, begin a run with another --seed"

@@ -9,7 +9,7 @@ from dreamfleet.common.protocol.tasks import steps_word
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.run.background_jobs import BackgroundJobs
-from dreamfleet.coordinator.settings.config import LimitsConfig
+from dreamfleet.coordinator.settings.limits import LimitsConfig
 
 
 def find_stop_reason(

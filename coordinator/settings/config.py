@@ -1,4 +1,4 @@
-"""What a run is, when it stops, and where it is reached: the coordinator's configuration.
+"""What a run is: its settings, which it freezes in its journal.
 
 Each setting is one field. The bounds are in its annotation; `frozen_option` names the record that stores it.
 """
@@ -6,13 +6,12 @@ Each setting is one field. The bounds are in its annotation; `frozen_option` nam
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_type_hints
+from typing import Annotated, Any, Literal
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.bundle_store import find_bundle
@@ -29,7 +28,6 @@ from dreamfleet.common.protocol.measures import NO_ARCHIVE, check_dreamt, parse_
 from dreamfleet.common.protocol.messages import (
     MAX_OPTIONS,
     OWN_END_VERSION,
-    FleetShare,
     Horizon,
     Patience,
     Share,
@@ -56,18 +54,18 @@ from dreamfleet.common.runs.records import (
     RunSettings,
     StageSettings,
 )
-from dreamfleet.common.runs.stages import Stage, stages_of
+from dreamfleet.common.runs.stages import stages_of
 from dreamfleet.common.serialization.validation import Between, Count
-from dreamfleet.common.transport.network import parse_metrics_address
-from dreamfleet.coordinator.settings.live_log import parse_sinks
+from dreamfleet.coordinator.settings.bounds import check_bounds
 from dreamfleet.coordinator.settings.presets import check_preset_fits
+from dreamfleet.coordinator.settings.run_checks import check_subspace, try_optimiser
 from dreamfleet.coordinator.settings.schedule import check_schedule, split_first_stage
 from dreamfleet.coordinator.settings.task_options import (
     check_normalisation,
     parse_environment,
 )
 
-DEFAULT_BUNDLE, NO_BUNDLE, NO_SUBSPACE = "tiny", "none", "none"
+DEFAULT_BUNDLE, NO_BUNDLE = "tiny", "none"
 DEFAULT_HORIZON = 1000  # steps
 LARGEST_STEP = 1e6  # of sigma0: parameters travel in single precision
 Interval = Annotated[int, Between(0, 10**6)]  # generations; 0: never
@@ -288,7 +286,7 @@ class RunConfig:
                 check_dreamt(names)
             spec = replace(spec, measures=names)
         if self.loaded_subspace is not None:
-            _check_subspace(self.loaded_subspace, spec, shape, bundle)
+            check_subspace(self.loaded_subspace, spec, shape, bundle)
         derived = {
             "task": spec,
             "packages": packages,
@@ -305,7 +303,7 @@ class RunConfig:
             with _naming_stage(stage.number if self.stages else None):
                 replace(self, **{name: getattr(stage, name) for name in STAGE_FIELDS})  # checks each value
                 if stage.starts_new_search and not settings.is_external:
-                    _try_optimiser(settings, stage, self.loaded_subspace)
+                    try_optimiser(settings, stage, self.loaded_subspace)
         return settings
 
     @property
@@ -434,17 +432,6 @@ def config_values(run: RunSettings, bundle: Path) -> dict[str, Any]:
     return {**values, "bundle": str(bundle), "variant": Variant.from_json(spec.options).option_texts}
 
 
-def check_bounds(config: Any) -> None:
-    """`UsageError` for a number outside the `Between` in its field's annotation; `None` is within any."""
-    for name, hint in get_type_hints(type(config), include_extras=True).items():
-        value = getattr(config, name)
-        for kind in (hint, *get_args(hint)):  # the second finds the parts of `Annotated[...] | None`
-            for bounds in getattr(kind, "__metadata__", ()):
-                if value is not None and not bounds.low <= value <= bounds.high:
-                    low, high = (f"{each:g}" if isinstance(each, float) else each for each in (bounds.low, bounds.high))
-                    raise UsageError(f"--{name.replace('_', '-')} must be from {low} to {high}, not {value}")
-
-
 @contextmanager
 def _naming_stage(number: int | None) -> Iterator[None]:
     """Name the stage in an error; `None`: the run has no schedule."""
@@ -452,111 +439,3 @@ def _naming_stage(number: int | None) -> Iterator[None]:
         yield
     except UsageError as error:
         raise error if number is None else UsageError(f"stage {number}: {error}") from error
-
-
-def _check_subspace(subspace: Subspace, spec: TaskSpec, shape: ControllerShape, bundle: Bundle | None) -> None:
-    """`UsageError` for a subspace of another world model, or of controllers with other inputs."""
-    if bundle is None or subspace.bundle not in bundle.same_models:
-        own = f"world model {spec.bundle[:12]}" if spec.bundle else "a task without a world model"
-        raise UsageError(
-            f"--subspace (given, or the preset's) belongs to world model {subspace.bundle[:12]}, the run uses {own}: "
-            f"give its own --bundle, or --subspace {NO_SUBSPACE}"
-        )
-    if (inputs := subspace.weights.shape[1]) != shape.features:
-        raise UsageError(
-            f"--subspace fits controllers that see {inputs} numbers, latent and hidden state alone, and this run's "
-            f"see {shape.features}: omit --features and feedback=last, or pass --subspace {NO_SUBSPACE}"
-        )
-
-
-def _try_optimiser(settings: RunSettings, stage: Stage, subspace: Subspace | None) -> None:
-    """Build the run's optimiser once, so that a search which it cannot do is refused before the run exists."""
-    from dreamfleet.coordinator.optimisers.evolution import (  # heavy: `--help` reads this module too
-        Evolution,
-        EvolutionConfig,
-    )
-
-    evolution = Evolution(EvolutionConfig.of(settings, stage, subspace))
-    if settings.on_failure == "redraw":
-        if stage.racing:
-            raise UsageError("--on-failure redraw cannot be combined with --racing: a late candidate has no first half")
-        evolution.check_redraws()
-
-
-MOST_OF_A_LIMIT = 2**53  # every float below it is exact
-
-
-@dataclass(frozen=True)
-class LimitsConfig:
-    """When a run ends: at the first limit reached; all are checked as a generation ends. 0: no such limit."""
-
-    generations: int = option(0, "stop after so many generations")
-    steps: int = option(0, "stop with the generation that reaches so many environment steps")
-    minutes: float = option(
-        0.0,
-        "stop with the generation that closes after so many minutes of work: its episodes are finished, and the last "
-        "evaluation and the confirmation come on top",
-    )
-    target: float | None = option(None, "stop when an evaluated mean reaches this score")
-    candidate_target: float | None = option(None, "stop when a candidate reaches this score")
-    stagnation: int = option(0, "stop when no candidate beat the best one before for so many generations")
-    parted: int = option(0, "stop when so many evaluations in a row fell clearly behind the best one before them")
-
-    def __post_init__(self) -> None:
-        for name in ("generations", "steps", "minutes", "parted", "stagnation"):
-            if not getattr(self, name) >= 0:
-                raise UsageError(f"--{name} must not be negative")
-            if getattr(self, name) > MOST_OF_A_LIMIT:
-                raise UsageError(f"--{name} must be at most {MOST_OF_A_LIMIT:,}, or 0 for no limit")
-        for name, score in (("target", self.target), ("candidate-target", self.candidate_target)):
-            if score is not None and not math.isfinite(score):
-                raise UsageError(f"--{name} must be a number, not {score}")
-
-
-@dataclass(frozen=True)
-class NetworkConfig:
-    """Where the coordinator is reached, and how it treats its workers."""
-
-    listen: tuple[str, ...] = option((), "listen here (default tcp/127.0.0.1:7447, unless --connect is given)")
-    connect: tuple[str, ...] = option((), "connect to these stand-alone routers; with --listen, do both")
-    beat: Annotated[float, Between(0.05, 60.0)] = option(1.0, "seconds between a worker's beats")
-    evaluation_share: Annotated[float, Between(0.0, 0.9)] = option(
-        0.25, "share of a busy fleet's time for evaluations, 0 to 0.9; 0: only idle slots"
-    )  # the search needs the rest
-    failure_limit: Annotated[float, Between(0.0, 1.0)] = option(
-        0.5, "pause when more than this share of the last five generations' candidates failed, 0 to 1"
-    )
-    share: FleetShare = option(
-        1.0, "weight of this run among those that share workers: 3 gets three times the time of 1, while both have work"
-    )
-    strict: bool = option(
-        False,
-        "take results only of hosts that compute the same bits as the first one that scored, so that the run ends with "
-        "the same bits even if processes are killed",
-    )
-    verify: Share = option(
-        0.0,
-        "share of each worker's results, 0 to 1, that another host of its class scores again; a host that differs is "
-        "barred, and all its results are scored again (docs/how-to/trust.md)",
-    )
-    metrics_port: str = option(
-        "",
-        "serve Prometheus metrics under /metrics at this port of 127.0.0.1, or at HOST:PORT; anybody there may read "
-        "them",
-    )
-    log_to: tuple[str, ...] = option(
-        (),
-        "also write the run's curves, as it goes on, to tensorboard, wandb or mlflow, or to several of them; a folder, "
-        "project or address may stand behind a colon (docs/how-to/monitor.md). It has no flag",
-        flag=False,
-    )
-    insecure: bool = option(
-        False, "listen beyond this host without a join file: anyone who reaches the port owns the run, may read, forge "
-        "and stop everything"
-    )  # fmt: skip
-
-    def __post_init__(self) -> None:
-        if self.metrics_port:
-            parse_metrics_address(self.metrics_port)
-        parse_sinks(self.log_to)
-        check_bounds(self)

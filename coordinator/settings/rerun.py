@@ -16,7 +16,8 @@ from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL
 from dreamfleet.common.runs.run_provenance import RunProvenance, read_run_provenance, read_run_settings
-from dreamfleet.coordinator.settings.config import LimitsConfig, RunConfig, config_values
+from dreamfleet.coordinator.settings.config import RunConfig, config_values
+from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.resume_settings import stored_network
 from dreamfleet.coordinator.settings.run_provenance import versions
 from dreamfleet.coordinator.settings.start import START_MEAN, StartPoint

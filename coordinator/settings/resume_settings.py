@@ -17,7 +17,8 @@ from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.security.credentials import Credentials
 from dreamfleet.common.transport.network import DEFAULT_ENDPOINT, SECURED_ENDPOINT
-from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
+from dreamfleet.coordinator.settings.limits import LimitsConfig
+from dreamfleet.coordinator.settings.network import NetworkConfig
 
 LIMITS, NETWORK = "limits", "network"  # the facts' names
 

@@ -19,13 +19,8 @@ from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_
 from dreamfleet.common.printable import plural
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
-from dreamfleet.coordinator.settings.config import (
-    DEFAULT_BUNDLE,
-    DEFAULT_HORIZON,
-    NetworkConfig,
-    RunConfig,
-    default_world,
-)
+from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, DEFAULT_HORIZON, RunConfig, default_world
+from dreamfleet.coordinator.settings.network import NetworkConfig
 
 if TYPE_CHECKING:
     from dreamfleet.common.artifacts.bundle import Bundle

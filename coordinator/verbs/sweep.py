@@ -15,7 +15,9 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_signals
 from dreamfleet.common.printable import plural
-from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig, RunConfig
+from dreamfleet.coordinator.settings.config import RunConfig
+from dreamfleet.coordinator.settings.limits import LimitsConfig
+from dreamfleet.coordinator.settings.network import NetworkConfig
 
 if TYPE_CHECKING:
     from dreamfleet.coordinator.experiments.sweep.folder import SweepFolder

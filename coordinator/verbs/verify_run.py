@@ -11,7 +11,7 @@ from dreamfleet.common.cli.config import add_flags
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag
 from dreamfleet.common.protocol.keys import check_run_name
-from dreamfleet.coordinator.settings.config import NetworkConfig
+from dreamfleet.coordinator.settings.network import NetworkConfig
 
 SUMMARY = (
     "re-run the run that a controller came from, by its provenance, and compare its reported controller bit by bit"

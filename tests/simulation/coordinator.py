@@ -17,7 +17,8 @@ from dreamfleet.coordinator.optimisers import evolution
 from dreamfleet.coordinator.run.report import ControllerWriter
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.run.worker_protocol import WorkerProtocol
-from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
+from dreamfleet.coordinator.settings.limits import LimitsConfig
+from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 from tests.simulation.disk import Disk, MemoryJournal, Witness
 from tests.simulation.schedule import Shape

@@ -10,7 +10,9 @@ from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.errors import UsageError
 from dreamfleet.coordinator.experiments.local_run import load_parsed_flags
 from dreamfleet.coordinator.experiments.sweep.plan import Sweep, SweepRun
-from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, LimitsConfig, NetworkConfig, RunConfig
+from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, RunConfig
+from dreamfleet.coordinator.settings.limits import LimitsConfig
+from dreamfleet.coordinator.settings.network import NetworkConfig
 
 # Flags of `coordinator` that a sweep sets for each run, or has for all of them.
 OWN = (

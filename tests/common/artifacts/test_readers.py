@@ -173,7 +173,9 @@ def test_damaged_bundles(bundle, watched):
 
 
 def test_damaged_settings(tmp_path, watched):
-    from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig, RunConfig
+    from dreamfleet.coordinator.settings.config import RunConfig
+    from dreamfleet.coordinator.settings.limits import LimitsConfig
+    from dreamfleet.coordinator.settings.network import NetworkConfig
 
     whole = (
         b'connect = ["tcp/h:1"]\n[run]\npopulation = 8\nsigma0 = 0.1\ntask = "gym:A-v0"\nenvironment = ["a=1"]\n'

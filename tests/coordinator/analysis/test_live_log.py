@@ -15,8 +15,8 @@ from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.analysis.export import scalars_of
 from dreamfleet.coordinator.analysis.live_log import follow, live_log
 from dreamfleet.coordinator.analysis.sinks import open_sink
-from dreamfleet.coordinator.settings.config import NetworkConfig
 from dreamfleet.coordinator.settings.live_log import SinkName, check_sinks, parse_sink
+from dreamfleet.coordinator.settings.network import NetworkConfig
 from tests.support.events import scalars
 
 RUN = "dream"

@@ -14,7 +14,8 @@ from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.coordinator.run import batches as batches_module
 from dreamfleet.coordinator.run.batches import Batches
 from dreamfleet.coordinator.run.run import Run
-from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
+from dreamfleet.coordinator.settings.limits import LimitsConfig
+from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 from tests.support.samples import SPEC
 

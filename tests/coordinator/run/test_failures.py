@@ -13,7 +13,7 @@ from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.seeds import CONFIRMING_OFFSET, training_seed
 from dreamfleet.coordinator.run.run import BY_HAND
-from dreamfleet.coordinator.settings.config import LimitsConfig
+from dreamfleet.coordinator.settings.limits import LimitsConfig
 from tests.coordinator.run.test_run import SETTINGS as TWO
 from tests.coordinator.run.test_run import A, B, Bench
 

@@ -13,7 +13,8 @@ from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.run.worker_protocol import WorkerProtocol
 from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.service.status import encode_status
-from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
+from dreamfleet.coordinator.settings.limits import LimitsConfig
+from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 from tests.coordinator.run.test_run import SETTINGS, A
 

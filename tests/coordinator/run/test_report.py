@@ -12,7 +12,7 @@ from dreamfleet.common.runs.lookup import find_controller
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.coordinator.run.report import SAVE_INTERVAL
-from dreamfleet.coordinator.settings.config import LimitsConfig
+from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.start import find_start
 from tests.coordinator.run.test_run import SETTINGS, Bench
 

@@ -24,7 +24,8 @@ from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.run.worker_protocol import WorkerProtocol
-from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig
+from dreamfleet.coordinator.settings.limits import LimitsConfig
+from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 from tests.support.samples import SPEC
 

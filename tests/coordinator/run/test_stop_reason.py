@@ -10,7 +10,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.records import StoredGeneration
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.run.stop_reason import find_stop_reason
-from dreamfleet.coordinator.settings.config import LimitsConfig
+from dreamfleet.coordinator.settings.limits import LimitsConfig
 from tests.support.samples import SPEC
 
 NO_JOBS = SimpleNamespace(evaluations=SimpleNamespace(best=None))

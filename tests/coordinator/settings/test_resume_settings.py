@@ -8,7 +8,9 @@ from dreamfleet.common.cli.global_config import GlobalConfig
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.transport.network import DEFAULT_ENDPOINT
-from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig, RunConfig
+from dreamfleet.coordinator.settings.config import RunConfig
+from dreamfleet.coordinator.settings.limits import LimitsConfig
+from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.settings.resume_settings import (
     choose_addresses,
     serving_facts,

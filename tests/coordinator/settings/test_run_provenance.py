@@ -14,7 +14,9 @@ from dreamfleet.common.runs.effort import START_EFFORT, Effort
 from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
 from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.common.runs.run_provenance import read_run_provenance, read_run_settings
-from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig, RunConfig
+from dreamfleet.coordinator.settings.config import RunConfig
+from dreamfleet.coordinator.settings.limits import LimitsConfig
+from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.settings.rerun import Rerun
 from dreamfleet.coordinator.settings.resume_settings import serving_facts
 from dreamfleet.coordinator.settings.start import StartPoint, find_start

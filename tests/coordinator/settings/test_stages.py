@@ -14,8 +14,8 @@ from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.scoring_params import scoring_params_of
 from dreamfleet.common.runs.stages import begun_stages
 from dreamfleet.coordinator.service.snapshot import take_snapshot
-from dreamfleet.coordinator.settings.config import LimitsConfig
 from dreamfleet.coordinator.settings.fork import Fork
+from dreamfleet.coordinator.settings.limits import LimitsConfig
 from tests.coordinator.evaluated import EVERY, Evaluated
 from tests.coordinator.run.test_run import SETTINGS
 from tests.support.samples import SPEC

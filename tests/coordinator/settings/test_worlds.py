@@ -15,7 +15,9 @@ from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.common.worlds import shipped
 from dreamfleet.coordinator.experiments.demo import DemoConfig
 from dreamfleet.coordinator.service.main import RunRequest, _resolve_settings
-from dreamfleet.coordinator.settings.config import LimitsConfig, NetworkConfig, RunConfig, config_values
+from dreamfleet.coordinator.settings.config import RunConfig, config_values
+from dreamfleet.coordinator.settings.limits import LimitsConfig
+from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.settings.presets import find_preset
 from dreamfleet.coordinator.settings.start import StartPoint
 from tests.support.bundles import write_world_bundle

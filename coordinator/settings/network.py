@@ -1,0 +1,62 @@
+"""Where a run is reached, and how it treats its workers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from dreamfleet.common.cli.config import option
+from dreamfleet.common.protocol.messages import FleetShare, Share
+from dreamfleet.common.serialization.validation import Between
+from dreamfleet.common.transport.network import parse_metrics_address
+from dreamfleet.coordinator.settings.bounds import check_bounds
+from dreamfleet.coordinator.settings.live_log import parse_sinks
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Where the coordinator is reached, and how it treats its workers."""
+
+    listen: tuple[str, ...] = option((), "listen here (default tcp/127.0.0.1:7447, unless --connect is given)")
+    connect: tuple[str, ...] = option((), "connect to these stand-alone routers; with --listen, do both")
+    beat: Annotated[float, Between(0.05, 60.0)] = option(1.0, "seconds between a worker's beats")
+    evaluation_share: Annotated[float, Between(0.0, 0.9)] = option(
+        0.25, "share of a busy fleet's time for evaluations, 0 to 0.9; 0: only idle slots"
+    )  # the search needs the rest
+    failure_limit: Annotated[float, Between(0.0, 1.0)] = option(
+        0.5, "pause when more than this share of the last five generations' candidates failed, 0 to 1"
+    )
+    share: FleetShare = option(
+        1.0, "weight of this run among those that share workers: 3 gets three times the time of 1, while both have work"
+    )
+    strict: bool = option(
+        False,
+        "take results only of hosts that compute the same bits as the first one that scored, so that the run ends with "
+        "the same bits even if processes are killed",
+    )
+    verify: Share = option(
+        0.0,
+        "share of each worker's results, 0 to 1, that another host of its class scores again; a host that differs is "
+        "barred, and all its results are scored again (docs/how-to/trust.md)",
+    )
+    metrics_port: str = option(
+        "",
+        "serve Prometheus metrics under /metrics at this port of 127.0.0.1, or at HOST:PORT; anybody there may read "
+        "them",
+    )
+    log_to: tuple[str, ...] = option(
+        (),
+        "also write the run's curves, as it goes on, to tensorboard, wandb or mlflow, or to several of them; a folder, "
+        "project or address may stand behind a colon (docs/how-to/monitor.md). It has no flag",
+        flag=False,
+    )
+    insecure: bool = option(
+        False, "listen beyond this host without a join file: anyone who reaches the port owns the run, may read, forge "
+        "and stop everything"
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        if self.metrics_port:
+            parse_metrics_address(self.metrics_port)
+        parse_sinks(self.log_to)
+        check_bounds(self)
