@@ -15,8 +15,8 @@ from typing import Any
 
 from dreamfleet.common.monitoring.eta import estimate_eta, summarise_status
 from dreamfleet.common.monitoring.status import Status
-from dreamfleet.common.printable import format_number
-from dreamfleet.common.protocol.tasks import is_unregistered
+from dreamfleet.common.printable import format_number, plural
+from dreamfleet.common.protocol.tasks import is_function_task, is_unregistered
 from dreamfleet.common.runs.records import StoredGeneration, count_episodes, format_mean, in_values, with_error
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, Credentials, describe_time_left
 from dreamfleet.common.transport.network import Network, is_loopback
@@ -50,6 +50,9 @@ class RunLog:
         facts = {"event": "begin", "run": self._name, "run_uid": run.uid, "incarnation": run.incarnation}
         log.info("run %s, incarnation %d, generation %d", self._name, run.incarnation, run.generation.number,
                  extra={"facts": facts})  # fmt: skip
+        if run.settings.confirm_episodes and not is_function_task(run.settings.task.task):
+            log.info("once its last generation is closed, %s or more confirm the best mean (--confirm-episodes)",
+                     plural(run.settings.confirm_episodes, "whole episode"))  # fmt: skip
         if listen:
             log.info("listening on %s", ", ".join(listen))
             if self._network.credentials is None and not all(is_loopback(each) for each in listen):
