@@ -5,6 +5,7 @@
 
 #include "roll.h"
 
+#include "body.h"
 #include "canvas.h"
 
 #include <math.h>
@@ -337,6 +338,9 @@ static PyMethodDef methods[] = {
     {"bar", bar, METH_VARARGS, "Draw the bar's 12 rows without its text."},
     {"picture", picture, METH_VARARGS, "The 64x64 picture of an observation's scene."},
     {"roll", roll, METH_VARARGS, "A step of the car's wheels."},
+    {"knows", knows, METH_O, "Whether Box2D's contacts and bodies lie in memory as is assumed here."},
+    {"look", look, METH_VARARGS, "Where the wheels and the hull are."},
+    {"touch", touch, METH_VARARGS, "What a contact changes of tiles, wheels and reward."},
     {"widen", widen, METH_O, "Draw with instructions at most so wide: 0 plain, 1 AVX2, 2 AVX-512; say with which."},
     {NULL, NULL, 0, NULL},
 };
@@ -348,7 +352,7 @@ static struct PyModuleDef definition = {
 PyMODINIT_FUNC PyInit__native(void)
 {
     canvas_init(&canvas);
-    if (!roll_init())
+    if (!roll_init() || !body_init())
         return NULL;
     return PyModule_Create(&definition);
 }
