@@ -92,6 +92,13 @@ static void quadrilateral(const View *view, const double *corners, double reach,
     canvas_polygon(&canvas, points, 4, colour);
 }
 
+/* Whether a first corner may be near enough to be seen: cheaper than to project it. */
+static inline bool is_within(const double *corner, Vector hull, double far)
+{
+    double x = corner[0] - hull.x, y = corner[1] - hull.y;
+    return x * x + y * y <= far * far;
+}
+
 static uint32_t colour_of(const double *rgb)
 {
     return ((uint32_t)rgb[0] & 255) << 16 | ((uint32_t)rgb[1] & 255) << 8 | ((uint32_t)rgb[2] & 255);
@@ -237,10 +244,14 @@ static bool draw_scene(Doubles *in, uint8_t *out)
         double corners[8] = {bounds, bounds, bounds, -bounds, -bounds, -bounds, -bounds, bounds};
         quadrilateral(&view, corners, INFINITY, ground);
     }
+    Vector hull = {sight[2], sight[3]};
+    double far = hypot(WIDTH / 2.0 + reach, HEIGHT * 3 / 4.0 + reach) / sight[0] + 1; /* the hull is at (1/2, 1/4) */
     for (Py_ssize_t i = 0; i + 8 <= in[GRASS].length; i += 8)
-        quadrilateral(&view, in[GRASS].values + i, reach, patch);
+        if (is_within(in[GRASS].values + i, hull, far))
+            quadrilateral(&view, in[GRASS].values + i, reach, patch);
     for (Py_ssize_t i = 0; i < roads; i++)
-        quadrilateral(&view, in[ROAD].values + 8 * i, reach, colour_of(in[ROAD_COLOURS].values + 3 * i));
+        if (is_within(in[ROAD].values + 8 * i, hull, far))
+            quadrilateral(&view, in[ROAD].values + 8 * i, reach, colour_of(in[ROAD_COLOURS].values + 3 * i));
     if (!draw_car(&view, in[BODY_STATE].values, in[FIXTURES].values, in[FIXTURES].length, in[WHEEL].values))
         return fail("damaged fixtures");
     if (canvas.overflow)
