@@ -67,11 +67,11 @@ class Car(_Base):  # type: ignore[misc]
 class Listener(_Listener):  # type: ignore[misc]
     """Notes which wheels touch which tiles. Assigning `__class__` turns gymnasium's listener into one."""
 
-    def BeginContact(self, contact: Any) -> None:
+    def BeginContact(self, contact: Any) -> None:  # noqa: N802 - Box2D's name
         """A wheel or the hull comes upon a tile."""
         _native.touch(self, contact, True)
 
-    def EndContact(self, contact: Any) -> None:
+    def EndContact(self, contact: Any) -> None:  # noqa: N802 - Box2D's name
         """It leaves the tile."""
         _native.touch(self, contact, False)
 
@@ -81,7 +81,7 @@ class _Trial(Box2D.b2ContactListener):  # type: ignore[misc]
 
     known: bool | None = None
 
-    def BeginContact(self, contact: Any) -> None:
+    def BeginContact(self, contact: Any) -> None:  # noqa: N802 - Box2D's name
         self.known = self.known is not False and _native.knows(contact)
 
 
@@ -94,8 +94,8 @@ def find_native() -> ModuleType | None:
     world = Box2D.b2World(gravity=(0, 0), contactListener=trial)
     for turn in (1, 2):
         body = world.CreateDynamicBody(
-            position=(0.25 * turn, -0.5 * turn), angle=0.75 * turn, linearVelocity=(3.5 * turn, -4.5), angularVelocity=turn,
-            fixtures=Box2D.b2FixtureDef(shape=Box2D.b2PolygonShape(box=(2, 3)), density=1.0),
+            position=(0.25 * turn, -0.5 * turn), angle=0.75 * turn, linearVelocity=(3.5 * turn, -4.5),
+            angularVelocity=turn, fixtures=Box2D.b2FixtureDef(shape=Box2D.b2PolygonShape(box=(2, 3)), density=1.0),
         )  # fmt: skip
         body.userData = body
     world.Step(0.02, 1, 1)

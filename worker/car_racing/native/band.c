@@ -575,21 +575,26 @@ static __m128i weigh(__m128i value, __m128i weight)
 /* The sums of the even and the odd ones of a cell's pixels, four 16-bit channels each: of one row, or of two. The first
    pixel and the last ones have weights. */
 #ifdef __AVX2__
+static __m256i weigh_two(__m256i value, const uint16_t *weights)
+{
+    __m128i once = _mm_loadu_si128((const __m128i *)weights);
+    return _mm256_mulhi_epu16(_mm256_slli_epi16(value, 2), _mm256_broadcastsi128_si256(once));
+}
+
 static __m256i add_up(const uint32_t *a, const uint32_t *b, const uint16_t *weights)
 {
-    __m256i zero = _mm256_setzero_si256(), sum = zero, first = zero;
+    __m256i zero = _mm256_setzero_si256(), sum = zero;
     for (int x = 0; x < CELL; x += 4) {
         __m256i four = _mm256_inserti128_si256(_mm256_castsi128_si256(_mm_loadu_si128((const __m128i *)(a + x))),
                                                _mm_loadu_si128((const __m128i *)(b + x)), 1);
         __m256i low = _mm256_unpacklo_epi8(four, zero), high = _mm256_unpackhi_epi8(four, zero);
         if (x == 0)
-            low = _mm256_mulhi_epu16(_mm256_slli_epi16(low, 2), _mm256_broadcastsi128_si256(_mm_loadu_si128((const __m128i *)weights)));
+            low = weigh_two(low, weights);
         if (x == CELL - 4)
-            high = _mm256_mulhi_epu16(_mm256_slli_epi16(high, 2), _mm256_broadcastsi128_si256(_mm_loadu_si128((const __m128i *)weights + 1)));
-        sum = _mm256_add_epi16(sum, high);
-        first = _mm256_add_epi16(first, low);
+            high = weigh_two(high, weights + 8);
+        sum = _mm256_add_epi16(sum, _mm256_add_epi16(low, high));
     }
-    return _mm256_add_epi16(sum, first);
+    return sum;
 }
 #else
 static __m128i add_up(const uint32_t *row, const uint16_t *weights)

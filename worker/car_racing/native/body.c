@@ -4,8 +4,6 @@
 
 #include "body.h"
 
-#include <string.h>
-
 #define NAMES(each)                                                                                                    \
     each(__dict__) each(angle) each(angularVelocity) each(body) each(color) each(env) each(fixtureA) each(fixtureB)    \
         each(hull) each(idx) each(lap_complete_percent) each(linearVelocity) each(new_lap) each(phase) each(position)  \
@@ -95,9 +93,10 @@ static bool is_pair(PyObject *object, PyObject *name, float x, float y)
 static bool knows_body(PyObject *object, const Body *body)
 {
     PyObject *user = PyObject_GetAttr(object, NAME(userData));
-    bool known = user && body_of(object) == body && body->user == user && is_pair(object, NAME(position), body->x, body->y) &&
-                 is(object, NAME(angle), body->angle) && is_pair(object, NAME(linearVelocity), body->vx, body->vy) &&
-                 is(object, NAME(angularVelocity), body->spin);
+    bool known = user && body_of(object) == body && body->user == user && is(object, NAME(angle), body->angle) &&
+                 is(object, NAME(angularVelocity), body->spin) &&
+                 is_pair(object, NAME(position), body->x, body->y) &&
+                 is_pair(object, NAME(linearVelocity), body->vx, body->vy);
     Py_XDECREF(user);
     return known;
 }
@@ -176,8 +175,8 @@ static bool visit(PyObject *listener, PyObject *environment, PyObject *tile)
     Py_ssize_t tiles = track ? PyObject_Size(track) : -1;
     Py_XDECREF(track);
     double reward, visited, index, enough;
-    if (tiles <= 0 || !get(environment, NAME(reward), &reward) || !get(environment, NAME(tile_visited_count), &visited) ||
-        !get(tile, NAME(idx), &index) || !get(listener, NAME(lap_complete_percent), &enough))
+    if (tiles <= 0 || !get(environment, NAME(reward), &reward) || !get(tile, NAME(idx), &index) ||
+        !get(environment, NAME(tile_visited_count), &visited) || !get(listener, NAME(lap_complete_percent), &enough))
         return false;
     PyObject *count = PyLong_FromDouble(++visited);
     bool done = count && PyObject_SetAttr(tile, NAME(road_visited), Py_True) == 0 &&

@@ -10,15 +10,18 @@ enum { LINE = CELLS * 3, SIXTEENTHS = 16 * SCENE_ROWS / SMALL /* of a row, that 
 #define THREE(a, b, c) a, a, a, b, b, b, c, c, c
 #define OFTEN(three) three, three, three, three, three, three, three, three
 #define LINE_OF(a, b, c) {OFTEN(THREE(a, b, c)), OFTEN(THREE(a, b, c)), OFTEN(THREE(a, b, c)), OFTEN(THREE(a, b, c))}
-static const uint16_t left[LINE] = LINE_OF(2, 1, 0), right[LINE] = LINE_OF(1, 2, 0); /* a cell's weight, the next one's */
+/* The weights of a cell and of the next one. */
+static const uint16_t left[LINE] = LINE_OF(2, 1, 0), right[LINE] = LINE_OF(1, 2, 0);
 
 /* A row of the picture from the rows of the observation that it lies on. */
 static void shrink_row(const uint8_t *source, int i, uint8_t *target)
 {
     uint16_t sums[LINE + 3] = {0}; /* 3 more that nobody looks at */
     int top = SIXTEENTHS * i, skipped = top % 16, rest = SIXTEENTHS + skipped - 32; /* of the first and the third row */
-    const uint8_t *first = source + top / 16 * LINE, *second = first + LINE, *third = rest > 0 ? second + LINE : second;
-    uint16_t one = (uint16_t)(16 - skipped), two = (uint16_t)(rest < 0 ? 16 + rest : 16), three = (uint16_t)(rest > 0 ? rest : 0);
+    const uint8_t *first = source + top / 16 * LINE, *second = first + LINE;
+    const uint8_t *third = rest > 0 ? second + LINE : second; /* the picture's last row has none */
+    uint16_t one = (uint16_t)(16 - skipped), two = (uint16_t)(rest < 0 ? 16 + rest : 16);
+    uint16_t three = (uint16_t)(rest > 0 ? rest : 0);
     for (int x = 0; x < LINE; x++)
         sums[x] = (uint16_t)(one * first[x] + two * second[x] + three * third[x]);
     /* Of three cells the first two places become the two pixels; nobody looks at the third. */

@@ -1,4 +1,5 @@
-/* CarRacing's picture for Python: `scene`, `bar`, `picture`, `widen`, and `roll` of roll.c. Arrays come as buffers of doubles.
+/* CarRacing's picture for Python: `scene`, `bar`, `picture` and `widen`, with `roll` of roll.c, and `knows`, `look` and
+   `touch` of body.c. Arrays come as buffers of doubles.
 
    One canvas a process, whatever the number of environments: it is rebuilt for every picture, and the interpreter
    lock is held throughout. */

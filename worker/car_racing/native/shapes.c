@@ -8,7 +8,6 @@
 #include <stdlib.h>
 #include <string.h>
 
-
 enum { MAX_POINTS = 16 };
 
 /* ---- keeping shapes ---- */
@@ -206,9 +205,9 @@ void canvas_polygon(Canvas *canvas, const Point *points, int count, uint32_t col
     if (low == high)
         return;
     if (two_sided(points, count)) {
-        if (new_spans(canvas, shape, HEIGHT - 1 - high, HEIGHT - 1 - low))
-            canvas_fill(canvas->spans + canvas->spans_used - (shape->bottom - shape->top + 1), shape->top, shape->bottom, points,
-                        count, high);
+        Span *spans = new_spans(canvas, shape, HEIGHT - 1 - high, HEIGHT - 1 - low);
+        if (spans)
+            canvas_fill(spans, shape->top, shape->bottom, points, count, high);
         return;
     }
     for (int y = MAX(low, HEIGHT - 1 - canvas->bottom); y <= MIN(high, HEIGHT - 1 - canvas->top); y++) {
