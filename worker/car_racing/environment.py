@@ -34,6 +34,8 @@ class CarRacing(_Base):  # type: ignore[misc]
     environments of one process share one canvas.
     """
 
+    prev_reward: float  # gymnasium's
+
     def __init__(self, *arguments: Any, preprocessing: str = RAW.name, native: bool = True, **more: Any) -> None:
         super().__init__(*arguments, **more)
         self._native = native and is_native_available()
