@@ -394,8 +394,6 @@ static __m256i two_weights(uint32_t at, uint32_t slope)
 }
 #endif
 
-enum { STRIDE = MARGIN + WIDTH + MARGIN };
-
 /* A step is a row: its two pixels lie side by side, the lighter one on either side. */
 static void draw_steep(const Edge *edge, const Line *line, uint32_t *origin, Ink ink)
 {
@@ -471,6 +469,62 @@ static void draw_line(Canvas *canvas, const Band *band, const Line *line)
         draw_shallow(edge, line, origin, ink_of(colour));
 }
 
+#if defined(__AVX512F__)
+enum { CHUNK = 32 /* pixels of two cache lines */ };
+
+/* Paints columns `left` to `right` of `rows` rows, as far as they lie within the row's span. */
+static void paint_spans(uint32_t *row, __m512i spans, int rows, int left, int right, uint32_t colour)
+{
+    __m512i many = _mm512_set1_epi32((int)colour), all = _mm512_set1_epi32(-1), none = _mm512_setzero_si512();
+    __m512i from = _mm512_max_epi32(_mm512_srai_epi32(_mm512_slli_epi32(spans, 16), 16), _mm512_set1_epi32(left));
+    __m512i to = _mm512_min_epi32(_mm512_srai_epi32(spans, 16), _mm512_set1_epi32(right));
+    for (int x = left & -16; x <= right; x += CHUNK) {
+        __m512i start = _mm512_max_epi32(_mm512_sub_epi32(from, _mm512_set1_epi32(x)), none);
+        __m512i end = _mm512_max_epi32(_mm512_sub_epi32(to, _mm512_set1_epi32(x - 1)), none); /* beyond the last */
+        uint32_t masks[16];
+        _mm512_storeu_si512(masks, _mm512_andnot_si512(_mm512_sllv_epi32(all, end), _mm512_sllv_epi32(all, start)));
+        uint32_t *pixels = row + x;
+        if (right < x + 16)
+            for (int i = 0; i < rows; i++, pixels += STRIDE)
+                _mm512_mask_store_epi32(pixels, (__mmask16)masks[i], many);
+        else
+            for (int i = 0; i < rows; i++, pixels += STRIDE) {
+                _mm512_mask_store_epi32(pixels, (__mmask16)masks[i], many);
+                _mm512_mask_store_epi32(pixels + 16, (__mmask16)(masks[i] >> 16), many);
+            }
+    }
+}
+
+static __m512i spans_of(const Span *spans, int rows)
+{
+    return _mm512_maskz_loadu_epi32((__mmask16)((1u << rows) - 1), spans);
+}
+#endif
+
+/* Paints columns `left` to `right` of some rows, as far as they lie within the spans. */
+static void paint_rows(Canvas *canvas, const Band *band, int top, int bottom, const Span *spans, int left, int right,
+                       uint32_t colour)
+{
+    uint32_t *row = canvas->band[top - band->first + 1] + MARGIN;
+    int rows = bottom - top + 1;
+#if defined(__AVX512F__)
+    paint_spans(row, spans_of(spans, rows), rows, left, right, colour);
+#else
+    for (int i = 0; i < rows; i++, row += STRIDE)
+        paint(row, MAX(spans[i].left, left), MIN(spans[i].right, right), colour);
+#endif
+}
+
+/* Whole cache lines: what lies beside the run is clean, or nothing was painted there yet. */
+static void paint_background(Canvas *canvas, const Band *band, DirtyRun run, uint32_t background)
+{
+    uint32_t *row = canvas->band[band->top - band->first + 1] + MARGIN;
+    for (int y = band->top; y <= band->bottom; y++, row += STRIDE)
+        for (int x = run.left & -16; x <= run.right; x += 16)
+            for (int i = 0; i < 16; i++)
+                row[x + i] = background;
+}
+
 static void draw_patch(Canvas *canvas, const Band *band, const Patch *patch)
 {
     const Shape *shape = patch->shape;
@@ -482,11 +536,8 @@ static void draw_patch(Canvas *canvas, const Band *band, const Patch *patch)
             continue;
         if (run.left > right)
             break;
-        for (int row = patch->top; row <= patch->bottom; row++) {
-            Span span = shape->spans[row - shape->top];
-            paint(canvas->band[row - band->first + 1] + MARGIN, MAX(span.left, run.left), MIN(span.right, run.right),
-                  shape->colour);
-        }
+        paint_rows(canvas, band, patch->top, patch->bottom, shape->spans + patch->top - shape->top,
+                   MAX(run.left, left), MIN(run.right, right), shape->colour);
     }
 }
 
@@ -502,8 +553,7 @@ static void draw(Canvas *canvas, Band *band, uint32_t background)
     find_runs(canvas, band);
     for (int k = 0; k < band->run_count; k++)
         if (band->runs[k].first < 0)
-            for (int row = band->top; row <= band->bottom; row++)
-                paint(canvas->band[row - band->first + 1] + MARGIN, band->runs[k].left, band->runs[k].right, background);
+            paint_background(canvas, band, band->runs[k], background);
     const Line *line = band->lines;
     for (const Patch *patch = band->patches; patch < band->patches + band->patch_count; patch++) {
         for (; line < band->lines + patch->lines_end; line++)
@@ -517,91 +567,69 @@ static void draw(Canvas *canvas, Band *band, uint32_t background)
 /* ---- averaging ---- */
 
 #ifdef __SSE2__
-/* Two source rows side by side, four 16-bit channels each. */
-static __m128i widen(__m128i pixels)
-{
-    return _mm_unpacklo_epi8(pixels, _mm_setzero_si128());
-}
-
-static __m128i pair(const uint32_t *a, const uint32_t *b)
-{
-    return widen(_mm_unpacklo_epi32(_mm_cvtsi32_si128((int)*a), _mm_cvtsi32_si128((int)*b)));
-}
-
-/* Four pixels of a row, added up two by two. */
-static __m128i fold(const uint32_t *pixels)
-{
-    __m128i four = _mm_loadu_si128((const __m128i *)pixels);
-    return _mm_add_epi16(widen(four), _mm_unpackhi_epi8(four, _mm_setzero_si128()));
-}
-
 static __m128i weigh(__m128i value, __m128i weight)
 {
     return _mm_mulhi_epu16(_mm_slli_epi16(value, 2), weight);
 }
 
-/* The averages along cell j of two source rows. */
-static __m128i average_rows(const Axis *across, const uint32_t *a, const uint32_t *b, int j)
-{
-    int x = MARGIN + across->first[j], last = MARGIN + across->last[j];
-    __m128i sum = _mm_setzero_si128();
-    if (j > 0) {
-        sum = weigh(pair(a + x, b + x), _mm_set1_epi16((short)across->first_weight[j]));
-        x++;
-    }
-    for (; x + 4 <= last; x += 4) {
-        __m128i left = fold(a + x), right = fold(b + x);
-        sum = _mm_add_epi16(sum, _mm_add_epi16(_mm_unpacklo_epi64(left, right), _mm_unpackhi_epi64(left, right)));
-    }
-    for (; x < last; x++)
-        sum = _mm_add_epi16(sum, pair(a + x, b + x));
-    sum = _mm_add_epi16(sum, weigh(pair(a + last, b + last), _mm_set1_epi16((short)across->last_weight[j])));
-    return _mm_mulhi_epu16(sum, _mm_set1_epi16((short)across->reciprocal));
-}
-
+/* The sums of the even and the odd ones of a cell's pixels, four 16-bit channels each: of one row, or of two. The first
+   pixel and the last ones have weights. */
 #ifdef __AVX2__
-static __m256i join(__m128i low, __m128i high)
+static __m256i weigh_two(__m256i value, const uint16_t *weights)
 {
-    return _mm256_inserti128_si256(_mm256_castsi128_si256(low), high, 1);
+    __m128i once = _mm_loadu_si128((const __m128i *)weights);
+    return _mm256_mulhi_epu16(_mm256_slli_epi16(value, 2), _mm256_broadcastsi128_si256(once));
 }
 
-static __m256i fold_two(const uint32_t *low, const uint32_t *high)
+static __m256i add_up(const uint32_t *a, const uint32_t *b, const uint16_t *weights)
 {
-    __m256i pixels = join(_mm_loadu_si128((const __m128i *)low), _mm_loadu_si128((const __m128i *)high));
-    __m256i zero = _mm256_setzero_si256();
-    return _mm256_add_epi16(_mm256_unpacklo_epi8(pixels, zero), _mm256_unpackhi_epi8(pixels, zero));
-}
-
-static __m256i weigh_four(__m256i value, int weight)
-{
-    return _mm256_mulhi_epu16(_mm256_slli_epi16(value, 2), _mm256_set1_epi16((short)weight));
-}
-
-/* The averages along cell j of four source rows. */
-static __m256i average_four(const Axis *across, const uint32_t *a, const uint32_t *b, const uint32_t *c,
-                            const uint32_t *d, int j)
-{
-    int x = MARGIN + across->first[j], last = MARGIN + across->last[j];
-    __m256i sum = _mm256_setzero_si256();
-    if (j > 0) {
-        sum = weigh_four(join(pair(a + x, b + x), pair(c + x, d + x)), across->first_weight[j]);
-        x++;
+    __m256i zero = _mm256_setzero_si256(), sum = zero;
+    for (int x = 0; x < CELL; x += 4) {
+        __m256i four = _mm256_inserti128_si256(_mm256_castsi128_si256(_mm_loadu_si128((const __m128i *)(a + x))),
+                                               _mm_loadu_si128((const __m128i *)(b + x)), 1);
+        __m256i low = _mm256_unpacklo_epi8(four, zero), high = _mm256_unpackhi_epi8(four, zero);
+        if (x == 0)
+            low = weigh_two(low, weights);
+        if (x == CELL - 4)
+            high = weigh_two(high, weights + 8);
+        sum = _mm256_add_epi16(sum, _mm256_add_epi16(low, high));
     }
-    for (; x + 4 <= last; x += 4) {
-        __m256i left = fold_two(a + x, c + x), right = fold_two(b + x, d + x);
-        sum = _mm256_add_epi16(sum, _mm256_add_epi16(_mm256_unpacklo_epi64(left, right),
-                                                     _mm256_unpackhi_epi64(left, right)));
+    return sum;
+}
+#else
+static __m128i add_up(const uint32_t *row, const uint16_t *weights)
+{
+    __m128i zero = _mm_setzero_si128(), sum = zero;
+    for (int x = 0; x < CELL; x += 4) {
+        __m128i four = _mm_loadu_si128((const __m128i *)(row + x));
+        __m128i low = _mm_unpacklo_epi8(four, zero), high = _mm_unpackhi_epi8(four, zero);
+        if (x == 0)
+            low = weigh(low, _mm_loadu_si128((const __m128i *)weights));
+        if (x == CELL - 4)
+            high = weigh(high, _mm_loadu_si128((const __m128i *)weights + 1));
+        sum = _mm_add_epi16(sum, _mm_add_epi16(low, high));
     }
-    for (; x < last; x++)
-        sum = _mm256_add_epi16(sum, join(pair(a + x, b + x), pair(c + x, d + x)));
-    sum = _mm256_add_epi16(sum, weigh_four(join(pair(a + x, b + x), pair(c + x, d + x)), across->last_weight[j]));
-    return _mm256_mulhi_epu16(sum, _mm256_set1_epi16((short)across->reciprocal));
+    return sum;
 }
 #endif
 
+/* The averages along cell j of two source rows, side by side. */
+static __m128i average_rows(const Axis *across, const uint32_t *a, const uint32_t *b, int j)
+{
+    int x = MARGIN + across->first[j];
+#ifdef __AVX2__
+    __m256i both = add_up(a + x, b + x, across->ends[j]);
+    __m128i one = _mm256_castsi256_si128(both), other = _mm256_extracti128_si256(both, 1);
+#else
+    __m128i one = add_up(a + x, across->ends[j]), other = add_up(b + x, across->ends[j]);
+#endif
+    __m128i sum = _mm_add_epi16(_mm_unpacklo_epi64(one, other), _mm_unpackhi_epi64(one, other));
+    return _mm_mulhi_epu16(sum, _mm_set1_epi16((short)across->reciprocal));
+}
+
 static uint32_t average(const Canvas *canvas, int i, int j)
 {
-    static const uint32_t nothing[MARGIN + WIDTH + MARGIN];
+    static const uint32_t nothing[STRIDE];
     const Axis *across = &canvas->across, *down = &canvas->down;
     int row = 1, last = 1 + down->last[i] - down->first[i];
     const uint32_t *first = nothing;
@@ -613,13 +641,6 @@ static uint32_t average(const Canvas *canvas, int i, int j)
     __m128i weights = _mm_unpacklo_epi64(_mm_set1_epi16((short)first_weight),
                                          _mm_set1_epi16((short)down->last_weight[i]));
     __m128i sum = weigh(average_rows(across, first, canvas->band[last], j), weights);
-#ifdef __AVX2__
-    for (; row + 2 < last; row += 4) {
-        const uint32_t *fourth = row + 3 < last ? canvas->band[row + 3] : nothing;
-        __m256i four = average_four(across, canvas->band[row], canvas->band[row + 1], canvas->band[row + 2], fourth, j);
-        sum = _mm_add_epi16(sum, _mm_add_epi16(_mm256_castsi256_si128(four), _mm256_extracti128_si256(four, 1)));
-    }
-#endif
     for (; row < last; row += 2)
         sum = _mm_add_epi16(sum, average_rows(across, canvas->band[row],
                                               row + 1 < last ? canvas->band[row + 1] : nothing, j));
@@ -665,21 +686,26 @@ static uint32_t average(const Canvas *canvas, int i, int j)
 #endif
 
 /* Begins with the row's source rows that lie in the window, all background. */
-static void begin_band(const Canvas *canvas, Band *band, int i, uint32_t background, uint8_t *out)
+static void begin_band(const Canvas *canvas, Band *band, int i, const uint8_t *blank, uint8_t *out)
 {
     band->first = canvas->down.first[i];
     band->top = MAX(band->first, canvas->top);
     band->bottom = MIN(canvas->down.last[i], canvas->bottom);
     band->patch_count = band->line_count = 0;
     band->out = out;
-    cover(band, 0, CELLS - 1, background, -1);
+    band->dirty = (Cells){0, 0};
+    memset(band->base, 0xff, sizeof band->base); /* -1 */
+    memcpy(out, blank, 3 * CELLS);
 }
 
 void band_finish(Canvas *canvas, uint32_t background, int from, int to, uint8_t *out)
 {
     static Band band; /* as the canvas, one a process */
+    uint8_t blank[3 * CELLS];
+    for (int x = 0; x < 3 * CELLS; x++)
+        blank[x] = finished(background, 16 - x % 3 * 8);
     for (int i = from; i < to; i++, out += 3 * CELLS) {
-        begin_band(canvas, &band, i, background, out);
+        begin_band(canvas, &band, i, blank, out);
         for (int word = 0; word * 64 < canvas->count; word++)
             for (uint64_t rest = canvas->active[word][i]; rest; rest &= rest - 1)
                 survey(canvas, &band, word * 64 + lowest_bit(rest));

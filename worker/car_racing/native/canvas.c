@@ -29,6 +29,11 @@ static void axis_init(Axis *axis, int length)
         cell++;
     }
     for (int j = 0; j < CELLS; j++) {
+        bool full = axis->last[j] - axis->first[j] == CELL - 1;
+        uint16_t weights[4] = {j > 0 ? axis->first_weight[j] : ONE, ONE, full ? ONE : axis->last_weight[j],
+                               full ? axis->last_weight[j] : 0};
+        for (int lane = 0; lane < 16; lane++)
+            axis->ends[j][lane] = weights[lane / 4];
         for (int pixel = axis->first[j]; pixel <= axis->last[j]; pixel++) {
             if (axis->low[pixel] == 0xff)
                 axis->low[pixel] = (uint8_t)j;
@@ -49,6 +54,7 @@ static void axis_init(Axis *axis, int length)
 
 static CanvasFinish *finish;
 static CanvasShrink *shrink;
+static CanvasFill *fill;
 
 int canvas_widen(int most)
 {
@@ -57,17 +63,20 @@ int canvas_widen(int most)
         __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("bmi2")) {
         finish = band_finish_avx512;
         shrink = box_shrink_avx512;
+        fill = fill_spans_avx512;
         return 2;
     }
     if (most >= 1 && __builtin_cpu_supports("avx2")) {
         finish = band_finish_avx2;
         shrink = box_shrink_avx2;
+        fill = fill_spans_avx2;
         return 1;
     }
 #endif
     (void)most;
     finish = band_finish;
     shrink = box_shrink;
+    fill = fill_spans;
     return 0;
 }
 
@@ -95,4 +104,9 @@ void canvas_finish(Canvas *canvas, uint32_t background, int from, int to, uint8_
 void canvas_shrink(const uint8_t *source, uint8_t *target)
 {
     shrink(source, target);
+}
+
+void canvas_fill(Span *spans, int top, int bottom, const Point *points, int count, int highest)
+{
+    fill(spans, top, bottom, points, count, highest);
 }

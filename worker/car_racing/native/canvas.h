@@ -18,7 +18,9 @@ enum {
     SCENE_ROWS = 84, /* rows of cells above the indicator bar */
     SCENE = 700,     /* source rows above it */
     BAND = 12,       /* source rows of a row of cells, at most */
-    MARGIN = 8,      /* pixels beside a band, where an outline may step out by one */
+    CELL = 12,       /* source columns of a cell, at most; 11 at least */
+    MARGIN = 16,     /* pixels beside a band, where an outline may step out by one */
+    STRIDE = 1040,   /* pixels from a band's row to the next: whole cache lines, and no power of two */
     MAX_SHAPES = 2048,
     MAX_SPANS = 1 << 18,
     MAX_EDGES = 4,
@@ -56,6 +58,7 @@ typedef struct {
     int first[CELLS], last[CELLS];
     uint16_t first_weight[CELLS], last_weight[CELLS];
     uint16_t reciprocal;
+    uint16_t ends[CELLS][16]; /* weights of the first two and the last two of CELL pixels, four times each */
     uint8_t low[WIDTH], high[WIDTH]; /* the one or two cells that a source pixel belongs to */
     uint8_t after[WIDTH];            /* the first cell that begins at or after this pixel, or CELLS */
     int8_t before[WIDTH];            /* the last cell that ends at or before it, or -1 */
@@ -69,7 +72,7 @@ typedef struct {
     int spans_used;
     Span spans[MAX_SPANS];
     bool overflow; /* more was drawn than there is room for; the caller must not trust the picture */
-    uint32_t band[BAND + 2][MARGIN + WIDTH + MARGIN]; /* one row more above and below, which an outline may touch */
+    _Alignas(64) uint32_t band[BAND + 2][STRIDE]; /* one row more above and below, which an outline may touch */
     Axis across, down;
 } Canvas;
 
@@ -90,17 +93,23 @@ CanvasFinish canvas_finish;
 typedef void CanvasShrink(const uint8_t *source, uint8_t *target);
 CanvasShrink canvas_shrink;
 
+/* The spans of rows `top` to `bottom` of a polygon of which every line crosses two edges; `highest` is its last y. */
+typedef void CanvasFill(Span *spans, int top, int bottom, const Point *points, int count, int highest);
+CanvasFill canvas_fill;
+
 /* Draws with the processor's widest instructions up to 0 (none), 1 (AVX2) or 2 (AVX-512); says with which. They change
    no bit; to do without is for comparing. */
 int canvas_widen(int most);
 
-/* What canvas_finish and canvas_shrink choose from. */
+/* What canvas_finish, canvas_shrink and canvas_fill choose from. */
 CanvasFinish band_finish;
 CanvasShrink box_shrink;
+CanvasFill fill_spans;
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
 #define DREAMFLEET_WIDE
 CanvasFinish band_finish_avx2, band_finish_avx512;
 CanvasShrink box_shrink_avx2, box_shrink_avx512;
+CanvasFill fill_spans_avx2, fill_spans_avx512;
 #endif
 
 #endif

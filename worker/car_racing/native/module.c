@@ -1,10 +1,12 @@
-/* CarRacing's picture for Python: `scene`, `bar`, `picture`, `widen`, and `roll` of roll.c. Arrays come as buffers of doubles.
+/* CarRacing's picture for Python: `scene`, `bar`, `picture` and `widen`, with `roll` of roll.c, and `knows`, `look` and
+   `touch` of body.c. Arrays come as buffers of doubles.
 
    One canvas a process, whatever the number of environments: it is rebuilt for every picture, and the interpreter
    lock is held throughout. */
 
 #include "roll.h"
 
+#include "body.h"
 #include "canvas.h"
 
 #include <math.h>
@@ -89,6 +91,13 @@ static void quadrilateral(const View *view, const double *corners, double reach,
     if (left == 4 || right == 4 || low == 4 || high == 4)
         return;
     canvas_polygon(&canvas, points, 4, colour);
+}
+
+/* Whether a first corner may be near enough to be seen: cheaper than to project it. */
+static inline bool is_within(const double *corner, Vector hull, double far)
+{
+    double x = corner[0] - hull.x, y = corner[1] - hull.y;
+    return x * x + y * y <= far * far;
 }
 
 static uint32_t colour_of(const double *rgb)
@@ -236,10 +245,14 @@ static bool draw_scene(Doubles *in, uint8_t *out)
         double corners[8] = {bounds, bounds, bounds, -bounds, -bounds, -bounds, -bounds, bounds};
         quadrilateral(&view, corners, INFINITY, ground);
     }
+    Vector hull = {sight[2], sight[3]};
+    double far = hypot(WIDTH / 2.0 + reach, HEIGHT * 3 / 4.0 + reach) / sight[0] + 1; /* the hull is at (1/2, 1/4) */
     for (Py_ssize_t i = 0; i + 8 <= in[GRASS].length; i += 8)
-        quadrilateral(&view, in[GRASS].values + i, reach, patch);
+        if (is_within(in[GRASS].values + i, hull, far))
+            quadrilateral(&view, in[GRASS].values + i, reach, patch);
     for (Py_ssize_t i = 0; i < roads; i++)
-        quadrilateral(&view, in[ROAD].values + 8 * i, reach, colour_of(in[ROAD_COLOURS].values + 3 * i));
+        if (is_within(in[ROAD].values + 8 * i, hull, far))
+            quadrilateral(&view, in[ROAD].values + 8 * i, reach, colour_of(in[ROAD_COLOURS].values + 3 * i));
     if (!draw_car(&view, in[BODY_STATE].values, in[FIXTURES].values, in[FIXTURES].length, in[WHEEL].values))
         return fail("damaged fixtures");
     if (canvas.overflow)
@@ -337,6 +350,9 @@ static PyMethodDef methods[] = {
     {"bar", bar, METH_VARARGS, "Draw the bar's 12 rows without its text."},
     {"picture", picture, METH_VARARGS, "The 64x64 picture of an observation's scene."},
     {"roll", roll, METH_VARARGS, "A step of the car's wheels."},
+    {"knows", knows, METH_O, "Whether Box2D's contacts and bodies lie in memory as is assumed here."},
+    {"look", look, METH_VARARGS, "Where the wheels and the hull are."},
+    {"touch", touch, METH_VARARGS, "What a contact changes of tiles, wheels and reward."},
     {"widen", widen, METH_O, "Draw with instructions at most so wide: 0 plain, 1 AVX2, 2 AVX-512; say with which."},
     {NULL, NULL, 0, NULL},
 };
@@ -348,7 +364,7 @@ static struct PyModuleDef definition = {
 PyMODINIT_FUNC PyInit__native(void)
 {
     canvas_init(&canvas);
-    if (!roll_init())
+    if (!roll_init() || !body_init())
         return NULL;
     return PyModule_Create(&definition);
 }

@@ -1,16 +1,18 @@
 /* A step of the car's four wheels: gymnasium's arithmetic in the same order, in double precision.
 
-   Box2D's values come and go through its Python objects; only the interpreter's way between them is saved. */
+   What Box2D is told goes through its Python objects; the state of its bodies is read where it lies. */
 
 #include "roll.h"
+
+#include "body.h"
 
 #include <math.h>
 #include <stdbool.h>
 
 #define NAMES(each)                                                                                                    \
-    each(angle) each(ApplyForceToCenter) each(brake) each(fuel_spent) each(gas) each(joint) each(linearVelocity)       \
-        each(motorSpeed) each(omega) each(phase) each(road_friction) each(skid) each(skid_particle) each(skid_start)   \
-            each(steer) each(tiles) each(wheel_rad) each(wheels) each(x) each(y)
+    each(angle) each(ApplyForceToCenter) each(brake) each(fuel_spent) each(gas) each(joint) each(motorSpeed)           \
+        each(omega) each(phase) each(road_friction) each(skid) each(skid_particle) each(skid_start) each(steer)        \
+            each(tiles) each(wheel_rad) each(wheels)
 
 #define INDEX(name) NAME_##name,
 #define TEXT(name) #name,
@@ -30,24 +32,6 @@ bool roll_init(void)
         if (!(names[i] = PyUnicode_InternFromString(texts[i])))
             return false;
     return true;
-}
-
-static bool get(PyObject *object, PyObject *name, double *value)
-{
-    PyObject *found = PyObject_GetAttr(object, name);
-    if (!found)
-        return false;
-    *value = PyFloat_AsDouble(found);
-    Py_DECREF(found);
-    return *value != -1.0 || !PyErr_Occurred();
-}
-
-static bool set(PyObject *object, PyObject *name, double value)
-{
-    PyObject *number = PyFloat_FromDouble(value);
-    bool done = number && PyObject_SetAttr(object, name, number) == 0;
-    Py_XDECREF(number);
-    return done;
 }
 
 static double sign(double value)
@@ -91,14 +75,6 @@ static bool grip(PyObject *wheel, double road, double *limit, bool *grass)
     return !PyErr_Occurred();
 }
 
-static bool velocity_of(PyObject *wheel, double *x, double *y)
-{
-    PyObject *velocity = PyObject_GetAttr(wheel, NAME(linearVelocity));
-    bool done = velocity && get(velocity, NAME(x), x) && get(velocity, NAME(y), y);
-    Py_XDECREF(velocity);
-    return done;
-}
-
 /* Lengthens the wheel's trace, which pictures for people show, or ends it. */
 static bool skid(PyObject *car, PyObject *wheel, bool skids, bool grass)
 {
@@ -130,16 +106,17 @@ static double spin(double omega, double power, double brake, double inertia)
 
 static bool roll_wheel(PyObject *car, PyObject *wheel, const Constants *constants, double *fuel)
 {
-    double limit, angle, vx, vy, omega, gas, brake, phase, radius, dt = constants->dt;
+    double limit, omega, gas, brake, phase, radius, dt = constants->dt;
     bool grass;
-    if (!(steer(wheel) && grip(wheel, constants->road, &limit, &grass) && get(wheel, NAME(angle), &angle) &&
-          velocity_of(wheel, &vx, &vy) && get(wheel, NAME(omega), &omega) && get(wheel, NAME(gas), &gas) &&
-          get(wheel, NAME(brake), &brake) && get(wheel, NAME(phase), &phase) && get(wheel, NAME(wheel_rad), &radius)))
+    const Body *body = body_of(wheel);
+    if (!(body && steer(wheel) && grip(wheel, constants->road, &limit, &grass) && get(wheel, NAME(omega), &omega) &&
+          get(wheel, NAME(gas), &gas) && get(wheel, NAME(brake), &brake) && get(wheel, NAME(phase), &phase) &&
+          get(wheel, NAME(wheel_rad), &radius)))
         return false;
     /* Box2D's GetWorldVector((1, 0)), in its single precision; forwards is (-sine, cosine) */
-    float sine_once = sinf((float)angle), cosine_once = cosf((float)angle);
+    float sine_once = sinf(body->angle), cosine_once = cosf(body->angle);
     double cosine = cosine_once * 1.0f - sine_once * 0.0f, sine = sine_once * 1.0f + cosine_once * 0.0f;
-    double ahead = -sine * vx + cosine * vy, power = dt * constants->engine * gas;
+    double vx = body->vx, vy = body->vy, ahead = -sine * vx + cosine * vy, power = dt * constants->engine * gas;
     omega = spin(omega, power, brake, constants->inertia);
     *fuel += power;
     double forwards = (-ahead + omega * radius) * constants->stiffness;

@@ -2,14 +2,11 @@
    draw.polygon, which rounds in another way. The rules were read from pygame-ce 2.5 (SDL_gfx's primitives and draw.c)
    and are restated here; worker.car_racing.native_check holds them against the installed pygame. */
 
-#include "canvas.h"
+#include "span.h"
 
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
-
-#define MIN(a, b) ((a) < (b) ? (a) : (b))
-#define MAX(a, b) ((a) > (b) ? (a) : (b))
 
 enum { MAX_POINTS = 16 };
 
@@ -62,14 +59,6 @@ static Span *new_spans(Canvas *canvas, Shape *shape, int top, int bottom)
     shape->spans = spans;
     concern(canvas, shape, shape->top, shape->bottom);
     return spans;
-}
-
-static const Span EMPTY = {WIDTH, -1};
-
-static Span span_of(int left, int right)
-{
-    int first = MAX(MIN(left, right), 0), last = MIN(MAX(left, right), WIDTH - 1);
-    return first <= last ? (Span){(int16_t)first, (int16_t)last} : EMPTY;
 }
 
 /* One run of an interior, as a shape of its own. */
@@ -185,14 +174,6 @@ static int crossings(const Point *points, int count, int y, int bottom, int *fou
     return n;
 }
 
-/* The span between two crossings. */
-static Span between(int a, int b)
-{
-    a++;
-    b--;
-    return span_of((int16_t)((a >> 16) + ((a & 32768) >> 15)), (int16_t)((b >> 16) + ((b & 32768) >> 15)));
-}
-
 /* Whether a walk along the edges goes up once and down once, so that every line crosses exactly two. */
 static bool two_sided(const Point *points, int count)
 {
@@ -207,36 +188,6 @@ static bool two_sided(const Point *points, int count)
         way = next;
     }
     return turns + (way != first) == 2;
-}
-
-/* The crossings of rows `top` to `bottom` (clipped) with one edge. A double's quotient is exact here: half a unit more
-   outweighs its error, and is less than what lacks to the next whole quotient. */
-static void walk_edge(Point low, Point high, int top, int bottom, bool last, int *found)
-{
-    int from = MAX(HEIGHT - 1 - high.y + !last, top), to = MIN(HEIGHT - 1 - low.y, bottom);
-    double once = 1.0 / (high.y - low.y);
-    uint32_t dx = (uint32_t)(high.x - low.x), start = 65536u * (uint32_t)low.x;
-    for (int row = from; row <= to; row++) {
-        uint32_t part = (uint32_t)(int)((65536.0 * (HEIGHT - 1 - row - low.y) + 0.5) * once);
-        found[row - top] = (int)(part * dx + start);
-    }
-}
-
-/* The spans of a polygon of which every line crosses two edges. */
-static void fill_between(Canvas *canvas, Shape *shape, const Point *points, int count, int highest)
-{
-    int up[HEIGHT], down[HEIGHT]; /* the crossing with either side */
-    int rows = shape->bottom - shape->top + 1;
-    Span *spans = canvas->spans + canvas->spans_used - rows;
-    for (int i = 0; i < count; i++) {
-        Point a = points[i], b = points[(i + 1) % count];
-        if (a.y < b.y)
-            walk_edge(a, b, shape->top, shape->bottom, b.y == highest, up);
-        else if (a.y > b.y)
-            walk_edge(b, a, shape->top, shape->bottom, a.y == highest, down);
-    }
-    for (int i = 0; i < rows; i++)
-        spans[i] = between(MIN(up[i], down[i]), MAX(up[i], down[i]));
 }
 
 /* gfxdraw.aapolygon and gfxdraw.filled_polygon over it. */
@@ -254,8 +205,9 @@ void canvas_polygon(Canvas *canvas, const Point *points, int count, uint32_t col
     if (low == high)
         return;
     if (two_sided(points, count)) {
-        if (new_spans(canvas, shape, HEIGHT - 1 - high, HEIGHT - 1 - low))
-            fill_between(canvas, shape, points, count, high);
+        Span *spans = new_spans(canvas, shape, HEIGHT - 1 - high, HEIGHT - 1 - low);
+        if (spans)
+            canvas_fill(spans, shape->top, shape->bottom, points, count, high);
         return;
     }
     for (int y = MAX(low, HEIGHT - 1 - canvas->bottom); y <= MIN(high, HEIGHT - 1 - canvas->top); y++) {

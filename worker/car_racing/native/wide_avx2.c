@@ -1,4 +1,5 @@
-/* band.c and box.c for processors with AVX2. They compute with whole numbers only, so they draw the same bits. */
+/* band.c, box.c and fill.c for processors with AVX2. No instruction of theirs rounds in another way, so they draw
+   the same bits. */
 
 #include "canvas.h"
 
@@ -8,4 +9,6 @@
 #include "band.c"
 #define box_shrink box_shrink_avx2
 #include "box.c"
+#define fill_spans fill_spans_avx2
+#include "fill.c"
 #endif
