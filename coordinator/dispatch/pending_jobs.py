@@ -73,6 +73,8 @@ class PendingJob:
 
     def steps_lost_to(self, scorer: str, steps: int) -> int:
         """What former holders had done of the job that `scorer` has now scored in `steps`."""
+        if not self.lost_steps:
+            return 0
         gone = self.lost_steps.keys() - self.holders - {scorer}
         return sum(min(steps if (made := self.lost_steps[each]) is None else made, steps) for each in gone)
 

@@ -39,22 +39,26 @@ def make_work(
     """
     identity = hashlib.sha256(vector).digest()
     run_spec = run_spec or spec
+    stall = FUNCTION_STALL_SECONDS if is_function_task(spec.task) else STALL_SECONDS
+    overrides = (
+        None if spec.temperature == run_spec.temperature else spec.temperature,
+        None if spec.horizon == run_spec.horizon else spec.horizon,
+        None if spec.patience == run_spec.patience else spec.patience,
+        None if spec.driven == run_spec.driven else spec.driven,
+    )
     return [
         Work(
             Job(
-                kind=kind,
-                task=spec.task,
-                generation=generation,
-                candidate=candidate,
-                episode=episode,
-                seeds=(seed,),
-                vector=identity,
-                digest=spec.digest(kind, identity, (seed,)),
-                stall=FUNCTION_STALL_SECONDS if is_function_task(spec.task) else STALL_SECONDS,
-                temperature=None if spec.temperature == run_spec.temperature else spec.temperature,
-                horizon=None if spec.horizon == run_spec.horizon else spec.horizon,
-                patience=None if spec.patience == run_spec.patience else spec.patience,
-                driven=None if spec.driven == run_spec.driven else spec.driven,
+                kind,
+                spec.task,
+                generation,
+                candidate,
+                episode,
+                (seed,),
+                identity,
+                spec.digest(kind, identity, (seed,)),
+                stall,
+                *overrides,
             ),
             vector,
         )
