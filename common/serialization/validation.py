@@ -178,7 +178,7 @@ def _plain_checker(hint: Any) -> Check:
 
     base, *bounds = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     kind: Any = get_args(base)[0] if get_origin(base) is tuple else None
-    if bounds or not is_dataclass(kind):
+    if bounds or not _field_names(kind):
         return dump
     dump_item = _dumper(kind)
 
