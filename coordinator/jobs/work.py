@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,11 +57,17 @@ def make_work(
                 episode,
                 (seed,),
                 identity,
-                spec.digest(kind, identity, (seed,)),
+                hashlib.sha256(identity + text).digest(),
                 stall,
                 *overrides,
             ),
             vector,
         )
-        for episode, seed in enumerate(seeds, first)
+        for episode, (seed, text) in enumerate(zip(seeds, _digest_texts(spec, kind, tuple(seeds)), strict=True), first)
     ]
+
+
+@lru_cache(8)
+def _digest_texts(spec: TaskSpec, kind: Kind, seeds: tuple[int, ...]) -> tuple[bytes, ...]:
+    """What the jobs' identities hash behind the vector's hash: the same for each candidate of a generation."""
+    return tuple(spec.digest_text(kind, (seed,)) for seed in seeds)

@@ -225,7 +225,9 @@ class Service:
     def _is_commit_due(self, now: float) -> bool:
         """Whether the turn goes on to the disk: later while workers hold jobs whose results may share the commit."""
         goes_on = self._run.ended is None and self._run.stalled is None and not self._run.is_rewound
-        return not (goes_on and self._run.fleet.lease_count) or now >= self._commit_at or self._batch_queries.has_waiting
+        return (
+            not (goes_on and self._run.fleet.lease_count) or now >= self._commit_at or self._batch_queries.has_waiting
+        )
 
     def _commit(self) -> bool:
         """Commit; whether that succeeded. The next one waits as long as this one took, so jobs get half the time."""
