@@ -183,7 +183,7 @@ def _plain_checker(hint: Any) -> Check:
     dump_item = _dumper(kind)
 
     def dump_items(value: Any) -> Any:
-        if len(value) <= MAX_ITEMS and all(type(each) is kind for each in value):
+        if isinstance(value, tuple) and len(value) <= MAX_ITEMS and all(type(each) is kind for each in value):
             return [dump_item(each) for each in value]
         return dump(value)
 

@@ -88,6 +88,7 @@ class Service:
         self._error_counter = ErrorCounter(log)
         self._stopping = False
         self._commit_at = 0.0  # before that a commit waits for further results
+        self._has_uncommitted = False  # whether the last turn left its commit to a later one
 
     def stop(self) -> None:
         """End the loop soon; the run can be continued. Safe in a signal handler."""
@@ -152,7 +153,8 @@ class Service:
             opened = self._run.advance(now)
             if not self._run.is_rewound:  # jobs need not wait for the disk
                 self._put(session, self._run.fleet.dispatch(now, durable=False))
-            if not (opened or self._is_commit_due(now)):
+            self._has_uncommitted = not (opened or self._is_commit_due(now))
+            if self._has_uncommitted:
                 continue
             durable = self._commit()
             if self._run.is_rewound:  # no verdict: the next life counts what workers still hold
@@ -238,9 +240,9 @@ class Service:
 
     def _drain_events(self) -> None:
         """Handle the events that have arrived; without any, wait for one until a commit or a tick is due."""
-        left = self._commit_at - monotonic()
+        patience = min(max(self._commit_at - monotonic(), 0.0), TICK) if self._has_uncommitted else TICK
         try:
-            self._handle(*self._events.get(timeout=left if 0.0 < left < TICK else TICK))
+            self._handle(*self._events.get(timeout=patience))
             for _ in range(MOST_EVENTS):
                 self._handle(*self._events.get(timeout=0.0))
         except queue.Empty:
