@@ -15,7 +15,7 @@ import msgpack
 
 from dreamfleet.common.protocol.keys import PROTOCOL_VERSION
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, Message
-from dreamfleet.common.serialization.validation import MalformedError, T, checker_of, to_plain
+from dreamfleet.common.serialization.validation import MalformedError, T, checker_of, to_checked_plain, to_plain
 
 M = TypeVar("M", bound=Message)
 
@@ -27,9 +27,7 @@ def encoding(kind: type[Any]) -> str:
 
 def encode(message: Message) -> bytes:
     """Encode a message as msgpack; `MalformedError` if it breaks its own schema, as a peer would drop it."""
-    plain = to_plain(message)
-    checker_of(type(message))(plain)
-    payload: bytes = msgpack.packb({"v": PROTOCOL_VERSION, **plain})
+    payload: bytes = msgpack.packb({"v": PROTOCOL_VERSION, **to_checked_plain(message)})
     if len(payload) > MAX_MESSAGE:
         raise MalformedError("oversize")
     return payload

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 
 from dreamfleet.common.artifacts.controller import ControllerShape
@@ -99,13 +99,15 @@ class TaskSpec(DisplayedFields):
 
     def digest(self, kind: Kind, vector: bytes, seeds: tuple[int, ...]) -> bytes:
         """The identity of a job: SHA-256 of its kind, this specification, the parameters' hash and the seeds."""
-        text = f'{{"kind": "{kind}", "seeds": {list(seeds)}, "spec": {_spec_json(self)}}}'
-        return hashlib.sha256(vector + text.encode()).digest()
+        return hashlib.sha256(vector + self.digest_text(kind, seeds)).digest()
 
+    def digest_text(self, kind: Kind, seeds: tuple[int, ...]) -> bytes:
+        """What a job's identity hashes behind the parameters' hash."""
+        return f'{{"kind": "{kind}", "seeds": {list(seeds)}, "spec": {self._json}}}'.encode()
 
-@lru_cache
-def _spec_json(spec: TaskSpec) -> str:
-    return json.dumps(to_dict(spec), sort_keys=True)
+    @cached_property
+    def _json(self) -> str:
+        return json.dumps(to_dict(self), sort_keys=True)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import types
 from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -122,19 +122,115 @@ def _checker_for_items(hint: Any, bounds: list[Any]) -> Check:
 
 def _dataclass_checker(kind: type[Any]) -> Check:
     hints = get_type_hints(kind, include_extras=True)
-    checks = {field.name: checker_of(hints[field.name]) for field in fields(kind)}
-    names = frozenset(checks)
+    names = [field.name for field in fields(kind)]
     document: Any = kind  # mypy takes no class for hashable
-    required = names - optional_defaults(document).keys()
+    required = frozenset(names) - optional_defaults(document).keys()
+    scope = {"kind": kind, "names": frozenset(names), "required": required, "MalformedError": MalformedError}
+    # As `copy` and `pickle` do: the constructor of a frozen dataclass takes longer than all checks.
+    is_plain = not hasattr(kind, "__post_init__") and not any(
+        each.default_factory is not MISSING for each in fields(kind)
+    )
+    scope |= {"new": object.__new__, "defaults": optional_defaults(document) if is_plain else {}}
+    make = ["made_ = new(kind)", "made_.__dict__.update(made)", "return made_"] if is_plain else ["return kind(**made)"]
+    lines = [
+        "if not isinstance(value, dict):",
+        "    raise MalformedError('wrong type')",
+        "if value.keys() != required and not required <= value.keys() <= names:",
+        "    raise MalformedError('wrong fields')",
+        "made = {**defaults}",
+    ]
+    for name in names:
+        within = _checked_field(scope, name, hints[name], f"value[{name!r}]", checker_of(hints[name]))
+        within.append(f"made[{name!r}] = {name}_")
+        lines += within if name in required else [f"if {name!r} in value:", *(f"    {line}" for line in within)]
+    return _define("value", [*lines, *make], scope)
 
-    def build(value: Any) -> Any:
-        if not isinstance(value, dict):
-            raise MalformedError("wrong type")
-        if not required <= value.keys() <= names:
-            raise MalformedError("wrong fields")
-        return kind(**{name: check(value[name]) for name, check in checks.items() if name in value})
 
-    return build
+def to_checked_plain(value: Any) -> dict[str, Any]:
+    """A dataclass as `to_plain` gives it; `MalformedError` if that breaks its schema."""
+    kind: Any = type(value)
+    plain: dict[str, Any] = _dumper(kind)(value)
+    return plain
+
+
+@cache
+def _dumper(kind: Any) -> Check:
+    hints, optional, scope = get_type_hints(kind, include_extras=True), optional_defaults(kind), dict[str, Any]()
+    lines = ["plain = {}"]
+    for name in _field_names(kind):
+        within = _checked_field(scope, name, hints[name], f"value.{name}", _plain_checker(hints[name]))
+        within.append(f"plain[{name!r}] = {name}_")
+        if name in optional:
+            scope[f"{name}_default"] = optional[name]
+            within = [f"if not value.{name} == {name}_default:", *(f"    {line}" for line in within)]
+        lines += within
+    return _define("value", [*lines, "return plain"], scope)
+
+
+def _plain_checker(hint: Any) -> Check:
+    """A function that returns a field's plain form if that fits."""
+    check = checker_of(hint)
+
+    def dump(value: Any) -> Any:
+        plain = to_plain(value)
+        check(plain)
+        return plain
+
+    base, *bounds = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+    kind: Any = get_args(base)[0] if get_origin(base) is tuple else None
+    if bounds or not _field_names(kind):
+        return dump
+    dump_item = _dumper(kind)
+
+    def dump_items(value: Any) -> Any:
+        if isinstance(value, tuple) and len(value) <= MAX_ITEMS and all(type(each) is kind for each in value):
+            return [dump_item(each) for each in value]
+        return dump(value)
+
+    return dump_items
+
+
+def _checked_field(scope: dict[str, Any], name: str, hint: Any, source: str, check: Check) -> list[str]:
+    """The lines that set `name_` to a checked field; `check` is called only if a short condition does not hold."""
+    scope[f"{name}_check"] = check
+    condition = _condition(hint, f"{name}_", scope)
+    if condition is None:
+        return [f"{name}_ = {name}_check({source})"]
+    return [f"{name}_ = {source}", f"if not ({condition}): {name}_ = {name}_check({name}_)"]
+
+
+def _condition(hint: Any, x: str, scope: dict[str, Any]) -> str | None:
+    """An expression that holds only for values of `x` that a hint's checker returns as they are; `None`: there is none.
+
+    Generated code is ten times as fast as nested functions, and every field of every job passes here.
+    """
+    origin = get_origin(hint)
+    if origin is Annotated:
+        base, *bounds = get_args(hint)
+        found = _condition(base, x, scope)
+        measured = {Between: x, Length: f"len({x})"}
+        limits = [f"{each.low!r} <= {measured[type(each)]} <= {each.high!r}" for each in bounds]
+        return None if found is None else " and ".join([found, *limits])
+    if origin is Literal:
+        scope[f"{x}words"] = get_args(hint)
+        return f"type({x}) is str and {x} in {x}words"
+    if origin in (Union, types.UnionType):
+        (inner,) = [option for option in get_args(hint) if option is not type(None)]
+        found = _condition(inner, x, scope)
+        return None if found is None else f"{x} is None or {found}"
+    if hint is float:
+        return f"type({x}) is float and {x} - {x} == 0.0"  # finite
+    if hint is str:
+        return f"type({x}) is str and {x}.isascii()"
+    return f"type({x}) is {hint.__name__}" if hint in (int, bytes, bool) else None
+
+
+def _define(parameter: str, lines: list[str], scope: dict[str, Any]) -> Check:
+    """The function of one parameter with these lines."""
+    body = "".join(f"    {line}\n" for line in lines)
+    exec(f"def compiled({parameter}):\n{body}", scope)  # noqa: S102 - made from this package's own annotations
+    compiled: Check = scope["compiled"]
+    return compiled
 
 
 def _bounded_checker(check: Check, bounds: list[Any]) -> Check:

@@ -5,7 +5,7 @@ Events are kept in blocks that only grow, so a view costs the same however long 
 
 from __future__ import annotations
 
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Collection, Iterator
 from typing import NamedTuple
 
@@ -52,12 +52,12 @@ class EventLog:
 
     def __init__(self) -> None:
         self._blocks: deque[list[FleetEvent]] = deque([[]], maxlen=BLOCKS)
-        self._names: dict[bytes, tuple[str, int, int, int]] = {}
+        self._names: OrderedDict[bytes, tuple[str, int, int, int]] = OrderedDict()  # a dict's first is not found fast
 
     def add_given(self, now: float, worker: str, job: Job) -> None:
         """Record that a worker was given a job, and remember the job's name."""
         if job.digest not in self._names and len(self._names) >= MAX_NAMED:
-            del self._names[next(iter(self._names))]
+            self._names.popitem(last=False)
         self._names[job.digest] = (job.kind, job.generation, job.candidate, job.episode)
         self.add(now, "given", worker, job.digest)
 

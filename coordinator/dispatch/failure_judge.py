@@ -80,9 +80,10 @@ class FailureJudge:
     def awaits_proof(self) -> bool:
         """Whether only suspects and failed jobs are open, and an idle host has not scored, while others have."""
         idle = {host_of(name) for name, each in self._members.items() if each.takes_jobs and not each.leases}
+        if not self.working_hosts or idle <= self.working_hosts:
+            return False
         wanted = [each for each in self._jobs.values() if each.check is None]
-        is_stuck = all(each.is_suspect or (each.attempts and not each.is_proof) for each in wanted)
-        return bool(self.working_hosts and wanted and is_stuck and idle - self.working_hosts)
+        return bool(wanted) and all(each.is_suspect or (each.attempts and not each.is_proof) for each in wanted)
 
     @property
     def hosts_for_suspects(self) -> Collection[str]:

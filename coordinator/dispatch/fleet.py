@@ -49,6 +49,7 @@ class Fleet:
         self._numberings = count(1)
         self._last_tick: float | None = None
         self._now = 0.0  # of the event that is being handled
+        self._planned_at: float | None = None  # when jobs were given that no commit has followed yet
         self._hosts = HostRecords()
         self.departed = DepartedWorkers()
         self.jobs = PendingJobs(evaluation_share)
@@ -245,7 +246,9 @@ class Fleet:
         self._now = now
         for member in self.members.values():
             member.record_turnarounds(now)
-        given = {} if self.paused else self._plan(now)
+        is_planned = durable and self._planned_at == now  # the turn's jobs went out before its commit
+        self._planned_at = None if durable or self.paused else now
+        given = {} if self.paused or is_planned else self._plan(now)
         sends: list[OutgoingBatch] = []
         for member in self.members.values():
             if member.state is not MemberState.PRESENT:

@@ -24,7 +24,7 @@ class BatchContent:
 
     def has_vector(self, vector: bytes) -> bool:
         """Whether the batch carries a part of the vector with this hash."""
-        return any(part.id == vector for part in self.vectors)
+        return any(part.id == vector for part in reversed(self.vectors))
 
 
 @dataclass(frozen=True)

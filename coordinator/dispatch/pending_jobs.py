@@ -37,8 +37,8 @@ class PendingJob:
     in_queue: bool = False  # whether a queue has an entry for it; the entry may outlive the state `QUEUED`
     holders: set[str] = field(default_factory=set)  # workers that have a lease
     given_to: set[str] = field(default_factory=set)  # workers that hold it or held it
-    overrun_by: set[str] = field(default_factory=set)  # workers that reported more steps than it can have
-    attempts: list[Attempt] = field(default_factory=list)  # the failed ones
+    overrun_by: frozenset[str] = frozenset()  # workers that reported more steps than it can have
+    attempts: tuple[Attempt, ...] = ()  # the failed ones
     lost_with: list[str] = field(default_factory=list)  # workers that ended while they held it
     is_proof: bool = False  # it was scored before: who scores it again shows that a host can score
     check: Check | None = None  # it has an accepted result, which another host is to repeat
@@ -69,17 +69,19 @@ class PendingJob:
 
         R8: a job that failed is given to another worker.
         """
-        return {each.worker for each in self.attempts} | self.overrun_by
+        return self.overrun_by.union(each.worker for each in self.attempts) if self.attempts else self.overrun_by
 
     def steps_lost_to(self, scorer: str, steps: int) -> int:
         """What former holders had done of the job that `scorer` has now scored in `steps`."""
+        if not self.lost_steps:
+            return 0
         gone = self.lost_steps.keys() - self.holders - {scorer}
         return sum(min(steps if (made := self.lost_steps[each]) is None else made, steps) for each in gone)
 
     @property
     def failure(self) -> JobFailure:
         """Its failures so far."""
-        return JobFailure(self.work, tuple(self.attempts), self.retry_at)
+        return JobFailure(self.work, self.attempts, self.retry_at)
 
 
 @dataclass(frozen=True)
@@ -222,7 +224,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
     def add_holder(self, digest: bytes, worker: str, *, by_share: bool = False) -> None:
         """Note that a worker has this job, or is about to be sent it."""
         pending = self._pending[digest]
-        self._background_held += pending.is_background and not pending.holders
+        self._background_held += not pending.holders and pending.is_background
         pending.holders.add(worker)
         pending.given_to.add(worker)
         if by_share:
@@ -234,7 +236,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         if pending is None or worker not in pending.holders:
             return False
         pending.holders.discard(worker)
-        self._background_held -= pending.is_background and not pending.holders
+        self._background_held -= not pending.holders and pending.is_background
         return not pending.holders
 
     def record_failure(self, worker: str, result: Result, now: float) -> None:
@@ -266,13 +268,13 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         for pending in self._pending.values():
             if worker in pending.lost_with:
                 pending.lost_with.remove(worker)
-                pending.attempts = [each for each in pending.attempts if each != Attempt(worker, WORKER_ENDED)]
+                ended = Attempt(worker, WORKER_ENDED)
+                pending.attempts = tuple(each for each in pending.attempts if each != ended)
         self._failing = {digest: pending for digest, pending in self._failing.items() if pending.attempts}
 
     def _add_attempt(self, digest: bytes, attempt: Attempt, now: float) -> None:
         pending = self._pending[digest]
-        pending.attempts.append(attempt)
-        del pending.attempts[:-MAX_FAILED]
+        pending.attempts = (*pending.attempts, attempt)[-MAX_FAILED:]
         if pending.check is not None:
             pending.check.passed_over.add(host_of(attempt.worker))
             return
@@ -294,7 +296,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
 
     def record_overrun(self, digest: bytes, worker: str) -> None:
         """Note that a worker reported more steps of this job than it can have."""
-        self._pending[digest].overrun_by.add(worker)
+        self._pending[digest].overrun_by |= {worker}
 
     def accept(self, result: Result) -> PendingJob:
         """Take a wanted job's first valid result, and want the job no more.
@@ -316,7 +318,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         self._waiting.discard(digest)
         self._tags.pop(digest[:TAG_BYTES], None)
         self._share.release(digest)
-        self._background_held -= pending.is_background and bool(pending.holders)
+        self._background_held -= bool(pending.holders) and pending.is_background
         return pending
 
     @property
@@ -327,7 +329,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
     def clear_failures(self) -> None:
         """Forget all failures, so that each job may be tried anew."""
         for digest, pending in self._failing.items():
-            pending.attempts.clear()
+            pending.attempts = ()
             if pending.retry_at:
                 self._release(digest)
         self._failing.clear()

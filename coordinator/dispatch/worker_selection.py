@@ -36,7 +36,8 @@ class WorkerSelection:
         self._now = now
         self._dependable = {name for name, member in members.items() if is_dependable(member, now)}
         self._jobs = sum(len(members[name].leases) for name in self._dependable)
-        self._rate = sum(members[name].host_stats.rate for name in self._dependable)
+        self._rates = {name: members[name].host_stats.rate for name in self._dependable}
+        self._rate = sum(self._rates.values())
         self._expected_seconds = {
             name: members[name].host_stats.expected_seconds(load + 1) for name, load in self._loads.items()
         }
@@ -49,8 +50,9 @@ class WorkerSelection:
 
     def assign(self, name: str) -> None:
         """Note that this member is given one more job."""
-        self._loads[name] += 1
-        self._expected_seconds[name] = self._members[name].host_stats.expected_seconds(self._loads[name] + 1)
+        self._loads[name] = load = self._loads[name] + 1
+        if load & (load - 1) == 0:  # else one more job is of the same size class
+            self._expected_seconds[name] = self._members[name].host_stats.expected_seconds(load + 1)
         self._waiting -= 1
         self._jobs += name in self._dependable
 
@@ -94,21 +96,22 @@ class WorkerSelection:
 
     def _finishes_in_time(self, name: str) -> bool:
         """Whether this worker should return one more job without delaying the generation."""
-        if self._dependable <= {name}:
+        if len(self._dependable) < 2 and self._dependable <= {name}:
             return True  # there is no other that would wait for it
         member = self._members[name]
         if name not in self._dependable or member.host_stats.is_likely_lost(
             self._loads[name] + 1, self._now - member.joined_at
         ):
             return False
-        return self._expected_seconds[name] <= max(
-            PEER_RATIO * self._best_other_seconds(name), REST_FRACTION * self._rest_seconds(name)
-        )
+        expected = self._expected_seconds[name]
+        return expected <= PEER_RATIO * self._best_other_seconds(
+            name
+        ) or expected <= REST_FRACTION * self._rest_seconds(name)
 
     def _rest_seconds(self, name: str) -> float:
         """Seconds that the other workers need for the jobs that they hold and those in the queue."""
         jobs = self._waiting + self._jobs - self._loads[name]
-        return jobs / max(self._rate - self._members[name].host_stats.rate, 1e-9)
+        return jobs / max(self._rate - self._rates[name], 1e-9)
 
     def _best_other_seconds(self, name: str) -> float:
         """Seconds in which the fastest other worker returns about as many jobs as this one holds."""
@@ -126,13 +129,14 @@ class JobAssignment:
         self.given: dict[str, list[Work]] = {}
         self.shares = {name: member.held_share for name, member in members.items() if member.credit > 0}
         self._full_at = {name: share + members[name].credit for name, share in self.shares.items()}
+        self._idle = {name for name, share in self.shares.items() if share < members[name].capacity}
         self._jobs = jobs
         self._members = members
 
     @property
     def has_idle(self) -> bool:
         """Whether a member with credit has a slot without a job."""
-        return any(share < self._members[name].capacity for name, share in self.shares.items())
+        return bool(self._idle)
 
     def give(self, digest: bytes, name: str, *, by_share: bool = False) -> None:
         """Give a job to a member."""
@@ -141,6 +145,8 @@ class JobAssignment:
         self._jobs.add_holder(digest, name, by_share=by_share)
         if name in self.shares:
             self.shares[name] += self._members[name].share_of(runs_alone=job.runs_alone)
+            if self.shares[name] >= self._members[name].capacity:
+                self._idle.discard(name)
             if self.shares[name] >= self._full_at[name]:
                 del self.shares[name]
 
@@ -249,9 +255,10 @@ def _eligible_workers(pending: PendingJob, free: Collection[str], members: Mappi
     that was killed once must not stop the run. A stranger's hello cannot keep a failed job from being tried again, and
     neither can a worker that was never ready, so guests and these do not count.
     """
-    if eligible := [name for name in free if name not in pending.avoided_workers]:
+    avoided = pending.avoided_workers
+    if eligible := [name for name in free if name not in avoided]:
         return eligible
-    if any(name not in pending.avoided_workers for name, member in members.items() if member.has_been_ready):
+    if any(name not in avoided for name, member in members.items() if member.has_been_ready):
         return []
     failed = Counter(each.worker for each in pending.attempts)
     fewest = min((failed[name] for name in free), default=0)

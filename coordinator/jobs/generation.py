@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import isnan
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,8 +109,12 @@ class Generation:
     def missing(self) -> list[Work]:
         """Wanted jobs without a result, each digest once, candidate by candidate."""
         first = {work.job.digest: work for work in reversed(self.work)}
-        open_places = self._open_places
-        return [first[digest] for digest, places in self._places.items() if any(open_places[each] for each in places)]
+        is_open = self._open_places.tolist()
+        return [
+            first[digest]
+            for digest, places in self._places.items()
+            if any(is_open[candidate][episode] for candidate, episode in places)
+        ]
 
     @property
     def unwanted(self) -> list[bytes]:
@@ -139,11 +144,11 @@ class Generation:
         was drawn anew since has no place for it.
         """
         for number, place in enumerate(self._places.get(digest, ())):
-            if np.isnan(fitness):
+            if isnan(fitness):
                 self._failed[place[0]] = True
             self._scores[place] = fitness
             self._steps[place] = 0 if number else steps
-            if len(measures) == self._measures.shape[2]:
+            if measures and len(measures) == self._measures.shape[2]:
                 self._measures[place] = measures
         return self._open_second_half()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,24 +40,34 @@ def make_work(
     """
     identity = hashlib.sha256(vector).digest()
     run_spec = run_spec or spec
+    stall = FUNCTION_STALL_SECONDS if is_function_task(spec.task) else STALL_SECONDS
+    overrides = (
+        None if spec.temperature == run_spec.temperature else spec.temperature,
+        None if spec.horizon == run_spec.horizon else spec.horizon,
+        None if spec.patience == run_spec.patience else spec.patience,
+        None if spec.driven == run_spec.driven else spec.driven,
+    )
     return [
         Work(
             Job(
-                kind=kind,
-                task=spec.task,
-                generation=generation,
-                candidate=candidate,
-                episode=episode,
-                seeds=(seed,),
-                vector=identity,
-                digest=spec.digest(kind, identity, (seed,)),
-                stall=FUNCTION_STALL_SECONDS if is_function_task(spec.task) else STALL_SECONDS,
-                temperature=None if spec.temperature == run_spec.temperature else spec.temperature,
-                horizon=None if spec.horizon == run_spec.horizon else spec.horizon,
-                patience=None if spec.patience == run_spec.patience else spec.patience,
-                driven=None if spec.driven == run_spec.driven else spec.driven,
+                kind,
+                spec.task,
+                generation,
+                candidate,
+                episode,
+                (seed,),
+                identity,
+                hashlib.sha256(identity + text).digest(),
+                stall,
+                *overrides,
             ),
             vector,
         )
-        for episode, seed in enumerate(seeds, first)
+        for episode, (seed, text) in enumerate(zip(seeds, _digest_texts(spec, kind, tuple(seeds)), strict=True), first)
     ]
+
+
+@lru_cache(8)
+def _digest_texts(spec: TaskSpec, kind: Kind, seeds: tuple[int, ...]) -> tuple[bytes, ...]:
+    """What the jobs' identities hash behind the vector's hash: the same for each candidate of a generation."""
+    return tuple(spec.digest_text(kind, (seed,)) for seed in seeds)

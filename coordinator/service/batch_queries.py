@@ -23,6 +23,11 @@ class BatchQueries:
         self._replies: list[tuple[zenoh.Query, BatchReply]] = []
         self._progress_at = 0.0
 
+    @property
+    def has_waiting(self) -> bool:
+        """Whether a reply waits for a commit."""
+        return bool(self._replies)
+
     def handle(self, query: zenoh.Query, now: float) -> None:
         """Do what a query says; its reply waits."""
         key = str(query.key_expr)

@@ -52,8 +52,8 @@ from dreamfleet.coordinator.storage.served_bundle import ServedBundle
 
 log = logging.getLogger(__name__)
 TICK = 0.05  # seconds: the longest that a lost worker waits to be noticed
-MOST_EVENTS_PER_COMMIT = 256  # events that share one commit at most
-LINGER = 0.005  # seconds that a commit waits for more events to share it
+MOST_EVENTS = 256  # events of a turn at most
+LINGER = 0.005  # the least seconds between two commits while results arrive, which then share one
 SNAPSHOT_INTERVAL = 0.2
 END_GRACE = 2.0  # seconds that workers may take to leave a run that has ended
 _WORKER_MESSAGES: dict[str, type[WorkerMessage]] = {"result": ResultBatch, "beat": Heartbeat, "upload": UploadPart}
@@ -87,6 +87,8 @@ class Service:
         self._inbox = CountingDecoder()
         self._error_counter = ErrorCounter(log)
         self._stopping = False
+        self._commit_at = 0.0  # before that a commit waits for further results
+        self._has_uncommitted = False  # whether the last turn left its commit to a later one
 
     def stop(self) -> None:
         """End the loop soon; the run can be continued. Safe in a signal handler."""
@@ -148,9 +150,13 @@ class Service:
             self._drain_events()
             now = monotonic()
             self._run.tick(now)
-            if self._run.advance(now):  # the new generation's jobs need not wait for the disk
+            opened = self._run.advance(now)
+            if not self._run.is_rewound:  # jobs need not wait for the disk
                 self._put(session, self._run.fleet.dispatch(now, durable=False))
-            durable = self._run.commit()
+            self._has_uncommitted = not (opened or self._is_commit_due(now))
+            if self._has_uncommitted:
+                continue
+            durable = self._commit()
             if self._run.is_rewound:  # no verdict: the next life counts what workers still hold
                 self._run_log.write_notes()
                 self._stopping = self._stopping or durable
@@ -218,14 +224,27 @@ class Service:
                 continue
             session.put(keys.job(self._name, batch.identity), message, encoding=encoding(JobBatch))
 
+    def _is_commit_due(self, now: float) -> bool:
+        """Whether the turn goes on to the disk: later while workers hold jobs whose results may share the commit."""
+        goes_on = self._run.ended is None and self._run.stalled is None and not self._run.is_rewound
+        return (
+            not (goes_on and self._run.fleet.lease_count) or now >= self._commit_at or self._batch_queries.has_waiting
+        )
+
+    def _commit(self) -> bool:
+        """Commit; whether that succeeded. The next one waits as long as this one took, so jobs get half the time."""
+        began = monotonic()
+        durable = self._run.commit()
+        self._commit_at = monotonic() + max(LINGER, monotonic() - began)
+        return durable
+
     def _drain_events(self) -> None:
-        """Handle the events that have arrived: wait at most a tick for the first, and briefly for more."""
+        """Handle the events that have arrived; without any, wait for one until a commit or a tick is due."""
+        patience = min(max(self._commit_at - monotonic(), 0.0), TICK) if self._has_uncommitted else TICK
         try:
-            self._handle(*self._events.get(timeout=TICK))
-            until = monotonic() + LINGER
-            for _ in range(MOST_EVENTS_PER_COMMIT):
-                left = until - monotonic() if self._run.fleet.jobs else 0.0  # a complete generation does not wait
-                self._handle(*self._events.get(timeout=max(left, 0.0)))
+            self._handle(*self._events.get(timeout=patience))
+            for _ in range(MOST_EVENTS):
+                self._handle(*self._events.get(timeout=0.0))
         except queue.Empty:
             pass
 

@@ -69,6 +69,7 @@ class Journal(RecallRecords):
         super().__init__(path)
         self._incarnation = 0
         self._effort = None
+        self._made: dict[tuple[str, str, bool], list[int]] = {}  # steps and microseconds that `_effort` lacks
         self._counted = None
 
     @classmethod
@@ -257,8 +258,9 @@ class Journal(RecallRecords):
         if self._counted is not None:
             self._counted[host_class or class_from_fingerprint(fingerprint), fingerprint] += 1
         if self._effort is not None:
-            made = result.steps, int(result.seconds * 1e6)
-            self._effort += Effort.of(job.task, job.kind, *made, driven=bool(job.driven))
+            made = self._made.setdefault((job.task, job.kind, bool(job.driven)), [0, 0])
+            made[0] += result.steps
+            made[1] += int(result.seconds * 1e6)
 
     @property
     def effort(self) -> Effort:
@@ -269,6 +271,10 @@ class Journal(RecallRecords):
             task = settings.task.task
             efforts = (Effort.of(task, kind, *made, driven=bool(driven)) for kind, _, _, driven, *made in rows)
             self._effort = sum(efforts, Effort())
+            self._made.clear()
+        while self._made:
+            (task, kind, driven), made = self._made.popitem()
+            self._effort += Effort.of(task, kind, *made, driven=driven)
         return self._effort
 
     def drop_excessive(self, horizon: int) -> int:

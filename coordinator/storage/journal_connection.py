@@ -19,6 +19,10 @@ from dreamfleet.coordinator.storage.journal_file import (
     sqlite_side_files,
 )
 
+# Of the write-ahead log, before it is folded into the journal. Results come in the order of their digests, so each
+# changes another page: the more of them a fold has, the fewer pages it writes.
+LOG_PAGES = 4000
+
 
 class JournalConnection:
     """An open journal. Writes wait in memory, in order, until `commit` or the next read."""
@@ -38,6 +42,7 @@ class JournalConnection:
                 schema.migrate(self._connection, schema.check_schema(self._connection, path))
                 self._connection.execute("PRAGMA journal_mode = WAL")
                 self._connection.execute("PRAGMA synchronous = FULL")
+                self._connection.execute(f"PRAGMA wal_autocheckpoint = {LOG_PAGES}")
                 self._connection.execute("PRAGMA cache_spill = OFF")  # only a commit can find the disk full
             except BaseException:
                 self._connection.close()

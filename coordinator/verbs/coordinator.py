@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import logging
 import signal
 import sys
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
 __all__ = ["EXTRAS", "SUMMARY", "configure", "run"]
 EXTRAS: tuple[str, ...] = ()
 LEFT_OPEN = 130
+# Python looks for cycles after every 700 new objects by default. A generation's jobs are many and have none.
+COLLECTION = (20_000, 10, 10)
 log = logging.getLogger("dreamfleet.coordinator")
 
 
@@ -131,6 +134,7 @@ def serve_request(
     check_room_for_session()  # before anything else starts a thread
     make_stderr_nonblocking()
     label_logs(f"run {request.name}")
+    gc.set_threshold(*COLLECTION)
     run = serve_run(request, _stop_on_signals)
     _restore_signals()  # its last word may wait for a reader of stdout
     outcome = ExitReport(code=LEFT_OPEN) if run.ended is None else on_ended()

@@ -59,6 +59,7 @@ class Coordinator:
         self.fleet = self.run.fleet
         self.worker_protocol = WorkerProtocol(self.run, "simulated", self.nonce, Intervals(BEAT, REPEAT))
         self.draining = False
+        self.commit_at = 0.0
 
     def hear(self, worker: str, message: Any, now: float) -> None:
         """One event, as `Service._handle` takes it; hello is `welcome`."""
@@ -76,11 +77,17 @@ class Coordinator:
         """What follows the events in a turn of the loop, step by step: a life may end between any two."""
         yield None
         self.run.tick(now)
-        if self.run.advance(now):
+        opened = self.run.advance(now)
+        if opened:
             yield OPENED
+        if not self.run.is_rewound:
             yield from self.fleet.dispatch(now, durable=False)
         yield None
+        goes_on = self.run.ended is None and self.run.stalled is None and not self.run.is_rewound
+        if not opened and goes_on and self.fleet.lease_count and now < self.commit_at:
+            return
         self.run.commit()
+        self.commit_at = now + LINGER
         yield COMMITTED
         if self.run.is_rewound:
             return

@@ -250,10 +250,8 @@ class RunSession:
             self._finished += 1
             self._steps_finished += result.steps
             self._outbox.add(result)
-        if results:
-            if event.upload is not None:
-                self._uploads.add(results[0].digest, event.upload)
-            self._fill_slots(now)  # before other events, so that the slot does not idle
+        if results and event.upload is not None:
+            self._uploads.add(results[0].digest, event.upload)
 
     def _publish_frame(self, event: SlotEvent, frame: SampledFrame) -> None:
         """Publish a frame. The coordinator owes no answer to it, so its silence is not restarted."""

@@ -98,6 +98,7 @@ class Slot:
         self._child: ChildProcess | None = None  # `None` until `_start_at`
         self._kill_reason, self._last_error = "", ""
         self._looked_at = 0.0
+        self._weigh_at = 0.0  # when the child's memory is looked at next
         self._given_up_at = math.inf  # when a child that was killed or has exited counts as gone in any case
         self._sent = 0  # groups sent to this child
         self._is_watched = False
@@ -277,9 +278,11 @@ class Slot:
             log.warning("slot %d failed%s; a fresh process tries again", self.number, _describe_jobs(group.jobs))
             self._restart()
             return tuple(each for each in done.results if each.fitness is not None)
-        if self._child and not self._groups and 0 < self._memory_limit < (resident_bytes := self._child.memory):
-            log.warning("slot %d holds %d MiB; starting another", self.number, resident_bytes >> 20)
-            self._restart()
+        if self._child and not self._groups and self._memory_limit and (now := monotonic()) >= self._weigh_at:
+            self._weigh_at = now + LOOK_INTERVAL
+            if (resident_bytes := self._child.memory) > self._memory_limit:
+                log.warning("slot %d holds %d MiB; starting another", self.number, resident_bytes >> 20)
+                self._restart()
         return done.results
 
     def _restart(self) -> None:
@@ -347,6 +350,7 @@ class Slot:
         self._child_number += 1
         self._child = None
         self._given_up_at = math.inf
+        self._weigh_at = 0.0
         self._start_at = monotonic() + pause
 
     def start(self) -> None:
