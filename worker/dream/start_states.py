@@ -74,7 +74,8 @@ class StartStates:
     def deviation(self, logvar: Floats) -> Floats:
         """The standard deviation of a start's latent."""
         half = 0.5 * logvar
-        return np.exp(half, dtype=np.float64).astype(np.float32) if self.doubled else np.exp(half)
+        found: Floats = np.exp(half, dtype=np.float64).astype(np.float32) if self.doubled else np.exp(half)
+        return found
 
     def _recorded(self, index: int) -> StartState:
         latent = self.initial.shape[2]

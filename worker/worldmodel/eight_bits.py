@@ -75,9 +75,23 @@ def add_exponential(graph: GraphBuilder, value: str) -> str:
     return str(graph.node("Div", share, graph.node("Sub", above_one, share)))
 
 
+def round_weights_exactly(kernel: Floats, step: np.float32, *, centred: bool) -> tuple[NDArray[np.int8], Floats]:
+    """The integers of a kernel (inputs, outputs), and the scales of its sums, whose products with them are exact.
+
+    The inputs are integers of this `step`, from -128 to 127 if `centred`, else from 0 to 255.
+    """
+    weights, steps = _round_weights(kernel)
+    above, below = (np.maximum(sign * weights.astype(np.int64), 0).sum(axis=0) for sign in (1, -1))
+    largest = CENTRE * (above + below) if centred else HIGHEST_OUTPUT * np.maximum(above, below)
+    digits = np.maximum(MANTISSA - np.frexp(largest)[1], 1)
+    part, exponent = np.frexp(steps.astype(np.float64) * step)
+    scales = np.ldexp(np.ceil(np.ldexp(part, digits)), exponent - digits)  # larger ones: no weight leaves its range
+    return np.rint(kernel / (scales / step)).astype(np.int8), scales.astype(np.float32)
+
+
 def _add_product(graph: GraphBuilder, factor: Sequence[str], kernel: Floats, bias: Floats, step: np.float32) -> str:
     value, *centre = factor
-    weights, scales = _round_weights_exactly(kernel, step, centred=bool(centre))
+    weights, scales = round_weights_exactly(kernel, step, centred=bool(centre))
     scale = graph.constant(scales)
     one, no_zero = graph.constant(np.array(1, np.float32)), ""
     # The runtime's own operator is MatMulInteger, Cast, Mul and Add in one: the same bits, in less time.
@@ -98,17 +112,3 @@ def _round_weights(kernel: Floats) -> tuple[NDArray[np.int8], Floats]:
     steps = (np.abs(kernel).max(axis=0) / HIGHEST_WEIGHT).astype(np.float32)
     steps[steps == 0] = 1
     return np.rint(kernel / steps).astype(np.int8), steps
-
-
-def _round_weights_exactly(kernel: Floats, step: np.float32, *, centred: bool) -> tuple[NDArray[np.int8], Floats]:
-    """The integers of a kernel (inputs, outputs), and the scales of its sums, whose products with them are exact.
-
-    The inputs are integers of this `step`, from -128 to 127 if `centred`, else from 0 to 255.
-    """
-    weights, steps = _round_weights(kernel)
-    above, below = (np.maximum(sign * weights.astype(np.int64), 0).sum(axis=0) for sign in (1, -1))
-    largest = CENTRE * (above + below) if centred else HIGHEST_OUTPUT * np.maximum(above, below)
-    digits = np.maximum(MANTISSA - np.frexp(largest)[1], 1)
-    part, exponent = np.frexp(steps.astype(np.float64) * step)
-    scales = np.ldexp(np.ceil(np.ldexp(part, digits)), exponent - digits)  # larger ones: no weight leaves its range
-    return np.rint(kernel / (scales / step)).astype(np.int8), scales.astype(np.float32)
