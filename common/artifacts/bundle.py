@@ -43,6 +43,7 @@ RECORDED_STATES = "recorded_states.npy"  # states of recorded drives; only in bu
 # Graphs for controllers of any size; their input holds a controller in each row.
 LINEAR_CONTROLLER, LAYERED_CONTROLLER = "controller-linear.onnx", "controller-hidden.onnx"
 WEIGHTS = "weights.safetensors"  # only in bundles from which training can continue
+EIGHT_BITS = "eight_bits"  # among a manifest's models: the ranges of eight-bit products
 SINGLE_PRECISION = "single_precision"  # in the provenance of a bundle of eight bits: SHA-256 of what was rounded
 REQUIRED = (ENCODER, DECODER, POLICY, INITIAL_LATENTS_PART)  # of a bundle that does not describe its world
 REQUIRED_WITH_WORLD = (ENCODER, DECODER, DREAM_GRAPH, INITIAL_LATENTS_PART)

@@ -14,6 +14,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pygame
+from Box2D import b2Vec2
 from gymnasium.envs.box2d import car_dynamics, car_racing
 from gymnasium.error import InvalidAction
 from numpy.typing import NDArray
@@ -57,6 +58,11 @@ class CarRacing(_Base):  # type: ignore[misc]
     def drawn_by(self) -> str:
         """Which one draws the observation: `native` or `gymnasium`."""
         return "native" if self._native else "gymnasium"
+
+    @property
+    def fuses_products(self) -> bool:
+        """Whether Box2D was built with fused multiplications and additions, which move bodies to other bits."""
+        return box2d_fuses_products()
 
     def step(self, action: Any) -> Any:
         """Gymnasium's step; `InvalidAction` for an action of another shape or with NaN, before anything moves."""
@@ -219,3 +225,11 @@ def _grass_squares() -> NDArray[np.float64]:
 
 GRASS = _grass_squares()
 WHEEL = np.array([car_dynamics.WHEEL_W, car_dynamics.WHEEL_R, car_dynamics.SIZE, *car_dynamics.WHEEL_WHITE], float)
+
+
+@cache
+def box2d_fuses_products() -> bool:
+    """Whether a product of the installed Box2D keeps digits that a separate multiplication drops."""
+    root, square = 1 + 2.0**-12, 1 + 2.0**-11  # the root's square is 2^-24 larger
+    pairs = (((root, -1), (root, square)), ((-1, root), (square, root)))
+    return any(b2Vec2(*first).dot(b2Vec2(*second)) != 0 for first, second in pairs)

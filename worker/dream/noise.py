@@ -72,7 +72,7 @@ class EpisodeNoise:
         first = int(self._random.integers(len(start_states.initial)))
         mu, logvar, memory = start_states.choose(self._seed, first)
         normal = self._random.standard_normal(self._chance.latent, dtype=np.float32)
-        return DreamStart(mu + np.exp(0.5 * logvar) * normal, memory)
+        return DreamStart(mu + start_states.deviation(logvar) * normal, memory)
 
     def draw_block(self) -> Draw:
         """The draw of the next `BLOCK_STEPS` steps, one row each."""

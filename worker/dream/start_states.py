@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.bundle import INITIAL_LATENTS_PART, RECORDED_STATES, Bundle
+from dreamfleet.common.artifacts.bundle import EIGHT_BITS, INITIAL_LATENTS_PART, RECORDED_STATES, Bundle
 from dreamfleet.common.artifacts.onnx_checks import read_float_array
 from dreamfleet.common.errors import BundleError, UsageError
 
@@ -30,12 +30,14 @@ class StartStates:
 
     `initial` `(N, 2, latent)` holds mu and logvar of first pictures. `recorded` `(M, 2 * latent + memory)` holds mu,
     logvar and memory at recorded moments. `empty` `(memory,)` is the memory before anything is seen; by default zeros.
+    If `doubled`, deviations are computed in double precision, so that hosts of several kinds round them alike.
     """
 
     initial: Floats
     recorded: Floats
     share: float = 0.0
     empty: Floats | None = None
+    doubled: bool = False
 
     @classmethod
     def of(cls, bundle: Bundle, share: float, empty: Floats) -> StartStates:
@@ -45,15 +47,16 @@ class StartStates:
         """
         check_recorded_share(share)
         initial, width = read_float_array(bundle.read(INITIAL_LATENTS_PART)), 2 * bundle.manifest.latent + len(empty)
+        doubled = EIGHT_BITS in bundle.manifest.models
         if not share:
-            return cls(initial, np.zeros((0, width), dtype=np.float32), empty=empty)
+            return cls(initial, np.zeros((0, width), dtype=np.float32), empty=empty, doubled=doubled)
         recorded = bundle.read_recorded()
         if recorded.shape[1] != width:
             raise BundleError(
                 f"{bundle.path}: a state in {RECORDED_STATES} has {recorded.shape[1]} numbers, its model {width}; "
                 "build the bundle again"
             )
-        return cls(initial, recorded, share, empty)
+        return cls(initial, recorded, share, empty, doubled)
 
     def choose(self, seed: int, first: int) -> StartState:
         """The start of the dream with this seed: a recorded state, or else the first picture number `first`.
@@ -67,6 +70,12 @@ class StartStates:
         mu, logvar = self.initial[first]
         memory = np.zeros(self.recorded.shape[1] - 2 * len(mu), np.float32) if self.empty is None else self.empty
         return StartState(mu, logvar, memory)
+
+    def deviation(self, logvar: Floats) -> Floats:
+        """The standard deviation of a start's latent."""
+        half = 0.5 * logvar
+        found: Floats = np.exp(half, dtype=np.float64).astype(np.float32) if self.doubled else np.exp(half)
+        return found
 
     def _recorded(self, index: int) -> StartState:
         latent = self.initial.shape[2]

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import (
     DREAM_GRAPH,
+    EIGHT_BITS,
     ENCODER,
     INITIAL_LATENTS_PART,
+    LINEAR_CONTROLLER,
     POLICY,
     SINGLE_PRECISION,
     Bundle,
@@ -23,9 +25,15 @@ from dreamfleet.common.files.archives import parse_array
 from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.training.data.data_folder import explain_write_errors
-from dreamfleet.worker.training.unbundle import EIGHT_BITS, Models, restore_models
+from dreamfleet.worker.training.unbundle import Models, restore_models
 from dreamfleet.worker.worldmodel.eight_bits import Ranges
-from dreamfleet.worker.worldmodel.export import export_activations, export_dream, export_encoder, export_policy
+from dreamfleet.worker.worldmodel.export import (
+    export_activations,
+    export_controller,
+    export_dream,
+    export_encoder,
+    export_policy,
+)
 from dreamfleet.worker.worldmodel.inference import Decoder, DreamStep, open_graph
 
 DREAMS, STEPS, EVERY = 32, 250, 10  # dreams, their steps, and the steps from one picture to the next
@@ -54,6 +62,7 @@ def write_eight_bit_bundle(bundle: Bundle, out: Path) -> Bundle:
     if POLICY in parts:
         actions: Any = task_of(bundle).world.actions
         parts[POLICY] = export_policy(vae, rnn, vae_config, rnn_config, actions, ranges)
+        parts[LINEAR_CONTROLLER] = export_controller(actions, hidden=False, ordered=True)
     manifest = bundle.manifest
     made = replace(
         manifest, name=out.stem, parts={}, provenance=manifest.provenance | {SINGLE_PRECISION: bundle.sha256},

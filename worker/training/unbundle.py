@@ -13,6 +13,7 @@ from safetensors.numpy import load
 from dreamfleet.common.artifacts.bundle import (
     DECODER,
     DREAM_GRAPH,
+    EIGHT_BITS,
     ENCODER,
     SINGLE_PRECISION,
     WEIGHTS,
@@ -34,8 +35,6 @@ from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae import VAE
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from dreamfleet.worker.worldmodel.weights_from_graphs import Weights, mdnrnn_weights, vae_weights
-
-EIGHT_BITS = "eight_bits"  # ranges among a manifest's models
 
 
 def unbundle(bundle: Bundle, folder: Path) -> tuple[Path, Path]:

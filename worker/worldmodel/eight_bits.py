@@ -1,7 +1,8 @@
 """Eight-bit encoders and LSTMs: their weights and inputs are integers, whose products have the same sum in any order.
 
 An input has eight bits without a sign, a weight seven bits with one: the sums of two products, which some processors
-form in sixteen bits, then never overflow.
+form in sixteen bits, then never overflow. Where a sum becomes a single-precision number, its scale is so short that the
+product is exact: processors that add the bias in the same instruction then round as those that do not.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ CENTRE = 128  # an LSTM's input is an integer from -127 to 127, plus 128
 PIXEL_STEP = np.float32(1 / 255)  # of a picture, whose bytes are a convolution's inputs as they are
 INPUT_STEP = np.float32(1 / 127)  # of an input that is divided by its range
 HIGHEST_OUTPUT = 255  # of a convolution, whose outputs are not negative
+MANTISSA = 24  # binary digits of a single-precision number
 
 Floats = NDArray[np.float32]
 
@@ -66,10 +68,31 @@ def add_input_product(graph: GraphBuilder, value: str, kernel: Floats, bias: Flo
     return _add_product(graph, [value, _centre(graph)], kernel * ranges[:, None], bias, INPUT_STEP)
 
 
+def add_exponential(graph: GraphBuilder, value: str) -> str:
+    """Raise e to `value`, up to 2^23, by a sigmoid: processors agree on it to the bit, and on the operator Exp not."""
+    share = graph.node("Sigmoid", value)
+    above_one = graph.constant(np.nextafter(np.ones((), np.float32), np.float32(2)))
+    return str(graph.node("Div", share, graph.node("Sub", above_one, share)))
+
+
+def round_weights_exactly(kernel: Floats, step: np.float32, *, centred: bool) -> tuple[NDArray[np.int8], Floats]:
+    """The integers of a kernel (inputs, outputs), and the scales of its sums, whose products with them are exact.
+
+    The inputs are integers of this `step`, from -128 to 127 if `centred`, else from 0 to 255.
+    """
+    weights, steps = _round_weights(kernel)
+    above, below = (np.maximum(sign * weights.astype(np.int64), 0).sum(axis=0) for sign in (1, -1))
+    largest = CENTRE * (above + below) if centred else HIGHEST_OUTPUT * np.maximum(above, below)
+    digits = np.maximum(MANTISSA - np.frexp(largest)[1], 1)
+    part, exponent = np.frexp(steps.astype(np.float64) * step)
+    scales = np.ldexp(np.ceil(np.ldexp(part, digits)), exponent - digits)  # larger ones: no weight leaves its range
+    return np.rint(kernel / (scales / step)).astype(np.int8), scales.astype(np.float32)
+
+
 def _add_product(graph: GraphBuilder, factor: Sequence[str], kernel: Floats, bias: Floats, step: np.float32) -> str:
-    weights, scales = _round_weights(kernel)
     value, *centre = factor
-    scale = graph.constant((scales.astype(np.float64) * step).astype(np.float32))
+    weights, scales = round_weights_exactly(kernel, step, centred=bool(centre))
+    scale = graph.constant(scales)
     one, no_zero = graph.constant(np.array(1, np.float32)), ""
     # The runtime's own operator is MatMulInteger, Cast, Mul and Add in one: the same bits, in less time.
     factor = [value, graph.constant(weights), one, scale, *(centre or [no_zero]), no_zero, graph.constant(bias)]

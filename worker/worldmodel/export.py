@@ -100,7 +100,9 @@ def export_policy(
     latent = _encode(graph, picture, vae, vae_config, ranges)("mu")
     weights, biases = graph.split(parameters, size - count, count)
     weights = graph.node("Reshape", weights, graph.shape(-1, count, rnn_config.latent + rnn_config.hidden))
-    action = squash(graph, _layer(graph, graph.join(latent, recurrent.hidden), weights, biases), actions)
+    features = graph.join(latent, recurrent.hidden)
+    ordered = ranges is not None and count > 1
+    action = squash(graph, _layer(graph, features, weights, biases, ordered=ordered), actions)
     recurrent.advance(latent, action)
     graph.add_output(action, "action", TensorProto.FLOAT, count)
     graph.add_output(recurrent.next_state(), "next_state", TensorProto.FLOAT, rnn_config.state)
@@ -108,17 +110,21 @@ def export_policy(
     return graph.build()
 
 
-def export_controller(actions: Continuous, *, hidden: bool) -> bytes:
+def export_controller(actions: Continuous, *, hidden: bool, ordered: bool = False) -> bytes:
     """Export controllers of any size, one per row: `features` (N, F) to `action` (N, A).
 
     Inputs `weights0` (N, A, F) and `biases0` (N, A). With a `hidden` layer of K units: `weights0` (N, K, F), `biases0`
     (N, K), `weights1` (N, A, K), `biases1` (N, A).
+
+    If `ordered`, all processors add the products of a linear controller with several outputs in the same order. A sum
+    with one output would have another order alone than in a batch.
     """
     graph, kind = GraphBuilder("controller"), TensorProto.FLOAT
     value, sizes = graph.add_input("features", kind, "F"), ["F", "K", "A"] if hidden else ["F", "A"]
     for index, (before, after) in enumerate(pairwise(sizes)):
         weights = graph.add_input(f"weights{index}", kind, after, before)
-        value = _layer(graph, value, weights, graph.add_input(f"biases{index}", kind, after))
+        biases = graph.add_input(f"biases{index}", kind, after)
+        value = _layer(graph, value, weights, biases, ordered=ordered and not hidden and actions.outputs > 1)
     graph.add_output(squash(graph, value, actions), "action", kind, actions.outputs)
     return graph.build()
 
@@ -179,10 +185,17 @@ def _linear(graph: GraphBuilder, value: str, weights: Weights, name: str) -> str
     return graph.linear(value, weights[f"{name}.weight"].T, weights[f"{name}.bias"])
 
 
-def _layer(graph: GraphBuilder, features: str, weights: str, biases: str) -> str:
-    """Add a tanh layer in which each row has its own weights."""
-    product = graph.node("MatMul", weights, graph.node("Unsqueeze", features, graph.shape(2)))
-    return str(graph.node("Tanh", graph.node("Add", graph.node("Squeeze", product, graph.shape(2)), biases)))
+def _layer(graph: GraphBuilder, features: str, weights: str, biases: str, *, ordered: bool = False) -> str:
+    """Add a tanh layer in which each row has its own weights; if `ordered`, its sums have the same order everywhere."""
+    if ordered:
+        products = graph.node("Mul", weights, graph.node("Unsqueeze", features, graph.shape(1)))
+        # Only sums over the first axis have one order. The reshaping keeps the shape, and the runtime from undoing it.
+        moved = graph.node("Reshape", graph.node("Transpose", products, perm=[2, 0, 1]), graph.shape(0, 0, 0))
+        value = graph.node("ReduceSum", moved, graph.shape(0), keepdims=0)
+    else:
+        product = graph.node("MatMul", weights, graph.node("Unsqueeze", features, graph.shape(2)))
+        value = graph.node("Squeeze", product, graph.shape(2))
+    return str(graph.node("Tanh", graph.node("Add", value, biases)))
 
 
 def squash(graph: GraphBuilder, squashed: str, actions: Continuous) -> str:

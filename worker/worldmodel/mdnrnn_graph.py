@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from onnx import TensorProto
 
-from dreamfleet.worker.worldmodel.eight_bits import Ranges, add_input_product, round_inputs
+from dreamfleet.worker.worldmodel.eight_bits import Ranges, add_exponential, add_input_product, round_inputs
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
 
@@ -95,7 +95,7 @@ def window_input(graph: GraphBuilder, latent: str, action: str, config: MDNRNNCo
 
 
 def export_dream(rnn: Weights, config: MDNRNNConfig, ranges: Ranges | None = None) -> bytes:
-    """Export a step of the dream; with `ranges` the LSTM's products are of eight-bit integers.
+    """Export a step of the dream; with `ranges` the products of LSTM and heads are of eight-bit integers.
 
     Inputs: `latent` (N, latent), `action` (N, actions), `state` (N, state), the random numbers `uniform` and `normal`
     (N, latent), `temperature` (1,), and with dropout `mask` (N, hidden), a factor of the LSTM's output. Outputs:
@@ -115,10 +115,7 @@ def export_dream(rnn: Weights, config: MDNRNNConfig, ranges: Ranges | None = Non
     hidden = recurrent.advance(latent, action)
     if config.dropout:
         hidden = graph.node("Mul", hidden, graph.add_input("mask", kind, config.hidden))
-    order = mixture_major_order(config)
-    # In half precision: the bundle holds the LSTM twice already, and its size is limited.
-    kernel, bias = graph.weight(rnn["heads.weight"][order].T), graph.constant(rnn["heads.bias"][order])
-    heads = graph.node("Gemm", hidden, kernel, bias)
+    heads = _heads(graph, hidden, rnn, config, ranges)
     columns = graph.split(
         heads, *[config.weighted] * config.mixtures, *[config.latent] * (2 * config.mixtures),
         int(config.has_reward_head), int(config.done),
@@ -126,9 +123,10 @@ def export_dream(rnn: Weights, config: MDNRNNConfig, ranges: Ranges | None = Non
     *mixtures, reward, done = columns
     if config.joint:
         uniform, _ = graph.split(uniform, 1, config.latent - 1)
-    mean, deviation = _select_mixture(graph, mixtures, uniform, temperature)
+    exponential = add_exponential if _is_rounded(ranges) else _exponential
+    mean, deviation = _select_mixture(graph, mixtures, uniform, temperature, exponential)
     noise = graph.node("Mul", normal, graph.node("Sqrt", temperature))
-    spread = graph.node("Mul", graph.node("Exp", deviation), noise)
+    spread = graph.node("Mul", exponential(graph, deviation), noise)
     graph.add_output(graph.node("Add", mean, spread), "next_latent", kind, config.latent)
     label = _dreamt_reward_label(graph, reward, config) if config.previous_reward else ""
     graph.add_output(recurrent.next_state(label), "next_state", kind, config.state)
@@ -142,6 +140,24 @@ def export_dream(rnn: Weights, config: MDNRNNConfig, ranges: Ranges | None = Non
     return graph.build()
 
 
+def _heads(graph: GraphBuilder, hidden: str, rnn: Weights, config: MDNRNNConfig, ranges: Ranges | None) -> str:
+    order = mixture_major_order(config)
+    kernel, bias = rnn["heads.weight"][order].T, rnn["heads.bias"][order]
+    if _is_rounded(ranges):
+        widths = np.full(config.hidden, 1 / (1 - config.dropout), np.float32)  # the hidden state is below 1
+        return add_input_product(graph, round_inputs(graph, hidden, widths), kernel, bias, widths)
+    # In half precision: the bundle holds the LSTM twice already, and its size is limited.
+    return str(graph.node("Gemm", hidden, graph.weight(kernel), graph.constant(bias)))
+
+
+def _is_rounded(ranges: Ranges | None) -> bool:
+    return ranges is not None and bool(ranges.inputs)
+
+
+def _exponential(graph: GraphBuilder, value: str) -> str:
+    return str(graph.node("Exp", value))
+
+
 def mixture_major_order(config: MDNRNNConfig) -> NDArray[Any]:
     """The heads' rows in the order (kind, mixture, latent) instead of (kind, latent, mixture), to slice mixtures."""
     rows, start = [], 0
@@ -152,7 +168,10 @@ def mixture_major_order(config: MDNRNNConfig) -> NDArray[Any]:
     return np.concatenate([*rows, np.arange(start, config.outputs)])
 
 
-def _select_mixture(graph: GraphBuilder, mixtures: Sequence[str], uniform: str, temperature: str) -> tuple[str, str]:
+def _select_mixture(
+    graph: GraphBuilder, mixtures: Sequence[str], uniform: str, temperature: str,
+    exponential: Callable[[GraphBuilder, str], str],
+) -> tuple[str, str]:  # fmt: skip
     """Mean and log deviation (N, latent) of the mixture selected by `uniform`; `mixtures` are the heads' columns."""
     count = len(mixtures) // 3
     logits, means, deviations = mixtures[:count], mixtures[count : 2 * count], mixtures[2 * count :]
@@ -161,7 +180,7 @@ def _select_mixture(graph: GraphBuilder, mixtures: Sequence[str], uniform: str, 
     highest = graph.node("Max", *logits)
     cumulated: list[str] = []
     for each in logits:
-        weight = graph.node("Exp", graph.node("Div", graph.node("Sub", each, highest), temperature))
+        weight = exponential(graph, graph.node("Div", graph.node("Sub", each, highest), temperature))
         cumulated.append(graph.node("Add", cumulated[-1], weight) if cumulated else weight)
     point = graph.node("Mul", uniform, cumulated[-1])
     mean, deviation = means[0], deviations[0]

@@ -7,6 +7,7 @@ from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, HostClasses, class_from_fingerprint
 from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.worker.car_racing import environment
 from dreamfleet.worker.scoring.host_class_probe import HostClassProbe, fixed_parameters
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tasks.policy import FlatPolicy
@@ -36,6 +37,12 @@ def test_another_bit_of_the_world_is_another_class(random_bundle, monkeypatch):
     here = scorer_of(tasks.ROUNDED, random_bundle).host_class
     monkeypatch.setenv(tasks.ROUNDING, "1")
     assert scorer_of(tasks.ROUNDED, random_bundle).host_class != here
+
+
+def test_a_simulator_that_fuses_products_is_another_class(random_bundle, monkeypatch):
+    here = scorer_of("car-racing", random_bundle).host_class
+    monkeypatch.setattr(environment, "box2d_fuses_products", lambda: True)
+    assert scorer_of("car-racing", random_bundle).host_class != here
 
 
 def test_another_bit_of_a_policys_outputs_is_another_class(monkeypatch):

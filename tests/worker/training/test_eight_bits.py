@@ -3,7 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
+import onnx
 import pytest
+from onnx import numpy_helper
 
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, ENCODER
 from dreamfleet.common.artifacts.controller import Controller
@@ -12,7 +14,7 @@ from dreamfleet.common.errors import BundleError, ControllerError
 from dreamfleet.common.serialization.validation import from_plain
 from dreamfleet.worker.training.eight_bits import write_eight_bit_bundle
 from dreamfleet.worker.training.unbundle import restore_models, unbundle
-from dreamfleet.worker.worldmodel.eight_bits import PIXEL_STEP, Ranges
+from dreamfleet.worker.worldmodel.eight_bits import PIXEL_STEP, Ranges, round_weights_exactly
 from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, PolicyStep
 from dreamfleet.worker.worldmodel.mdnrnn_config import ATTENTIVE, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -49,6 +51,12 @@ def round_rows(kernel):
     return np.rint(rows / steps[:, None]).astype(np.int64).reshape(kernel.shape), steps
 
 
+def scale_of_first_product(graph):
+    graph = onnx.load_model_from_string(graph).graph
+    name = next(node.input[3] for node in graph.node if node.op_type == "MatMulIntegerToFloat")
+    return next(numpy_helper.to_array(each) for each in graph.initializer if each.name == name)
+
+
 def test_the_encoder_sums_integers_exactly(whole, rounded):
     models, seen = restore_models(whole), pictures(3)
     ranges = from_plain(Ranges, rounded.manifest.models["eight_bits"])
@@ -61,10 +69,25 @@ def test_the_encoder_sums_integers_exactly(whole, rounded):
         scale = (steps * np.float32(step) / ranges.step_of(index)).astype(np.float32)
         value = np.clip(np.rint(total.astype(np.float32) * scale[:, None, None]), 0, 255).astype(np.int64)
         step = ranges.step_of(index)
-    weights, steps = round_rows(models.vae["mu.weight"])
-    scale = (steps.astype(np.float64) * step).astype(np.float32)
+    kernel = models.vae["mu.weight"]
+    scale = scale_of_first_product(rounded.read(ENCODER))
+    weights = np.rint(kernel / (scale.astype(np.float64)[:, None] / step)).astype(np.int64)
+    assert 32 <= np.abs(weights).max() <= 63
     expected = (value.reshape(3, -1) @ weights.T).astype(np.float32) * scale + models.vae["mu.bias"]
     assert np.abs(Encoder(rounded).encode(seen)[0] - expected).max() < 1e-6
+
+
+@pytest.mark.parametrize("centred", [True, False])
+def test_a_sum_of_integers_and_its_scale_have_an_exact_product(centred):
+    kernel, step = np.random.default_rng(1).normal(0, 1, (300, 8)).astype(np.float32), np.float32(0.0123)
+    weights, scale = round_weights_exactly(kernel, step, centred=centred)
+    extremes = np.where(weights > 0, 127 if centred else 255, -128 if centred else 0)
+    assert 32 <= np.abs(weights).max() <= 63
+    for inputs in (extremes, np.random.default_rng(2).permuted(extremes)):
+        sums = (inputs * weights.astype(np.int64)).sum(axis=0)
+        assert (sums.astype(np.float32) == sums).all()
+        assert (sums.astype(np.float32) * scale == sums * scale.astype(np.float64)).all()
+    assert np.abs(weights * (scale / step) - kernel).max() <= (scale / step).max() / 2 * (1 + 1e-6)
 
 
 def test_it_sees_and_dreams_nearly_as_before(whole, rounded):
