@@ -43,7 +43,8 @@ class HostClassProbe:
         Other controllers' outputs for the same observations are added too.
         """
         parameters, seen = fixed_parameters(size), []
-        if getattr(environment.unwrapped, "fuses_products", False):  # it shows in pictures after the probe's last step
+        inner = getattr(environment, "unwrapped", None)
+        if getattr(inner, "fuses_products", False):  # it shows in pictures after the probe's last step
             self.add_value("fused products")
         watched = WatchedPolicy(policy, self, 0)  # it also passes the world model's latent and state to `observe`
         watched.begin(parameters)
