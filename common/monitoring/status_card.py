@@ -23,10 +23,10 @@ TABLE = "font:inherit;border-collapse:collapse;background:none"
 CELL = "text-align:left;padding:1px 16px 1px 0;font-weight:normal"
 
 
-def show_live(statuses: Iterable[Status]) -> None:
+def show_live(statuses: Iterable[Status]) -> bool:
     """Show each status in the place of the one before, in a notebook's cell; elsewhere print a line of each.
 
-    Interrupting it ends the showing and not the run.
+    Interrupting it ends the showing and not the run. Returns whether there was any status.
     """
     try:
         from IPython.core.getipython import get_ipython
@@ -35,9 +35,10 @@ def show_live(statuses: Iterable[Status]) -> None:
         shell = None
     else:
         shell = get_ipython()
-    place = None
+    place, any_shown = None, False
     try:
         for status in statuses:
+            any_shown = True
             if shell is None:
                 print(repr(status), flush=True)  # noqa: T201 - a terminal has no card
             elif place is None:
@@ -45,7 +46,8 @@ def show_live(statuses: Iterable[Status]) -> None:
             else:
                 place.update(status)
     except KeyboardInterrupt:
-        return
+        return True
+    return any_shown
 
 
 def status_card(status: Status) -> str:

@@ -126,8 +126,8 @@ class StartedRun(StoredRun):
 
         Interrupting the cell ends the showing and not the run.
         """
-        if self.client is not None and self._is_live:
-            show_live(self._watch(self.client, pause))
+        if self.client is not None and self._is_live and not show_live(self._watch(self.client, pause)):
+            print(f"run {self.name} ended before it could be shown: {self.ended}")  # noqa: T201 - a notebook's cell
 
     def _watch(self, client: Client, pause: float) -> Iterator[Status]:
         try:

@@ -25,7 +25,6 @@ from dreamfleet.worker.tasks.registry import check_task_allowed, find_task
 log = logging.getLogger(__name__)
 
 
-LEAST_ROOM = 128  # results without a verdict for which any worker has room: one commit may take that many short jobs
 IDLE_CHILD = 60.0  # seconds without a job after which a child that is not the last one ends, beside other runs
 
 
@@ -134,7 +133,7 @@ class SlotPool:
 
         R26: nothing starts while too many results, `undelivered`, wait for a verdict, so the outbox stays bounded.
         """
-        room = max(4 * len(self._slots) * self._batch_size, LEAST_ROOM) - undelivered
+        room = 4 * len(self._slots) * self._batch_size - undelivered
         idle = [slot for slot in self._slots if slot.idle and room >= 0]
         groups = math.ceil(len(backlog) / self._batch_size)
         self._settle(min(groups, len(idle)), has_jobs=groups > 0)

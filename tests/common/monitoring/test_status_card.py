@@ -15,7 +15,7 @@ from tests.support.samples import STATUS
 SHOWN = """
 import dreamfleet
 run = dreamfleet.start_run(
-    run="pole", task="gym:CartPole-v1", population=6, episodes=1, generations=4, evaluate_every=0, workers=1,
+    run="pole", task="gym:CartPole-v1", population=6, episodes=4, generations=60, evaluate_every=0, workers=1,
 )
 run.show(pause=0.1)
 print(run.ended)
@@ -70,7 +70,7 @@ def test_a_notebook_shows_a_run_in_one_place_until_it_ends(tmp_path, monkeypatch
     shown = [output for output in notebook.cells[0].outputs if output.output_type == "display_data"]
     assert len(shown) == 1
     card = shown[0]["data"]["text/html"]
-    assert "ended: 4 generations" in card
+    assert "ended: 60 generations" in card
     assert "<polyline" in card
     text = "".join(output.get("text", "") for output in notebook.cells[0].outputs)
-    assert text.strip().endswith("4 generations")
+    assert text.strip().endswith("60 generations")
