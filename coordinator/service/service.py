@@ -53,6 +53,7 @@ from dreamfleet.coordinator.storage.served_bundle import ServedBundle
 log = logging.getLogger(__name__)
 TICK = 0.05  # seconds: the longest that a lost worker waits to be noticed
 MOST_EVENTS = 256  # events of a turn at most
+LONGEST_LINGER = 0.2  # the most, however slow the disk is
 LINGER = 0.005  # the least seconds between two commits while results arrive, which then share one
 SNAPSHOT_INTERVAL = 0.2
 END_GRACE = 2.0  # seconds that workers may take to leave a run that has ended
@@ -235,7 +236,7 @@ class Service:
         """Commit; whether that succeeded. The next one waits as long as this one took, so jobs get half the time."""
         began = monotonic()
         durable = self._run.commit()
-        self._commit_at = monotonic() + max(LINGER, monotonic() - began)
+        self._commit_at = monotonic() + min(max(LINGER, monotonic() - began), LONGEST_LINGER)
         return durable
 
     def _drain_events(self) -> None:

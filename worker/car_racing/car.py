@@ -8,6 +8,7 @@ module reads bodies and contacts where Box2D keeps them, if they lie there as it
 from __future__ import annotations
 
 import logging
+from contextlib import suppress
 from functools import cache
 from types import ModuleType
 from typing import Any
@@ -84,7 +85,8 @@ class _Trial(Box2D.b2ContactListener):  # type: ignore[misc]
     known: bool | None = None
 
     def BeginContact(self, contact: Any) -> None:  # noqa: N802 - Box2D's name
-        self.known = self.known is not False and _native.knows(contact)
+        with suppress(Exception):
+            self.known = self.known is not False and _native.knows(contact)
 
 
 @cache

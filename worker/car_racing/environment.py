@@ -34,7 +34,7 @@ class CarRacing(_Base):  # type: ignore[misc]
     """CarRacing-v3 with its observation drawn natively.
 
     `preprocessing` names its pictures: `raw-96`, gymnasium's own, or another of `car_racing.preprocessing`. With
-    `native` False, or without the native module, gymnasium draws. Like gymnasium's, it is not thread-safe:
+    `native` False, or without the native module, gymnasium drives and draws. Like gymnasium's, it is not thread-safe:
     environments of one process share one canvas.
 
     With `checked` N, gymnasium draws the first and then every Nth picture too; `DreamfleetError` if one differs.
@@ -46,6 +46,8 @@ class CarRacing(_Base):  # type: ignore[misc]
         self, *arguments: Any, preprocessing: str = RAW.name, native: bool = True, checked: int = 0, **more: Any
     ) -> None:
         super().__init__(*arguments, **more)
+        own = {"preprocessing": preprocessing, "native": native, "checked": checked}
+        gymnasium.utils.EzPickle.__init__(self, *arguments, **own, **more)  # what a copy is made of
         self._native = native and is_native_available()
         self._checked, self._drawn = checked, 0
         self._preprocessing = find_preprocessing(preprocessing)
@@ -66,14 +68,14 @@ class CarRacing(_Base):  # type: ignore[misc]
 
     def step(self, action: Any) -> Any:
         """Gymnasium's step; `InvalidAction` for an action of another shape or with NaN, before anything moves."""
-        if self.car.__class__ is car_dynamics.Car and is_native_available():  # a reset made a new car
+        if self._native and self.car.__class__ is car_dynamics.Car:  # a reset made a new car
             self.car.__class__ = Car
         if action is None or not self.continuous:
             return super().step(action)
         action = np.asarray(action)
         if action.shape != (3,) or not all(map(math.isfinite, action.tolist())):
             raise InvalidAction(f"an action is three finite numbers (steering, gas, brake), not {action!r}")
-        return self._step(*map(float, action.tolist())) if is_native_available() else super().step(action)
+        return self._step(*map(float, action.tolist())) if self._native else super().step(action)
 
     def _step(self, steering: float, gas: float, brake: float) -> Any:
         """Gymnasium's step, its continuous case, with fewer calls."""
@@ -105,8 +107,10 @@ class CarRacing(_Base):  # type: ignore[misc]
         """Make gymnasium's track; then keep the tiles' colours in one array, which contacts change in place."""
         if not super()._create_track():
             return False
-        if is_native_available():
-            self.world.contactListener_bug_workaround.__class__ = Listener
+        listener = self.world.contactListener_bug_workaround
+        if self._native and listener.__class__ is car_racing.FrictionDetector:
+            listener.__class__ = Listener
+        self._drawn = 0
         self._road = np.array([corners for corners, _ in self.road_poly], dtype=np.float64)
         self._road_colours = np.array([colour for _, colour in self.road_poly], dtype=np.float64)
         rows = {id(colour): row for row, (_, colour) in enumerate(self.road_poly)}

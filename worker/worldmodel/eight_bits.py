@@ -21,6 +21,7 @@ CENTRE = 128  # an LSTM's input is an integer from -127 to 127, plus 128
 PIXEL_STEP = np.float32(1 / 255)  # of a picture, whose bytes are a convolution's inputs as they are
 INPUT_STEP = np.float32(1 / 127)  # of an input that is divided by its range
 HIGHEST_OUTPUT = 255  # of a convolution, whose outputs are not negative
+HIGHEST_BIAS = np.float32(2**30)  # a convolution's, as an integer of 32 bits
 MANTISSA = 24  # binary digits of a single-precision number
 
 Floats = NDArray[np.float32]
@@ -44,7 +45,8 @@ def add_convolution(
 ) -> str:  # fmt: skip
     """Add a convolution and its rectifier to `value`: integers of the first step become integers of the second."""
     before, after = (graph.constant(np.array(step)) for step in steps)
-    scales = _steps(kernel.reshape(len(kernel), -1).T)
+    least = np.abs(bias) / (steps[0] * HIGHEST_BIAS)
+    scales: Floats = np.maximum(_steps(kernel.reshape(len(kernel), -1).T), least).astype(np.float32)
     weights, zeros = _round_keeping_sums(kernel / scales[:, None, None, None]), np.zeros(len(kernel), np.int8)
     whole_bias = np.rint(bias / (scales.astype(np.float64) * steps[0])).astype(np.int32)
     factor = [graph.constant(each) for each in (weights, scales, zeros)]

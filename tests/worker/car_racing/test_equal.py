@@ -1,5 +1,6 @@
 """The native picture is gymnasium's, to the bit. `dreamfleet lab bench env --exact` compares far more."""
 
+import copy
 import os
 from pathlib import Path
 
@@ -173,6 +174,24 @@ def test_a_user_may_let_gymnasium_draw(monkeypatch, said, by):
     finally:
         native_is_exact.cache_clear()
     assert getattr(make_judging_environment(BOX, "rgb_array").unwrapped, "drawn_by", "-") == "-"
+
+
+def test_a_copy_draws_as_its_original():
+    copied = copy.deepcopy(CarRacing(preprocessing="box-64", native=False, checked=7, domain_randomize=True))
+    assert (copied._checked, copied.drawn_by, copied.domain_randomize) == (7, "gymnasium", True)
+    assert copied.observation_space.shape == BOX.shape
+
+
+@needs_native
+def test_where_gymnasium_draws_it_drives_too(monkeypatch):
+    monkeypatch.setattr("dreamfleet.worker.car_racing.car.STIFFNESS", 100_000)  # as if our arithmetic were another
+    action, positions = np.array([0.3, 0.8, 0], np.float32), []
+    for environment in (gymnasium.make("CarRacing-v3").unwrapped, CarRacing(native=False), CarRacing()):
+        environment.reset(seed=3)
+        for _ in range(40):
+            environment.step(action)
+        positions.append(tuple(environment.car.hull.position))
+    assert positions[0] == positions[1] != positions[2]
 
 
 def test_where_it_was_not_built_gymnasium_draws():

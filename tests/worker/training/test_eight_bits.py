@@ -5,18 +5,21 @@ from dataclasses import replace
 import numpy as np
 import onnx
 import pytest
-from onnx import numpy_helper
+from onnx import TensorProto, numpy_helper
 
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, ENCODER
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import BundleError, ControllerError
+from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.serialization.validation import from_plain
+from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.training.eight_bits import write_eight_bit_bundle
 from dreamfleet.worker.training.unbundle import restore_models, unbundle
-from dreamfleet.worker.worldmodel.eight_bits import PIXEL_STEP, Ranges, round_weights_exactly
-from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, PolicyStep
+from dreamfleet.worker.worldmodel.eight_bits import PIXEL_STEP, Ranges, add_convolution, round_weights_exactly
+from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, PolicyStep, open_graph
 from dreamfleet.worker.worldmodel.mdnrnn_config import ATTENTIVE, MDNRNNConfig
+from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
 
@@ -87,6 +90,25 @@ def test_a_sum_of_integers_and_its_scale_have_an_exact_product(centred):
         assert (sums.astype(np.float32) == sums).all()
         assert (sums.astype(np.float32) * scale == sums * scale.astype(np.float64)).all()
     assert np.abs(weights * (scale / step) - kernel).max() <= (scale / step).max() / 2 * (1 + 1e-6)
+
+
+def test_a_bias_far_above_its_kernel_does_not_overflow():
+    graph, picture = GraphBuilder("convolution"), np.zeros((1, 3, 4, 4), np.uint8)
+    value = graph.add_input("value", TensorProto.UINT8, 3, 4, 4)
+    kernel, bias = np.full((2, 3, 4, 4), 1e-12, np.float32), np.array([0.4, 0.2], np.float32)
+    steps = PIXEL_STEP, np.float32(1 / 255)
+    graph.add_output(add_convolution(graph, value, kernel, bias, steps, {}), "out", TensorProto.UINT8, 2, 1, 1)
+    (found,) = open_graph(graph.build(), 1).run(None, {"value": picture})
+    assert found.ravel().tolist() == [102, 51]
+
+
+def test_a_candidate_whose_actions_are_no_numbers_has_no_fitness(rounded):
+    parameters = np.zeros(rounded.controller_shape.size, np.float32)
+    parameters[::2], parameters[1::2] = 3e38, -3e38
+    batch = DreamBatch(rounded, TaskSpec("dream", rounded.sha256, horizon=5, patience=0))
+    wild, tame = batch.score([(parameters, 1), (np.zeros_like(parameters), 1)])
+    assert not np.isfinite(wild.fitness)
+    assert np.isfinite(tame.fitness)
 
 
 def test_it_sees_and_dreams_nearly_as_before(whole, rounded):

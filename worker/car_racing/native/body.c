@@ -134,14 +134,15 @@ PyObject *look(PyObject *self, PyObject *args)
     if (!done && !PyErr_Occurred())
         PyErr_SetString(PyExc_ValueError, "a car has a hull and four wheels");
     for (int i = 0; done && i <= WHEELS; i++, state += STATE) {
-        PyObject *each = i < WHEELS ? PyList_GetItem(wheels, i) : hull;
-        const Body *body = body_of(each);
+        PyObject *each = i < WHEELS ? PySequence_GetItem(wheels, i) : Py_NewRef(hull);
+        const Body *body = each ? body_of(each) : NULL;
         done = body && (each == hull || get(each, NAME(phase), &state[3]));
-        if (!done)
-            break;
-        state[0] = body->x;
-        state[1] = body->y;
-        state[2] = body->angle;
+        if (done) {
+            state[0] = body->x;
+            state[1] = body->y;
+            state[2] = body->angle;
+        }
+        Py_XDECREF(each);
     }
     Py_XDECREF(wheels);
     Py_XDECREF(hull);
@@ -175,6 +176,8 @@ static bool visit(PyObject *listener, PyObject *environment, PyObject *tile)
     Py_ssize_t tiles = track ? PyObject_Size(track) : -1;
     Py_XDECREF(track);
     double reward, visited, index, enough;
+    if (tiles == 0)
+        PyErr_SetString(PyExc_ZeroDivisionError, "a track without tiles");
     if (tiles <= 0 || !get(environment, NAME(reward), &reward) || !get(tile, NAME(idx), &index) ||
         !get(environment, NAME(tile_visited_count), &visited) || !get(listener, NAME(lap_complete_percent), &enough))
         return false;
