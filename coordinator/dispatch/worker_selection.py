@@ -50,9 +50,8 @@ class WorkerSelection:
 
     def assign(self, name: str) -> None:
         """Note that this member is given one more job."""
-        self._loads[name] = load = self._loads[name] + 1
-        if load & (load - 1) == 0:  # else one more job is of the same size class
-            self._expected_seconds[name] = self._members[name].host_stats.expected_seconds(load + 1)
+        self._loads[name] += 1
+        self._expected_seconds[name] = self._members[name].host_stats.expected_seconds(self._loads[name] + 1)
         self._waiting -= 1
         self._jobs += name in self._dependable
 
@@ -96,17 +95,16 @@ class WorkerSelection:
 
     def _finishes_in_time(self, name: str) -> bool:
         """Whether this worker should return one more job without delaying the generation."""
-        if len(self._dependable) < 2 and self._dependable <= {name}:
+        if self._dependable <= {name}:
             return True  # there is no other that would wait for it
         member = self._members[name]
         if name not in self._dependable or member.host_stats.is_likely_lost(
             self._loads[name] + 1, self._now - member.joined_at
         ):
             return False
-        expected = self._expected_seconds[name]
-        return expected <= PEER_RATIO * self._best_other_seconds(
-            name
-        ) or expected <= REST_FRACTION * self._rest_seconds(name)
+        return self._expected_seconds[name] <= max(
+            PEER_RATIO * self._best_other_seconds(name), REST_FRACTION * self._rest_seconds(name)
+        )
 
     def _rest_seconds(self, name: str) -> float:
         """Seconds that the other workers need for the jobs that they hold and those in the queue."""

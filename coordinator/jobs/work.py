@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,25 +42,23 @@ def make_work(
     identity = hashlib.sha256(vector).digest()
     run_spec = run_spec or spec
     stall = FUNCTION_STALL_SECONDS if is_function_task(spec.task) else STALL_SECONDS
-    overrides = (
-        None if spec.temperature == run_spec.temperature else spec.temperature,
-        None if spec.horizon == run_spec.horizon else spec.horizon,
-        None if spec.patience == run_spec.patience else spec.patience,
-        None if spec.driven == run_spec.driven else spec.driven,
-    )
+    names = "temperature", "horizon", "patience", "driven"
+    overrides: dict[str, Any] = {
+        name: given for name in names if (given := getattr(spec, name)) != getattr(run_spec, name)
+    }
     return [
         Work(
             Job(
-                kind,
-                spec.task,
-                generation,
-                candidate,
-                episode,
-                (seed,),
-                identity,
-                hashlib.sha256(identity + text).digest(),
-                stall,
-                *overrides,
+                kind=kind,
+                task=spec.task,
+                generation=generation,
+                candidate=candidate,
+                episode=episode,
+                seeds=(seed,),
+                vector=identity,
+                digest=hashlib.sha256(identity + text).digest(),
+                stall=stall,
+                **overrides,
             ),
             vector,
         )

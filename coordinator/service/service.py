@@ -53,8 +53,8 @@ from dreamfleet.coordinator.storage.served_bundle import ServedBundle
 log = logging.getLogger(__name__)
 TICK = 0.05  # seconds: the longest that a lost worker waits to be noticed
 MOST_EVENTS = 256  # events of a turn at most
-LONGEST_LINGER = 0.2  # the most, however slow the disk is
-LINGER = 0.005  # the least seconds between two commits while results arrive, which then share one
+LINGER = 0.005  # seconds from one commit to the next at least while workers hold jobs, so that results share one
+LONGEST_LINGER = 0.2  # seconds from one commit to the next at most, however slow the disk is
 SNAPSHOT_INTERVAL = 0.2
 END_GRACE = 2.0  # seconds that workers may take to leave a run that has ended
 _WORKER_MESSAGES: dict[str, type[WorkerMessage]] = {"result": ResultBatch, "beat": Heartbeat, "upload": UploadPart}
@@ -233,10 +233,10 @@ class Service:
         )
 
     def _commit(self) -> bool:
-        """Commit; whether that succeeded. The next one waits as long as this one took, so jobs get half the time."""
+        """Commit; whether that succeeded."""
         began = monotonic()
         durable = self._run.commit()
-        self._commit_at = monotonic() + min(max(LINGER, monotonic() - began), LONGEST_LINGER)
+        self._commit_at = next_commit(began, monotonic())
         return durable
 
     def _drain_events(self) -> None:
@@ -355,3 +355,8 @@ class Service:
         credentials = self._network.credentials
         expires = None if credentials is None else credentials.expires.timestamp()
         return take_snapshot(self._run, self._name, dropped, now - self._started, now, expires, self._score_word)
+
+
+def next_commit(began: float, ended: float) -> float:
+    """When the next commit is due: it waits as long as the last one took, so that jobs get half of the time."""
+    return ended + min(max(LINGER, ended - began), LONGEST_LINGER)

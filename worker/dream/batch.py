@@ -66,9 +66,8 @@ class DreamBatch:
                 first = int(rows[0])
                 seen = StepSnapshot(step, float(fitness[first]), moment.action[0], None, latent[0], state[0])
                 self._observer.observe(start + first, lambda seen=seen: seen)  # type: ignore[misc]
-            fitness[rows] += moment.reward
-            if not np.isfinite(moment.action).all():  # no action of a world, and integers would make it one
-                fitness[rows[~np.isfinite(moment.action).all(axis=1)]] = np.nan
+            # No world takes such an action, and a model of integers would see a number in it.
+            fitness[rows] += np.where(np.isfinite(moment.action).all(axis=1), moment.reward, np.nan)
             steps[rows] += 1
             if self._measurer.names:
                 tally.add(rows, moment.action)

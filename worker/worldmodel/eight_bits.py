@@ -63,7 +63,7 @@ def round_inputs(graph: GraphBuilder, value: str, ranges: Floats) -> str:
 def add_product(graph: GraphBuilder, value: str, kernel: Floats, bias: Floats, step: np.float32) -> str:
     """Multiply `value`, integers of this step, by `kernel` (inputs, outputs), and add `bias` in single precision.
 
-    A weight is two integers, the second of what the first leaves: with one, a controller that had 903 points had 880.
+    A weight is two integers, the second of what the first leaves: with one, a controller fell from 903 points to 880.
     """
     return _add_product(graph, [value], kernel, bias, step)
 
