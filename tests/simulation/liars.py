@@ -55,11 +55,14 @@ class LenientWitness(Witness):
 
 
 def by_chance(rate: float, host: int) -> Lie:
-    """Changes this share of a host's results, the same ones each time."""
+    """Changes this share of a host's results, the same ones each time, in the host's own way.
+
+    Two that add the same to one result would confirm each other.
+    """
 
     def lie(job: Job, fitness: float) -> float:
         drawn = hashlib.blake2b(job.digest + str(host).encode(), digest_size=4).digest()
-        return fitness + 0.5 if int.from_bytes(drawn, "little") < rate * 2**32 else fitness
+        return fitness + 0.5 + host if int.from_bytes(drawn, "little") < rate * 2**32 else fitness
 
     return lie
 
