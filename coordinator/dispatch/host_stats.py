@@ -15,6 +15,7 @@ UNKNOWN_LINK = 32_000.0  # bytes a second: assumed of a link before the first me
 RATE_DECAY = 0.95  # factor of the best measured rate at each new measurement
 RISING, FALLING = 0.5, 0.2  # weights of a slower and of a faster new value in a moving mean
 GROWTH, SHRINKING = 0.9, 0.25  # exponents: expected time of more, and of fewer, jobs than ever measured
+SHORTEST = 1e-9  # seconds that a turnaround counts at least
 TURNAROUND_MEMORY = 60.0  # seconds that a turnaround is remembered after a newer one
 DEVIATIONS = 2.0  # above the mean that are still expected, like TCP's retransmission timer (RFC 6298: four)
 LIFETIMES = 8.0  # an unreliable host is given only jobs that take less than this part of its lifetime
@@ -88,25 +89,27 @@ class HostStats:
     def expected_seconds(self, jobs: int) -> float:
         """Seconds until the host has returned `jobs` jobs, if it holds no others; infinite without a record.
 
-        More jobs than ever measured take nearly proportionally longer, fewer somewhat less.
+        More jobs than ever measured take nearly proportionally longer, fewer than ever measured somewhat less. Between
+        two measured numbers of jobs, the time grows by equal factors.
         """
         size = _size_class(jobs)
         if (exactly := self.turnarounds.get(size)) is not None:
             return exactly.seconds
         smaller = max((each for each in self.turnarounds if each < size), default=None)
         larger = min((each for each in self.turnarounds if each > size), default=None)
-        bounds = [math.inf]
-        if smaller is not None:
-            bounds.append(self.turnarounds[smaller].seconds * 2 ** (GROWTH * (size - smaller)))
+        after = math.inf if larger is None else self.turnarounds[larger].seconds
+        if smaller is None:
+            return after if larger is None else after * 2 ** (SHRINKING * (size - larger))
+        before, growth = self.turnarounds[smaller].seconds, GROWTH
         if larger is not None:
-            factor = 1.0 if smaller is not None else 2 ** (SHRINKING * (size - larger))
-            bounds.append(self.turnarounds[larger].seconds * factor)
-        return min(bounds)
+            ratio = max(after / max(before, SHORTEST), 1.0)
+            growth = min(GROWTH, math.log2(ratio) / (larger - smaller))
+        return min(before * 2 ** (growth * (size - smaller)), after)
 
     @property
     def rate(self) -> float:
         """The highest measured rate, in jobs a second."""
-        return max((2**size / max(each.mean, 1e-9) for size, each in self.turnarounds.items()), default=0.0)
+        return max((2**size / max(each.mean, SHORTEST) for size, each in self.turnarounds.items()), default=0.0)
 
     def record_loss(self, age: float) -> None:
         """Note that a worker of this host was lost with jobs in hand, `age` seconds after it joined."""

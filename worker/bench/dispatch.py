@@ -27,6 +27,7 @@ SLOTS = 8
 CANDIDATES = 200
 GENERATIONS = 6  # the first is not counted: workers join during it
 NULL_JOBS = 4096  # per generation: 64 candidates x 64 episodes
+CROWD_SLOTS, CROWD_ROUNDS = 64, 8  # slots of a simulated worker, and jobs of each slot in a generation
 RUN_SECONDS = 300.0
 PEER_SECONDS = 120.0
 ROUNDS = -(-CANDIDATES // SLOTS)
@@ -69,7 +70,11 @@ def measure_null_jobs() -> Figures:
 
 
 def measure_crowd(count: int) -> Figures:
-    """Figures of a run in which `count` simulated workers of one slot each join, work and leave."""
+    """Figures of two runs in which simulated workers join, work and leave, with `count` slots in all.
+
+    Null jobs on workers of one slot each; and how close jobs of a second come to the ideal on workers of up to
+    `CROWD_SLOTS` slots.
+    """
     started = time.monotonic()
     with BenchRun(NULL_TASK, 64, NULL_JOBS // 64) as run, run.crowd(count, 1):
         run.finish()
@@ -78,7 +83,17 @@ def measure_crowd(count: int) -> Figures:
             "seconds_in_all": round(time.monotonic() - started, 1),
             "null_jobs_per_second": round(NULL_JOBS / run.generation_seconds()),
             "coordinator_rss_mb": round(run.peak_mb, 1),
+            "efficiency_1s": round(measure_long_jobs(count), 4),
         }
+
+
+def measure_long_jobs(slots: int) -> float:
+    """The ideal makespan of a generation of jobs of a second divided by the measured one."""
+    workers = -(-slots // CROWD_SLOTS)
+    each = -(-slots // workers)
+    with BenchRun(NULL_TASK, CROWD_ROUNDS, workers * each) as run, run.crowd(workers, each, seconds=1.0):
+        run.finish()
+        return CROWD_ROUNDS / run.generation_seconds()
 
 
 class BenchRun:
@@ -112,10 +127,10 @@ class BenchRun:
         return VerbProcess("worker", "--connect", self.endpoint, *arguments)
 
     @contextmanager
-    def crowd(self, count: int, slots: int) -> Iterator[None]:
-        """Start `count` simulated workers in one process."""
+    def crowd(self, count: int, slots: int, seconds: float = 0.0) -> Iterator[None]:
+        """Start `count` simulated workers in one process, whose jobs take so many `seconds`."""
         process = get_context("spawn").Process(
-            target=run_simulated_workers, args=(self.endpoint, count, slots), daemon=True
+            target=run_simulated_workers, args=(self.endpoint, count, slots, seconds), daemon=True
         )
         process.start()
         try:

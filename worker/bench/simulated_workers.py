@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import time
+from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,7 +14,15 @@ from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import CountingDecoder, encode, encoding
-from dreamfleet.common.protocol.messages import MAX_LEASES, TAG_BYTES, Heartbeat, JobBatch, Result, ResultBatch
+from dreamfleet.common.protocol.messages import (
+    MAX_LEASES,
+    TAG_BYTES,
+    Heartbeat,
+    JobBatch,
+    Result,
+    ResultBatch,
+    RunningJob,
+)
 from dreamfleet.common.transport.session import Network, enqueue_into, open_session
 from dreamfleet.worker.bench.sleep_tasks import NULL_TASK
 from dreamfleet.worker.service.admission import Admission, make_request, request_admission
@@ -23,13 +32,15 @@ from dreamfleet.worker.service.outbox import Outbox
 
 @dataclass
 class SimulatedWorker:
-    """One simulated worker; it finishes each job as it arrives."""
+    """One simulated worker; each of its slots holds a job for so many `seconds`, with 0 all jobs end as they arrive."""
 
     identity: str
     admission: Admission
     slots: int
+    seconds: float = 0.0
     backlog: Backlog = field(init=False)
     outbox: Outbox = field(init=False)
+    running: deque[tuple[float, Result]] = field(init=False, default_factory=deque)  # with the moment of its end
     beat_at: float = 0.0
 
     def __post_init__(self) -> None:
@@ -38,26 +49,43 @@ class SimulatedWorker:
         self.outbox = Outbox(self.admission.intervals.repeat)
 
     def take(self, batch: JobBatch) -> None:
-        """Finish every job of a batch."""
-        self.backlog.add_batch(batch)
+        """Queue the jobs of a batch."""
+        self.backlog.add_batch(batch, {result.digest for _, result in self.running})
         self.outbox.acknowledge(verdict.digest for verdict in batch.verdicts)
-        for job, _ in self.backlog.take(MAX_LEASES):
-            self.outbox.add(Result(job.digest, float(job.seeds[0] % 1000), 1, 0.0, None, None))
+
+    def work(self, now: float) -> bool:
+        """Finish what is done and begin what is queued; return whether a result is new."""
+        finished = 0
+        while self.running and self.running[0][0] <= now:
+            self.outbox.add(self.running.popleft()[1])
+            finished += 1
+        for job, _ in self.backlog.take(self.slots - len(self.running) if self.seconds else MAX_LEASES):
+            result = Result(job.digest, float(job.seeds[0] % 1000), 1, self.seconds, None, None)
+            if self.seconds:
+                self.running.append((now + self.seconds, result))
+            else:
+                self.outbox.add(result)
+                finished += 1
+        return finished > 0
 
     def beat(self) -> Heartbeat:
-        """Return its heartbeat: no queued or running jobs, only results not acknowledged yet."""
+        """Return its heartbeat: what it has, and results not acknowledged yet."""
         run = self.admission
         return Heartbeat(
             run_uid=run.run_uid, incarnation=run.incarnation, nonce=run.nonce,
-            numbering=self.backlog.numbering, seen=self.backlog.seen, capacity=self.slots, slots=self.slots, queued=(),
-            running=(),
+            numbering=self.backlog.numbering, seen=self.backlog.seen, capacity=self.slots, slots=self.slots,
+            queued=tuple(digest[:TAG_BYTES] for digest in self.backlog.queued),
+            running=tuple(RunningJob(result.digest[:TAG_BYTES], 0) for _, result in self.running),
             unacked=tuple(digest[:TAG_BYTES] for digest in self.outbox.digests), load=0.0, steps_per_second=0.0,
             drawn_by="-",
         )  # fmt: skip
 
 
-def run_simulated_workers(endpoint: str, count: int, slots: int) -> None:
-    """Join the coordinator at `endpoint` as `count` workers of `slots` slots, and work until killed."""
+def run_simulated_workers(endpoint: str, count: int, slots: int, seconds: float = 0.0) -> None:
+    """Join the coordinator at `endpoint` as `count` workers of `slots` slots, and work until killed.
+
+    A job takes so many `seconds` of a slot, and nothing of a processor.
+    """
     session, inbox = _connect(endpoint), CountingDecoder()
     events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
     crowd: dict[str, SimulatedWorker] = {}
@@ -67,7 +95,7 @@ def run_simulated_workers(endpoint: str, count: int, slots: int) -> None:
         request = make_request(identity, (NULL_TASK,), slots)
         while (admission := request_admission(session, None, request, inbox)) is None:
             time.sleep(0.1)
-        crowd[identity] = SimulatedWorker(identity, admission, slots)
+        crowd[identity] = SimulatedWorker(identity, admission, slots, seconds)
         declarations.append(session.declare_subscriber(keys.job(admission.run, identity), enqueue_into(events, "job")))
         declarations.append(session.liveliness().declare_token(keys.live_worker(admission.run, identity)))
         _handle_and_send(session, crowd, events, inbox, wait=0.0)
@@ -99,13 +127,14 @@ def _handle_and_send(
             identity = keys.worker_from_key(str(sample.key_expr))
             if batch is not None and identity in crowd:
                 crowd[identity].take(batch)
-                active.add(identity)
             _, sample = events.get_nowait()
     except queue.Empty:
         pass
     now = time.monotonic()
     for identity, worker in crowd.items():
         run = worker.admission
+        if worker.work(now):
+            active.add(identity)
         if now >= worker.beat_at:
             worker.beat_at = now + run.intervals.beat
             active.add(identity)
