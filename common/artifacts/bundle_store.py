@@ -23,6 +23,7 @@ from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
 from dreamfleet.common.files.locks import wait_for_lock
 from dreamfleet.common.files.regular_files import open_append, path_exists
 
+INT8_SUFFIX = "-int8"  # in the name of a shipped bundle: NAME rounded to eight bits
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 

@@ -7,7 +7,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.artifacts.bundle_store import BundleStore, default_cache, find_bundle, pretrained_folder
+from dreamfleet.common.artifacts.bundle_store import (
+    INT8_SUFFIX,
+    BundleStore,
+    default_cache,
+    find_bundle,
+    pretrained_folder,
+)
 from dreamfleet.common.artifacts.controller import Controller, import_hint
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.artifacts.trained_agent import TrainedAgent, is_agent
@@ -128,8 +134,9 @@ def find_bundle_of(
 
 
 def shipped_subspace_name(bundle: str) -> str | None:
-    """The name of the shipped subspace for a shipped world model; `None` if there is none."""
-    return bundle if is_file(pretrained_folder() / SUBSPACES / f"{bundle}.npz") else None
+    """The name of the shipped subspace for a shipped world model, of eight bits too; `None` if there is none."""
+    name = bundle.removesuffix(INT8_SUFFIX)
+    return name if is_file(pretrained_folder() / SUBSPACES / f"{name}.npz") else None
 
 
 def find_subspace(name: str) -> Subspace:

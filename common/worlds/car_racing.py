@@ -11,7 +11,7 @@ from dreamfleet.common.worlds.profile import DemoPlan, PublishedScore, Published
 # A few generations in the dream, then reality, in the features that ship; docs/lab/results.md says what each is for.
 REAL: dict[str, Any] = {
     "task": "dream",
-    "bundle": "tiny",
+    "bundle": "tiny-int8",
     "subspace": "tiny",
     "population": 64,
     "episodes": 16,
@@ -112,7 +112,7 @@ PROFILE = WorldProfile(
         ),
     ),
     demo=DemoPlan(
-        bundle="tiny",
+        bundle="tiny-int8",
         preset="dream",
         dream_minutes=0.5,
         minutes=4.5,

@@ -15,7 +15,7 @@ def find_plan(world: str) -> DemoPlan:
     """The plan of this world's demonstration; `UsageError` lists the worlds that have one.
 
     >>> find_plan("car-racing").bundle
-    'tiny'
+    'tiny-int8'
     """
     if world not in PLANS:
         raise UsageError(f"--world must be one of {', '.join(PLANS)}, not {world!r}")

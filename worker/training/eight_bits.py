@@ -38,6 +38,7 @@ from dreamfleet.worker.worldmodel.inference import Decoder, DreamStep, open_grap
 
 DREAMS, STEPS, EVERY = 32, 250, 10  # dreams, their steps, and the steps from one picture to the next
 SPREAD = 0.3  # standard deviation of the parameters of the random controllers that dream
+FARTHEST = 10  # times the largest latent of a picture: a dream that goes farther has lost its world
 MARGIN = 1.125  # reality goes beyond dreams: the largest outputs were 14 % higher in drives
 
 Floats = NDArray[np.float32]
@@ -76,6 +77,12 @@ def measure_ranges(bundle: Bundle, models: Models) -> Ranges:
     """The largest numbers in a world model's own dreams, under random controllers, and a margin."""
     pictures, inputs = _dream(bundle)
     graph = open_graph(export_activations(models.vae, models.vae_config), threads=1)
+    real = float(np.abs(parse_array(bundle.read(INITIAL_LATENTS_PART))[:, 0]).max())
+    if not (dreamt := float(np.abs(inputs).max())) <= FARTHEST * max(real, 1.0):  # false for NaN too
+        raise BundleError(
+            f"{bundle.path}: its dreams reach latents of {dreamt:.3g}, where pictures have {real:.3g} at most, so they "
+            "do not say how large its numbers become: train its MDN-RNN longer"
+        )
     largest = [float(each.max()) for each in graph.run(None, {"picture": pictures})]
     if not min(largest) > 0:
         raise BundleError(f"{bundle.path}: a layer of its encoder gives nothing but zeros")

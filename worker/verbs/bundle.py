@@ -17,6 +17,7 @@ SUMMARY = (
 )
 EXTRAS = ("train",)
 RECORDED = 512  # states of the default layers are 0.6 MB
+OF_DATA = ("recorded", "reward", "end", "measured", "with_weights")  # arguments of a bundle that is built from --data
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -65,10 +66,10 @@ def run(args: argparse.Namespace) -> int:
     """Write the bundle and print its SHA-256, or write checkpoints and print their paths."""
     if args.extract is None and args.eight_bits is None:
         return _write_bundle(args)
-    others = ("recorded", "reward", "end")
-    if given := [name for name in others if getattr(args, name) is not None] + ["measured"] * bool(args.measured):
+    given = [f"--{name.replace('_', '-')}" for name in OF_DATA if getattr(args, name) not in (None, False, [])]
+    if given:
         source = "--extract" if args.eight_bits is None else "--from"
-        raise UsageError(f"--{given[0]} is of a bundle to build from --data: omit it or {source}")
+        raise UsageError(f"{given[0]} is of a bundle to build from --data: omit it or {source}")
     return _write_checkpoints(args) if args.eight_bits is None else _write_eight_bits(args)
 
 

@@ -7,7 +7,8 @@ import onnx
 import pytest
 from onnx import TensorProto, numpy_helper
 
-from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, ENCODER
+from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, ENCODER, write_bundle
+from dreamfleet.common.artifacts.bundle_store import find_bundle, pretrained_folder
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import BundleError, ControllerError
@@ -17,6 +18,7 @@ from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.training.eight_bits import write_eight_bit_bundle
 from dreamfleet.worker.training.unbundle import restore_models, unbundle
 from dreamfleet.worker.worldmodel.eight_bits import PIXEL_STEP, Ranges, add_convolution, round_weights_exactly
+from dreamfleet.worker.worldmodel.export import export_dream
 from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, PolicyStep, open_graph
 from dreamfleet.worker.worldmodel.mdnrnn_config import ATTENTIVE, MDNRNNConfig
 from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
@@ -167,6 +169,24 @@ def test_other_activations_are_refused(tmp_path):
     assert not (tmp_path / "b.zip").exists()
 
 
+def test_a_dream_that_loses_its_world_gives_no_ranges(whole, tmp_path):
+    wild = restore_models(whole).mdnrnn
+    numbers = MEMORY.mixtures * MEMORY.latent
+    wild["heads.bias"][-2 * numbers :] = 30  # of means and deviations
+    parts = {name: whole.read(name) for name in whole.manifest.parts} | {DREAM_GRAPH: export_dream(wild, MEMORY)}
+    bundle = write_bundle(tmp_path / "wild.zip", replace(whole.manifest, parts={}), parts)
+    with pytest.raises(BundleError, match=r"reach latents of .* train its MDN-RNN longer"):
+        write_eight_bit_bundle(bundle, tmp_path / "b.zip")
+    assert not (tmp_path / "b.zip").exists()
+
+
+def test_the_rounded_bundle_that_ships_is_tiny():
+    whole, rounded = find_bundle("tiny"), find_bundle("tiny-int8")
+    assert rounded.same_models == (rounded.sha256, whole.sha256)
+    assert from_plain(Ranges, rounded.manifest.models["eight_bits"]).inputs
+    rounded.for_controller(Controller.load(pretrained_folder() / "real.npz"))
+
+
 def test_the_verb_writes_the_same_file_twice(whole, tmp_path, capsys):
     files = [tmp_path / name / "fast.zip" for name in "ab"]
     for file in files:
@@ -181,6 +201,7 @@ def test_the_verb_writes_the_same_file_twice(whole, tmp_path, capsys):
     [
         (["--out", "x.zip", "--recorded", "3"], "--recorded is of a bundle to build from --data"),
         (["--extract", "tiny"], "give --out"),
+        (["--out", "fast.zip", "--with-weights"], "--with-weights is of a bundle to build from --data"),
     ],
 )
 def test_flags_that_do_not_fit_are_refused(more, message, capsys, tmp_path, monkeypatch):
