@@ -144,13 +144,13 @@ def test_a_schedule_is_frozen_with_its_run_and_another_file_is_refused(processes
 
 def test_a_preset_may_hold_stages_and_a_schedule_goes_before_them(processes):
     config, schedule = processes.folder / "fleet.toml", processes.folder / "stages.toml"
-    config.write_text('[run]\npreset = "real"\n')
+    config.write_text('[run]\npreset = "mixed"\n')
     schedule.write_text(STAGES)
     coordinator = processes.coordinator("--config", config, name="night")
-    coordinator.wait_for("generation 0 is in stage 1 of 4 (400 steps, 64 x 16 episodes")
+    coordinator.wait_for("generation 0 is in stage 1 of 2 (400 steps, 64 x 16 episodes")
     coordinator.end()
     with open_run(processes.runs, "night") as run:
-        assert [each.driven for each in stages_of(run.settings)] == [0, 1, 1, 1]
+        assert [each.driven for each in stages_of(run.settings)] == [0, 0.5]
     coordinator = resume(processes, "night", "--config", config)
     coordinator.wait_for("incarnation 2")
     coordinator.end()
