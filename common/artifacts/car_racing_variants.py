@@ -22,6 +22,7 @@ from dreamfleet.common.artifacts.task_options import check_options, read_options
 from dreamfleet.common.errors import UsageError
 
 CAR_RACING = "car-racing"  # the task; its dream has the same options
+COSTS = ("time_cost", "offroad_cost")  # options by which candidates pay
 OPTION_HELP = {
     "actions": "continuous, or linear or discrete with pedals=two",
     "pedals": "two, half or one",

@@ -17,6 +17,7 @@ REAL: dict[str, Any] = {
     "subspace": "tiny",
     "preset_variant": ("offroad_cost=0.5",),
     "population": 24,
+    "episodes": 1,
     "sigma0": 0.3,
     "covariance": "full",
     "horizon": 1000,
@@ -25,7 +26,7 @@ REAL: dict[str, Any] = {
     "evaluation_episodes": 32,
     "confirm_episodes": 64,
     "stages": (
-        StageSettings(score=800.0, steps=600_000, episodes=1),
+        StageSettings(score=800.0, steps=600_000),
         StageSettings(steps=1_200_000, episodes=4, sigma0=0.06),
         StageSettings(steps=2_500_000, episodes=8),
         StageSettings(episodes=16),
@@ -138,7 +139,7 @@ PROFILE = WorldProfile(
         able_score=800,
         quick_steps=700_000,
         # To drive on grass predicts losses that one track may not show.
-        variant="offroad_cost=0.5",
+        variant="offroad_cost=2",
         judge="gymnasium's environment",
         video_steps=1000,
     ),

@@ -371,9 +371,10 @@ class RunConfig:
             raise UsageError(f"task {self.task} has no variants: {world} has, and its dream")
         costs = [each for each in driving.option_texts if each not in driving.without_costs.option_texts]
         if costs and self.task == DREAM:
+            cost = costs[0].partition("=")[0]
+            remedy = "omit it from --variant" if cost in given else f"pass --variant {cost}=0 over the preset's"
             raise UsageError(
-                f"{costs[0].partition('=')[0]} needs candidates that drive in the world: a dream has no lap and no "
-                "road; omit it from --variant"
+                f"{cost} needs candidates that drive in the world: a dream has no lap and no road; {remedy}"
             )
         return driving
 

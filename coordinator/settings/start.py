@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle, describe_bundle
+from dreamfleet.common.artifacts.car_racing_variants import COSTS
 from dreamfleet.common.artifacts.driving import Variant
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.errors import ControllerError, DreamfleetError, JournalError
 from dreamfleet.common.files.regular_files import is_file, path_exists
 from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.effort import START_EFFORT, Effort
 from dreamfleet.common.runs.lookup import find_controller
 from dreamfleet.common.runs.records import RunSettings
@@ -46,12 +48,14 @@ class StartPoint:
         """The configuration with the options that this start was evolved under, where it does not name them.
 
         They are stronger than a preset's: parameters mean something in their own way of driving alone. What candidates
-        pay is the start's only where nothing is named.
+        pay is the start's only where nothing is named, by a preset neither, and in the dream nothing.
         """
         if self.bundle:
-            own, said = Variant.from_json(self.options), {_key_of(text) for text in config.variant}
-            kept = (text for text in (own.without_costs if said else own).option_texts if _key_of(text) not in said)
-            return replace(config, variant=(*kept, *config.variant), preset_variant=())
+            costs = tuple(text for text in config.preset_variant if _key_of(text) in COSTS)
+            own, said = Variant.from_json(self.options), {_key_of(text) for text in (*costs, *config.variant)}
+            way = own.without_costs if said or config.task == DREAM else own
+            kept = (text for text in way.option_texts if _key_of(text) not in said)
+            return replace(config, variant=(*kept, *config.variant), preset_variant=costs)
         given = config.task_options is not None or config.environment or config.normalise
         return config if given else replace(config, task_options=self.options)
 

@@ -78,13 +78,13 @@ def measure_crowd(count: int) -> Figures:
     started = time.monotonic()
     with BenchRun(NULL_TASK, 64, NULL_JOBS // 64) as run, run.crowd(count, 1):
         run.finish()
-        return {
+        crowd = {
             "workers": count,
             "seconds_in_all": round(time.monotonic() - started, 1),
             "null_jobs_per_second": round(NULL_JOBS / run.generation_seconds()),
             "coordinator_rss_mb": round(run.peak_mb, 1),
-            "efficiency_1s": round(measure_long_jobs(count), 4),
         }
+    return {**crowd, "efficiency_1s": round(measure_long_jobs(count), 4)}
 
 
 def measure_long_jobs(slots: int) -> float:

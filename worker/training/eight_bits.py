@@ -78,7 +78,8 @@ def measure_ranges(bundle: Bundle, models: Models) -> Ranges:
     pictures, inputs = _dream(bundle)
     graph = open_graph(export_activations(models.vae, models.vae_config), threads=1)
     real = float(np.abs(parse_array(bundle.read(INITIAL_LATENTS_PART))[:, 0]).max())
-    if not (dreamt := float(np.abs(inputs).max())) <= FARTHEST * max(real, 1.0):  # false for NaN too
+    dreamt = float(np.abs(inputs[:, : bundle.manifest.latent]).max())
+    if not dreamt <= FARTHEST * max(real, 1.0):  # false for NaN too
         raise BundleError(
             f"{bundle.path}: its dreams reach latents of {dreamt:.3g}, where pictures have {real:.3g} at most, so they "
             "do not say how large its numbers become: train its MDN-RNN longer"

@@ -36,7 +36,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="the other way: write the VAE and MDN-RNN of this bundle, a file or one that ships, into --data as "
         "checkpoints from which training can continue",
     )  # fmt: skip
-    parser.add_argument("--with-weights", action="store_true", help="keep the training weights in it")
+    parser.add_argument("--with-weights", action="store_true", default=None, help="keep the training weights in it")
     parser.add_argument(
         "--recorded", type=int, metavar="N",
         help=f"recorded states at which dreams may begin, with the model's memory (default {RECORDED}; 0: none)",
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     """Write the bundle and print its SHA-256, or write checkpoints and print their paths."""
     if args.extract is None and args.eight_bits is None:
         return _write_bundle(args)
-    given = [f"--{name.replace('_', '-')}" for name in OF_DATA if getattr(args, name) not in (None, False, [])]
+    given = [f"--{name.replace('_', '-')}" for name in OF_DATA if getattr(args, name) not in (None, [])]
     if given:
         source = "--extract" if args.eight_bits is None else "--from"
         raise UsageError(f"{given[0]} is of a bundle to build from --data: omit it or {source}")
@@ -81,7 +81,7 @@ def _write_bundle(args: argparse.Namespace) -> int:
         raise UsageError(f"--recorded must be from 0 to {MAX_RECORDED_STATES}, not {recorded}")
     check_output_path(args.out)
     bundle = assemble(
-        args.data, args.out, args.out.stem, with_weights=args.with_weights, recorded=recorded,
+        args.data, args.out, args.out.stem, with_weights=bool(args.with_weights), recorded=recorded,
         measured=args.measured, reward=args.reward, end=args.end,
     )  # fmt: skip
     return _answer(args, bundle)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.bundle import SINGLE_PRECISION, WEIGHTS, Bundle, describe_bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli.model_commands import Model, Words
 from dreamfleet.common.errors import BundleError, DatasetError, UsageError
@@ -257,6 +257,11 @@ def find_init(name: str, runs_dir: Path) -> tuple[Controller, Bundle]:
         ) from error
     if bundle is None:
         raise UsageError(f"controller {name} sees no world model, and an iteration needs one")
+    if (whole := bundle.manifest.provenance.get(SINGLE_PRECISION)) and WEIGHTS not in bundle.manifest.parts:
+        raise UsageError(
+            f"the world model of {name} is rounded to eight bits, and no training goes on from it: give a controller "
+            f"of {describe_bundle(str(whole))}, of which it was made"
+        )
     return controller, bundle
 
 

@@ -9,6 +9,7 @@ from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.common.cli.presets import NAMES, check_preset
 from dreamfleet.common.errors import UsageError
 from dreamfleet.coordinator.settings import presets as runs
+from dreamfleet.coordinator.settings.schedule import split_first_stage
 from dreamfleet.coordinator.verbs import coordinator
 from dreamfleet.worker.baselines import presets as baselines
 from dreamfleet.worker.training import presets
@@ -20,6 +21,12 @@ def test_the_names_match_the_presets_of_each_side():
     assert set(NAMES["run"]) == set(runs.PRESETS)
     assert set(NAMES["training"]) == set(presets.PRESETS)
     assert set(NAMES["baseline"]) == set(baselines.PRESETS)
+
+
+def test_a_flag_changes_what_a_presets_first_stage_does():
+    for settings in runs.PRESETS.values():
+        named, _ = split_first_stage(settings.get("stages", ()))
+        assert not named, "it would hide the flag of that name"
 
 
 def test_the_error_names_the_other_kind_of_a_preset():

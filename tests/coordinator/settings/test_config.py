@@ -197,6 +197,31 @@ def test_a_start_keeps_its_way_of_driving_whatever_a_preset_does(random_bundle, 
     assert settings.task.options == options
 
 
+@pytest.mark.parametrize(
+    ("task", "own", "texts", "options"),
+    [
+        (None, "", (), '{"offroad_cost": 0.5}'),
+        (None, '{"offroad_cost": 2.0}', (), '{"offroad_cost": 0.5}'),
+        (None, HALF, ("offroad_cost=1",), '{"offroad_cost": 1.0, "pedals": "half"}'),
+        ("dream", '{"offroad_cost": 2.0, "pedals": "half"}', ("offroad_cost=0",), HALF),
+    ],
+)
+def test_what_a_preset_lets_candidates_pay_is_stronger_than_what_a_starts_paid(
+    random_bundle, task, own, texts, options
+):
+    given = {} if task is None else {"task": task}
+    config = RunConfig(preset="real", variant=texts, preset_variant=("offroad_cost=0.5",), **given)
+    start = StartPoint(np.zeros(867), random_bundle.sha256, "run night", own)
+    assert start.apply_to(config).settings(random_bundle).task.options == options
+
+
+def test_the_dream_of_a_start_that_paid_has_no_price(random_bundle):
+    start = StartPoint(np.zeros(867), random_bundle.sha256, "run night", '{"offroad_cost": 2.0}')
+    assert start.apply_to(RunConfig(task="dream")).settings(random_bundle).task.options == ""
+    with pytest.raises(UsageError, match="pass --variant offroad_cost=0 over the preset's"):
+        RunConfig(task="dream", preset_variant=("offroad_cost=2",)).settings(random_bundle)
+
+
 def test_a_start_of_another_length_is_refused(random_bundle):
     start = StartPoint(np.zeros(867), random_bundle.sha256, "run night")
     start.check(RunConfig().settings(random_bundle), random_bundle)

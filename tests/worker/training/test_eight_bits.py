@@ -201,6 +201,7 @@ def test_the_verb_writes_the_same_file_twice(whole, tmp_path, capsys):
     [
         (["--out", "x.zip", "--recorded", "3"], "--recorded is of a bundle to build from --data"),
         (["--extract", "tiny"], "give --out"),
+        (["--out", "fast.zip", "--recorded", "0"], "--recorded is of a bundle to build from --data"),
         (["--out", "fast.zip", "--with-weights"], "--with-weights is of a bundle to build from --data"),
     ],
 )
