@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from dreamfleet.common.artifacts.actions import (
     FIVE_CHOICES,
@@ -22,7 +22,6 @@ from dreamfleet.common.artifacts.task_options import check_options, read_options
 from dreamfleet.common.errors import UsageError
 
 CAR_RACING = "car-racing"  # the task; its dream has the same options
-COSTS = ("time_cost", "offroad_cost")  # options by which candidates pay
 OPTION_HELP = {
     "actions": "continuous, or linear or discrete with pedals=two",
     "pedals": "two, half or one",
@@ -37,6 +36,8 @@ OPTION_HELP = {
 @dataclass(frozen=True)
 class Variant:
     """How a controller drives, and the penalties of its candidates; `UsageError` for a value out of range."""
+
+    COSTS: ClassVar[tuple[str, ...]] = ("time_cost", "offroad_cost")  # options by which candidates pay
 
     # linear: the outputs are the action, without tanh; discrete: one of gymnasium's five
     actions: Literal["continuous", "linear", "discrete"] = "continuous"

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle, describe_bundle
-from dreamfleet.common.artifacts.car_racing_variants import COSTS
 from dreamfleet.common.artifacts.driving import Variant
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.errors import ControllerError, DreamfleetError, JournalError
@@ -51,7 +50,7 @@ class StartPoint:
         pay is the start's only where nothing is named, by a preset neither, and in the dream nothing.
         """
         if self.bundle:
-            costs = tuple(text for text in config.preset_variant if _key_of(text) in COSTS)
+            costs = tuple(text for text in config.preset_variant if _key_of(text) in Variant.COSTS)
             own, said = Variant.from_json(self.options), {_key_of(text) for text in (*costs, *config.variant)}
             way = own.without_costs if said or config.task == DREAM else own
             kept = (text for text in way.option_texts if _key_of(text) not in said)
