@@ -9,8 +9,7 @@ from dreamfleet.common.runs.records import StageSettings
 from dreamfleet.common.worlds.profile import DemoPlan, PublishedScore, PublishedScores, ShippedScore, WorldProfile
 
 # Reality from nothing, in the features that ship: one track a candidate by large steps until a mean is able, then ever
-# more tracks. What a candidate pays for the grass says long before its score that it will lose tiles
-# (docs/lab/results.md).
+# more tracks. A candidate pays for the grass, because who drives there soon misses tiles (docs/lab/results.md).
 REAL: dict[str, Any] = {
     "task": "car-racing",
     "bundle": "tiny-int8",
