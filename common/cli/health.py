@@ -99,11 +99,14 @@ def _check_box2d() -> Finding:
 def _check_bundles() -> Iterator[Finding]:
     names = shipped_names()
     for name in names:
+        found, ok, remedy = "", False, "reinstall dreamfleet"
         try:
             found, ok = find_bundle(name).sha256[:12], True
         except DreamfleetError as error:
-            found, ok = str(error), False
-        yield Finding(f"bundle {name}", ok, True, found, "everything", "reinstall dreamfleet")
+            found = str(error)
+            if isinstance(error.__cause__, OSError):  # it could not be assembled in the cache
+                remedy = ""  # that of the cache folder
+        yield Finding(f"bundle {name}", ok, True, found, "everything", remedy)
     if not names:
         yield Finding("bundle", False, True, "none shipped", "everything", "reinstall dreamfleet")
 

@@ -379,6 +379,7 @@ class RunConfig:
         return driving
 
     def _resolve_without_bundle(self) -> tuple[TaskSpec, ControllerShape, tuple[str, ...]]:
+        check_preset_fits(self.preset, str(self.task))
         if self.temperature is not None or self.collect_every or self.variant:
             given = {
                 "--temperature": self.temperature is not None,

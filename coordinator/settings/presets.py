@@ -23,16 +23,16 @@ PIXELS: dict[str, Any] = {
 PRESETS = {"pixels": PIXELS, **{name: each for world in WORLDS.values() for name, each in world.run_presets.items()}}
 
 
-def check_preset_fits(name: str | None, world: str, bundle: str) -> None:
-    """`UsageError` if a preset was made for a named world model, and the run's `bundle` is of another world.
+def check_preset_fits(name: str | None, world: str, bundle: str = "") -> None:
+    """`UsageError` if a preset was made for a named world model, and the run's `bundle` or task is of another `world`.
 
     Presets that name no world model, such as dream, are of any.
     """
     own = next((each.task for each in WORLDS.values() if "bundle" in each.run_presets.get(name or "", {})), world)
     if own != world:
-        raise UsageError(
-            f"the preset {name} is of {own}, and {bundle} is a world model of {world}: give --preset pixels"
-        )
+        with_bundle = f"{bundle} is a world model of {world}: give --preset pixels"
+        other = with_bundle if bundle else f"the task is {world}: omit --preset"
+        raise UsageError(f"the preset {name} is of {own}, and {other}")
 
 
 def find_preset(name: str) -> dict[str, Any]:

@@ -68,6 +68,7 @@ def worker_words(processes):
     return ("--connect", processes.endpoint, "--task", tasks.SLOW_TOY, "--run", "test")
 
 
+@pytest.mark.slow
 def test_slurm_starts_a_worker_that_drains_before_its_limit(processes, coordinator, start):
     """As with `--signal=B:TERM`, only the batch shell gets the signal."""
     variables = {"SLURM_CPUS_PER_TASK": "2", "SLURM_ARRAY_TASK_ID": "7", "SLURMD_NODENAME": "node3"}

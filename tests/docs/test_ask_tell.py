@@ -42,6 +42,7 @@ def run(*command, where, cache):
     return done.stdout
 
 
+@pytest.mark.slow
 def test_pycmas_own_loop(fleet, tmp_path):
     code = block("python").replace(ADDRESS, fleet.endpoint)
     out = run(sys.executable, "-c", code, where=tmp_path, cache=fleet.cache).splitlines()

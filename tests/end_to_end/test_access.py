@@ -41,6 +41,7 @@ def note(answered, name, reply):
         answered.add(name)
 
 
+@pytest.mark.slow
 def test_each_may_do_what_its_role_says_and_the_run_is_none_the_worse(processes, access, endpoint, random_bundle):
     plain = processes.coordinator(
         "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 1,
@@ -104,6 +105,7 @@ def test_each_may_do_what_its_role_says_and_the_run_is_none_the_worse(processes,
     assert (processes.runs / "safe" / "journal.sqlite").stat().st_mode & 0o077 == 0
 
 
+@pytest.mark.slow
 def test_a_stranger_to_the_fleet_is_refused_with_the_reason(access, endpoint, tmp_path):
     other = Access(tmp_path / "other")
     good, elsewhere = read_join_file(access.path("viewer")), f"tls/127.0.0.2:{free_port()}"
@@ -128,6 +130,7 @@ def test_a_stranger_to_the_fleet_is_refused_with_the_reason(access, endpoint, tm
         assert b"speaks TLS" in Watcher(plain, None, tmp_path).poll().absent_event
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_not_let_in_says_why_once_and_tries_again(access, endpoint, tmp_path):
     plain, other = Network(connect=(endpoint.replace("tls", "tcp"),)), Access(tmp_path / "other")
     with open_session(Network(listen=(endpoint,), credentials=read_join_file(access.path("coordinator")))):

@@ -38,6 +38,7 @@ def fleet(processes, random_bundle):
     return processes
 
 
+@pytest.mark.slow
 def test_batches_are_scored_and_the_same_content_is_never_scored_twice(fleet):
     with scorer(fleet) as search:
         assert search.size == SIZE

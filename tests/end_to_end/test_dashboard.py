@@ -143,6 +143,7 @@ def test_a_killed_worker_goes_from_the_page_within_two_seconds(page, processes, 
 PAINTED = "all => all.every(each => each.getContext('2d').getImageData(each.width - 4, 9, 1, 1).data[3] > 0)"
 
 
+@pytest.mark.slow
 def test_workers_out_of_sight_are_drawn_for_screenshots_and_print(browser, processes):
     with serving(processes.endpoint, snapshot(workers=60)), dashboard(processes, "--port", 0) as started, \
             tab(browser, viewport={"width": 1280, "height": 400}) as page:  # fmt: skip
@@ -162,6 +163,7 @@ def test_before_the_first_generation_a_chart_has_no_axes_and_says_what_comes(bro
         assert page.locator("main svg.main-svg").count() == 0
 
 
+@pytest.mark.slow
 def test_a_run_that_is_paused_says_why_and_one_that_is_left_how_to_go_on(page, processes, settings):
     coordinator = processes.coordinator(*settings, "--generations", 1000)
     wait(page, "waiting")
@@ -223,6 +225,7 @@ def test_several_live_runs_can_be_chosen_among(browser, processes):
         assert page.locator("[data-part=chooser] a").all_inner_texts() == ["lucid", "night"]
 
 
+@pytest.mark.slow
 def test_past_runs_are_searched_sorted_opened_and_compared_by_keyboard(browser, processes, tmp_path):
     for name in ("dream", "reality", "hidden"):
         shutil.copytree(RUNS / name, tmp_path / "runs" / name)
@@ -330,6 +333,7 @@ def busy(page):
     return 1000 * seconds, page.evaluate("performance.getEntriesByName('update').length")
 
 
+@pytest.mark.slow
 def test_five_thousand_generations_and_five_hundred_workers_are_painted_in_no_time(browser, processes):
     with serving(processes.endpoint, snapshot(5000, workers=500, population=400)) as served, \
             dashboard(processes, "--port", 0) as started, tab(browser) as page:  # fmt: skip
@@ -425,6 +429,7 @@ def send_to(port, request, deadline=DEADLINE):
     return said
 
 
+@pytest.mark.slow
 def test_clients_that_are_no_browsers_neither_stop_it_nor_see_more(processes):
     with dashboard(processes, "--port", 0) as started, ExitStack() as stack:
         port = int(started.address.split(":")[-1].strip("/"))

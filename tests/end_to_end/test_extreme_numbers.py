@@ -6,6 +6,7 @@ from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", [tasks.EXPLODING, tasks.ENDLESS])
 def test_extreme_numbers_pause_the_run_with_their_reason_and_it_can_be_continued(processes, random_bundle, task):
     coordinator = processes.coordinator(

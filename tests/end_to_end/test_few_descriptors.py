@@ -15,6 +15,7 @@ def at_most(files):
     return ("bash", "-c", f'ulimit -n {files}; exec "$@"', "-")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("files", [12, 40])
 def test_a_worker_without_descriptors_for_its_slots_ends_and_says_so(processes, random_bundle, files):
     processes.coordinator("--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4)

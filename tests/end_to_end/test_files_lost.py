@@ -63,6 +63,7 @@ def goes_on(processes, coordinator, said, name="test"):
     assert len(history) == generations + 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", [("journal.sqlite",), ("journal.sqlite-wal",), ("journal.sqlite", "journal.sqlite-wal",
                                   "journal.sqlite-shm")], ids=["journal", "log", "all"])  # fmt: skip
 def test_a_journal_that_is_removed_is_rescued_under_its_own_name(processes, live, lost):
@@ -75,6 +76,7 @@ def test_a_journal_that_is_removed_is_rescued_under_its_own_name(processes, live
     goes_on(processes, coordinator, said)
 
 
+@pytest.mark.slow
 def test_a_folder_that_is_removed_is_rescued_beside_it(processes, live):
     coordinator, folder = live
     shutil.rmtree(folder)
@@ -83,6 +85,7 @@ def test_a_folder_that_is_removed_is_rescued_beside_it(processes, live):
     goes_on(processes, coordinator, said, "test-rescued")
 
 
+@pytest.mark.slow
 def test_a_journal_that_is_replaced_by_a_copy_is_rescued_and_the_copy_stays(processes, live):
     coordinator, folder = live
     copy = folder / "copy"
@@ -94,6 +97,7 @@ def test_a_journal_that_is_replaced_by_a_copy_is_rescued_and_the_copy_stays(proc
     goes_on(processes, coordinator, said)
 
 
+@pytest.mark.slow
 def test_a_journal_that_others_read_is_no_reason_to_leave(processes, live):
     coordinator, folder = live
     for _ in range(5):
@@ -106,6 +110,7 @@ def test_a_journal_that_others_read_is_no_reason_to_leave(processes, live):
     assert coordinator.popen.poll() is None
 
 
+@pytest.mark.slow
 def test_a_folder_that_is_moved_goes_on_where_it_lies(processes, live):
     coordinator, folder = live
     folder.rename(processes.runs / "elsewhere")
@@ -114,6 +119,7 @@ def test_a_folder_that_is_moved_goes_on_where_it_lies(processes, live):
     goes_on(processes, coordinator, said, "elsewhere")
 
 
+@pytest.mark.slow
 def test_a_bundle_that_is_removed_is_served_on_and_written_again(processes, live):
     coordinator, folder = live
     (folder / "bundle.zip").unlink()
@@ -124,6 +130,7 @@ def test_a_bundle_that_is_removed_is_served_on_and_written_again(processes, live
     assert (folder / "bundle.zip").exists()
 
 
+@pytest.mark.slow
 def test_a_controller_whose_name_is_a_folder_is_a_clear_error(processes, live):
     coordinator, folder = live
     (folder / "controller.npz").unlink(missing_ok=True)
@@ -141,6 +148,7 @@ def test_a_controller_whose_name_is_a_folder_is_a_clear_error(processes, live):
     assert again.finish()[0] == 0
 
 
+@pytest.mark.slow
 def test_a_lock_that_is_removed_by_hand_lets_nobody_in(processes, live):
     coordinator, folder = live
     (folder / "lock").unlink()
@@ -151,6 +159,7 @@ def test_a_lock_that_is_removed_by_hand_lets_nobody_in(processes, live):
     coordinator.wait_for("generation")
 
 
+@pytest.mark.slow
 def test_a_log_that_is_truncated_is_rescued_before_anything_is_written_over_it(processes, live):
     coordinator, folder = live
     os.truncate(folder / "journal.sqlite-wal", 0)
@@ -159,6 +168,7 @@ def test_a_log_that_is_truncated_is_rescued_before_anything_is_written_over_it(p
     goes_on(processes, coordinator, said)
 
 
+@pytest.mark.slow
 def test_a_log_that_a_checkpoint_of_others_empties_is_no_reason_to_leave(processes, live):
     coordinator, folder = live
     with closing(sqlite3.connect(folder / "journal.sqlite", timeout=30)) as other:

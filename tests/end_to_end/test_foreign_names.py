@@ -216,6 +216,7 @@ def test_no_verb_imports_what_a_file_names(folder, mark, capfd):
     }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("file", "task"), [("own.npz", OWN), ("gym.npz", GYM)])
 def test_what_the_user_names_is_imported(folder, mark, capfd, file, task):
     words = ["evaluate", "--controller", file, "--episodes", "1", "--jobs", "1"]

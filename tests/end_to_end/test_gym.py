@@ -132,6 +132,7 @@ def test_it_is_learnt_from_zero_on_two_workers_and_one_gives_the_same_bits(proce
     assert evolve(processes, "alone", 1, *settings) == two
 
 
+@pytest.mark.slow
 def test_what_a_run_is_begun_in_is_tried_first(processes):
     odd = ("--run", "odd", "--runs-dir", processes.runs, "--task", ODD, "--environment")
     code, _, err = processes.call("coordinator", *odd, "fault=old step")

@@ -115,6 +115,7 @@ def hello(session, **changes):
     return decode_json(HelloReply, say(session, keys.hello("test"), json.dumps(document).encode()))
 
 
+@pytest.mark.slow
 def test_no_hello_and_no_control_verb_is_too_long_to_be_answered(processes, random_bundle):
     coordinator = processes.coordinator(
         "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0,

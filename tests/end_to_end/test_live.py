@@ -45,6 +45,7 @@ def sights(view, count):
     return seen
 
 
+@pytest.mark.slow
 def test_a_view_follows_a_worker_and_another_where_that_one_is_killed(processes, run):
     with Client((processes.endpoint,)) as client, LiveView(client) as view:
         seen = sights(view, 5)
@@ -61,6 +62,7 @@ def test_a_view_follows_a_worker_and_another_where_that_one_is_killed(processes,
         assert sights(view, 1)[0].worker.startswith("first/")
 
 
+@pytest.mark.slow
 def test_a_view_of_any_worker_turns_to_one_that_is_there(processes, run):
     with Client((processes.endpoint,)) as client, LiveView(client) as view:
         sights(view, 1)
@@ -70,6 +72,7 @@ def test_a_view_of_any_worker_turns_to_one_that_is_there(processes, run):
             pass
 
 
+@pytest.mark.slow
 def test_who_is_not_there_is_named_and_a_coordinator_that_is_killed_is_missed(processes, run):
     with Client((processes.endpoint,)) as client:
         with pytest.raises(ConnectionFailedError, match="no coordinator of run 'other'"):
@@ -83,6 +86,7 @@ def test_who_is_not_there_is_named_and_a_coordinator_that_is_killed_is_missed(pr
                 sights(view, 1000)
 
 
+@pytest.mark.slow
 def test_hostile_frames_are_dropped_and_counted(processes, run):
     with Client((processes.endpoint,)) as client, LiveView(client) as view:
         (sight,) = sights(view, 1)

@@ -5,6 +5,8 @@ import signal
 from collections import Counter
 from pathlib import Path
 
+import pytest
+
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.analysis.export import scalars_of
 from tests.support import tasks
@@ -17,6 +19,7 @@ def followers(process):
     return [int(each) for each in children if "spawn_main" in Path(f"/proc/{each}/cmdline").read_text()]
 
 
+@pytest.mark.slow
 def test_curves_go_on_after_a_kill_and_stall_nothing(processes, random_bundle, monkeypatch):
     """The last of three lives stops its follower, which holds up neither generations nor, for long, the run's end."""
     monkeypatch.setenv("DREAMFLEET_NETWORK_LOG_TO", "tensorboard")

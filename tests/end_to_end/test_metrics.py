@@ -18,6 +18,7 @@ def read(port, path="/metrics"):
     return {sample.name: sample for family in text_string_to_metric_families(text) for sample in family.samples}
 
 
+@pytest.mark.slow
 def test_a_coordinator_answers_prometheus_and_a_taken_port_is_one_line(processes, random_bundle):
     port = free_port()
     settings = ("--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,

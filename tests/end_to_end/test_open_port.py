@@ -32,6 +32,7 @@ def harmed(processes, random_bundle, *actions):
     return evil, coordinator
 
 
+@pytest.mark.slow
 def test_all_at_once_change_no_bit(processes, random_bundle, unharmed):
     evil, coordinator = harmed(processes, random_bundle, *ACTIONS)
     assert outcome(processes) == unharmed, "\n".join(coordinator.lines)

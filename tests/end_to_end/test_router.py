@@ -77,6 +77,7 @@ def test_two_linked_routers_one_of_which_is_killed_cost_no_bit(processes, recipe
     assert fitness(processes, "far") == alone
 
 
+@pytest.mark.slow
 def test_a_coordinator_that_nobody_reaches_meets_workers_of_another_network_at_a_router(
     processes, recipe, random_bundle, alone
 ):

@@ -81,6 +81,7 @@ def test_stopped_with_a_signal_and_continued_equals_never_stopped(processes, set
             assert [one.fitness(generation, i) for i in range(4)] == [other.fitness(generation, i) for i in range(4)]
 
 
+@pytest.mark.slow
 def test_status_is_json_that_zenoh_cli_reads_too(processes, settings):
     coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
     processes.worker("--task", tasks.SLOW_TOY)

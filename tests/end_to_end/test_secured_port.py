@@ -20,6 +20,7 @@ ARRIVES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "who", [*(pytest.param(who, marks=pytest.mark.long) for who in ("viewer", "operator")), "second"]
 )

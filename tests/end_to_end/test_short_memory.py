@@ -32,6 +32,7 @@ def limited():
         each.rmdir()
 
 
+@pytest.mark.slow
 def test_a_slot_that_the_kernel_kills_blames_its_host(processes, random_bundle, limited):
     name = rough_tasks.name_of(rough_tasks.Hungry)
     coordinator = processes.coordinator("--bundle", random_bundle.path, "--task", name, "--population", 4)

@@ -89,6 +89,7 @@ def test_up_brings_hosts_to_a_run_again_leaves_them_and_down_leaves_nothing(proc
     assert {row["state"] for row in rows_of(processes, "down", "a", "b", "--ssh", hosts.ssh).values()} == {"nothing"}
 
 
+@pytest.mark.slow
 def test_through_a_tunnel_workers_serve_a_coordinator_on_loopback_and_end_with_the_command(processes, hosts):
     a = hosts.add("a")
     coordinator = processes.coordinator(*TOY, "--generations", 10**6)
@@ -117,6 +118,7 @@ def test_through_a_tunnel_workers_serve_a_coordinator_on_loopback_and_end_with_t
     assert not runs(pid)
 
 
+@pytest.mark.slow
 def test_a_log_is_followed_until_the_worker_ends_or_somebody_has_seen_enough(processes, hosts):
     a, coordinator = hosts.add("a"), processes.coordinator(*TOY, "--generations", 10**6)
     flags = ("--connect", processes.endpoint, "--no-tunnel", "--follow")
@@ -280,6 +282,7 @@ def pip_of(host):
     return None
 
 
+@pytest.mark.slow
 def test_a_join_file_is_handed_over_by_no_command_line_for_its_reader_alone(processes, hosts, tmp_path):
     a, join = hosts.add("a"), tmp_path / "hosts.join"
     authority = Authority.create(tmp_path / "access")

@@ -41,6 +41,7 @@ def test_a_watcher_prints_a_line_each_time_and_at_last_how_the_run_ended(process
         assert seen[-1]["last"]["mean"] == run.history()[-1].mean
 
 
+@pytest.mark.slow
 def test_the_last_panel_shows_the_final_state(processes, settings):
     coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 2)
     watcher = processes.start("status", "--connect", processes.endpoint, "--watch")
@@ -87,6 +88,7 @@ def test_parts_that_nobody_answers_any_more_are_an_error_for_people(processes, s
                 ask("test")
 
 
+@pytest.mark.slow
 def test_a_live_runs_controller_is_fetched_and_judged_on_another_host(processes, random_bundle, tmp_path):
     """One of many units, which travels in parts; the other host has neither runs nor bundles."""
     coordinator = processes.coordinator(
@@ -122,6 +124,7 @@ def test_a_live_runs_controller_is_fetched_and_judged_on_another_host(processes,
     assert code == 0, err
 
 
+@pytest.mark.slow
 def test_resuming_past_a_limit_names_a_controller_that_is_there(processes, settings):
     coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
     processes.worker("--task", tasks.SLOW_TOY, "--exit-when-done")

@@ -28,6 +28,7 @@ def stopped(process, number, there):
     return process.lines[-1]
 
 
+@pytest.mark.slow
 def test_training_keeps_all_updates(processes, tmp_path, number):
     write_drives(tmp_path, episodes=4, steps=8)
     curve = tmp_path / "vae.jsonl"
@@ -57,6 +58,7 @@ def test_a_training_that_was_killed_goes_on_to_the_same_bits(processes, tmp_path
     assert all(weights[0][name].tobytes() == weights[1][name].tobytes() for name in weights[0])
 
 
+@pytest.mark.slow
 def test_a_recording_can_be_played(processes, tmp_path, number):
     out = tmp_path / "drive.mp4"
     recording = processes.start("record", "--controller", "tiny", "--out", out)

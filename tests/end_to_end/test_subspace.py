@@ -95,6 +95,7 @@ def test_the_same_bits_through_kills_and_again_by_the_receipt(processes, begin, 
     assert (code, json.loads(out)["same"]) == (0, True)
 
 
+@pytest.mark.slow
 def test_a_fork_goes_on_in_it_or_leaves_it_with_a_step_of_its_own(processes, begin, subspace):
     coordinator = begin("night")
     processes.worker("--task", tasks.TOY, "--run", "night")

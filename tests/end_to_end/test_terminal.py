@@ -56,6 +56,7 @@ def watch(processes):
         each.end()
 
 
+@pytest.mark.slow
 def test_a_watcher_sees_the_whole_run_in_24_lines_and_at_last_its_end(processes, watch, random_bundle):
     coordinator = processes.coordinator(
         "--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,

@@ -44,6 +44,7 @@ def outcome(processes, name):
         return scores, np.load(run.controller_path)["parameters"].tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", RUNS)
 def test_a_run_evolves_to_the_same_bits_and_is_replayed(processes, evolve, kind):
     flags, shape = RUNS[kind]

@@ -48,6 +48,7 @@ def first(processes, random_bundle, tmp_path):
     return kept
 
 
+@pytest.mark.slow
 def test_a_run_is_repeated_to_the_bit_through_a_kill(processes, first, random_bundle):
     words = ("verify", "run", first, "--bundle", random_bundle.path, "--runs-dir", processes.runs, "--listen",
              processes.endpoint, "--beat", 0.2, "--json")  # fmt: skip
@@ -68,6 +69,7 @@ def test_a_run_is_repeated_to_the_bit_through_a_kill(processes, first, random_bu
         assert len(run.settings.stages) == 2
 
 
+@pytest.mark.slow
 def test_a_script_runs_both_sides_and_its_exit_code_says_whether_it_is_the_same(processes, first):
     receipt = Controller.load(first)
     changed = {**receipt.provenance, "settings": {**receipt.provenance["settings"], "seed": 2}}

@@ -172,6 +172,7 @@ def test_damaged_bundles(bundle, watched):
     damage(bundle, bundle.with_name("d.zip"), watched, BundleError, Bundle.open, seed=2)
 
 
+@pytest.mark.slow
 def test_damaged_settings(tmp_path, watched):
     from dreamfleet.coordinator.settings.config import RunConfig
     from dreamfleet.coordinator.settings.limits import LimitsConfig

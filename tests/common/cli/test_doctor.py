@@ -83,3 +83,10 @@ def test_a_worker_needs_no_folder_for_runs():
     findings = run_checks(Path("/dev/null/runs"))
     assert missing_for_role("worker", findings) == []
     assert [each.name for each in missing_for_role("coordinator", findings)] == ["runs folder"]
+
+
+def test_what_only_the_cache_keeps_from_being_assembled_is_not_to_be_reinstalled(monkeypatch):
+    monkeypatch.setenv("DREAMFLEET_CACHE", "/dev/null/cache")
+    lacking = {each.name: each.remedy for each in run_checks(Path("/dev/null/runs")) if not each.ok and each.needed}
+    assert lacking["bundle able"] == ""
+    assert "DREAMFLEET_CACHE" in lacking["cache folder"]

@@ -50,6 +50,7 @@ def test_the_old_api_is_found_without_gymnasiums_wrappers_too():
     assert "its step returns 4 values" in dry_run("old step", ODD.replace("Odd-", "OddEndless-")).fault
 
 
+@pytest.mark.slow
 def test_a_hang_ends_at_the_limit():
     assert dry_run("hang", limit=8).fault.endswith("cannot be scored: reset(seed=0) took longer than 8 s")
 

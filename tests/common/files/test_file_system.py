@@ -48,6 +48,7 @@ def test_locks_work_here_and_the_trial_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("error", "said"), [(errno.ENOLCK, "database is locked"), (errno.EOPNOTSUPP, "disk I/O error")]
 )

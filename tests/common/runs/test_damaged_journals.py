@@ -87,6 +87,7 @@ def loose(path):
     return tables
 
 
+@pytest.mark.slow
 def test_values_of_other_types(folder, watched):
     path = folder / "journal.sqlite"
     tables = loose(path)

@@ -24,6 +24,7 @@ def knock(port, count):
             link.connect_ex(("127.0.0.1", port))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="a filter of Linux's kernel")
 def test_many_unauthenticated_connections_delay_only_new_ones(tmp_path, caplog):
     authority, port = Authority.create(tmp_path / "access"), free_port()

@@ -49,6 +49,7 @@ def test_a_noisy_search_has_no_more_calls_than_maxfevals(tmp_path):
         assert 400 - 2 * generation - run.settings.evaluation_episodes < found.nfev == run.result_count() <= 400
 
 
+@pytest.mark.slow
 def test_restarts_are_runs_of_larger_populations_and_share_the_budget(tmp_path):
     found = dreamfleet.maximise(
         objectives.sphere, [0, 0], 1.0, bounds=(-2, 2), maxfevals=60, restarts=3, generations=2, runs_dir=tmp_path,
@@ -68,6 +69,7 @@ def test_a_function_that_varies_without_a_seed_is_warned_of(tmp_path):
         dreamfleet.minimise(objectives.varying, [0, 0], 1.0, generations=1, runs_dir=tmp_path, **FEW)
 
 
+@pytest.mark.slow
 def test_failed_candidates_are_tried_in_a_fresh_process_and_said_once(tmp_path):
     with pytest.warns(RuntimeWarning, match="holed returned nan") as warned:
         found = dreamfleet.minimise(
@@ -88,6 +90,7 @@ def test_a_search_without_any_value_ends_with_its_first_failure(tmp_path):
         dreamfleet.minimise(objectives.narrow, [0, 0], 30.0, runs_dir=tmp_path, **FEW)
 
 
+@pytest.mark.slow
 def test_a_search_that_loses_all_values_returns_what_it_found(tmp_path, monkeypatch):
     lost = tmp_path / "lost"
     monkeypatch.setenv("LOST", str(lost))

@@ -51,6 +51,7 @@ def wait_until(reached):
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 def test_generations_come_as_they_close_and_the_journal_stays(alive, tmp_path):
     with start_run(run="pole", generations=40, runs_dir=tmp_path, **SMALL) as run:
         assert alive()

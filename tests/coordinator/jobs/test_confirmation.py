@@ -185,6 +185,7 @@ def lived(path, bundle, kills):
     return confirmed, controller.sha256, provenance, evaluations
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None)
 @given(kills=st.sets(st.integers(40, 74), min_size=1, max_size=5))  # from the last generations to the end
 def test_killed_anywhere_it_confirms_to_the_bit(tmp_path_factory, random_bundle, undisturbed, kills):

@@ -320,6 +320,7 @@ def test_under_loss_duplication_late_parts_and_restarts_each_rollout_is_kept_who
     bench.journal.close()
 
 
+@pytest.mark.slow
 def test_a_run_whose_population_is_one_point_ends_with_that_reason(tmp_path, random_bundle):
     """With equal fitness the step size falls until the population is one point; later it would underflow."""
     settings = replace(SETTINGS, population=4, collect_every=0, sigma0=1e-30)

@@ -179,6 +179,12 @@ def test_a_presets_variant_is_no_matter_of_worlds_without_a_world_model():
     assert found.settings(None).task == RunConfig(task="gym:CartPole-v1").settings(None).task
 
 
+def test_a_preset_with_a_world_model_is_of_that_world_alone():
+    found = load(RunConfig, "run", file={"run": {"preset": "real", "task": "gym:CartPole-v1"}}, preset=find_preset)
+    with pytest.raises(UsageError, match="preset real is of car-racing, and the task is gym:CartPole-v1: omit"):
+        found.settings(None)
+
+
 @pytest.mark.parametrize(
     ("own", "texts", "options"),
     [

@@ -126,6 +126,7 @@ def test_another_run_is_not_gone_on_with_and_another_version_is_named(tmp_path, 
         strange.plan(tmp_path / "new")
 
 
+@pytest.mark.slow
 def test_a_run_is_neither_compared_with_itself_nor_with_one_that_began_elsewhere(make):
     first = make()
     again = Rerun.of(first.end(), None)
@@ -162,6 +163,7 @@ def test_no_file_chooses_what_is_imported(random_bundle, tmp_path):
     assert "antigravity" not in sys.modules
 
 
+@pytest.mark.slow
 def test_why_a_second_time_differs_is_said_as_far_as_it_is_known(make):
     first, second = make(), make(seed=2)
     controller = first.end()
@@ -182,6 +184,7 @@ def test_why_a_second_time_differs_is_said_as_far_as_it_is_known(make):
         again.compare(first.path.parent)
 
 
+@pytest.mark.slow
 def test_whether_hosts_of_the_second_time_are_of_the_first_ones_class_is_said(make):
     first, second = make(), make(seed=2)
     first.host_class, second.host_class = "a" * 16, "b" * 16

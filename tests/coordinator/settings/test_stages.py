@@ -70,6 +70,7 @@ def undisturbed(staged):
     return bench.outcome()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_killed_anywhere_it_comes_to_the_same_stages_and_gives_the_same_bits(staged, undisturbed, seed):
     bench, chance = staged("night"), random.Random(seed)
