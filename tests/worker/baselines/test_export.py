@@ -106,6 +106,7 @@ def test_it_gives_the_same_worth_through_time():
         assert worth[0] == pytest.approx(row, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_a_file_describes_its_training_and_is_reproducible(tmp_path, capsys):
     train_drqn(tmp_path / "training", LAYERS, LEARNING)
     words = ["baseline", "export", "drqn", "--data", str(tmp_path / "training"), "--json", "--out"]

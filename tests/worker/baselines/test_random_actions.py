@@ -48,6 +48,7 @@ def test_without_a_task_the_first_line_names_the_world(tmp_path, capsys):
     assert printed.out.strip().endswith("in its first 3 steps (--steps)")  # and no mean of whole laps beside it
 
 
+@pytest.mark.slow
 def test_a_report_of_random_actions_is_verified_under_its_environments_arguments(tmp_path, capsys):
     found = judge(LANDER, tmp_path / "report.json", "--environment", "continuous=true")
     assert json.loads(found.options) == {"environment": {"continuous": True}}

@@ -75,6 +75,7 @@ def test_it_drives_learns_and_reports(whole):
     assert not np.array_equal(weights["online.value.weight"], weights["target.value.weight"])
 
 
+@pytest.mark.slow
 def test_a_kill_at_any_checkpoint_leads_to_the_same_files(whole, tmp_path, monkeypatch):
     real, writes = train.save_checkpoint, []
 

@@ -35,6 +35,7 @@ def test_the_quick_look_at_a_workers_start_finds_it_exact():
     assert native_is_exact()
 
 
+@pytest.mark.slow
 @needs_native
 @pytest.mark.parametrize("seed", [3, 4])
 def test_random_driving_looks_the_same(seed):
@@ -80,6 +81,7 @@ def test_leaving_the_field_looks_the_same():
     assert compare(6, 260, straight_out) is None
 
 
+@pytest.mark.slow
 @needs_native
 @pytest.mark.parametrize(
     ("settings", "actions"),
@@ -147,6 +149,7 @@ def test_a_car_that_cannot_be_drawn_is_a_clear_error(x):
         )  # fmt: skip
 
 
+@pytest.mark.slow
 @needs_native
 @pytest.mark.parametrize("name", PREPROCESSINGS)
 def test_a_judging_environment_goes_on_while_pictures_are_equal(name):

@@ -196,6 +196,7 @@ def test_any_error_while_an_environment_is_made_is_one_line(strange, arguments, 
         describe_task(strange, {"environment": arguments})
 
 
+@pytest.mark.slow
 def test_an_environment_without_a_time_limit_is_bounded(strange):
     assert describe_task(strange, {"normalise": True}).observations == 2
     scorer = Scorer(spec(strange))

@@ -116,6 +116,7 @@ def test_a_part_of_another_shape_is_refused(imported, tmp_path):
         read_vae(tmp_path / "ctrl" / "best.tar")
 
 
+@pytest.mark.slow
 def test_a_real_drive_is_theirs(imported):
     """Each action in gymnasium's environment is that of their formulas on Pillow's picture of the same observation."""
     image = pytest.importorskip("PIL.Image")

@@ -90,6 +90,7 @@ def sigmoid(value):
     return 1 / (1 + np.exp(-value))
 
 
+@pytest.mark.slow
 def test_a_controller_acts_as_in_their_program(theirs, tmp_path):
     folder, vae, rnn, vector = theirs
     assert main(["import", str(folder), "--out", str(tmp_path / "wme.zip")]) == 0

@@ -36,6 +36,7 @@ def call(tmp_path, capsys, monkeypatch):
     return run
 
 
+@pytest.mark.slow
 def test_a_probe_prints_a_row_a_quantity(call):
     lines = call("tiny", "--probe", "--controller", "tiny", "--episodes", "2").splitlines()
     assert cells(lines[0]) == [
@@ -45,12 +46,14 @@ def test_a_probe_prints_a_row_a_quantity(call):
     assert lines[-1].startswith("R² ± standard error on held-out drives; 2 drives, ")
 
 
+@pytest.mark.slow
 def test_a_driver_drives_without_a_controller(call):
     found = json.loads(call("tiny", "--probe", "--driver", "ornstein-uhlenbeck", "--episodes", "8", "--json"))
     assert found["driver"] == "ornstein-uhlenbeck"
     assert found["probe"]["steps"] > 50
 
 
+@pytest.mark.slow
 def test_likeness_prints_how_often_dreams_come_to_what_is_rare(call):
     lines = call("tiny", "--likeness", "--controller", "tiny", "--episodes", "3", "--noise", "0.1").splitlines()
     assert cells(lines[0]) == ["quantity", "rare", "reality", "reality, foreseen", "dream"]

@@ -71,6 +71,7 @@ def test_what_is_no_action_of_the_world_is_refused(attentive, action, says):
         record_drive(attentive, None, DriveConfig(action=action))
 
 
+@pytest.mark.slow
 def test_a_page_has_every_section_and_needs_nothing_else(attentive, tmp_path):
     write_curves(tmp_path)
     sections = []
@@ -93,6 +94,7 @@ def test_a_page_has_every_section_and_needs_nothing_else(attentive, tmp_path):
         assert (page.parent / f"{name}.png").read_bytes().startswith(PNG)
 
 
+@pytest.mark.slow
 def test_what_a_bundle_cannot_do_is_left_out_or_explained(attentive, tmp_path):
     rnn = MDNRNNConfig(latent=5, hidden=8, reward="none")
     plain = write_random_bundle(tmp_path / "plain.zip", vae=VAE, rnn=rnn)
@@ -150,6 +152,7 @@ def test_attention_is_that_of_the_trained_model(attentive):
     np.testing.assert_allclose(DreamStep(attentive).attend(latent, action, state), expected.numpy(), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_drive_is_seen_as_its_bundle_sees(tmp_path):
     whole = VAEConfig(picture=96, padding="same", latent=5, channels=(2, 2, 2, 2))
     bundle = write_random_bundle(tmp_path / "whole.zip", vae=whole, rnn=MDNRNNConfig(latent=5, hidden=4))

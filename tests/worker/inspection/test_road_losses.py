@@ -32,6 +32,7 @@ def drives(tiny, controller):
     return collect_losing_drives(record_disturbed_drives(tiny, recurrent, lambda _seed: actor, DRIVEN), CONFIG, DRIVEN)
 
 
+@pytest.mark.slow
 def test_as_many_losses_are_gathered_as_are_wanted(drives):
     lost = [each for each in drives if each.lost is not None]
     assert len(lost) >= CONFIG.losses

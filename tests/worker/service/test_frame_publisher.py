@@ -88,6 +88,7 @@ def test_a_viewer_sees_the_running_job_and_its_observation(stage, hand, cached, 
     assert rewards == sorted(rewards, reverse=True), "they are summed up, and each is below 0"
 
 
+@pytest.mark.slow
 def test_scores_are_the_same_bits_while_two_viewers_come_and_go_or_are_killed(stage, hand, cached, viewer):
     stage.worker()
     hand.ready()

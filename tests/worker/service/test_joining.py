@@ -82,6 +82,7 @@ def test_it_says_hello_again_with_the_packages_of_the_runs_fingerprint(stage, ca
     assert hand.beat(lambda beat: beat.capacity > 0).slots == 1
 
 
+@pytest.mark.slow
 def test_a_refusal_is_logged_once_for_each_reason_and_the_run_is_asked_again(stage, said, cached):
     hand = stage.hand()
     hand.refusal = ("your moon is full", "wait a week")
