@@ -178,6 +178,7 @@ def test_runs_that_do_not_exist(processes):
     complains_here("verify", "candidate", "night", "--candidate", "first", says="write generation/index")
 
 
+@pytest.mark.slow
 def test_a_run_is_listed_shown_archived_and_deleted(processes, random_bundle):
     coordinator = processes.coordinator(
         "--bundle",

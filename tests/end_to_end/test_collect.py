@@ -50,6 +50,7 @@ def resume(processes, name):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_drives_are_a_function_of_the_run_and_not_of_the_worker(processes, settings):
     seen = []
     for name, workers in (("one", 1), ("three", 3)):
@@ -113,6 +114,7 @@ def test_what_strangers_upload_is_dropped_and_counted(processes, random_bundle):
     assert processes.status()["collecting"] == {"episodes_done": 0, "episodes": 0}
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
 @pytest.mark.parametrize("preprocessing", [BOX, RAW])
 def test_drives_of_the_real_car_are_episodes_that_a_data_set_takes_in_once(processes, tmp_path, preprocessing):

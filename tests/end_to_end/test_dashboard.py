@@ -155,6 +155,7 @@ def test_workers_out_of_sight_are_drawn_for_screenshots_and_print(browser, proce
         )
 
 
+@pytest.mark.slow
 def test_before_the_first_generation_a_chart_has_no_axes_and_says_what_comes(browser, processes):
     with serving(processes.endpoint, snapshot(0)), dashboard(processes, "--port", 0) as started, \
             tab(browser) as page:  # fmt: skip

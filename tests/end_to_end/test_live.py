@@ -168,6 +168,7 @@ def test_the_verb_ends_with_the_run_and_says_how_that_ended(processes, settings,
     assert (code, (tmp_path / "live.mp4").stat().st_size > 1000) == (0, True), out
 
 
+@pytest.mark.slow
 def test_what_cannot_be_shown_is_said_in_one_line(processes, tmp_path):
     for flags, said in (
         (("--controller", "tiny"), "write a file by --out"),

@@ -201,6 +201,7 @@ def test_ctrl_c_while_hosts_are_brought_up_ends_the_command_and_not_what_others_
     assert "the same command continues" in command.lines[-1]
 
 
+@pytest.mark.slow
 def test_a_full_disk_and_a_folder_that_cannot_be_written_are_said(processes, hosts, tmp_path):
     hosts.add("a")
     with small_disk(tmp_path / "disk", 1) as disk:

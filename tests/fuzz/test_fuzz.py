@@ -28,6 +28,7 @@ def test_the_calls_follow_from_the_seed():
     assert Call("runs.list", ("--runs-dir=nan",)) in list(one_value_calls("runs.list", verbs["runs.list"]))
 
 
+@pytest.mark.slow
 def test_verbs_take_empty_values(stage):
     """Of the verbs that end by themselves."""
     calls = [call for name, parser in parsers("runs.").items() for call in one_value_calls(name, parser, ("",))]

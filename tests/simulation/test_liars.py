@@ -97,6 +97,7 @@ def test_an_honest_fleet_loses_no_more_than_the_share_and_accuses_nobody():
     assert scored - counted - checked <= 0.02 * counted + 3 * 5, "beside the copies that measure newcomers"
 
 
+@pytest.mark.slow
 def test_most_liars_are_barred_and_nobody_else():
     rows = list(campaign(2, 0.3, (3,)))
     assert sum(row["wrongly"] for row in rows) == 0

@@ -23,6 +23,7 @@ def assert_no_violation(tally, report):
     assert report["by_kind"].keys() == KINDS.keys(), "every kind of fault has found something to disturb"
 
 
+@pytest.mark.slow
 def test_no_schedule_of_faults_breaks_a_rule():
     assert_no_violation(*run(schedules=300, seed=1, jobs=1))
 

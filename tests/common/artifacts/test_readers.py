@@ -168,6 +168,7 @@ def test_damaged_controllers(controller, watched):
     damage(controller, controller.with_name("d.npz"), watched, ControllerError, Controller.load, seed=1)
 
 
+@pytest.mark.slow
 def test_damaged_bundles(bundle, watched):
     damage(bundle, bundle.with_name("d.zip"), watched, BundleError, Bundle.open, seed=2)
 

@@ -58,6 +58,7 @@ def test_a_killed_coordinators_open_transaction_is_rolled_back(folder, tmp_path)
         assert (run.uid, run.settings) == (own.uid, own.settings)
 
 
+@pytest.mark.slow
 def test_damaged_pages(folder, watched):
     path = folder / "journal.sqlite"
     whole, source, read = path.read_bytes(), random.Random(5), 0

@@ -172,6 +172,7 @@ def test_no_table_of_an_earlier_export_stands_among_those_of_a_later_one(runs, t
     assert (out / "notes.txt").exists()
 
 
+@pytest.mark.slow
 def test_events_onto_a_full_disk_end_with_one_line_and_leave_nothing(runs, tmp_path):
     with small_disk(tmp_path / "disk", 1) as disk:
         if disk is None:

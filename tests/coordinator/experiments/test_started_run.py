@@ -137,6 +137,7 @@ def test_a_worker_that_dies_is_named_and_so_is_a_stop_from_elsewhere(alive, tmp_
     assert not alive()
 
 
+@pytest.mark.slow
 def test_a_pause_is_no_endless_wait(alive, tmp_path, random_bundle):
     rough = {"task": RAISING, "bundle": random_bundle.path, "on_failure": "pause", "population": 3, "episodes": 1}
     with (

@@ -62,6 +62,7 @@ def test_it_asks_the_same_bits_whether_it_was_interrupted_or_not(optimiser, cova
     assert_continues(config(optimiser, covariance, dimension, population), (0, 1, 2, 7, 30), 40)
 
 
+@pytest.mark.slow
 @EVERY_OPTIMISER
 def test_it_can_be_interrupted_between_any_two_generations(optimiser, covariance):
     setting = config(optimiser, covariance)

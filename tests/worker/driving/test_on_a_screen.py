@@ -35,6 +35,7 @@ def standing_still():
     return score
 
 
+@pytest.mark.slow
 def test_a_person_drives_and_quits(screen, tmp_path):
     seen = {**environment(tmp_path), "DISPLAY": screen, "SDL_VIDEODRIVER": "x11"}
 

@@ -90,6 +90,7 @@ def test_a_reward_head_that_was_never_trained_is_left_out(imported, tmp_path):
     assert np.array_equal(found.weights["heads.bias"], np.delete(with_head.weights["heads.bias"], -2))
 
 
+@pytest.mark.slow
 def test_training_goes_on_from_such_a_bundle(imported, tmp_path):
     from dreamfleet.worker.training.unbundle import unbundle
 

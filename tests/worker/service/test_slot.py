@@ -404,6 +404,7 @@ def test_signals_for_the_worker_do_not_end_a_starting_child(harness, number):
     assert slot.slot.pid == pid
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="Linux")
 def test_a_child_dies_with_its_worker(random_bundle, tmp_path):
     script = tmp_path / "parent.py"

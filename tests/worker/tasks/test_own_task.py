@@ -50,6 +50,7 @@ def run(code, *folders):
     return done.stdout.strip()
 
 
+@pytest.mark.slow
 def test_a_package_registers_a_task_that_needs_no_bundle(installed):
     code = """
 from dreamfleet.common.protocol.tasks import describe_task

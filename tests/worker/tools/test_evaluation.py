@@ -62,6 +62,7 @@ def test_an_error_in_a_process_ends_the_evaluation_with_the_reason(controller, r
         EpisodeResults.of(evaluate(make_agent(controller(task), random_bundle), SEEDS, 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_an_episode_that_fails_is_reported_and_the_others_go_on(processes, controller, random_bundle, tmp_path, jobs):
     controller(tasks.BRITTLE).save(tmp_path / "toy.npz")
@@ -90,6 +91,7 @@ def test_an_episode_that_fails_is_reported_and_the_others_go_on(processes, contr
     assert (code, f"{30 - failed} bit-identical scores" in out) == (0, True), err
 
 
+@pytest.mark.slow
 def test_an_evaluation_without_any_score_ends_with_one_line(processes, controller, random_bundle, tmp_path):
     controller(tasks.NAN).save(tmp_path / "toy.npz")
     code, out, err = processes.call(
@@ -201,6 +203,7 @@ def test_the_verb_reports_every_score_and_warns_about_tracks_outside_the_test_se
     assert (report["task"], report["bundle"]) == (tasks.TOY, random_bundle.sha256)
 
 
+@pytest.mark.slow
 def test_the_report_is_what_it_prints_and_can_be_repeated_to_the_bit(processes, controller, random_bundle, tmp_path):
     controller().save(tmp_path / "toy.npz")
     (tmp_path / "bundle.zip").write_bytes(random_bundle.path.read_bytes())

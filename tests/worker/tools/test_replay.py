@@ -21,6 +21,7 @@ def finished_run(processes, random_bundle):
     return processes.runs / "test"
 
 
+@pytest.mark.slow
 def test_a_fitness_that_differs_from_the_stored_one_is_reported_and_exits_1(processes, finished_run):
     replay = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
     code, out, _ = processes.call(*replay)
@@ -35,6 +36,7 @@ def test_a_fitness_that_differs_from_the_stored_one_is_reported_and_exits_1(proc
     assert "candidate 5/0" in err
 
 
+@pytest.mark.slow
 def test_results_of_another_host_class_are_counted_and_optionally_compared(processes, finished_run):
     with closing(sqlite3.connect(finished_run / JOURNAL)) as connection, connection:
         connection.execute("UPDATE result SET fitness = fitness + 0.5, host_class = 'there' WHERE episode = 1")
@@ -60,6 +62,7 @@ def score_generation(processes, bundle, task, episodes):
     assert coordinator.finish()[0] == 0
 
 
+@pytest.mark.slow
 def test_an_episode_that_hangs_or_ends_its_process_now_differs(processes, random_bundle, monkeypatch):
     task = rough_tasks.name_of(rough_tasks.Halting)
     score_generation(processes, random_bundle, task, 3)
@@ -124,6 +127,7 @@ def change_failures(folder, error):
     connection.close()
 
 
+@pytest.mark.slow
 def test_a_candidate_that_failed_is_driven_again_and_its_cause_compared(processes, brittle_run):
     folder = brittle_run("worst")
     with RunFolder(folder) as run:
@@ -166,6 +170,7 @@ def test_a_candidate_that_scored_and_now_fails_differs(processes, brittle_run):
     assert "Traceback" not in err
 
 
+@pytest.mark.slow
 def test_a_candidate_that_was_drawn_anew_is_compared_with_its_final_vector_alone(processes, brittle_run):
     with RunFolder(brittle_run("redraw")) as run:
         numbers = {each.candidate for each in run.failures()}

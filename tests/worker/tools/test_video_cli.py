@@ -32,6 +32,7 @@ def pictures(video):
         return [each.to_ndarray(format="rgb24").astype(int) for each in container.decode(container.streams.video[0])]
 
 
+@pytest.mark.slow
 def test_each_track_has_its_own_video(verb, tmp_path, capsys):
     both = answers(capsys, verb, "--seed", FIRST, SECOND, FIRST, "--out", tmp_path / "drive.mp4")
     assert [each["seed"] for each in both] == [FIRST, SECOND]

@@ -43,6 +43,7 @@ def trained(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_weights", [False, True])
 def test_equal_folders_make_equal_bundles(with_weights, trained, tmp_path):
     names = [tmp_path / f"{index}.zip" for index in range(4)]
@@ -62,6 +63,7 @@ def test_a_bundle_encodes_as_its_training_did(trained, tmp_path):
     assert PolicyStep(bundle).shape == bundle.controller_shape
 
 
+@pytest.mark.slow
 def test_training_goes_on_where_it_stopped(tmp_path):
     write_drives(tmp_path, episodes=4, steps=6)
     seen = []

@@ -89,6 +89,7 @@ def test_every_preset_is_named_for_both_sides():
     assert sorted(PRESETS) == sorted(NAMES["training"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("picture", [64, 96])
 def test_no_drive_is_mirrored_whose_pictures_show_the_indicators(tmp_path, picture, monkeypatch):
     write_drives(tmp_path, episodes=4, steps=6, picture=picture)

@@ -48,6 +48,7 @@ def test_a_system_without_such_a_heap_is_left_alone(monkeypatch):
     torch_setup._keep_freed_memory()
 
 
+@pytest.mark.slow
 def test_nothing_that_is_learnt_depends_on_it():
     """The gradients are equal in a configured process and in one with other settings in its environment."""
     own = {name: text for name, text in os.environ.items() if not name.startswith(("OMP_", "MALLOC_"))}

@@ -51,6 +51,7 @@ def equal(one: Path, other: Path):
     return all(np.array_equal(first[name], second[name]) for name in first)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stop", [1, 3])
 def test_the_vae_goes_on_to_the_same_weights_as_without_a_stop(encoded, tmp_path, stop):
     (tmp_path / "episodes").symlink_to(encoded / "episodes")

@@ -65,11 +65,13 @@ def parameters(bundle):
     return np.random.default_rng(0).normal(size=bundle.controller_shape.size).astype(np.float32)
 
 
+@pytest.mark.slow
 def test_the_bundle_says_what_it_sees(data, bundle):
     assert (bundle.manifest.preprocessing, bundle.manifest.picture) == (RAW.name, (96, 96, 3))
     assert load_pictures(episode_path(data, 0)).shape == (8, 96, 96, 3)
 
 
+@pytest.mark.slow
 def test_environment_judge_and_video_score_alike_to_the_bit(bundle, parameters, tmp_path):
     fitness, spec = [], TaskSpec("car-racing", bundle.sha256, 70, 0)
     scorer = Scorer(spec, bundle)

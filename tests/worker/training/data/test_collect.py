@@ -146,6 +146,7 @@ def test_the_articles_driver_pushes_first_and_then_moves_one_control_at_a_time()
     np.testing.assert_allclose(kinds.mean(axis=0), [0.2, 0.2, 0.4, 0.1], atol=0.04)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [64, 96])
 def test_the_network_looks_at_pictures_and_each_drive_has_its_own(side):
     pictures = np.random.default_rng(0).integers(0, 256, (2, side, side, 3), dtype=np.uint8)
