@@ -38,6 +38,10 @@ class BundleError(DreamfleetError):
     """A world-model bundle is missing, damaged, or not the expected one."""
 
 
+class CacheError(BundleError):
+    """A bundle that cannot be written into the user's cache."""
+
+
 class DownloadError(BundleError):
     """The download of a world model failed or was damaged; a later try, or another source, may succeed."""
 

@@ -18,12 +18,13 @@ from dreamfleet.common.artifacts.delta_bundle import (
     rebuild_bundle,
     write_delta,
 )
-from dreamfleet.common.errors import BundleError, UsageError
+from dreamfleet.common.errors import BundleError, CacheError, UsageError
 from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
 from dreamfleet.common.files.locks import wait_for_lock
 from dreamfleet.common.files.regular_files import open_append, path_exists
 
 INT8_SUFFIX = "-int8"  # in the name of a shipped bundle: NAME rounded to eight bits
+CACHE_REMEDY = "make room in the cache, or point $DREAMFLEET_CACHE elsewhere"
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
@@ -98,10 +99,8 @@ class BundleStore:
         return Bundle.open(path, sha256)
 
     def reporting_write_errors(self) -> AbstractContextManager[None]:
-        """Turn an `OSError` while writing in the cache into a `BundleError`."""
-        return reporting_unwritable_folder(
-            self._folder, "make room there, or point $DREAMFLEET_CACHE elsewhere", BundleError
-        )
+        """Turn an `OSError` while writing in the cache into a `CacheError`."""
+        return reporting_unwritable_folder(self._folder, CACHE_REMEDY, CacheError)
 
     def _path(self, sha256: str) -> Path:
         return self._folder / f"{_check_sha256(sha256)}.zip"

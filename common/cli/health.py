@@ -11,9 +11,9 @@ from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 
-from dreamfleet.common.artifacts.bundle_store import default_cache, find_bundle, shipped_names
+from dreamfleet.common.artifacts.bundle_store import CACHE_REMEDY, default_cache, find_bundle, shipped_names
 from dreamfleet.common.cli.task_check import try_task
-from dreamfleet.common.errors import AccessError, DreamfleetError
+from dreamfleet.common.errors import AccessError, CacheError, DreamfleetError
 from dreamfleet.common.files.file_system import file_system_type, is_network, lock_problem
 from dreamfleet.common.host.packages import PACKAGES, install_command, package_version
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, describe_time_left, read_join_file
@@ -99,13 +99,13 @@ def _check_box2d() -> Finding:
 def _check_bundles() -> Iterator[Finding]:
     names = shipped_names()
     for name in names:
-        found, ok, remedy = "", False, "reinstall dreamfleet"
+        remedy = "reinstall dreamfleet"
         try:
             found, ok = find_bundle(name).sha256[:12], True
+        except CacheError as error:  # it ships in parts, which are put together there
+            found, ok, remedy = str(error), False, CACHE_REMEDY
         except DreamfleetError as error:
-            found = str(error)
-            if isinstance(error.__cause__, OSError):  # it could not be assembled in the cache
-                remedy = ""  # that of the cache folder
+            found, ok = str(error), False
         yield Finding(f"bundle {name}", ok, True, found, "everything", remedy)
     if not names:
         yield Finding("bundle", False, True, "none shipped", "everything", "reinstall dreamfleet")

@@ -62,5 +62,5 @@ def _row(each: Finding) -> dict[str, object]:
 def _verdict(lacks: list[Finding]) -> str:
     if not lacks:
         return "can be played"
-    remedies = "; ".join(dict.fromkeys(each.remedy for each in lacks if each.remedy))
+    remedies = "; ".join(dict.fromkeys(each.remedy for each in lacks))
     return f"cannot be played: {', '.join(each.name for each in lacks)} missing; {remedies}"
