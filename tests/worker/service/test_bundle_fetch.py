@@ -170,7 +170,7 @@ def test_a_full_disk_is_one_line_and_the_parts_stay(session, hand, store, bundle
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_PART + 100, hard))
     try:
-        with pytest.raises(BundleError, match=r"cannot write in .*File too large; make room there"):
+        with pytest.raises(BundleError, match=r"cannot write in .*File too large; make room in the cache"):
             fetch(session, hand, store)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
