@@ -147,6 +147,7 @@ def test_cloud_init_takes_the_user_data(tmp_path):
     checked(BIN / "check-jsonschema", "--schemafile", where, DEPLOY / "cloud-init" / "worker.yaml")
 
 
+@pytest.mark.slow
 def test_one_command_begins_a_run_and_goes_on_with_it(processes, random_bundle):
     """Restarted after every stop, as a container or unit is."""
     settings = ("--bundle", random_bundle.path, "--task", tasks.TOY, "--population", 4, "--episodes", 1,

@@ -52,6 +52,7 @@ def test_pycmas_own_loop(fleet, tmp_path):
     assert again == out  # the same ids and the same seeds: found, not scored again
 
 
+@pytest.mark.slow
 @pytest.mark.needs_programs("curl")
 def test_curl(fleet, bridge, tmp_path):
     out = run("sh", "-ec", block("sh", 2).replace(HTTP, bridge), where=tmp_path, cache=fleet.cache)
@@ -60,6 +61,7 @@ def test_curl(fleet, bridge, tmp_path):
     assert out.rindex('"batches":') > out.rindex('"fitness":') > 0
 
 
+@pytest.mark.slow
 @pytest.mark.needs_programs("node")
 def test_javascript(fleet, bridge, tmp_path):
     (tmp_path / "search.mjs").write_text(block("javascript").replace(HTTP, bridge))
@@ -67,6 +69,7 @@ def test_javascript(fleet, bridge, tmp_path):
     assert [line.lstrip(".").split()[0] for line in out] == [*"01234"]
 
 
+@pytest.mark.slow
 @pytest.mark.needs_programs("g++", "curl-config")
 def test_cpp(fleet, bridge, tmp_path):
     (tmp_path / "search.cpp").write_text(block("cpp").replace(HTTP, bridge))

@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+import pytest
 
 from dreamfleet.coordinator.optimisers.api import Search
 from tests.support import tasks
@@ -26,6 +27,7 @@ def test_the_example_of_an_optimiser_learns_and_resumes_with_the_same_bits():
     assert np.array_equal(first.ask(), second.ask())
 
 
+@pytest.mark.slow
 def test_the_example_of_an_optimiser_leads_a_run(processes):
     (processes.folder / "half.py").write_text(CODE)
     flags = ("--task", tasks.TOY, "--optimiser", "half:Half", "--generations", 2, "--evaluate-every", 0)

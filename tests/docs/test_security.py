@@ -10,6 +10,7 @@ from tests.support.processes import ROOT, free_port
 HOST = "127.0.0.2"  # in no certificate by default
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have one loopback address")
 def test_five_commands_make_a_fleet(processes, tmp_path, monkeypatch):
     port = free_port()

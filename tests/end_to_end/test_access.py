@@ -145,6 +145,7 @@ def test_a_worker_that_is_not_let_in_says_why_once_and_tries_again(access, endpo
         assert [each.result() for each in serving] == [None, None]
 
 
+@pytest.mark.slow
 def test_a_plain_port_and_a_closed_port_give_different_errors_for_a_join_file(access):
     plain, nobody = f"127.0.0.1:{free_port()}", f"127.0.0.1:{free_port()}"
     served = open_session(Network(listen=(f"tcp/{plain}",)))
@@ -155,6 +156,7 @@ def test_a_plain_port_and_a_closed_port_give_different_errors_for_a_join_file(ac
         open_session(linked, timeout=1)
 
 
+@pytest.mark.slow
 def test_a_link_of_half_a_second_to_and_fro_lets_a_worker_in(processes, access, endpoint):
     begin(processes, access, endpoint, None)
     relay = Relay(int(endpoint.rpartition(":")[2]))
@@ -231,6 +233,7 @@ def test_a_worker_leaves_before_its_join_file_ends_and_says_so(processes, access
     assert "issued again" in worker.last_line()
 
 
+@pytest.mark.slow
 def test_a_fleet_is_joined_by_passwords_too(processes, tmp_path, endpoint, random_bundle):
     access = Access(tmp_path / "access", passwords=True)
     assert not read_join_file(access.path("first")).certificate
@@ -287,6 +290,7 @@ def router(request, processes, tmp_path, access, endpoint):
         yield routed
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("router")
 def test_a_router_of_its_own_holds_everybody_to_the_same_rules(processes, access, endpoint, random_bundle):
     coordinator = processes.start(

@@ -121,6 +121,7 @@ def test_what_needs_a_search_is_refused_for_an_external_run(processes, random_bu
     assert flags[0] in err
 
 
+@pytest.mark.slow
 def test_a_failed_candidate_has_no_fitness_and_an_error(processes, random_bundle):
     begin(processes, random_bundle, task=tasks.BRITTLE)
     processes.worker("--task", tasks.BRITTLE)
@@ -137,6 +138,7 @@ def test_a_failed_candidate_has_no_fitness_and_an_error(processes, random_bundle
         assert (np.isnan(again) == np.isnan(fitness)).all()
 
 
+@pytest.mark.slow
 def test_a_batch_is_cancelled_before_and_while_it_is_scored(processes, random_bundle):
     begin(processes, random_bundle, task=tasks.SLOW_TOY)
     processes.worker("--task", tasks.SLOW_TOY)

@@ -108,6 +108,7 @@ def test_a_batch_is_submitted_followed_read_and_kept(processes, bridge):
     assert drawn["id"]
 
 
+@pytest.mark.slow
 def test_bad_requests_are_refused_with_a_reason_and_lose_nothing(bridge):
     def refused(wanted, body, text="", **headers):
         status, answer = bridge.submit(body, **headers)

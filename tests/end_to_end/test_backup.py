@@ -65,6 +65,7 @@ def finished(tmp_path_factory):
         yield processes
 
 
+@pytest.mark.slow
 def test_what_cannot_be_a_copy_is_left_alone(finished, tmp_path):
     other = tmp_path / "other"
     for wrong, why in (
@@ -114,6 +115,7 @@ def test_a_call_that_is_interrupted_leaves_the_earlier_copy(finished, tmp_path, 
         assert len(copy.history()) == 2
 
 
+@pytest.mark.slow
 def test_a_world_model_is_copied_too(processes, tmp_path):
     coordinator = processes.coordinator(*SETTINGS, "--generations", 1, "--evaluate-every", 0)
     processes.worker("--run", "test")

@@ -74,6 +74,7 @@ def test_a_damaged_bundle_starts_nothing(processes, tmp_path):
     complains(processes, "coordinator", "--bundle", broken, says="not a whole bundle")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
 def test_an_unwritable_folder(processes, random_bundle):
     complains(
@@ -83,6 +84,7 @@ def test_an_unwritable_folder(processes, random_bundle):
     complains(processes, "collect", "--data", "/proc/dreamfleet", "--episodes", "1", says="choose another --data")
 
 
+@pytest.mark.slow
 def test_an_existing_run_is_not_begun_again(processes, random_bundle):
     settings = ("--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--generations", 1)
     processes.coordinator(*settings).end()
@@ -213,6 +215,7 @@ def test_a_run_is_listed_shown_archived_and_deleted(processes, random_bundle):
     assert (code, json.loads(out)["run"]) == (0, "test")
 
 
+@pytest.mark.slow
 def test_the_doctor_finds_this_installation_well(processes):
     code, out, _ = processes.call("doctor")
     assert code == 0, out

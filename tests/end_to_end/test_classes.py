@@ -71,6 +71,7 @@ def one_after_the_other(processes, settings, first, second):
         return run.classes
 
 
+@pytest.mark.slow
 def test_a_strangers_hello_keeps_nobody_out_of_a_strict_run(processes, settings):
     coordinator = processes.coordinator(*settings, "--generations", 1, "--strict")
     hello = HelloRequest(keys.PROTOCOL_VERSION, keys.PROTOCOL_VERSION, "0", "gone/00000001", (tasks.ROUNDED,), OTHER, 1)

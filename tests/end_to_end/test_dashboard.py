@@ -194,6 +194,7 @@ def test_the_dashboard_may_die_and_come_back(browser, processes, settings):
         without_absence(page)
 
 
+@pytest.mark.slow
 def test_hostile_names_and_errors_stay_text(browser, processes):
     nasty = "<img src=x onerror=alert(1)><script>alert(2)</script>\x1b[31m\u202e"
     hostile = snapshot(workers=1, why=nasty, state="paused", refused={nasty: nasty}, dropped={nasty: 7})
@@ -212,6 +213,7 @@ def test_hostile_names_and_errors_stay_text(browser, processes):
         assert page.locator("main img:not([data-part]), main script").count() == 0
 
 
+@pytest.mark.slow
 def test_several_live_runs_can_be_chosen_among(browser, processes):
     with serving(processes.endpoint, snapshot(), snapshot(name="lucid")), \
             dashboard(processes, "--port", 0) as started, tab(browser) as page:  # fmt: skip
@@ -284,6 +286,7 @@ def test_an_empty_runs_folder_says_how_a_run_is_started(page):
     page.wait_for_selector("text=No runs here yet")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "scheme"), [(390, "light"), (390, "dark"), (1280, "dark")])
 def test_it_fits_a_phone_and_follows_the_systems_colours(browser, processes, width, scheme):
     names = tuple(dataclasses.replace(WORKER, worker=f"{'a-rather-long-host-name-' * 2}{n}/0a1b2c3d") for n in range(3))
@@ -307,6 +310,7 @@ def test_it_fits_a_phone_and_follows_the_systems_colours(browser, processes, wid
         assert (page.evaluate(page_colour) == "rgb(14, 19, 26)") != dark, "a choice is kept"
 
 
+@pytest.mark.slow
 def test_everything_can_be_reached_by_keyboard_and_the_focus_is_seen(page):
     page.wait_for_selector("#theme")
     reached = []
@@ -355,6 +359,7 @@ def test_five_thousand_generations_and_five_hundred_workers_are_painted_in_no_ti
         assert (ended - began) / (updates - painted) < 100, "milliseconds an update"
 
 
+@pytest.mark.slow
 def test_another_coordinators_refusal_is_shown_and_ends_nothing(browser, processes):
     strange = snapshot(3)
     broken = dataclasses.replace(
@@ -371,6 +376,7 @@ def test_another_coordinators_refusal_is_shown_and_ends_nothing(browser, process
         without_absence(page)
 
 
+@pytest.mark.slow
 def test_the_token_is_asked_for_and_opens_the_page(browser, processes):
     with dashboard(processes, "--host", "0.0.0.0", "--port", 0, "--token", TOKEN) as started, tab(browser) as page:
         address = started.address.replace("0.0.0.0", "127.0.0.1")

@@ -125,6 +125,7 @@ def _runs(pid):
         return False
 
 
+@pytest.mark.slow
 def test_without_the_page_none_is_begun(processes, random_bundle):
     demo = processes.start(
         "demo", "--run", "demo", "--runs-dir", processes.runs, "--port", processes.port, "--bundle", random_bundle.path,

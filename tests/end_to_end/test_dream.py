@@ -87,6 +87,7 @@ def test_recorded_states_that_a_bundle_lacks_are_refused_as_the_run_begins(proce
     assert not (processes.runs / "run").exists()
 
 
+@pytest.mark.slow
 def test_a_world_model_without_a_dream_is_refused_by_its_worker(processes, random_bundle, tmp_path):
     parts = {name: random_bundle.read(name) for name in random_bundle.manifest.parts if name != DREAM_GRAPH}
     old = write_bundle(tmp_path / "old.zip", replace(random_bundle.manifest, parts={}), parts)

@@ -47,6 +47,7 @@ def test_their_candidates_are_scored_as_they_were(processes, runs, name):
     assert not here or (code == 0 and "DIFFERS" not in out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_they_go_on_as_the_version_that_wrote_them_would(processes, runs, name):
     expected = CONTINUED[name]

@@ -67,6 +67,7 @@ def test_a_limit_that_fits_no_session_is_one_line(processes, random_bundle, file
     assert "Traceback" not in said
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.geteuid() != 0 or not shutil.which("setpriv"), reason="needs another user, without processes")
 @pytest.mark.parametrize(
     ("verb", "processes_allowed"), [("worker", 2), ("worker", 8), ("worker", 24), ("coordinator", 16)]

@@ -66,6 +66,7 @@ def test_a_run_ends_although_nobody_reads_what_its_processes_log(processes, rand
     assert worker.wait(DEADLINE) == 0
 
 
+@pytest.mark.slow
 def test_a_task_that_prints_without_end_scores_although_nobody_reads_it(processes, random_bundle, frozen):
     run = frozen(*coordinator(processes, random_bundle, tasks.CHATTY, 2))
     frozen(*WORKER, tasks.CHATTY, "--connect", processes.endpoint, stdout=True)

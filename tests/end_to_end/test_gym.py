@@ -86,6 +86,7 @@ def test_a_worker_that_lacks_the_environment_says_so_and_the_run_waits(processes
     assert any("does not know" in why for why in status["refused"].values())
 
 
+@pytest.mark.slow
 def test_what_can_be_scored_in_is_listed(processes):
     code, out, err = processes.call("tasks", "--json")
     assert code == 0, err
@@ -94,6 +95,7 @@ def test_what_can_be_scored_in_is_listed(processes):
     assert "gym:ENVIRONMENT" in processes.call("tasks")[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "says"),
     [

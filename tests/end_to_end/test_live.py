@@ -131,6 +131,7 @@ def test_fifty_views_one_of_which_never_looks_leave_the_run_as_it_is(processes, 
     assert fitnesses[0] == fitnesses[1]
 
 
+@pytest.mark.slow
 def test_the_verb_streams_to_its_reader_and_ends_with_it(processes, run):
     words = command("live", "--connect", processes.endpoint, "--out", "-")
     with subprocess.Popen(
@@ -145,6 +146,7 @@ def test_the_verb_streams_to_its_reader_and_ends_with_it(processes, run):
         assert b"Traceback" not in live.stderr.read()
 
 
+@pytest.mark.slow
 def test_the_verb_writes_its_frames_when_it_is_stopped(processes, run, tmp_path):
     live = processes.start("live", "--connect", processes.endpoint, "--out", tmp_path / "stills", "--json")
     live.wait_for("watching run test")

@@ -86,6 +86,7 @@ def test_the_events_of_a_killed_workers_jobs_are_printed_while_the_run_lives(pro
     assert (code, "knows no worker 'host-b': known are host-a" in err) == (2, True), err
 
 
+@pytest.mark.slow
 def test_a_coordinator_from_before_stories_is_said_to_be_old_and_not_absent(processes):
     status = encode_part(snapshot(), "", {})
     with open_session(Network(listen=(processes.endpoint,))) as session:

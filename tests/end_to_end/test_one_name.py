@@ -58,6 +58,7 @@ def test_of_two_on_routers_that_are_linked_later_the_newcomer_leaves_and_the_oth
         assert len(run.history()) >= 1
 
 
+@pytest.mark.slow
 def test_of_two_copies_of_one_run_the_one_that_was_continued_last_goes_on(processes, settings):
     first_at, second_at = processes.endpoint, f"tcp/127.0.0.1:{free_port()}"
     made = begin(processes, processes.folder / "a", first_at, "--run", "test", *settings)

@@ -4,6 +4,8 @@ import json
 import re
 from pathlib import Path
 
+import pytest
+
 from tests.support import tasks
 from tests.support.processes import ROOT
 
@@ -19,6 +21,7 @@ def test_the_documented_file_is_accepted_by_every_kind_of_verb(processes):
     assert "cannot name a run" in err
 
 
+@pytest.mark.slow
 def test_a_run_ends_with_its_workers_and_one_of_any_run_waits_for_the_next(processes):
     coordinator = processes.coordinator("--task", tasks.SLOW_TOY, "--generations", 10**6, "--evaluate-every", 0)
     flags = ("--task", tasks.SLOW_TOY)

@@ -57,6 +57,7 @@ def test_a_coordinator_that_comes_back_finds_its_worker(processes, random_bundle
     assert worker.finish()[0] == 0
 
 
+@pytest.mark.slow
 def test_a_coordinator_that_is_gone_for_good_fails_its_worker(processes, random_bundle):
     coordinator = processes.coordinator("--bundle", random_bundle.path, *SETTINGS)
     worker = processes.worker("--task", tasks.SLOW_TOY, "--exit-when-done", "--coordinator-timeout", 1)
@@ -66,6 +67,7 @@ def test_a_coordinator_that_is_gone_for_good_fails_its_worker(processes, random_
     assert "was reachable for 1 s" in worker.lines[-1]
 
 
+@pytest.mark.slow
 def test_a_run_says_why_its_worker_left_and_the_worker_in_one_line(processes):
     there = processes.folder / "there"
     there.mkdir()

@@ -100,6 +100,7 @@ def test_a_run_moves_to_another_place_and_its_worker_follows(processes, settings
     assert history(elsewhere, "parts") == history(processes.runs, "whole")
 
 
+@pytest.mark.slow
 def test_one_file_serves_coordinator_worker_and_status(processes, random_bundle):
     path = processes.folder / "fleet.toml"
     path.write_text(

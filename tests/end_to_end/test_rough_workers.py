@@ -47,6 +47,7 @@ def wait_gone(pidfd):
         time.sleep(0.02)
 
 
+@pytest.mark.slow
 def test_a_crash_behind_a_forked_process_pauses_the_run_with_its_reason(processes, random_bundle, left):
     coordinator, worker = serve(processes, random_bundle, rough_tasks.Forking)
     assert "slot crashed (killed by SIGSEGV)" in coordinator.wait_for("paused: ")
@@ -54,6 +55,7 @@ def test_a_crash_behind_a_forked_process_pauses_the_run_with_its_reason(processe
     assert worker.finish()[0] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_two_signals_end_it_and_what_its_environment_left(processes, random_bundle, left, number):
     _, worker = serve(processes, random_bundle, rough_tasks.ForkingAndHanging)
@@ -65,6 +67,7 @@ def test_two_signals_end_it_and_what_its_environment_left(processes, random_bund
     wait_gone(pidfd)
 
 
+@pytest.mark.slow
 def test_what_its_environment_left_ends_with_a_worker_that_is_killed(processes, random_bundle, left):
     _, worker = serve(processes, random_bundle, rough_tasks.ForkingAndHanging)
     pidfd = wait_for_one(left)
@@ -73,6 +76,7 @@ def test_what_its_environment_left_ends_with_a_worker_that_is_killed(processes, 
     wait_gone(pidfd)
 
 
+@pytest.mark.slow
 def test_two_signals_end_a_process_whose_main_thread_is_stuck_in_native_code(tmp_path):
     script = (
         "import ctypes\n"

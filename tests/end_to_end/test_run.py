@@ -103,6 +103,7 @@ def test_status_is_json_that_zenoh_cli_reads_too(processes, settings):
     assert "mean fitness by generation" in out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("on_failure", "why"), [("worst", "no present host has ever scored"), ("pause", "failed on two workers")]
 )
@@ -187,6 +188,7 @@ def test_pause_resume_and_drain_from_the_command_line(processes, settings):
         assert len([each for i in range(4) for each in run.results(number, i)]) <= 8
 
 
+@pytest.mark.slow
 def test_a_fork_begins_where_its_run_was_and_may_change_what_is_frozen(processes, settings, tmp_path):
     first = processes.coordinator(*settings, "--task", tasks.TOY, "--generations", 3)
     processes.worker("--task", tasks.TOY, "--exit-when-done")

@@ -107,6 +107,7 @@ def test_a_run_of_three_stages_gives_the_same_bits_however_often_it_is_killed(pr
     assert picture.stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_a_live_run_shows_its_stage_and_a_fork_begins_with_it(processes, begin):
     coordinator = begin("night")
     worker = processes.worker("--task", tasks.TOY, "--run", "night")

@@ -63,6 +63,7 @@ def wait_for_nobody(cache):
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("verb", ["demo", "iterate", "pipeline", "contrast"])
 def test_it_ends_however_it_was_started(processes, words, verb, number):

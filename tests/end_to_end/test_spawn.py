@@ -141,6 +141,7 @@ def test_a_log_is_followed_until_the_worker_ends_or_somebody_has_seen_enough(pro
     assert "leaving run test" in out
 
 
+@pytest.mark.slow
 def test_two_commands_at_once_start_one_worker(processes, hosts):
     a = hosts.add("a")
     file = write_file(processes, hosts, "a", more="tunnel = false")
@@ -159,6 +160,7 @@ def mute():
         yield server
 
 
+@pytest.mark.slow
 def test_each_thing_that_stands_in_the_way_is_said_and_the_others_come_up(processes, hosts, mute, tmp_path):
     for name in ("good", "changed", "strange", "locked", "bare"):
         hosts.add(name, **({"path": "/nowhere"} if name == "bare" else {}))

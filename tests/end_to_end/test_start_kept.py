@@ -61,6 +61,7 @@ def test_a_start_outlives_a_coordinator_that_was_killed_at_once_and_its_own_file
         assert "start.npz" in run.fact("start")
 
 
+@pytest.mark.slow
 def test_a_run_that_was_killed_at_once_asks_for_what_one_that_was_not_asks_for(processes, settings, controller):
     again = processes.start("coordinator", "--run", "whole", "--runs-dir", processes.runs, "--listen",
                             processes.endpoint, "--init", controller, *settings)  # fmt: skip
@@ -69,6 +70,7 @@ def test_a_run_that_was_killed_at_once_asks_for_what_one_that_was_not_asks_for(p
     assert np.array_equal(continued(processes, "parts"), whole)
 
 
+@pytest.mark.slow
 def test_a_fork_that_was_killed_at_once_goes_on_from_its_source_though_that_is_gone(processes, settings, controller):
     mean = Controller.load(controller).parameters
     first = processes.coordinator(*settings, "--init", controller, name="first")

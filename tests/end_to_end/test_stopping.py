@@ -71,6 +71,7 @@ def test_a_recording_can_be_played(processes, tmp_path, number):
     assert f"{out} shows the first {frames} steps" in said
 
 
+@pytest.mark.slow
 def test_a_collection_keeps_its_episodes_and_counts_them(processes, tmp_path, number):
     flags = ("--episodes", 1000, "--jobs", 2)
     collecting = processes.start("collect", "--data", tmp_path, *flags)
@@ -80,6 +81,7 @@ def test_a_collection_keeps_its_episodes_and_counts_them(processes, tmp_path, nu
     assert [path.name for path in (tmp_path / "episodes").iterdir() if path not in existing_episodes(tmp_path)] == []
 
 
+@pytest.mark.slow
 def test_a_coordinator_that_waits_for_a_worker_says_so_once(processes, random_bundle):
     coordinator = processes.coordinator("--bundle", random_bundle.path, "--task", tasks.TOY)
     coordinator.wait_for("no worker is present")

@@ -53,6 +53,7 @@ def test_a_schedule_is_played_the_same_every_time():
         assert (first.now, first.events, first.scored) == (again.now, again.events, again.scored)
 
 
+@pytest.mark.slow
 def test_a_fleet_that_nobody_disturbs_wastes_next_to_nothing():
     for number in range(100):
         calm = replace(draw(1, number), faults=())

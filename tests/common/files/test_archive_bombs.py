@@ -140,6 +140,7 @@ SAYS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
 @pytest.mark.parametrize("make", SAYS, ids=lambda make: make.__name__)
 def test_a_bomb_costs_little_and_is_refused_in_one_line(tmp_path, make):

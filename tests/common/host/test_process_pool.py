@@ -43,6 +43,7 @@ def test_each_result_comes():
     assert set(map_in_processes(2, begin, (), abs, [-1, 2, -3])) == {1, 2, 3}
 
 
+@pytest.mark.slow
 def test_a_crash_is_noticed_although_another_process_holds_the_pipes(tmp_path, monkeypatch):
     monkeypatch.setenv(rough_tasks.FOLDER, str(tmp_path))
     with pytest.raises(BrokenProcessPool):

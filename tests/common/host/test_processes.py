@@ -72,6 +72,7 @@ def test_a_child_dies_with_a_killed_parent(tmp_path):
         os.close(child)
 
 
+@pytest.mark.slow
 def test_the_last_line_of_a_killed_child_says_so():
     with VerbProcess("worker", "--connect", "tcp/127.0.0.1:1") as child:
         child.wait_for("waiting for a coordinator")

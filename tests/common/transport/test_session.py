@@ -57,6 +57,7 @@ def test_the_reachable_address_is_used_first_and_again():
     router.close()
 
 
+@pytest.mark.slow
 def test_an_address_that_drops_packets_does_not_block_the_others():
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with (

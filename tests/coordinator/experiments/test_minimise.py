@@ -12,6 +12,7 @@ from tests.support import objectives
 FEW = {"workers": 1, "popsize": 8}
 
 
+@pytest.mark.slow
 def test_it_finds_the_minimum_and_the_run_can_be_read(tmp_path):
     seen = []
     found = dreamfleet.minimise(
@@ -29,6 +30,7 @@ def test_it_finds_the_minimum_and_the_run_can_be_read(tmp_path):
         assert run.spec.horizon == 1
 
 
+@pytest.mark.slow
 def test_a_noisy_function_gives_the_mean_that_was_judged(tmp_path):
     found = dreamfleet.minimise(
         objectives.noisy, [1, 1], 0.3, generations=6, evaluate_every=3, evaluation_episodes=4, confirm_episodes=4,
@@ -39,6 +41,7 @@ def test_a_noisy_function_gives_the_mean_that_was_judged(tmp_path):
     assert found.message == "6 generations"
 
 
+@pytest.mark.slow
 def test_a_noisy_search_has_no_more_calls_than_maxfevals(tmp_path):
     found = dreamfleet.minimise(objectives.noisy, [1, 1], 0.3, maxfevals=400, run="mine", runs_dir=tmp_path, **FEW)
     assert found.message == "maxfevals=400 is reached"
@@ -64,6 +67,7 @@ def test_restarts_are_runs_of_larger_populations_and_share_the_budget(tmp_path):
     assert found.fun == max(each.fun for each in found.history) > 2
 
 
+@pytest.mark.slow
 def test_a_function_that_varies_without_a_seed_is_warned_of(tmp_path):
     with pytest.warns(RuntimeWarning, match="not deterministic.* second parameter `seed`"):
         dreamfleet.minimise(objectives.varying, [0, 0], 1.0, generations=1, runs_dir=tmp_path, **FEW)
@@ -85,6 +89,7 @@ def test_failed_candidates_are_tried_in_a_fresh_process_and_said_once(tmp_path):
     assert says in (tmp_path / "mine" / "coordinator.log").read_text()
 
 
+@pytest.mark.slow
 def test_a_search_without_any_value_ends_with_its_first_failure(tmp_path):
     with pytest.raises(UsageError, match="no candidate has a value, first: narrow raised ZeroDivisionError"):
         dreamfleet.minimise(objectives.narrow, [0, 0], 30.0, runs_dir=tmp_path, **FEW)
@@ -103,6 +108,7 @@ def test_a_search_that_loses_all_values_returns_what_it_found(tmp_path, monkeypa
     assert "failed, first: losing returned nan" in found.message
 
 
+@pytest.mark.slow
 def test_a_callback_ends_the_search(tmp_path):
     def stop(progress):
         if progress.generation == 1:

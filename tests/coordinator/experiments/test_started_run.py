@@ -86,6 +86,7 @@ def end(_generation, run):
     run.end()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("callback", "error"), [(leave, None), (end, None), (fail, LookupError), (interrupt, KeyboardInterrupt)]
 )
@@ -100,6 +101,7 @@ def test_a_run_that_is_left_early_ends_its_processes_and_stays_open(alive, tmp_p
         assert (run.state, len(run.history()) > 0) == ("open", True)
 
 
+@pytest.mark.slow
 def test_a_run_that_nothing_refers_to_ends(alive, tmp_path):
     run = start_run(runs_dir=tmp_path, **SMALL)
     assert alive()
@@ -115,6 +117,7 @@ with dreamfleet.start_run(task="gym:CartPole-v1", evaluate_every=0, workers=2, r
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends children with a killed parent")
 def test_a_parent_that_is_killed_leaves_no_process(alive, tmp_path):
     done = subprocess.run(
@@ -124,6 +127,7 @@ def test_a_parent_that_is_killed_leaves_no_process(alive, tmp_path):
     wait_until(lambda: not alive())
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_is_named_and_so_is_a_stop_from_elsewhere(alive, tmp_path):
     with start_run(run="pole", runs_dir=tmp_path, **SMALL) as run:
         (worker,) = run._processes._workers
@@ -147,6 +151,7 @@ def test_a_pause_is_no_endless_wait(alive, tmp_path, random_bundle):
         run.wait()
 
 
+@pytest.mark.slow
 def test_a_wrong_setting_starts_nothing(alive, tmp_path):
     for settings, says in (
         ({"tsak": "gym:CartPole-v1"}, "unknown setting 'tsak': did you mean 'task'?"),
@@ -169,6 +174,7 @@ def test_a_name_that_a_run_has_is_refused(tmp_path):
         start_run(run="pole", runs_dir=tmp_path, **SMALL)
 
 
+@pytest.mark.slow
 def test_two_programs_that_start_one_name_at_once_share_nothing(alive, tmp_path):
     with start_run(run="pole", generations=10**6, runs_dir=tmp_path, **SMALL) as run:
         log = (tmp_path / "pole" / "coordinator.log").read_text()

@@ -13,6 +13,7 @@ from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.coordinator.spawn.parcel import Parcel, Wheel, pack_wheel, pins
 
 
+@pytest.mark.slow
 def test_the_wheel_matches_its_record_and_is_reproducible():
     wheel = pack_wheel(native=True)
     assert wheel == pack_wheel(native=True)

@@ -145,6 +145,7 @@ def test_it_goes_to_other_processes(file):
     assert agent_evaluator.AgentEvaluator(again).drive(SEED) == agent_evaluator.AgentEvaluator(agent).drive(SEED)
 
 
+@pytest.mark.slow
 def test_a_video_shows_the_same_drive(trained, file, tmp_path, capsys):
     drive = ["--seed", str(SEED), "--steps", str(STEPS), "--json", "--out", str(tmp_path / "drive.mp4")]
     assert main(["record", "--controller", str(file), *drive]) == 0

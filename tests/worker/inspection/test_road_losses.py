@@ -41,6 +41,7 @@ def test_as_many_losses_are_gathered_as_are_wanted(drives):
         assert each.truth[OFF][each.lost : each.lost + DRIVEN.lasting].all()
 
 
+@pytest.mark.slow
 def test_too_few_losses_are_reported(drives):
     calm = [replace(each, lost=None) for each in drives]
     with pytest.raises(UsageError, match=r"lost the road 0 times, not 6: raise --noise"):
@@ -50,6 +51,7 @@ def test_too_few_losses_are_reported(drives):
         collect_losing_drives(iter(blind), CONFIG, DRIVEN)
 
 
+@pytest.mark.slow
 def test_reality_loses_the_road_and_the_probe_sees_it_and_nothing_where_all_is_calm(drives, tiny, controller):
     compared = {each.begun: each for each in compare_losses(drives, tiny, controller, CONFIG, DRIVEN)}
     assert list(compared) == ["20 steps before", "0 steps before", CALM]

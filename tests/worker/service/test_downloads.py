@@ -32,6 +32,7 @@ def test_a_bundle_that_is_always_damaged_is_an_error(stage):
     assert "damaged 3 times" in str(error)
 
 
+@pytest.mark.slow
 def test_it_asks_again_for_a_bundle_that_arrived_damaged(stage, said):
     hand = stage.hand()
     hand.damage = lambda offset, data: data[::-1]

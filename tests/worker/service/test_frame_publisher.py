@@ -67,6 +67,7 @@ def viewer():
         each.close()
 
 
+@pytest.mark.slow
 def test_a_viewer_sees_the_running_job_and_its_observation(stage, hand, cached, viewer):
     stage.worker()
     hand.ready()
@@ -106,6 +107,7 @@ def test_scores_are_the_same_bits_while_two_viewers_come_and_go_or_are_killed(st
     assert hand.result(hand.job(0)).fitness == plain.fitness
 
 
+@pytest.mark.slow
 def test_frames_do_not_restart_the_coordinators_silence(stage, cached, viewer):
     """A worker that has results without a verdict says hello again after five silent beats, watched or not."""
     hand = stage.hand(tasks.PAINTED)
@@ -118,6 +120,7 @@ def test_frames_do_not_restart_the_coordinators_silence(stage, cached, viewer):
     watching.frame()
 
 
+@pytest.mark.slow
 def test_after_a_slot_was_killed_in_the_middle_the_next_child_is_watched(stage, hand, cached, viewer):
     stage.worker()
     hand.ready()
@@ -133,6 +136,7 @@ def test_after_a_slot_was_killed_in_the_middle_the_next_child_is_watched(stage, 
     assert (unpack_picture(frame) == frame.step).all()
 
 
+@pytest.mark.slow
 def test_one_of_two_slots_is_shown(stage, hand, cached, viewer):
     stage.worker(slots=2)
     hand.hello()
@@ -161,6 +165,7 @@ def shown_by(slot):
         seen.append(event.message)
 
 
+@pytest.mark.slow
 def test_an_unwatched_child_sends_only_its_result(slot):
     unwatched, fitness = shown_by(slot)
     assert unwatched == []

@@ -31,6 +31,7 @@ class OfTomorrow(TaskSpec):
     later: float = 0.5
 
 
+@pytest.mark.slow
 def test_it_waits_for_a_coordinator_that_starts_later(stage, said, cached):
     stage.worker()
     wait_for(said, "waiting for a coordinator")
@@ -59,6 +60,7 @@ def test_without_a_name_it_joins_the_only_run(stage, cached):
     assert hand.ready().slots == 1
 
 
+@pytest.mark.slow
 def test_without_a_name_several_runs_are_listed_until_one_is_left(stage, said, cached):
     hand = stage.hand(run="night")
     other = Hand(free_port(), stage.bundle, tasks.TOY, run="day")

@@ -159,6 +159,7 @@ def test_late_events_of_the_last_runs_slots_do_not_reach_the_next_run(stage, sai
     assert not [line for line in drained(said) if "starting another" in line]
 
 
+@pytest.mark.slow
 def test_without_a_flag_it_says_why_its_run_ended_and_waits_for_the_next_one(stage, said, cached):
     hand = stage.hand(tasks.SLOW_TOY)
     _, served = stage.worker()

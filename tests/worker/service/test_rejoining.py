@@ -17,6 +17,7 @@ from tests.support.stage import wait_for
 SLOW_BEATS = Intervals(beat=60.0, repeat=0.1)  # the longest valid ones
 
 
+@pytest.mark.slow
 def test_it_follows_its_run_into_the_coordinators_next_life(stage, cached):
     hand = stage.hand(tasks.SLOW_TOY)
     stage.worker()
@@ -38,6 +39,7 @@ def test_it_follows_its_run_into_the_coordinators_next_life(stage, cached):
     assert hand.result(queued).fitness is not None
 
 
+@pytest.mark.slow
 def test_a_batch_of_a_newer_numbering_makes_it_say_hello(stage, cached):
     hand = stage.hand(tasks.SLOW_TOY)
     stage.worker()
@@ -108,6 +110,7 @@ def test_it_says_hello_to_a_silent_coordinator(stage, cached, owed):
     hand.hello()
 
 
+@pytest.mark.slow
 def test_it_follows_its_run_to_another_name_with_its_results(stage, said, cached):
     hand = stage.hand(tasks.SLOW_TOY)
     stage.worker()
@@ -126,6 +129,7 @@ def test_it_follows_its_run_to_another_name_with_its_results(stage, said, cached
     assert again.result(again.job(2)).fitness is not None
 
 
+@pytest.mark.slow
 def test_it_stays_with_its_name_where_the_run_is_refused_under_another(stage, said, cached):
     hand = stage.hand()
     stage.worker()

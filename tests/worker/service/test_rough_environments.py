@@ -195,6 +195,7 @@ def test_an_environment_may_start_and_end_processes_of_its_own(harness):
     assert harness(rough_tasks.Parallel).score(stall=60.0).fitness is not None
 
 
+@pytest.mark.slow
 def test_a_suspended_child_with_a_full_pipe_does_not_block_its_worker(harness, monkeypatch):
     monkeypatch.setattr("dreamfleet.worker.service.child_process.SEND_LIMIT", 1)
     slot = harness(tasks.TOY)
@@ -204,6 +205,7 @@ def test_a_suspended_child_with_a_full_pipe_does_not_block_its_worker(harness, m
     slot.wait_ready()
 
 
+@pytest.mark.slow
 def test_a_child_that_cannot_end_is_left_behind(harness, monkeypatch):
     slot = harness(rough_tasks.Deaf)
     slot.wait_ready()
@@ -241,6 +243,7 @@ def test_whatever_an_environment_raises_is_the_jobs_error(harness, monkeypatch, 
     assert slot.slot.pid == pid
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["make", "policy"])
 @pytest.mark.parametrize("error", ["SystemExit", "KeyboardInterrupt", "Mute"])
 def test_whatever_is_raised_as_a_slot_starts_is_one_clear_error(harness, monkeypatch, place, error):
@@ -251,6 +254,7 @@ def test_whatever_is_raised_as_a_slot_starts_is_one_clear_error(harness, monkeyp
         slot.wait_ready()
 
 
+@pytest.mark.slow
 def test_many_children_that_cannot_end_do_not_delay_the_end_of_a_pool(random_bundle, monkeypatch):
     spec = TaskSpec(task=tasks.TOY, bundle=random_bundle.sha256, horizon=1, patience=0)
     pool = SlotPool(

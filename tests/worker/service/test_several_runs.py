@@ -25,6 +25,7 @@ def both(stage, cached):
     return one, two, made, served
 
 
+@pytest.mark.slow
 def test_it_serves_both_and_each_has_the_whole_worker_while_the_other_idles(both):
     one = both[0]
     for hand in both[:2]:
@@ -35,6 +36,7 @@ def test_it_serves_both_and_each_has_the_whole_worker_while_the_other_idles(both
     assert one.result(one.job(1)).fitness is not None
 
 
+@pytest.mark.slow
 def test_jobs_of_both_share_the_one_slot_and_none_fails(both):
     one, two, *_ = both
     jobs = [one.job(episode) for episode in range(3)]
@@ -133,6 +135,7 @@ def test_a_run_that_cannot_be_scored_ends_no_other(stage, said, cached, monkeypa
     assert not wait([served], timeout=0).done
 
 
+@pytest.mark.slow
 def test_children_start_as_jobs_need_them(stage, cached):
     one = stage.hand(tasks.SECOND_TOY, run="one")
     one.answers = True

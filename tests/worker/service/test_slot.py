@@ -136,6 +136,7 @@ def test_a_failed_collection_is_an_error_without_a_file(harness):
     assert (failed.fitness, failed.upload, file) == (None, None, None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "error"), [(tasks.RAISING, "RuntimeError: the road has ended"), (tasks.NAN, "ValueError: the episode's")]
 )
@@ -160,6 +161,7 @@ def test_a_crash_costs_one_job_and_another_child_takes_its_place(harness):
         assert (result.fitness, result.error) == (None, "slot crashed (killed by SIGSEGV)")
 
 
+@pytest.mark.slow
 def test_a_child_that_lives_but_closed_its_pipe_is_replaced(harness):
     slot = harness(tasks.SILENT)
     slot.wait_ready()
@@ -177,6 +179,7 @@ def test_nobody_reads_from_a_slot_that_was_stopped(harness):
     assert threading.active_count() == before - 1
 
 
+@pytest.mark.slow
 def test_a_killed_child_is_replaced_alone(harness):
     slot = harness(tasks.SLOW_TOY)
     slot.wait_ready()
@@ -210,6 +213,7 @@ def test_after_short_groups_the_next_one_is_queued_in_the_child(harness):
     assert [slot.result().digest for _ in range(2)] == [job(number, spec=slot.spec).digest for number in (1, 2)]
 
 
+@pytest.mark.slow
 def test_after_a_crash_the_next_child_gets_the_queued_group(harness):
     slot = harness(tasks.SLOW_TOY)
     slot.wait_ready()
@@ -356,6 +360,7 @@ def test_a_short_host_is_tried_for_ten_minutes(harness):
         kill_as_it_starts(slot, 1)
 
 
+@pytest.mark.slow
 def test_a_host_that_stays_short_gives_its_jobs_back(harness):
     slot = harness(tasks.SLOW_TOY)
     slot.wait_ready()
@@ -382,6 +387,7 @@ def test_the_time_limit_of_a_start_grows_after_a_failure(harness):
     assert slot.slot.pid == pid
 
 
+@pytest.mark.slow
 def test_a_child_that_ends_as_it_starts_blames_no_job(harness):
     slot = harness(tasks.SLOW_TOY)
     slot.wait_ready()

@@ -60,6 +60,7 @@ print("field" in known_tasks(), find_task("field").name, describe_task("field", 
     assert run(code, installed) == "True field 2"
 
 
+@pytest.mark.slow
 def test_candidates_are_scored_in_it(installed):
     code = """
 import numpy as np

@@ -93,6 +93,7 @@ def test_a_bundle_of_another_task_or_of_pictures_that_it_does_not_give_is_refuse
             make(Assignment.of(task, bundle))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preprocessing", [BOX, RAW])
 def test_both_environments_observe_gymnasiums_pictures_preprocessed(tmp_path, preprocessing):
     vae = VAEConfig(picture=preprocessing.size, latent=4, channels=(2, 2, 2, 2))

@@ -37,6 +37,7 @@ def run_script(folder, *seeds):
     return {int(seed): float(score) for seed, score in (line.split() for line in lines)}
 
 
+@pytest.mark.slow
 def test_the_folder_holds_what_its_card_names(card):
     text = (card / "README.md").read_text()
     names = {each.name for each in card.iterdir()}

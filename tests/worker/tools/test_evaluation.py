@@ -136,6 +136,7 @@ def test_what_only_python_itself_should_raise_is_an_episodes_failure(
     assert f"0 of 2 episodes, 2 failed: seed 10000, {error}: " in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_an_episode_that_hangs_is_given_up_and_the_others_go_on(controller, random_bundle, monkeypatch, jobs):
     monkeypatch.setenv(rough_tasks.HALT, "5")

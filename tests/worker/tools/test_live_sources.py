@@ -103,6 +103,7 @@ def driver(bundle):
     return lambda: (agent, {"controller": "mine"})
 
 
+@pytest.mark.slow
 def test_a_controller_is_shown_in_real_time_and_scores_the_same(random_bundle, monkeypatch):
     drive = driver(random_bundle)
     agent, _ = drive()

@@ -100,6 +100,7 @@ def save_controller(monkeypatch, name, path):
     Controller(ControllerShape(4, 2), np.zeros(10, np.float32), task, "").save(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "says"),
     [
@@ -144,6 +145,7 @@ def film_of(name, monkeypatch):
     return partial(record, make_agent(Controller(ControllerShape(4, 2), np.zeros(10, np.float32), task, "")), steps=900)
 
 
+@pytest.mark.slow
 def test_an_episode_that_hangs_ends_the_recording(tmp_path, monkeypatch):
     with pytest.raises(DreamfleetError, match=r"slot crashed \(no step for 2 s\)"):
         record_in_process(film_of("Stuck", monkeypatch), SEED, tmp_path / "drive.mp4", print, never_stop, stall=2.0)

@@ -86,6 +86,7 @@ def test_an_episode_fails_only_in_a_fresh_process(processes, random_bundle, monk
     assert (code, out.count("same bits")) == (0, 2), (out, err)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["make", "step"])
 def test_what_only_python_itself_should_raise_is_an_episodes_failure(processes, random_bundle, monkeypatch, place):
     task = rough_tasks.name_of(rough_tasks.Raising)
@@ -149,6 +150,7 @@ def test_a_candidate_that_failed_is_driven_again_and_its_cause_compared(processe
     assert "crashed or hung their process" in err
 
 
+@pytest.mark.slow
 def test_a_candidate_that_scored_and_now_fails_differs(processes, brittle_run):
     folder = brittle_run("worst")
     with RunFolder(folder) as run:

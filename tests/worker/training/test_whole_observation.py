@@ -85,6 +85,7 @@ def test_environment_judge_and_video_score_alike_to_the_bit(bundle, parameters, 
     assert fitness == fitness[:1] * 3
 
 
+@pytest.mark.slow
 def test_it_dreams_is_driven_in_reality_and_collects_drives_that_its_data_set_takes_in(
     data, bundle, parameters, tmp_path
 ):

@@ -90,6 +90,7 @@ def remembered(bundle, folder):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_a_recorded_state_is_what_a_drive_up_to_there_remembers(trained, tmp_path, name):
     folder = trained(MODELS[name])
