@@ -129,7 +129,9 @@ class RunSettings:
         try:
             return from_plain(cls, json.loads(text))
         except (ValueError, TypeError, MalformedError, RecursionError) as error:
-            raise JournalError(f"the journal's settings are damaged: {error}") from error
+            raise JournalError(
+                f"the journal's settings cannot be read ({error}): a newer dreamfleet wrote them, or they are damaged"
+            ) from error
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Damaged journals: each value is read, or is a one-line error."""
 
+import json
 import os
 import random
 import shutil
@@ -152,6 +153,18 @@ def test_a_confirmed_score_of_no_episodes_is_damaged(folder):
     journal.close()
     with RunFolder(folder) as run, pytest.raises(JournalError, match="confirmed score is damaged"):
         run.confirmation()
+
+
+def test_settings_with_a_field_of_a_newer_version_say_so(folder):
+    with closing(sqlite3.connect(folder / "journal.sqlite")) as journal, journal:
+        (text,) = journal.execute("SELECT value FROM run WHERE key = 'settings'").fetchone()
+        newer = json.dumps({**json.loads(text), "of_tomorrow": 1})
+        journal.execute("UPDATE run SET value = ? WHERE key = 'settings'", (newer,))
+    with (
+        RunFolder(folder) as run,
+        pytest.raises(JournalError, match="a newer dreamfleet wrote them, or they are damaged"),
+    ):
+        run.settings  # noqa: B018
 
 
 def test_a_locked_journal_is_not_called_damaged(folder, monkeypatch):
