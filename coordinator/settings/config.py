@@ -370,7 +370,8 @@ class RunConfig:
         if not driving.is_default and self.task not in (world, DREAM):
             raise UsageError(f"task {self.task} has no variants: {world} has, and its dream")
         costs = [each for each in driving.option_texts if each not in driving.without_costs.option_texts]
-        if costs and self.task == DREAM:
+        drives = self.driven > 0 or any(each.driven for each in self.stages)
+        if costs and self.task == DREAM and not drives:
             cost = costs[0].partition("=")[0]
             remedy = "omit it from --variant" if cost in given else f"pass --variant {cost}=0 over the preset's"
             raise UsageError(

@@ -9,7 +9,7 @@ from dreamfleet.common.errors import ControllerError, DreamfleetError, UsageErro
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import Description
 from dreamfleet.common.runs.lookup import find_subspace
-from dreamfleet.common.runs.records import RunSettings
+from dreamfleet.common.runs.records import RunSettings, StageSettings
 from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.coordinator.settings.config import RunConfig, config_values
 from dreamfleet.coordinator.settings.presets import PRESETS, find_preset
@@ -119,6 +119,16 @@ def test_a_variant_is_frozen_with_a_run_and_can_be_configured_again(random_bundl
 def test_a_variant_that_says_nothing_leaves_the_words_of_the_first_version(random_bundle):
     said = RunConfig(variant=("pedals=two", "decide_every=1", "feedback=none")).settings(random_bundle)
     assert said.to_json() == RunConfig().settings(random_bundle).to_json()
+
+
+@pytest.mark.parametrize(
+    "driven",
+    [{"driven": 1.0}, {"stages": (StageSettings(5), StageSettings(driven=0.5, episodes=2))}],
+    ids=["all", "later"],
+)
+def test_a_run_of_task_dream_that_drives_too_may_charge_its_drives(random_bundle, driven):
+    found = RunConfig(task="dream", variant=("offroad_cost=2",), **driven).settings(random_bundle)
+    assert found.task.options == '{"offroad_cost": 2.0}'
 
 
 @pytest.mark.parametrize(

@@ -186,6 +186,9 @@ def test_only_candidates_pay_for_steps_off_the_road(random_bundle):
     for kind in ("evaluate", "collect"):
         assert scorers[1].episode_config(kind, 3).off_course_cost == 0
     assert judged(dear, random_bundle, vector, scorers[1].episode_config("score", 3)) == paid
+    dream, _ = varied(random_bundle, "dream", horizon=150, offroad_cost=2.0)
+    scorers.append(Scorer(dream, random_bundle))
+    assert scorers[2].score("score", vector, 3, spec=dream.with_overrides(driven=True)) == paid
     for each in scorers:
         each.close()
 
