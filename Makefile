@@ -15,7 +15,7 @@ unexport PYTHONDONTWRITEBYTECODE
 demo: $(VENV)/.demo $(if $(filter takecover,$(WORLD)),$(VENV)/.demo-doom)  ## evolve a controller here (WORLD=takecover: there), judge it, plot it, record it
 	$(BIN)/dreamfleet demo $(if $(WORLD),--world $(WORLD)) $(ARGS)
 
-test: $(VENV)/.dev  ## every test that ends within two seconds: five minutes
+test: $(VENV)/.dev  ## every test that ends within two seconds: five and a half minutes
 	$(BIN)/pytest -m "not slow and not long" --numprocesses 3 --dist worksteal $(ARGS)
 
 slow: $(VENV)/.dev  ## those that take longer, each under two minutes; what lands has passed both
