@@ -262,6 +262,25 @@ class WearingEnvironment(ToyEnvironment):
         return super().step(action)
 
 
+class OneCrashes(Toy):
+    """The episode with the seed `DEADLY` kills its process."""
+
+    batch_size = 4
+
+    def make_environment(self, assignment):
+        return DeadlyEnvironment()
+
+
+DEADLY = 1048576 + 2
+
+
+class DeadlyEnvironment(ToyEnvironment):
+    def reset(self, *, seed=None, options=None):
+        if seed == DEADLY:
+            os.kill(os.getpid(), signal.SIGSEGV)
+        return super().reset(seed=seed, options=options)
+
+
 class PoisonedBatch(Toy):
     """From the second group of a process on, the last fitness of a group is out of bounds."""
 

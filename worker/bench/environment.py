@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from time import perf_counter
@@ -26,7 +26,7 @@ from dreamfleet.worker.car_racing.task import (
     PictureObservation,
     make_reference_environment,
 )
-from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
+from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode, score_together
 from dreamfleet.worker.tasks.api import Assignment
 
 STEPS = 1000
@@ -36,14 +36,19 @@ Policy = Callable[[NDArray[np.uint8]], Any]
 def bench_env(bundle: Bundle, rounds: int) -> dict[str, Any]:
     """Time whole episodes of each case in turn, reset and opening zoom included; return ratios of median step times.
 
-    All cases repeat the same actions, which the shipped controller chose on that track beforehand.
+    All cases repeat the same actions, which the shipped controller chose on that track beforehand. A fitness step is
+    one of as many episodes as a slot drives side by side, each on a track of its own; `fitness_step_alone` is one of a
+    single episode.
     """
     cases, notes = _cases(bundle)
-    times: dict[str, list[float]] = {name: [] for name in cases}
+    times: dict[str, list[float]] = {name: [] for name in (*cases, "fitness_step")}
+    together = CarRacingTask.batch_size
     for round_number in range(rounds):
-        recorded_drive = record_drive(VALIDATION.start + round_number)
+        first_seed = VALIDATION.start + together * round_number
+        recorded_drives = [record_drive(first_seed + number) for number in range(together)]
         for name, measure in cases.items():
-            times[name].append(measure(recorded_drive))
+            times[name].append(measure(recorded_drives[0]))
+        times["fitness_step"].append(seconds_a_step_together(bundle, recorded_drives))
     seconds = {name: statistics.median(values) for name, values in times.items()}
 
     def ratio(slow: str, fast: str) -> float | None:
@@ -71,8 +76,8 @@ def _cases(bundle: Bundle) -> tuple[dict[str, Callable[[RecordedDrive], float]],
             PictureObservation(gymnasium.make("CarRacing-v3"), BOX), recorded_drive
         ),
         "picture": lambda recorded_drive: seconds_a_step(make_car_racing(preprocessing=BOX.name), recorded_drive),
-        "fitness_step": lambda recorded_drive: seconds_a_step(
-            task.make_environment(assignment), recorded_drive, make_random_controller(bundle)
+        "fitness_step_alone": lambda recorded_drive: seconds_a_step(
+            task.make_environment(assignment), recorded_drive, make_random_policy(bundle).act
         ),
     }
     notes = []
@@ -148,11 +153,47 @@ def seconds_a_step(
     return seconds
 
 
-def make_random_controller(bundle: Bundle) -> Policy:
+def seconds_a_step_together(bundle: Bundle, recorded_drives: Sequence[RecordedDrive]) -> float:
+    """Seconds per step of episodes that are driven side by side, resets included, under a policy of random parameters.
+
+    As in `seconds_a_step`, its time counts, and its actions are not used.
+    """
+    task, assignment = CarRacingTask(), Assignment.of(CarRacingTask.name, bundle)
+    environments = [Repetition(task.make_environment(assignment), each) for each in recorded_drives]
+    policies, parameters = make_random_policy(bundle).side_by_side(), random_parameters(bundle)
+    started = perf_counter()
+    scores = score_together(
+        environments, policies, [parameters] * len(environments),
+        [EpisodeConfig(each.seed, STEPS) for each in recorded_drives],
+    )  # fmt: skip
+    seconds = (perf_counter() - started) / sum(score.steps for score in scores)
+    for environment in environments:
+        environment.close()
+    return seconds
+
+
+class Repetition(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment that takes a recorded drive's actions, whatever its agent chooses."""
+
+    def __init__(self, environment: gymnasium.Env[Any, Any], recorded_drive: RecordedDrive) -> None:
+        super().__init__(environment)
+        self._actions = iter(recorded_drive.actions)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:  # noqa: ARG002 - of the interface
+        """Take the next recorded action."""
+        return self.env.step(next(self._actions))
+
+
+def make_random_policy(bundle: Bundle) -> CarRacingPolicy:
     """A policy of the bundle with random parameters."""
     policy = CarRacingPolicy(bundle)
-    policy.begin(np.random.default_rng(0).normal(0, 0.1, bundle.controller_shape.size).astype(np.float32))
-    return policy.act
+    policy.begin(random_parameters(bundle))
+    return policy
+
+
+def random_parameters(bundle: Bundle) -> NDArray[np.float32]:
+    """Parameters `(size,)` of a random controller."""
+    return np.random.default_rng(0).normal(0, 0.1, bundle.controller_shape.size).astype(np.float32)
 
 
 def make_torch_controller(bundle: Bundle) -> Policy:

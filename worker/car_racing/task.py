@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -63,6 +63,7 @@ class CarRacingTask(Task):
     """The task `car-racing`."""
 
     name = "car-racing"
+    batch_size: ClassVar[int] = 4  # a step takes a seventh less time than alone; eight side by side are hardly faster
     world = WORLD
     drivers: Mapping[str, Callable[[np.random.Generator], Driver]] = DRIVERS
     policies = POLICIES

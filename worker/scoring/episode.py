@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.worker.scoring.rollout import Rollout
-from dreamfleet.worker.tasks.api import Policy, Score
+from dreamfleet.worker.tasks.api import Policies, Policy, Score
 from dreamfleet.worker.tasks.reset import reset_folded
 
 MAX_OFF_COURSE_STEPS = 100  # most steps off the course that are charged: a lost course is one loss, however long
@@ -49,32 +49,79 @@ ResetHook = Callable[[gymnasium.Env[Any, Any], Any], Any]
 """Changes an environment that was just reset; takes its first observation and returns the new one."""
 
 
+class OpenEpisode:
+    """An episode under way. `observation` is the one that the next action answers; `over`: there is none."""
+
+    def __init__(
+        self, environment: gymnasium.Env[Any, Any], episode_config: EpisodeConfig, begin: ResetHook | None = None
+    ) -> None:
+        """Reset the environment; `begin` may change it right after that."""
+        self.observation = reset_folded(environment, episode_config.seed)
+        if begin is not None:
+            self.observation = begin(environment, self.observation)
+        self._environment = environment
+        self._horizon, self._patience = episode_config.horizon, episode_config.patience
+        self._steps = self._idle = 0
+        self.over = self._horizon < 1
+
+    def step(self, action: Any) -> Transition:
+        """Take one step with an action.
+
+        The episode is over when the environment ends it, after `horizon` steps, or after `patience` steps without a
+        positive reward.
+        """
+        seen = self.observation
+        self.observation, given, terminated, truncated, info = self._environment.step(action)
+        reward = float(given)
+        self._steps += 1
+        self._idle = 0 if reward > 0 else self._idle + 1
+        ended = bool(terminated or truncated)
+        cut = not ended and 0 < self._patience <= self._idle
+        self.over = ended or cut or self._steps >= self._horizon
+        return Transition(seen, action, reward, self._steps, ended, cut, info, bool(terminated and not truncated))
+
+
 def run_episode(
     environment: gymnasium.Env[Any, Any], policy: Policy, episode_config: EpisodeConfig, begin: ResetHook | None = None
 ) -> Iterator[Transition]:
-    """Yield the steps of an episode; the caller has called `policy.begin`.
-
-    The episode ends when the environment ends it, after `horizon` steps, or after `patience` steps without a positive
-    reward. `begin` may change the environment right after its reset.
-    """
-    observation = reset_folded(environment, episode_config.seed)
-    if begin is not None:
-        observation = begin(environment, observation)
+    """Yield the steps of an episode (`OpenEpisode`); the caller has called `policy.begin`."""
+    episode = OpenEpisode(environment, episode_config, begin)
     # Only a `RewardAwarePolicy` has it; `isinstance` with a protocol takes 70 microseconds, as long as some steps.
     report_reward: Callable[[float], None] | None = getattr(policy, "reward", None)
-    idle, over = 0, False
-    for step in range(1, episode_config.horizon + 1):
-        seen, action = observation, policy.act(observation)
-        observation, given, terminated, truncated, info = environment.step(action)
-        reward = float(given)
+    while not episode.over:
+        moment = episode.step(policy.act(episode.observation))
         if report_reward is not None:
-            report_reward(reward)
-        idle = 0 if reward > 0 else idle + 1
-        ended = bool(terminated or truncated)
-        over = not ended and 0 < episode_config.patience <= idle
-        yield Transition(seen, action, reward, step, ended, over, info, bool(terminated and not truncated))
-        if ended or over:
-            return
+            report_reward(moment.reward)
+        yield moment
+
+
+class _Tally:
+    """What an episode has scored so far."""
+
+    def __init__(self, episode_config: EpisodeConfig) -> None:
+        self._config = episode_config
+        self._fitness, self._steps, self._off_course_steps, self._finished = 0.0, 0, 0, False
+
+    def add(self, moment: Transition) -> None:
+        """Add a step."""
+        config = self._config
+        self._fitness += moment.reward
+        self._steps = moment.step
+        if moment.cut:
+            self._fitness -= config.idle_cost * (config.horizon - moment.step)
+        if config.off_course_cost:
+            self._off_course_steps += bool(moment.info.get(config.off_course))
+        self._finished = moment.ended and bool(moment.info.get(config.finish))
+
+    def score(self) -> Score:
+        """The score of the whole episode; `ValueError` if it is not a number."""
+        fitness, config = self._fitness, self._config
+        if config.time_cost:
+            fitness -= config.time_cost * (self._steps if self._finished else config.horizon)
+        fitness -= config.off_course_cost * min(self._off_course_steps, MAX_OFF_COURSE_STEPS)
+        if not math.isfinite(fitness):
+            raise ValueError("the episode's rewards do not add up to a number")
+        return Score(fitness, self._steps)
 
 
 def score(
@@ -93,26 +140,54 @@ def score(
     to the horizon unless the course is finished, so that a crash saves nothing. Steps off the course are charged
     because they announce a loss long before rewards do.
     """
-    if not np.isfinite(parameters).all():
-        raise ValueError("the controller's parameters hold NaN or infinity")
+    _check_finite(parameters)
     policy.begin(parameters)
-    fitness, steps, off_course_steps, finished = 0.0, 0, 0, False
+    tally = _Tally(episode_config)
     for moment in run_episode(environment, policy, episode_config):
-        fitness += moment.reward
-        steps = moment.step
+        tally.add(moment)
         if rollout is not None:
             rollout.add(moment.seen, moment.action, moment.reward)
             rollout.ended, rollout.terminal = moment.ended, moment.terminal
         if on_transition is not None:
             on_transition(moment)
-        on_step(steps)
-        if moment.cut:
-            fitness -= episode_config.idle_cost * (episode_config.horizon - steps)
-        off_course_steps += bool(episode_config.off_course_cost and moment.info.get(episode_config.off_course))
-        finished = moment.ended and bool(moment.info.get(episode_config.finish))
-    if episode_config.time_cost:
-        fitness -= episode_config.time_cost * (steps if finished else episode_config.horizon)
-    fitness -= episode_config.off_course_cost * min(off_course_steps, MAX_OFF_COURSE_STEPS)
-    if not math.isfinite(fitness):
-        raise ValueError("the episode's rewards do not add up to a number")
-    return Score(fitness, steps)
+        on_step(moment.step)
+    return tally.score()
+
+
+def score_together(
+    environments: Sequence[gymnasium.Env[Any, Any]],
+    policies: Policies,
+    parameters: Sequence[NDArray[np.float32]],
+    episode_configs: Sequence[EpisodeConfig],
+    on_step: Callable[[int], None] = lambda _steps: None,
+) -> list[Score]:
+    """Run as many episodes side by side as there are `parameters`, each in an environment of its own.
+
+    Each score is that of `score`, to the bit. `on_step` gets the number of steps so far, over all episodes.
+    """
+    for each in parameters:
+        _check_finite(each)
+    policies.begin(np.stack(parameters))
+    together = zip(environments, episode_configs, strict=False)  # there may be more environments
+    episodes = [OpenEpisode(environment, config) for environment, config in together]
+    tallies = [_Tally(config) for config in episode_configs]
+    open_ones = [number for number, each in enumerate(episodes) if not each.over]
+    made = 0
+    while open_ones:
+        actions = policies.act(np.stack([episodes[number].observation for number in open_ones]))
+        moments = [episodes[number].step(action) for number, action in zip(open_ones, actions, strict=True)]
+        for number, moment in zip(open_ones, moments, strict=True):
+            tallies[number].add(moment)
+        policies.reward(np.array([moment.reward for moment in moments]))
+        made += len(open_ones)
+        on_step(made)
+        rows = [row for row, number in enumerate(open_ones) if not episodes[number].over]
+        if len(rows) < len(open_ones):
+            policies.keep(rows)
+            open_ones = [open_ones[row] for row in rows]
+    return [each.score() for each in tallies]
+
+
+def _check_finite(parameters: NDArray[np.float32]) -> None:
+    if not np.isfinite(parameters).all():
+        raise ValueError("the controller's parameters hold NaN or infinity")

@@ -19,7 +19,7 @@ from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, class_from_fingerprint
 from dreamfleet.common.protocol.messages import Kind, TaskSpec
 from dreamfleet.common.serialization.display import Displayed
-from dreamfleet.worker.scoring.episode import EpisodeConfig, score
+from dreamfleet.worker.scoring.episode import EpisodeConfig, score, score_together
 from dreamfleet.worker.scoring.host_class_probe import REPEAT_LIMIT, HostClassProbe
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld, Rollout
 from dreamfleet.worker.scoring.watched_policy import WatchedPolicy
@@ -27,6 +27,8 @@ from dreamfleet.worker.tasks.api import (
     Assignment,
     Batch,
     BatchedTask,
+    Policies,
+    PolicySideBySide,
     Score,
     StepObserver,
     Task,
@@ -72,6 +74,7 @@ class Scorer(Displayed):
             self._batch_for(spec)  # raises its errors now, not with the first job
         self._task, self._assignment = task, assignment
         self._environment = task.make_environment(assignment)
+        self._more_environments: list[gymnasium.Env[Any, Any]] = []  # for episodes that are driven side by side
         self._policy = task.make_policy(assignment)
         truth = getattr(task.reality(assignment), "truth", None)
         self._measurer = Measurer(spec.measures, self.world.actions, self.world.action_names, truth)
@@ -121,6 +124,8 @@ class Scorer(Displayed):
             if self.observer is not None and isinstance(batch, WatchableBatch):
                 batch = batch.watched(self.observer)
             return batch.score([(parameters, seed) for _, parameters, seed in jobs], on_step)
+        if (policies := self._policies_for(jobs)) is not None:
+            return self._drive_together(policies, jobs, on_step, spec)
         scores: list[Score] = []
         for kind, parameters, seed in jobs:
             before = sum(each.steps for each in scores)
@@ -199,9 +204,35 @@ class Scorer(Displayed):
 
     def close(self) -> None:
         """Release the environments."""
-        close_environment(self._environment)
+        for environment in (self._environment, *self._more_environments):
+            close_environment(environment)
         if (watched := self.__dict__.get("_watched_environment")) is not None:  # made on first use
             close_environment(watched)
+
+    def _policies_for(self, jobs: Sequence[object]) -> Policies | None:
+        """The policies that drive these jobs side by side; `None` if they are driven one by one."""
+        several = 1 < len(jobs) <= self._task.batch_size
+        if not several or self._batch_for or self.observer or self.spec.measures:
+            return None
+        return self._policies
+
+    @cached_property
+    def _policies(self) -> Policies | None:
+        return self._policy.side_by_side() if isinstance(self._policy, PolicySideBySide) else None
+
+    def _drive_together(
+        self, policies: Policies, jobs: Sequence[tuple[Kind, NDArray[np.float32], int]],
+        on_step: Callable[[int], None], spec: TaskSpec | None,
+    ) -> list[Score]:  # fmt: skip
+        while len(self._more_environments) < len(jobs) - 1:
+            self._more_environments.append(self._task.make_environment(self._assignment))
+        return score_together(
+            (self._environment, *self._more_environments),
+            policies,
+            [parameters for _, parameters, _ in jobs],
+            [self.episode_config(kind, seed, spec) for kind, _, seed in jobs],
+            on_step,
+        )
 
     def _run_episode(
         self,

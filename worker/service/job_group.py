@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dreamfleet.common.protocol.failures import describe_job
 from dreamfleet.common.protocol.measures import LARGEST_MEASURE
 from dreamfleet.common.protocol.messages import MAX_UPLOAD, Job, Result, TaskSpec
 from dreamfleet.common.protocol.result_bounds import LONGEST_EPISODE, clamp_count, rejection_reason
@@ -20,6 +21,8 @@ if TYPE_CHECKING:  # the child imports this module before it imports what scores
     from dreamfleet.worker.scoring.rollout import Rollout
     from dreamfleet.worker.scoring.scorer import Scorer
     from dreamfleet.worker.tasks.api import Score
+
+MOST_TRIED_ALONE = 8  # jobs of a failed group that are then tried one by one
 
 JobWithVector = tuple[Job, bytes]
 """A job, and the bytes of its vector."""
@@ -43,6 +46,17 @@ class JobGroup:
         """Bytes of all vectors."""
         return sum(len(vector) for _, vector in self.work)
 
+    @property
+    def is_small(self) -> bool:
+        """Whether it has several jobs, but few enough to try them one by one."""
+        return 1 < len(self.work) <= MOST_TRIED_ALONE
+
+    def split(self, wanted: Collection[bytes] | None = None) -> list[JobGroup]:
+        """Its jobs for another child, or those with the digests `wanted`: one by one if the group is small."""
+        work = [each for each in self.work if wanted is None or each[0].digest in wanted]
+        parts = [[each] for each in work] if self.is_small else [work]
+        return [JobGroup(0, part, self.unwanted & {job.digest for job, _ in part}) for part in parts]
+
 
 @dataclass(frozen=True)
 class GroupDone:
@@ -56,6 +70,14 @@ class GroupDone:
     results: tuple[Result, ...]
     upload: bytes | None = None
     failure: ScoringFailure | None = None
+
+
+def describe_jobs(jobs: list[Job]) -> str:
+    """Which jobs failed, in words."""
+    if not jobs:
+        return ""
+    first, more = jobs[0], f" and {len(jobs) - 1} more" if len(jobs) > 1 else ""
+    return f" at {describe_job(first.kind, first.generation, first.candidate, first.seeds)}{more}"
 
 
 class AbandonedError(Exception):

@@ -15,14 +15,14 @@ from typing import Any
 from dreamfleet.common.errors import BundleError, DreamfleetError
 from dreamfleet.common.host.stall_watch import START_LIMIT, StallWatch, describe_slow_start, describe_stall
 from dreamfleet.common.printable import truncate
-from dreamfleet.common.protocol.failures import describe_job, is_host_failure
+from dreamfleet.common.protocol.failures import is_host_failure
 from dreamfleet.common.protocol.messages import Job, Result, TaskSpec
 from dreamfleet.worker.scoring.failure_cause import describe_crash, describe_exit, is_hosts_fault
 from dreamfleet.worker.service.child import ChildReady
 from dreamfleet.worker.service.child_process import EXIT_GRACE, ChildMessage, ChildProcess
 from dreamfleet.worker.service.failure_log import ScoringFailure
 from dreamfleet.worker.service.frame_sampler import SampledFrame
-from dreamfleet.worker.service.job_group import GroupDone, JobGroup, JobWithVector
+from dreamfleet.worker.service.job_group import GroupDone, JobGroup, JobWithVector, describe_jobs
 
 log = logging.getLogger(__name__)
 FAILED_STARTS = 3  # failed starts in a row that end the worker
@@ -149,11 +149,15 @@ class Slot:
 
     def submit(self, work: Sequence[JobWithVector]) -> None:
         """Send the child a group of jobs."""
-        assert self._child is not None  # the caller checked `idle` or `can_queue_another`
-        self._sent += 1
-        group = JobGroup(self._sent, work)
+        group = JobGroup(0, work)
         self._groups.append(group)
-        if len(self._groups) == 1:
+        self._send(group)
+
+    def _send(self, group: JobGroup) -> None:
+        assert self._child is not None  # the caller has seen one
+        self._sent += 1
+        group.number = self._sent
+        if group is self._groups[0]:
             self._watch.restart()
         if not self._child.send(group.number, group.work):
             self._kill("it read no job")
@@ -197,7 +201,7 @@ class Slot:
         for group in self._groups:
             digests = {job.digest for job in group.jobs}
             group.unwanted |= {digest} & digests
-            if group.unwanted == digests and self._child:
+            if group.unwanted == digests and group.number and self._child:
                 self._child.abandon_group(group.number)
 
     def handle(self, event: SlotEvent) -> tuple[Result, ...]:
@@ -260,8 +264,8 @@ class Slot:
     def _finish_group(self, done: GroupDone) -> tuple[Result, ...]:
         """Take a group's results.
 
-        R8: a child may be poisoned by what it scored before, so only a fresh one fails a job. Another child is
-        replaced, and the new one scores the failed jobs first.
+        R8: a child may be poisoned by what it scored before, and a small group by one of its jobs. So only a fresh
+        child fails a job that it scored alone. Otherwise it is replaced, and the new one scores the failed jobs first.
         """
         group = self._groups.popleft()
         self._useless_children = 0
@@ -272,12 +276,13 @@ class Slot:
         )
         self._watch.restart()
         failed = {each.digest for each in done.results if each.fitness is None}
-        if failed and group.number > 1:
-            group.work = [work for work in group.work if work[0].digest in failed]
-            self._groups.appendleft(group)
-            log.warning("slot %d failed%s; a fresh process tries again", self.number, _describe_jobs(group.jobs))
+        if failed and (group.number > 1 or group.is_small):
+            self._groups.extendleft(reversed(group.split(failed)))
+            jobs = [job for job in group.jobs if job.digest in failed]
+            log.warning("slot %d failed%s; a fresh process tries again", self.number, describe_jobs(jobs))
             self._restart()
             return tuple(each for each in done.results if each.fitness is not None)
+        self._send_next()
         if self._child and not self._groups and self._memory_limit and (now := monotonic()) >= self._weigh_at:
             self._weigh_at = now + LOOK_INTERVAL
             if (resident_bytes := self._child.memory) > self._memory_limit:
@@ -303,14 +308,15 @@ class Slot:
         ended_by = "it closed its pipe and ran on" if status is None else self._last_error or describe_exit(status)
         reason = self._kill_reason or ended_by
         running = self.running if self.ready else []  # before it was ready it ran nothing
-        log.warning("slot %d ended (%s)%s; starting another", self.number, reason, _describe_jobs(running))
+        log.warning("slot %d ended (%s)%s; starting another", self.number, reason, describe_jobs(running))
         if not self.ready and is_host_failure(reason):
             self._count_starved_start(reason)
             return ()
         if not self.ready:
             self._count_failed_start(reason)
-        if running and self._groups[0].number > 1:
-            self.start()  # with the same jobs
+        if running and (self._groups[0].number > 1 or self._groups[0].is_small):
+            self._groups.extendleft(reversed(self._groups.popleft().split()))
+            self.start()
             return ()
         if running:
             self._groups.popleft()
@@ -378,19 +384,20 @@ class Slot:
             return
         self._child.show(self._is_watched)
         self._watch.restart()
-        waiting, self._groups = self._groups, deque()
-        for group in waiting:
-            if wanted := [work for work in group.work if work[0].digest not in group.unwanted]:
-                self.submit(wanted)
+        for group in self._groups:
+            group.number = 0
+        self._send_next()
+
+    def _send_next(self) -> None:
+        """Send the child the next group that waits for it, if the child has none."""
+        while self._groups and not self._groups[0].number:
+            group = self._groups[0]
+            group.work = [work for work in group.work if work[0].digest not in group.unwanted]
+            if group.work:
+                self._send(group)
+            else:
+                self._groups.popleft()
 
 
 def _cannot_start(reason: str) -> DreamfleetError:
     return DreamfleetError(f"a slot cannot start: {reason}; `dreamfleet doctor` looks for the cause")
-
-
-def _describe_jobs(jobs: list[Job]) -> str:
-    """Which jobs failed, in words."""
-    if not jobs:
-        return ""
-    first, more = jobs[0], f" and {len(jobs) - 1} more" if len(jobs) > 1 else ""
-    return f" at {describe_job(first.kind, first.generation, first.candidate, first.seeds)}{more}"

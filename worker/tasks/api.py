@@ -28,10 +28,10 @@ from dreamfleet.worker.tasks.policy import Driver, FlatPolicy
 
 __all__ = [
     "STEERING_GAS_BRAKE", "Actions", "Assignment", "Batch", "BatchedTask", "Continuous", "Description", "Discrete",
-    "DreamReward", "Driver", "EndRule", "Episode", "Mirror", "Policy", "PolicyWithOutputs", "Preprocessing",
-    "RecordableTask", "RewardAwarePolicy", "RewardFacts", "Score", "StepObserver", "StepSnapshot", "Task",
-    "TaskWithBeginnings", "TaskWithOptions", "TaskWithPolicies", "TaskWithTrueState", "WatchableBatch", "World",
-    "WorldFacts", "one_hot",
+    "DreamReward", "Driver", "EndRule", "Episode", "Mirror", "Policies", "Policy", "PolicySideBySide",
+    "PolicyWithOutputs", "Preprocessing", "RecordableTask", "RewardAwarePolicy", "RewardFacts", "Score",
+    "StepObserver", "StepSnapshot", "Task", "TaskWithBeginnings", "TaskWithOptions", "TaskWithPolicies",
+    "TaskWithTrueState", "WatchableBatch", "World", "WorldFacts", "one_hot",
 ]  # fmt: skip
 
 ENVIRONMENT_LIMIT = 10**6  # steps: the environment's own limit ends an episode
@@ -82,6 +82,46 @@ class PolicyWithOutputs(Protocol):
 
     def outputs(self, observation: Any) -> Any:
         """The numbers that an action comes from, as one or more arrays. Their bits distinguish host classes too."""
+
+
+class Policies(Protocol):
+    """Several controllers that act side by side, one a row; an action has the bits that it has alone.
+
+    >>> from dreamfleet import find_controller, make_policy
+    >>> controller = find_controller("tiny")
+    >>> policies = make_policy(controller).side_by_side()
+    >>> policies.begin(np.stack([controller.parameters, -controller.parameters]))
+    >>> policies.act(np.zeros((2, 64, 64, 3), np.uint8)).shape
+    (2, 3)
+    """
+
+    def begin(self, parameters: NDArray[np.float32]) -> None:
+        """Start an episode for each row of `parameters` `(rows, size)`."""
+
+    def act(self, observations: NDArray[Any]) -> NDArray[Any]:
+        """An action for each of the observations `(rows, ...)`."""
+
+    def reward(self, values: NDArray[np.float64]) -> None:
+        """Called with the rewards `(rows,)` of the last actions, before the next `act`."""
+
+    def keep(self, rows: Sequence[int]) -> None:
+        """Go on with these rows alone: the other episodes are over."""
+
+
+@runtime_checkable
+class PolicySideBySide(Protocol):
+    """Optional: a policy that can act for several episodes at once.
+
+    If its task has a `batch_size` of more than 1, a slot drives that many episodes side by side, each in an environment
+    of its own.
+
+    >>> from dreamfleet import find_controller, make_policy
+    >>> isinstance(make_policy(find_controller("tiny")), PolicySideBySide)
+    True
+    """
+
+    def side_by_side(self) -> Policies:
+        """The same policy for several controllers."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from gymnasium.error import InvalidAction
 import dreamfleet.worker.car_racing  # noqa: F401 - registers the environment
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.errors import DreamfleetError
-from dreamfleet.worker.bench.environment import drive_lap, make_random_controller, random_discrete_action
+from dreamfleet.worker.bench.environment import drive_lap, make_random_policy, random_discrete_action
 from dreamfleet.worker.car_racing.environment import (
     GRASS,
     PICTURES,
@@ -45,7 +45,7 @@ def test_random_driving_looks_the_same(seed):
 @pytest.mark.slow
 @needs_native
 def test_evolved_driving_looks_the_same():
-    act = make_random_controller(find_bundle("tiny"))
+    act = make_random_policy(find_bundle("tiny")).act
     assert compare(5, 160, lambda _step, seen, _random: act(seen)) is None
 
 

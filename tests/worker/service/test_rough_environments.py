@@ -12,6 +12,7 @@ import pytest
 
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.worker.service.job_group import MOST_TRIED_ALONE
 from dreamfleet.worker.service.slot import Slot
 from dreamfleet.worker.service.slot_budget import SharedSlots
 from dreamfleet.worker.service.slot_pool import SlotPool
@@ -176,13 +177,33 @@ def test_a_failed_job_that_is_not_wanted_is_not_repeated(harness):
     assert slot.score(3).fitness is not None
 
 
-def test_the_failures_of_a_fresh_childs_first_group_are_reported_at_once(harness):
+def test_the_failures_of_a_fresh_childs_first_large_group_are_reported_at_once(harness):
     slot = harness(tasks.EXPLODING)
     slot.wait_ready()
     pid = slot.slot.pid
-    slot.slot.submit([(job(number, spec=slot.spec), VECTOR) for number in range(2)])
-    assert [each.fitness for each in slot.results()] == [None, None]
+    slot.slot.submit([(job(number, spec=slot.spec), VECTOR) for number in range(MOST_TRIED_ALONE + 1)])
+    assert [each.fitness for each in slot.results()] == [None] * (MOST_TRIED_ALONE + 1)
     assert slot.slot.pid == pid
+
+
+def test_the_jobs_of_a_small_group_that_failed_are_tried_one_by_one(harness):
+    slot = harness(tasks.EXPLODING)
+    slot.wait_ready()
+    jobs = [job(number, spec=slot.spec) for number in range(3)]
+    slot.slot.submit([(each, VECTOR) for each in jobs])
+    for each in jobs:
+        assert [(result.digest, result.fitness) for result in slot.results()] == [(each.digest, None)]
+
+
+def test_a_job_that_crashes_its_process_takes_no_other_with_it(harness):
+    slot = harness(rough_tasks.OneCrashes)
+    slot.wait_ready()
+    jobs = [job(number, spec=slot.spec) for number in range(4)]
+    slot.slot.submit([(each, VECTOR) for each in jobs])
+    found = {}
+    while len(found) < len(jobs):
+        found |= {result.digest: result.fitness is not None for result in slot.results()}
+    assert found == {each.digest: each.seeds[0] != rough_tasks.DEADLY for each in jobs}
 
 
 def test_a_copy_of_the_child_does_not_answer(harness, left):
