@@ -157,8 +157,8 @@ class Job:
 
     @property
     def runs_alone(self) -> bool:
-        """Whether a slot runs this job alone; dreams of candidates are batched."""
-        return self.kind != "score" or bool(self.driven)
+        """Whether a slot runs this job alone; candidates' jobs may share one."""
+        return self.kind != "score"
 
     def spec(self, run_spec: TaskSpec) -> TaskSpec:
         """The run's specification with this job's overrides."""
@@ -246,6 +246,8 @@ class Heartbeat(Message):
     reason: Reason = field(default="", metadata=OPTIONAL)  # the worker leaves, and this is its last heartbeat
     # Of `capacity`, what the worker's other runs use now: jobs given to it would wait.
     taken: Annotated[int, Between(0, MAX_LEASES)] = field(default=0, metadata=OPTIONAL)
+    # Candidates' drives that a slot does side by side, where its task scores candidates otherwise, as a dream does.
+    together: Annotated[int, Between(1, MAX_LEASES)] = field(default=1, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -346,6 +348,7 @@ class HelloReply:
     reasons: bool = field(default=False, metadata=OPTIONAL)  # whether it reads `Heartbeat.reason`
     share: FleetShare = field(default=1.0, metadata=OPTIONAL)  # of a worker's slots, relative to its other runs
     taken: bool = field(default=False, metadata=OPTIONAL)  # whether it reads `Heartbeat.taken`
+    together: bool = field(default=False, metadata=OPTIONAL)  # whether it reads `Heartbeat.together`
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -62,7 +62,6 @@ class Fleet:
         self.drain_background = False  # only evaluations and kept rollouts are left to wait for
         self.paused = False
         self.checked: Work | None = None  # the job whose accepted result the last result repeats
-        self.single_job = False  # a slot scores one job at a time, even of a task whose slots score several at once
 
     def withdraw(self, digests: Iterable[bytes]) -> None:
         """Want these jobs no more; results that still come are obsolete."""
@@ -126,9 +125,7 @@ class Fleet:
             if beat.reason:  # R24: it fails before it can score, and has no token that could vanish
                 self.handle_departure(identity, now)
         beat = self._check_numbering(member, beat)
-        if self.single_job:
-            beat = replace(beat, capacity=min(beat.capacity, beat.slots))
-        for sent in member.apply_heartbeat(beat, now, single_job=self.single_job):
+        for sent in member.apply_heartbeat(beat, now):
             for work in sent.content.work:
                 self.event_log.add(now, "seen", identity, work.job.digest)
         running = {self.jobs.digest_of_tag(run.tag): run.steps for run in beat.running}
@@ -454,7 +451,7 @@ class Fleet:
 
     def _add_lease(self, member: Member, digest: bytes, lease: Lease) -> None:
         pending = self.jobs[digest]
-        lease.is_background, lease.runs_alone = pending.is_background, pending.work.job.runs_alone
+        lease.is_background, lease.job = pending.is_background, pending.work.job
         member.leases[digest] = lease
         self.jobs.add_holder(digest, member.identity)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 
 from dreamfleet.common.printable import one_line
-from dreamfleet.common.protocol.messages import MAX_LEASES, Heartbeat, Result, Verdict
+from dreamfleet.common.protocol.messages import MAX_LEASES, Heartbeat, Job, Result, Verdict
 from dreamfleet.coordinator.dispatch.host_stats import HostStats
 from dreamfleet.coordinator.dispatch.packing import BatchContent
 
@@ -45,7 +45,7 @@ class Lease:
     batch: int
     group: DispatchGroup
     is_background: bool = False
-    runs_alone: bool = False  # it takes a whole slot, also of a task whose slots score several jobs at once
+    job: Job | None = None
     absent_heartbeats: int = 0  # in a row that confirm the batch and do not list the job
     steps: int | None = None  # environment steps so far, once a heartbeat has shown the job running
     steps_seen_at: float = 0.0  # when the last heartbeat came
@@ -78,6 +78,7 @@ class Member:
     capacity: int = 0
     batch_size: int = 1  # candidates' jobs that one of its slots scores at once
     taken: int = 0  # of its capacity, what its other runs use now
+    together: int = 1  # candidates' drives that one of its slots does side by side
     leaves_with_run: bool = False  # it reads that the run has ended, and then exits
     reads_end: bool = False  # it reads why the run has ended, and leaves it
     gone_since: float | None = None  # when its token vanished, or its first heartbeat was its last
@@ -165,16 +166,18 @@ class Member:
         """How many more jobs it may be given whose results are compared."""
         return min(2 * self.capacity, MAX_LEASES) - self.held_share if self.is_reachable else 0
 
-    def share_of(self, *, runs_alone: bool) -> int:
-        """How much of its `capacity` a job takes: one that runs alone takes a whole slot."""
-        return self.batch_size if runs_alone else 1
+    def share_of(self, job: Job) -> int:
+        """How much of its `capacity` a job takes: one that runs alone takes a whole slot, a drive its part of one."""
+        if job.runs_alone:
+            return self.batch_size
+        return math.ceil(self.batch_size / self.together) if job.driven else 1
 
     @property
     def held_share(self) -> int:
         """How much of its `capacity` its leases take; more than all of it if some wait there."""
         if self.batch_size == 1:
             return len(self.leases)
-        return sum(self.share_of(runs_alone=lease.runs_alone) for lease in self.leases.values())
+        return sum(self.share_of(lease.job) for lease in self.leases.values() if lease.job)
 
     @property
     def slot_steps_per_second(self) -> float:
@@ -195,17 +198,17 @@ class Member:
         self.unconfirmed.clear()
         self.cancels, self.verdicts = [], []
 
-    def apply_heartbeat(self, beat: Heartbeat, now: float, *, single_job: bool = False) -> list[SentBatch]:
+    def apply_heartbeat(self, beat: Heartbeat, now: float) -> list[SentBatch]:
         """Take what a heartbeat says of the worker; return the batches that it confirms for the first time.
 
         R11: a batch is kept until a heartbeat confirms it. R19: the first heartbeat turns a guest into a member
-        with credit. With `single_job` its slots score one job at a time.
+        with credit.
         """
         self.is_guest = False
         self.farewell = one_line(beat.reason)
         self.capacity, self.slots, self.confirmed = beat.capacity, beat.slots, beat.seen
-        self.taken = beat.taken
-        self.batch_size = 1 if single_job else max(self.batch_size, math.ceil(beat.capacity / max(beat.slots, 1)))
+        self.taken, self.together = beat.taken, beat.together
+        self.batch_size = max(self.batch_size, math.ceil(beat.capacity / max(beat.slots, 1)))
         self.was_ready = self.was_ready or beat.capacity > 0
         self.load, self.steps_per_second, self.drawn_by = beat.load, beat.steps_per_second, beat.drawn_by
         if beat.running and beat.steps_per_second:

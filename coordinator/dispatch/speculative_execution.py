@@ -77,10 +77,10 @@ class SpeculativeExecution:
         ):
             for move in self._moves(taker, takers, loads, jobs, moved, now):
                 moved.add(move.digest)
-                runs_alone = jobs[move.digest].work.job.runs_alone
-                loads[taker.identity] += taker.share_of(runs_alone=runs_alone)
+                job = jobs[move.digest].work.job
+                loads[taker.identity] += taker.share_of(job)
                 if move.donor:
-                    loads[move.donor] -= members[move.donor].share_of(runs_alone=runs_alone)
+                    loads[move.donor] -= members[move.donor].share_of(job)
                 yield move
 
     def _moves(
@@ -189,7 +189,7 @@ class SpeculativeExecution:
 
 def _share(member: Member, given: Iterable[Work]) -> int:
     """How much of a member's capacity the work that it is about to be sent takes."""
-    return sum(member.share_of(runs_alone=work.job.runs_alone) for work in given)
+    return sum(member.share_of(work.job) for work in given)
 
 
 def _may_take(digest: bytes, taker: Member, jobs: Mapping[bytes, PendingJob]) -> bool:

@@ -142,7 +142,7 @@ class JobAssignment:
         self.given.setdefault(name, []).append(self._jobs[digest].work)
         self._jobs.add_holder(digest, name, by_share=by_share)
         if name in self.shares:
-            self.shares[name] += self._members[name].share_of(runs_alone=job.runs_alone)
+            self.shares[name] += self._members[name].share_of(job)
             if self.shares[name] >= self._members[name].capacity:
                 self._idle.discard(name)
             if self.shares[name] >= self._full_at[name]:
@@ -176,7 +176,7 @@ class JobAssignment:
     def _load(self, name: str) -> int:
         """How much of a member's capacity its jobs take, those that it is given now included."""
         member = self._members[name]
-        own = (member.share_of(runs_alone=work.job.runs_alone) for work in self.given.get(name, ()))
+        own = (member.share_of(work.job) for work in self.given.get(name, ()))
         return member.held_share + sum(own)
 
 

@@ -362,7 +362,7 @@ class Run:
         self.generation = generation
         self.verification.restore(generation.work)
         self.work_clock.restart()
-        self._prepare_fleet(generation)
+        self.fleet.jobs.begin_generation(generation.number)
 
     def _replace_generation(self, generation: Generation) -> None:
         """Score the open generation as it is now."""
@@ -398,7 +398,7 @@ class Run:
         generation = self.generation
         if len(self._agenda.stages) > 1:
             self.fleet.notes.append(f"generation {generation.number} is in {self._stage_text}")
-        self._prepare_fleet(generation)
+        self.fleet.jobs.begin_generation(generation.number)
         self.verification.restore(generation.work)
         if self._journal.fact(PAUSED) is not None:
             self.pause(BY_HAND)
@@ -429,10 +429,6 @@ class Run:
             self._begin_ending(reason)
         else:
             self.fleet.jobs.offer(generation.missing)
-
-    def _prepare_fleet(self, generation: Generation) -> None:
-        self.fleet.jobs.begin_generation(generation.number)
-        self.fleet.single_job = self.generations.scoring_params.stage.driven == 1
 
     def _note_stage_changes(self, generation: Generation) -> None:
         """Note for the log that a generation opens in another stage, and why."""

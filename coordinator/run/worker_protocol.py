@@ -79,6 +79,7 @@ class WorkerProtocol:
             reasons=True,
             share=self._run.fleet_share,
             taken=True,
+            together=True,
         )
 
     def handle(self, worker: str, message: WorkerMessage, now: float) -> None:

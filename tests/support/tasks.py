@@ -158,6 +158,40 @@ class Crashing(Toy):
         return CrashingPolicy()
 
 
+class SideBySide(Toy):
+    """A slot drives up to four episodes at once."""
+
+    batch_size = 4
+
+    def make_policy(self, assignment):
+        return SideBySidePolicy()
+
+
+class SideBySidePolicy(ToyPolicy):
+    def side_by_side(self):
+        return ToyPolicies()
+
+
+class OneByOne(Toy):
+    """A slot takes one job after the other, whatever `batch_size` says: the policy is for one episode."""
+
+    batch_size = 4
+
+
+class ToyPolicies:
+    def begin(self, parameters):
+        self._actions = parameters[:, :8].astype(np.float64)
+
+    def act(self, observations):
+        return self._actions
+
+    def reward(self, values):
+        pass
+
+    def keep(self, rows):
+        self._actions = self._actions[rows]
+
+
 class CrashingPolicy(ToyPolicy):
     def act(self, observation):
         os.kill(os.getpid(), signal.SIGSEGV)

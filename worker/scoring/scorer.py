@@ -76,8 +76,11 @@ class Scorer(Displayed):
         self._environment = task.make_environment(assignment)
         self._more_environments: list[gymnasium.Env[Any, Any]] = []  # for episodes that are driven side by side
         self._policy = task.make_policy(assignment)
-        truth = getattr(task.reality(assignment), "truth", None)
+        reality = task.reality(assignment)
+        truth = getattr(reality, "truth", None)
         self._measurer = Measurer(spec.measures, self.world.actions, self.world.action_names, truth)
+        able = isinstance(self._policy, PolicySideBySide) and not (spec.measures or isinstance(reality, BatchedTask))
+        self.together = reality.batch_size if able else 1  # candidates' drives that it does side by side
         self._preprocessing = "" if bundle is None else bundle.manifest.preprocessing
         self._data_world = OF_FIRST_WORLD if bundle is None else DataWorld.of(bundle)
 
@@ -211,14 +214,13 @@ class Scorer(Displayed):
 
     def _policies_for(self, jobs: Sequence[object]) -> Policies | None:
         """The policies that drive these jobs side by side; `None` if they are driven one by one."""
-        several = 1 < len(jobs) <= self._task.batch_size
-        if not several or self._batch_for or self.observer or self.spec.measures:
-            return None
-        return self._policies
+        return self._policies if 1 < len(jobs) <= self.together and self.observer is None else None
 
     @cached_property
-    def _policies(self) -> Policies | None:
-        return self._policy.side_by_side() if isinstance(self._policy, PolicySideBySide) else None
+    def _policies(self) -> Policies:
+        policy: Any = self._policy  # where `together` says so, it is a `PolicySideBySide`
+        found: Policies = policy.side_by_side()
+        return found
 
     def _drive_together(
         self, policies: Policies, jobs: Sequence[tuple[Kind, NDArray[np.float32], int]],

@@ -43,6 +43,7 @@ class Admission:
     reasons: bool = False  # whether the coordinator reads why a worker leaves
     share: float = 1.0  # of the worker's slots, relative to its other runs' shares
     taken: bool = False  # whether the coordinator reads what other runs use
+    together: bool = False  # whether the coordinator reads how many drives a slot does side by side
 
 
 def request_admission(
@@ -172,4 +173,5 @@ def _read_admission(reply: HelloReply) -> Admission:
     return Admission(
         keys.check_run_name(reply.run), reply.run_uid, reply.incarnation, reply.nonce, spec, intervals, reply.packages,
         reply.numbering, reply.classes, reply.reasons, reply.share, reply.taken,
+        reply.together,
     )  # fmt: skip

@@ -93,6 +93,11 @@ class Backlog:
         self._trim()
         return refused
 
+    @property
+    def is_driven(self) -> bool:
+        """Whether the first queued job is a drive of a task that scores candidates otherwise."""
+        return bool(self._jobs) and bool(next(iter(self._jobs.values())).driven)
+
     def take(self, count: int) -> list[tuple[Job, bytes]]:
         """Remove and return the first jobs whose vectors are complete, with their vectors.
 

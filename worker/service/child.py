@@ -25,10 +25,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ChildReady:
-    """First message of a child: it can score. `drawn_by` names what draws its pictures."""
+    """First message of a child: it can score.
+
+    `drawn_by` names what draws its pictures; `together` says how many drives it does side by side.
+    """
 
     drawn_by: str
     host_class: str
+    together: int = 1
 
 
 def serve_jobs(
@@ -70,7 +74,7 @@ def _make_scorer(
             opened = Bundle.open(bundle, spec.bundle)
             check_world_allowed(opened, allowed_tasks)
         scorer = Scorer(spec, opened)
-        pipe.send(ChildReady(scorer.drawn_by, scorer.host_class))
+        pipe.send(ChildReady(scorer.drawn_by, scorer.host_class, scorer.together))
         return scorer
     except BaseException as error:  # a simulator may raise `SystemExit`
         failure = ScoringFailure.of(error)

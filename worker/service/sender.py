@@ -103,6 +103,7 @@ class CoordinatorSender:
             host_class=self._host_class(slots),
             reason=reason if self._admission.reasons else "",
             taken=min(slots.taken, capacity) if self._admission.taken else 0,
+            together=slots.together if self._admission.together else 1,
         )
         self._publish(keys.heartbeat(self._admission.run, self._identity), beat)
 

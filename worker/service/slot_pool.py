@@ -56,7 +56,8 @@ class SlotPool:
         self._task = spec.task
         task = find_task(spec.task)
         self._batch_size = task.batch_size
-        self._batches_pay = isinstance(task, BatchedTask)  # then each batch costs some time of its own
+        self._has_batches = isinstance(task, BatchedTask)
+        self.together = 1  # candidates' drives that a slot does side by side; reported by the first child that is ready
         self._failures = FailureLog()
         self.host_class = ""  # reported by the first child that is ready
         self._watched = False
@@ -180,6 +181,7 @@ class SlotPool:
         slot = self._slots[event.slot]
         if isinstance(event.message, ChildReady):
             self.host_class = self.host_class or event.message.host_class
+            self.together = event.message.together
         if event.failure is not None:
             # A child that is not ready yet has started no job, so none is named.
             text = self._failures.format_if_new(event.failure, self._task, slot.running if slot.ready else ())
@@ -229,11 +231,12 @@ class SlotPool:
     def _group_size(self, backlog: Backlog) -> int:
         """How many jobs a slot takes at once.
 
-        Episodes that are driven side by side save time, but less than a slot without any loses. So as the jobs run
-        out, the groups shrink.
+        A drive beside others saves less time than a slot without any loses. So as the drives run out, their groups
+        shrink.
         """
-        share = math.ceil(len(backlog) / len(self._slots))
-        return self._batch_size if self._batches_pay else max(1, min(self._batch_size, share))
+        if self._has_batches and not backlog.is_driven:
+            return self._batch_size
+        return max(1, min(self.together, math.ceil(len(backlog) / len(self._slots))))
 
     def _count_groups(self, backlog: Backlog) -> int:
         return math.ceil(len(backlog) / self._group_size(backlog))

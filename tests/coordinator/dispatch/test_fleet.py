@@ -93,14 +93,12 @@ def test_credit_is_twice_the_capacity_and_a_result_returns_it():
     assert [(verdict.digest, verdict.verdict) for verdict in send.content.verdicts] == [(given[0], "accepted")]
 
 
-def test_while_jobs_are_done_alone_a_wide_workers_capacity_is_its_slots():
-    fleet = fleet_of(A, jobs=50)
-    wide = replace(beat(capacity=200), slots=2, seen=1)
-    for alone, capacity in ((False, 200), (True, 2)):
-        fleet.single_job = alone
-        fleet.handle_heartbeat(A, wide, 1.0)
-        assert fleet.members[A].capacity == capacity
-        assert len(digests(fleet.dispatch(1.0), A)) == (50 if capacity == 200 else 0)
+@pytest.mark.parametrize(("driven", "together", "given"), [(None, 1, 50), (True, 1, 4), (True, 4, 16)])
+def test_of_drives_a_wide_worker_is_given_as_many_as_its_slots_do_at_once_and_once_more(driven, together, given):
+    fleet = fleet_of(A, jobs=0)
+    fleet.jobs.offer([replace(each, job=replace(each.job, driven=driven)) for each in work(50)])
+    fleet.handle_heartbeat(A, replace(beat(capacity=200), slots=2, together=together), 1.0)
+    assert len(digests(fleet.dispatch(1.0), A)) == given
 
 
 def test_batches_count_without_a_gap():

@@ -10,6 +10,7 @@ from dreamfleet import find_controller
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.worker.car_racing.task import CarRacingTask
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.worldmodel.mdnrnn_config import REWARDED
 from tests.support.bundles import write_random_bundle
@@ -90,4 +91,26 @@ def test_parameters_that_are_no_numbers_are_refused():
     wrong = np.full(bundle.controller_shape.size, np.nan, np.float32)
     with pytest.raises(ValueError, match="NaN or infinity"):
         scorer.score_all([*jobs(bundle)[:3], ("score", wrong, 1)], lambda _: None)
+    scorer.close()
+
+
+def test_the_drives_of_a_dreams_run_are_driven_side_by_side():
+    bundle = find_bundle("tiny-int8")
+    asked = TaskSpec("dream", bundle.sha256, horizon=60, patience=30, temperature=1.0)
+    scorer = Scorer(asked, bundle)
+    assert scorer.together == CarRacingTask.batch_size
+    driven = asked.with_overrides(driven=True)
+    together = scorer.score_all(jobs(bundle), lambda _: None, driven)
+    assert together == [scorer.score(*each, spec=driven) for each in jobs(bundle)]
+    real = Scorer(spec(bundle), bundle)
+    assert together == real.score_all(jobs(bundle), lambda _: None)
+    for each in (scorer, real):
+        each.close()
+
+
+def test_measured_episodes_are_driven_one_by_one():
+    bundle = find_bundle("tiny-int8")
+    scorer = Scorer(spec(bundle, measures=("gas",)), bundle)
+    assert scorer.together == 1
+    assert all(score.measures for score in scorer.score_all(jobs(bundle)[:2], lambda _: None))
     scorer.close()
