@@ -55,8 +55,7 @@ class SlotPool:
         self._share, self._all_at_once = share, all_at_once
         self._task = spec.task
         task = find_task(spec.task)
-        self._batch_size = task.batch_size
-        self._has_batches = isinstance(task, BatchedTask)
+        self._batch_size = task.batch_size if isinstance(task, BatchedTask) else None
         self.together = 1  # candidates' drives that a slot does side by side; reported by the first child that is ready
         self._failures = FailureLog()
         self.host_class = ""  # reported by the first child that is ready
@@ -98,7 +97,7 @@ class SlotPool:
 
         R14: the coordinator gives this worker at most twice as many jobs, so that little is lost with it.
         """
-        return min(min(self.ready_count, self._share.allowance) * self._batch_size, MAX_LEASES // 2)
+        return min(min(self.ready_count, self._share.allowance) * self._jobs_a_slot, MAX_LEASES // 2)
 
     @property
     def taken(self) -> int:
@@ -106,7 +105,7 @@ class SlotPool:
 
         R17: such a slot is not idle, so it takes over no job of another worker and copies none.
         """
-        return max(0, self.capacity - self._share.usable * self._batch_size)
+        return max(0, self.capacity - self._share.usable * self._jobs_a_slot)
 
     @property
     def steps(self) -> int:
@@ -137,7 +136,7 @@ class SlotPool:
 
         R26: nothing starts while too many results, `undelivered`, wait for a verdict, so the outbox stays bounded.
         """
-        room = 4 * len(self._slots) * self._batch_size - undelivered
+        room = 4 * len(self._slots) * self._jobs_a_slot - undelivered
         idle = [slot for slot in self._slots if slot.idle and room >= 0]
         groups = self._count_groups(backlog)
         self._settle(min(groups, len(idle)), has_jobs=groups > 0)
@@ -228,13 +227,18 @@ class SlotPool:
             slot.submit(work)
         return bool(work)
 
+    @property
+    def _jobs_a_slot(self) -> int:
+        """Candidates' jobs that a slot scores at once."""
+        return self._batch_size or self.together
+
     def _group_size(self, backlog: Backlog) -> int:
         """How many jobs a slot takes at once.
 
         A drive beside others saves less time than a slot without any loses. So as the drives run out, their groups
         shrink.
         """
-        if self._has_batches and not backlog.is_driven:
+        if self._batch_size and not backlog.is_driven:
             return self._batch_size
         return max(1, min(self.together, math.ceil(len(backlog) / len(self._slots))))
 

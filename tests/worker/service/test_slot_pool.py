@@ -79,5 +79,5 @@ def test_a_few_jobs_go_to_as_many_slots(pool):
 
 def test_jobs_of_a_task_without_such_a_policy_are_scored_one_by_one(pool):
     fleet = pool(f"{tasks.MODULE}:OneByOne")
-    assert fleet.slots.together == 1
+    assert (fleet.slots.together, fleet.slots.capacity) == (1, 2)
     assert fleet.score(5)[2] == [1] * 5
