@@ -27,6 +27,7 @@ MAX_OPTIONS = 8_000  # characters; statuses and controllers contain them too
 MAX_END = 32  # characters of an end rule
 MAX_REASON = 400  # characters of why a worker leaves, or a run has ended
 MAX_LEASES = 1024  # of one worker; a heartbeat lists them all and must stay under MAX_MESSAGE
+MOST_TOGETHER = 8  # candidates' drives that a slot does side by side
 MAX_BATCHES = 2**53  # never reached
 MAX_SLOTS = 4096  # of one worker
 TAG_BYTES = 8
@@ -247,7 +248,7 @@ class Heartbeat(Message):
     # Of `capacity`, what the worker's other runs use now: jobs given to it would wait.
     taken: Annotated[int, Between(0, MAX_LEASES)] = field(default=0, metadata=OPTIONAL)
     # Candidates' drives that a slot does side by side, where its task scores candidates otherwise, as a dream does.
-    together: Annotated[int, Between(1, MAX_LEASES)] = field(default=1, metadata=OPTIONAL)
+    together: Annotated[int, Between(1, MOST_TOGETHER)] = field(default=1, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -241,6 +241,7 @@ class Fleet:
         R22: a member without news gets an empty batch, else it would say hello again.
         """
         self._now = now
+        self._share_slots()
         for member in self.members.values():
             member.record_turnarounds(now)
         is_planned = durable and self._planned_at == now  # the turn's jobs went out before its commit
@@ -259,6 +260,13 @@ class Fleet:
             member.last_sent = now if batches else member.last_sent
             sends += batches
         return sends
+
+    def _share_slots(self) -> None:
+        """Let a slot do only so many drives side by side that two rounds are left for each, so that none idles."""
+        slots = sum(member.slots for member in self.members.values() if member.takes_jobs)
+        drives = max(1, len(self.jobs) // max(2 * slots, 1))
+        for member in self.members.values():
+            member.drives_a_slot = drives
 
     def longest_held(self, *, is_background: bool) -> float:
         """Seconds after which a job has been away for too long."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 
 from dreamfleet.common.printable import one_line
-from dreamfleet.common.protocol.messages import MAX_LEASES, Heartbeat, Job, Result, Verdict
+from dreamfleet.common.protocol.messages import MAX_LEASES, MOST_TOGETHER, Heartbeat, Job, Result, Verdict
 from dreamfleet.coordinator.dispatch.host_stats import HostStats
 from dreamfleet.coordinator.dispatch.packing import BatchContent
 
@@ -79,6 +79,7 @@ class Member:
     batch_size: int = 1  # candidates' jobs that one of its slots scores at once
     taken: int = 0  # of its capacity, what its other runs use now
     together: int = 1  # candidates' drives that one of its slots does side by side
+    drives_a_slot: int = MOST_TOGETHER  # fewer once few are left
     leaves_with_run: bool = False  # it reads that the run has ended, and then exits
     reads_end: bool = False  # it reads why the run has ended, and leaves it
     gone_since: float | None = None  # when its token vanished, or its first heartbeat was its last
@@ -170,7 +171,8 @@ class Member:
         """How much of its `capacity` a job takes: one that runs alone takes a whole slot, a drive its part of one."""
         if job.runs_alone:
             return self.batch_size
-        return math.ceil(self.batch_size / self.together) if job.driven else 1
+        is_driven = job.driven or self.batch_size <= self.together
+        return math.ceil(self.batch_size / max(1, min(self.together, self.drives_a_slot))) if is_driven else 1
 
     @property
     def held_share(self) -> int:

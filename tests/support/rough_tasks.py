@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from dreamfleet.worker.tasks.api import Score
-from tests.support.tasks import Toy, ToyEnvironment
+from tests.support.tasks import SideBySide, Toy, ToyEnvironment
 
 MODULE = "tests.support.rough_tasks"
 FOLDER = "DREAMFLEET_TEST_LEFT"  # where processes that are left behind write their ids
@@ -260,6 +260,34 @@ class WearingEnvironment(ToyEnvironment):
         if self.steps > 10:
             fail()
         return super().step(action)
+
+
+class SlowToBegin(SideBySide):
+    """A reset takes a second."""
+
+    probe_steps = 0
+
+    def make_environment(self, assignment):
+        return SlowToBeginEnvironment()
+
+
+class SlowToBeginEnvironment(ToyEnvironment):
+    def reset(self, *, seed=None, options=None):
+        time.sleep(1.0)
+        return super().reset(seed=seed, options=options)
+
+
+class OnlyOne(SideBySide):
+    """A process can make one environment, as with a port of its own."""
+
+    def __init__(self):
+        self._made = False
+
+    def make_environment(self, assignment):
+        if self._made:
+            raise OSError(errno.EADDRINUSE, "Address already in use")
+        self._made = True
+        return ToyEnvironment()
 
 
 class OneCrashes(Toy):

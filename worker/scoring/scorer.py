@@ -17,7 +17,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, class_from_fingerprint
-from dreamfleet.common.protocol.messages import Kind, TaskSpec
+from dreamfleet.common.protocol.messages import MOST_TOGETHER, Kind, TaskSpec
 from dreamfleet.common.serialization.display import Displayed
 from dreamfleet.worker.scoring.episode import EpisodeConfig, score, score_together
 from dreamfleet.worker.scoring.host_class_probe import REPEAT_LIMIT, HostClassProbe
@@ -76,11 +76,9 @@ class Scorer(Displayed):
         self._environment = task.make_environment(assignment)
         self._more_environments: list[gymnasium.Env[Any, Any]] = []  # for episodes that are driven side by side
         self._policy = task.make_policy(assignment)
-        reality = task.reality(assignment)
-        truth = getattr(reality, "truth", None)
+        self._policies: Policies | None = None
+        truth = getattr(task.reality(assignment), "truth", None)
         self._measurer = Measurer(spec.measures, self.world.actions, self.world.action_names, truth)
-        able = isinstance(self._policy, PolicySideBySide) and not (spec.measures or isinstance(reality, BatchedTask))
-        self.together = reality.batch_size if able else 1  # candidates' drives that it does side by side
         self._preprocessing = "" if bundle is None else bundle.manifest.preprocessing
         self._data_world = OF_FIRST_WORLD if bundle is None else DataWorld.of(bundle)
 
@@ -217,17 +215,22 @@ class Scorer(Displayed):
         return self._policies if 1 < len(jobs) <= self.together and self.observer is None else None
 
     @cached_property
-    def _policies(self) -> Policies:
-        policy: Any = self._policy  # where `together` says so, it is a `PolicySideBySide`
-        found: Policies = policy.side_by_side()
-        return found
+    def together(self) -> int:
+        """How many candidates' drives it does side by side. Their environments are made when this is first asked."""
+        reality, policy = self._task.reality(self._assignment), self._policy
+        if self.spec.measures or isinstance(reality, BatchedTask) or not isinstance(policy, PolicySideBySide):
+            return 1
+        with suppress(BaseException):  # then they are driven one by one; `SystemExit` too, of a simulator
+            self._policies = policy.side_by_side()
+            for _ in range(min(reality.batch_size, MOST_TOGETHER) - 1):
+                self._more_environments.append(self._task.make_environment(self._assignment))
+            return 1 + len(self._more_environments)
+        return 1
 
     def _drive_together(
         self, policies: Policies, jobs: Sequence[tuple[Kind, NDArray[np.float32], int]],
         on_step: Callable[[int], None], spec: TaskSpec | None,
     ) -> list[Score]:  # fmt: skip
-        while len(self._more_environments) < len(jobs) - 1:
-            self._more_environments.append(self._task.make_environment(self._assignment))
         return score_together(
             (self._environment, *self._more_environments),
             policies,

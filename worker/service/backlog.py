@@ -61,6 +61,11 @@ class Backlog:
         return len(self._jobs)
 
     @property
+    def is_driven(self) -> bool:
+        """Whether the job that was queued first is a drive of a task that scores candidates otherwise."""
+        return bool(self._jobs) and bool(next(iter(self._jobs.values())).driven)
+
+    @property
     def queued(self) -> list[bytes]:
         """Digests of the queued jobs."""
         return list(self._jobs)
@@ -93,21 +98,21 @@ class Backlog:
         self._trim()
         return refused
 
-    @property
-    def is_driven(self) -> bool:
-        """Whether the first queued job is a drive of a task that scores candidates otherwise."""
-        return bool(self._jobs) and bool(next(iter(self._jobs.values())).driven)
+    def take(self, count: int, drives: int | None = None) -> list[tuple[Job, bytes]]:
+        """Remove and return the first job whose vector is complete, with its vector, and others of its specification.
 
-    def take(self, count: int) -> list[tuple[Job, bytes]]:
-        """Remove and return the first jobs whose vectors are complete, with their vectors.
-
-        They share one specification: up to `count` jobs, or a single job that runs alone.
+        They are at most `count`, or `drives` if they are drives of a task that scores candidates otherwise. A job that
+        runs alone is taken alone.
         R2: a job whose vector turned out to have another hash is dropped, never scored.
         """
         taken: list[tuple[Job, bytes]] = []
         for digest, job in list(self._jobs.items()):
-            if len(taken) == count or (taken and (job.runs_alone or job.overrides != taken[0][0].overrides)):
-                break
+            if taken:
+                first = taken[0][0]
+                if len(taken) >= (drives if first.driven and drives else count):
+                    break
+                if job.runs_alone or job.overrides != first.overrides:
+                    continue
             vector = self._assemble(job.vector)
             if job.vector not in self._vectors:  # its parts were of something else
                 del self._jobs[digest]

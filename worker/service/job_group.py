@@ -13,7 +13,7 @@ import numpy as np
 
 from dreamfleet.common.protocol.failures import describe_job
 from dreamfleet.common.protocol.measures import LARGEST_MEASURE
-from dreamfleet.common.protocol.messages import MAX_UPLOAD, Job, Result, TaskSpec
+from dreamfleet.common.protocol.messages import MAX_UPLOAD, MOST_TOGETHER, Job, Result, TaskSpec
 from dreamfleet.common.protocol.result_bounds import LONGEST_EPISODE, clamp_count, rejection_reason
 from dreamfleet.worker.service.failure_log import ScoringFailure
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # the child imports this module before it imports what scores
     from dreamfleet.worker.scoring.scorer import Scorer
     from dreamfleet.worker.tasks.api import Score
 
-MOST_TRIED_ALONE = 8  # jobs of a failed group that are then tried one by one
+MOST_TRIED_ALONE = MOST_TOGETHER  # jobs of a failed group that are then tried one by one
 
 JobWithVector = tuple[Job, bytes]
 """A job, and the bytes of its vector."""
@@ -42,9 +42,14 @@ class JobGroup:
         return [job for job, _ in self.work]
 
     @property
-    def size(self) -> int:
-        """Bytes of all vectors."""
-        return sum(len(vector) for _, vector in self.work)
+    def largest_size(self) -> int:
+        """Bytes of the vectors of a group of such jobs, of which the next one may have more."""
+        return max(len(vector) for _, vector in self.work) * max(len(self.work), MOST_TRIED_ALONE)
+
+    @property
+    def stall(self) -> float:
+        """Seconds without a step after which it hangs; 0: never. A few jobs may all begin, or take a step, in turn."""
+        return max(job.stall for job in self.jobs) * (len(self.work) if self.is_small else 1)
 
     @property
     def is_small(self) -> bool:

@@ -189,7 +189,7 @@ class Slot:
             limit = START_LIMIT * 2**self._failed_starts
             self._kill_after(limit, quiet, describe_slow_start(limit))
         elif self._groups:
-            limit = max(job.stall for job in self.running)
+            limit = self._groups[0].stall
             self._kill_after(limit, quiet, describe_stall(limit))
         self._check_exit(now)
 
@@ -201,7 +201,7 @@ class Slot:
         for group in self._groups:
             digests = {job.digest for job in group.jobs}
             group.unwanted |= {digest} & digests
-            if group.unwanted == digests and group.number and self._child:
+            if group.unwanted >= digests and group.number and self._child:
                 self._child.abandon_group(group.number)
 
     def handle(self, event: SlotEvent) -> tuple[Result, ...]:
@@ -270,7 +270,7 @@ class Slot:
         group = self._groups.popleft()
         self._useless_children = 0
         self._groups_are_short = (
-            group.size <= MAX_PIPELINED_BYTES
+            group.largest_size <= MAX_PIPELINED_BYTES
             and bool(done.results)
             and sum(each.seconds for each in done.results) < SHORT_GROUP
         )

@@ -221,7 +221,8 @@ class SlotPool:
 
     def _submit(self, slot: Slot, backlog: Backlog) -> bool:
         """Give a slot the next group, if one is whole."""
-        work = backlog.take(self._group_size(backlog))
+        drives = self._count_drives(backlog)
+        work = backlog.take(self._batch_size or drives, drives)
         if work:
             self._used_at[slot.number] = monotonic()
             slot.submit(work)
@@ -232,18 +233,18 @@ class SlotPool:
         """Candidates' jobs that a slot scores at once."""
         return self._batch_size or self.together
 
-    def _group_size(self, backlog: Backlog) -> int:
-        """How many jobs a slot takes at once.
+    def _count_drives(self, backlog: Backlog) -> int:
+        """How many drives a slot takes at once.
 
         A drive beside others saves less time than a slot without any loses. So as the drives run out, their groups
         shrink.
         """
-        if self._batch_size and not backlog.is_driven:
-            return self._batch_size
         return max(1, min(self.together, math.ceil(len(backlog) / len(self._slots))))
 
     def _count_groups(self, backlog: Backlog) -> int:
-        return math.ceil(len(backlog) / self._group_size(backlog))
+        """How many slots the waiting jobs could use, about."""
+        each = self._batch_size if self._batch_size and not backlog.is_driven else self._count_drives(backlog)
+        return math.ceil(len(backlog) / each)
 
     def _settle(self, wanted: int, *, has_jobs: bool) -> None:
         self._share.settle(sum(bool(slot.running) for slot in self._slots), wanted, has_jobs=has_jobs)

@@ -101,6 +101,23 @@ def test_of_drives_a_wide_worker_is_given_as_many_as_its_slots_do_at_once_and_on
     assert len(digests(fleet.dispatch(1.0), A)) == given
 
 
+def test_as_drives_run_out_a_job_that_waits_behind_one_goes_to_an_idle_slot():
+    fleet = fleet_of(A, jobs=0)
+    able = replace(beat(capacity=4), slots=1, together=4)
+    fleet.handle_heartbeat(A, able, 0.0)
+    fleet.jobs.offer(work(2, generation=1))
+    first, second = digests(fleet.dispatch(0.0), A)
+    fleet.add_worker(B, 1, "f", 1.0)
+    fleet.handle_heartbeat(B, able, 1.0)
+    fleet.handle_heartbeat(A, replace(able, seen=1, running=beat(running=(first,)).running), 1.0)
+    fleet.handle_heartbeat(
+        A, replace(able, seen=1, queued=(second[:TAG_BYTES],), running=beat(running=(first,)).running), 1.1
+    )
+    sends = fleet.dispatch(1.1)
+    assert digests(sends, B) == [second]
+    assert cancelled(sends, A) == [second]
+
+
 def test_batches_count_without_a_gap():
     fleet = fleet_of(A)
     numbers = []

@@ -21,6 +21,14 @@ def test_jobs_come_out_in_order_with_their_vector():
     assert [backlog.take(1), backlog.take(5), backlog.take(1)] == [[(job(0), VECTOR)], [(job(1), VECTOR)], []]
 
 
+def test_drives_between_dreams_are_taken_together_and_by_their_own_number():
+    backlog = Backlog(SPEC)
+    drives = [job(number, driven=True) for number in (1, 3, 5)]
+    backlog.add_batch(batch(1, (job(0), drives[0], job(2), job(6, "evaluate"), drives[1], job(4), drives[2])))
+    taken = [[each for each, _ in backlog.take(3, 2)] for _ in range(4)]
+    assert taken == [[job(0), job(2), job(4)], drives[:2], [job(6, "evaluate")], drives[2:]]
+
+
 def test_a_repeated_batch_counts_once():
     backlog = Backlog(SPEC)
     for _ in range(2):

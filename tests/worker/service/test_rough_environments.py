@@ -206,6 +206,41 @@ def test_a_job_that_crashes_its_process_takes_no_other_with_it(harness):
     assert found == {each.digest: each.seeds[0] != rough_tasks.DEADLY for each in jobs}
 
 
+def test_a_group_that_is_sent_again_without_its_unwanted_jobs_can_still_be_abandoned(harness):
+    slot = harness(tasks.SLOW_TOY)
+    assert slot.score(99).fitness is not None
+    jobs = [job(number, spec=slot.spec) for number in range(MOST_TRIED_ALONE + 4)]
+    slot.slot.submit([(each, VECTOR) for each in jobs])
+    slot.slot.abandon(jobs[0].digest)
+    os.kill(slot.slot.pid, signal.SIGKILL)
+    while slot.slot.ready:
+        slot.take()
+    slot.wait_ready()
+    assert slot.slot.running == jobs[1:]
+    for each in jobs:
+        slot.slot.abandon(each.digest)
+    while slot.slot.running:
+        assert slot.take() == ()
+
+
+def test_the_episodes_of_a_group_may_begin_one_after_the_other_without_counting_as_hung(harness):
+    slot = harness(rough_tasks.SlowToBegin)
+    slot.wait_ready()
+    pid = slot.slot.pid
+    slot.slot.submit([(replace(job(number, spec=slot.spec), stall=2.0), VECTOR) for number in range(4)])
+    assert all(each.fitness is not None for each in slot.results())
+    assert slot.slot.pid == pid
+
+
+def test_a_second_group_is_not_queued_where_its_vectors_may_not_fit_in_the_pipe(harness):
+    slot = harness(tasks.TOY)
+    for size, can_queue in ((1000, True), (60_000, False)):
+        assert slot.score(size, vector=bytes(size)).fitness is not None
+        slot.slot.submit([(job(1, spec=slot.spec), VECTOR)])
+        assert slot.slot.can_queue_another == can_queue
+        slot.results()
+
+
 def test_a_copy_of_the_child_does_not_answer(harness, left):
     slot = harness(rough_tasks.Twice)
     for number in range(3):

@@ -10,7 +10,7 @@ from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.slot_budget import SharedSlots
 from dreamfleet.worker.service.slot_pool import SlotPool
-from tests.support import tasks
+from tests.support import rough_tasks, tasks
 from tests.support.processes import DEADLINE
 from tests.support.samples import HEAD, VECTOR, VECTOR_ID, job
 
@@ -75,6 +75,12 @@ def test_groups_of_episodes_that_are_driven_side_by_side_shrink_as_the_jobs_run_
 
 def test_a_few_jobs_go_to_as_many_slots(pool):
     assert pool(SIDE_BY_SIDE).score(2)[2] == [1, 1]
+
+
+def test_where_a_second_environment_cannot_be_made_jobs_are_scored_one_by_one(pool):
+    fleet = pool(f"{rough_tasks.MODULE}:OnlyOne")
+    assert (fleet.slots.together, fleet.slots.capacity) == (1, 2)
+    assert fleet.score(5)[2] == [1] * 5
 
 
 def test_jobs_of_a_task_without_such_a_policy_are_scored_one_by_one(pool):
