@@ -63,7 +63,7 @@ class CarRacingTask(Task):
     """The task `car-racing`."""
 
     name = "car-racing"
-    batch_size: ClassVar[int] = 4  # a step takes a seventh less time than alone; eight side by side are hardly faster
+    batch_size: ClassVar[int] = 4  # with eight bits a step takes a seventh less time than alone; eight save hardly more
     world = WORLD
     drivers: Mapping[str, Callable[[np.random.Generator], Driver]] = DRIVERS
     policies = POLICIES
