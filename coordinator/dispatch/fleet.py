@@ -263,10 +263,10 @@ class Fleet:
 
     def _share_slots(self) -> None:
         """Let a slot do only so many drives side by side that two rounds are left for each, so that none idles."""
-        slots = sum(member.slots for member in self.members.values() if member.takes_jobs)
-        drives = max(1, len(self.jobs) // max(2 * slots, 1))
-        for member in self.members.values():
-            member.drives_a_slot = drives
+        able = [member for member in self.members.values() if member.together > 1]
+        slots = sum(member.slots for member in self.members.values() if member.takes_jobs) if able else 0
+        for member in able:
+            member.drives_a_slot = max(1, len(self.jobs) // max(2 * slots, 1))
 
     def longest_held(self, *, is_background: bool) -> float:
         """Seconds after which a job has been away for too long."""
