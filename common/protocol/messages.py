@@ -247,7 +247,7 @@ class Heartbeat(Message):
     reason: Reason = field(default="", metadata=OPTIONAL)  # the worker leaves, and this is its last heartbeat
     # Of `capacity`, what the worker's other runs use now: jobs given to it would wait.
     taken: Annotated[int, Between(0, MAX_LEASES)] = field(default=0, metadata=OPTIONAL)
-    # Candidates' drives that a slot does side by side, where its task scores candidates otherwise, as a dream does.
+    # Candidates' drives that a slot does side by side; `capacity` of a dream's run counts its dreams.
     together: Annotated[int, Between(1, MOST_TOGETHER)] = field(default=1, metadata=OPTIONAL)
 
 

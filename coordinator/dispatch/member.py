@@ -45,7 +45,7 @@ class Lease:
     batch: int
     group: DispatchGroup
     is_background: bool = False
-    job: Job | None = None
+    job: Job | None = None  # `Fleet` sets it as it adds the lease
     absent_heartbeats: int = 0  # in a row that confirm the batch and do not list the job
     steps: int | None = None  # environment steps so far, once a heartbeat has shown the job running
     steps_seen_at: float = 0.0  # when the last heartbeat came
@@ -79,7 +79,7 @@ class Member:
     batch_size: int = 1  # candidates' jobs that one of its slots scores at once
     taken: int = 0  # of its capacity, what its other runs use now
     together: int = 1  # candidates' drives that one of its slots does side by side
-    drives_a_slot: int = MOST_TOGETHER  # fewer once few are left
+    drives_a_slot: int = MOST_TOGETHER  # of these, as many as leave work for all slots; set before each dispatch
     leaves_with_run: bool = False  # it reads that the run has ended, and then exits
     reads_end: bool = False  # it reads why the run has ended, and leaves it
     gone_since: float | None = None  # when its token vanished, or its first heartbeat was its last
@@ -172,7 +172,7 @@ class Member:
         if job.runs_alone:
             return self.batch_size
         is_driven = job.driven or self.batch_size <= self.together
-        return math.ceil(self.batch_size / max(1, min(self.together, self.drives_a_slot))) if is_driven else 1
+        return math.ceil(self.batch_size / min(self.together, self.drives_a_slot)) if is_driven else 1
 
     @property
     def held_share(self) -> int:

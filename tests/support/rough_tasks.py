@@ -293,8 +293,6 @@ class OnlyOne(SideBySide):
 class OneCrashes(Toy):
     """The episode with the seed `DEADLY` kills its process."""
 
-    batch_size = 4
-
     def make_environment(self, assignment):
         return DeadlyEnvironment()
 

@@ -172,6 +172,5 @@ def _read_admission(reply: HelloReply) -> Admission:
         ) from error
     return Admission(
         keys.check_run_name(reply.run), reply.run_uid, reply.incarnation, reply.nonce, spec, intervals, reply.packages,
-        reply.numbering, reply.classes, reply.reasons, reply.share, reply.taken,
-        reply.together,
+        reply.numbering, reply.classes, reply.reasons, reply.share, reply.taken, reply.together,
     )  # fmt: skip

@@ -14,7 +14,7 @@ from dreamfleet.worker.car_racing.task import CarRacingTask
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.worldmodel.mdnrnn_config import REWARDED
 from tests.support.bundles import write_random_bundle
-from tests.support.variants import VARIANTS
+from tests.support.variants import VARIANTS, vectors
 
 SEEDS = range(2**20, 2**20 + 4)
 
@@ -23,9 +23,8 @@ def spec(bundle, **changes):
     return dataclasses.replace(TaskSpec("car-racing", bundle.sha256, horizon=60, patience=30), **changes)
 
 
-def jobs(bundle, kind="score", size=0.3):
-    random = np.random.default_rng(5)
-    return [(kind, random.normal(0, size, bundle.controller_shape.size).astype(np.float32), seed) for seed in SEEDS]
+def jobs(bundle):
+    return [("score", each, seed) for each, seed in zip(vectors(bundle, len(SEEDS)), SEEDS, strict=True)]
 
 
 def assert_equal_bits(bundle, asked=None):
@@ -71,7 +70,7 @@ def test_every_episode_has_an_end_of_its_own():
     scorer.close()
 
 
-def test_a_watched_group_is_driven_one_by_one(monkeypatch):
+def test_a_watched_group_is_driven_one_by_one():
     bundle = find_bundle("tiny-int8")
     asked = spec(bundle, horizon=10, patience=0)
     scorer = Scorer(asked, bundle)
