@@ -53,6 +53,31 @@ def test_who_dreams_and_who_dies_meanwhile_changes_no_bit(processes, random_bund
 
 
 @pytest.mark.slow
+def test_who_dreams_on_a_torch_device_changes_no_bit_either(processes, random_bundle, monkeypatch):
+    coordinator = begin(processes, random_bundle, "plain", "--generations", 1)
+    worker = processes.worker("--run", "plain")
+    assert coordinator.finish()[0] == 0
+    worker.end()
+    monkeypatch.setenv("DREAMFLEET_WORKER_TORCH_DEVICE", "cpu")
+    for name, workers in (("one", 1), ("two", 2)):
+        coordinator = begin(processes, random_bundle, name)
+        crew = [processes.worker("--run", name, "--name", f"w{number}") for number in range(workers)]
+        coordinator.wait_for("generation 0: mean")
+        if workers > 1:
+            os.kill(crew.pop().popen.pid, signal.SIGKILL)
+        assert coordinator.finish()[0] == 0, "".join(coordinator.lines)
+        for each in crew:
+            each.end()
+    assert outcome(processes, "one") == outcome(processes, "two")
+    classes = []
+    for name in ("plain", "one", "two"):
+        with open_run(processes.runs, name) as run:
+            classes.append({each.host_class for each in run.classes.largest})
+    assert classes[1] == classes[2]
+    assert not classes[0] & classes[1]
+
+
+@pytest.mark.slow
 def test_dreams_from_recorded_states_are_the_same_on_every_worker(processes, tmp_path):
     bundle = write_random_bundle(tmp_path / "b.zip", recorded=states(20))
     for name, workers, flags in (("alone", 1, ("--recorded", 0.5)), ("two", 2, ("--recorded", 0.5)), ("plain", 1, ())):

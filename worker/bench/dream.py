@@ -10,7 +10,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.bench.matrix_products import Size, fastest, product_cases
 from dreamfleet.worker.bench.measurement import TimedCall, time_alternately
-from dreamfleet.worker.dream.batch import DreamBatch
+from dreamfleet.worker.dream.batch import TORCH_ROWS, DreamBatch
 from dreamfleet.worker.tasks.api import Episode
 
 BATCHES = (1, 256, 1024)
@@ -24,13 +24,16 @@ def bench_dream(bundle: Bundle) -> dict[str, Any]:
 
     `of_floor`: at batch 256, the time of the step's matrix products alone divided by the time of the whole step. Each
     product runs at its own size in the library that is fastest at it on this core.
+    `cuda_steps_per_second`: the same dreams on a graphics processor, as a worker with `torch_device` dreams them; only
+    where torch has one.
     `torch_naive_ratio`: the time of a step of torch modules and distributions at batch 256, divided by ours.
     """
-    dreamer = DreamBatch(bundle, TaskSpec("dream", bundle.sha256, HORIZON, 0, temperature=1.25))
+    spec = TaskSpec("dream", bundle.sha256, HORIZON, 0, temperature=1.25)
+    dreamer = DreamBatch(bundle, spec)
     random = np.random.default_rng(0)
     vectors = random.normal(0, 0.1, (CANDIDATES, bundle.controller_shape.size)).astype(np.float32)
 
-    def dream(batch: int) -> TimedCall:
+    def dream(batch: int, dreamer: DreamBatch = dreamer) -> TimedCall:
         count = min(batch, CANDIDATES)
         dreams: list[Episode] = [(vector, seed) for vector in vectors[:count] for seed in range(batch // count)]
         return lambda: dreamer.score(dreams)
@@ -40,9 +43,12 @@ def bench_dream(bundle: Bundle) -> dict[str, Any]:
     cases |= product_cases(sizes)
     note = ""
     try:
-        from dreamfleet.worker.bench.torch_steps import make_torch_dream
+        from dreamfleet.worker.bench.torch_steps import has_cuda, make_torch_dream
+        from dreamfleet.worker.dream.torch_batch import TorchDreamBatch
 
         cases["torch"] = make_torch_dream(bundle, TILE)
+        if has_cuda():
+            cases["cuda"] = dream(TORCH_ROWS, TorchDreamBatch(bundle, spec, None, "cuda"))
     except ModuleNotFoundError as error:
         note = f"torch_naive_ratio needs {error.name}: pip install 'dreamfleet[train]'"
     seconds = time_alternately(cases)
@@ -55,6 +61,7 @@ def bench_dream(bundle: Bundle) -> dict[str, Any]:
         "torch_naive_ratio": round(rates[str(TILE)] * seconds["torch"] / TILE, 2) if "torch" in seconds else None,
         "floor_steps_per_second": round(floor),
         "floor_by": ", ".join(libraries),
+        **({"cuda_steps_per_second": round(TORCH_ROWS * HORIZON / seconds["cuda"])} if "cuda" in cases else {}),
         **({"note": note} if note else {}),
     }
 

@@ -22,6 +22,7 @@ from dreamfleet.worker.bench.measurement import TimedCall, time_alternately
 from dreamfleet.worker.scoring.episode import score
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.service.admission import Admission
+from dreamfleet.worker.service.child import ScorerArguments
 from dreamfleet.worker.service.frame_publisher import FramePublisher
 from dreamfleet.worker.service.frame_sampler import SampledFrame
 from dreamfleet.worker.service.job_group import JobWithVector
@@ -100,7 +101,8 @@ class WatchedSlot:
                 keys.view(RUN, WORKER), zenoh.handlers.Callback(self._count_frame, indirect=False)
             )
             self._frame_publisher = FramePublisher(worker, RUN, WORKER, lambda _status: None)
-            self._slot = Slot(0, self._spec, self._bundle.path, self._events, (self._spec.task,))
+            arguments = ScorerArguments(self._spec, self._bundle.path, (self._spec.task,))
+            self._slot = Slot(0, arguments, self._events)
             stack.callback(self._slot.stop)
             while not self._slot.ready:
                 self._slot.handle(self._events.get()[1])

@@ -38,6 +38,11 @@ def make_torch_step(bundle: Bundle, picture: NDArray[np.uint8], parameters: NDAr
     return step
 
 
+def has_cuda() -> bool:
+    """Whether torch has a graphics processor here."""
+    return bool(torch.cuda.is_available())
+
+
 def make_torch_dream(bundle: Bundle, batch: int) -> Callable[[], Any]:
     """Return a call that dreams one step of `batch` rows with torch modules and distributions on one thread."""
     torch.set_num_threads(1)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from copy import copy
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import UsageError
@@ -18,10 +19,13 @@ from dreamfleet.worker.tasks.measures import Measurer
 
 DEFAULT_TEMPERATURE = 1.0
 MAX_ROWS = 256  # episodes that are dreamt together: larger batches are slower
+TORCH_ROWS = 512  # on a torch device: half of what a worker may hold, so that the next are there when these are over
 
 
 class DreamBatch:
     """Scores batches of dreamt episodes."""
+
+    most_rows = MAX_ROWS
 
     def __init__(self, bundle: Bundle, spec: TaskSpec, world: World | None = None) -> None:
         """`world` is the bundle's world; by default it is looked up by the name of the bundle's task."""
@@ -45,34 +49,24 @@ class DreamBatch:
         `on_step` gets the number of steps so far, over all episodes.
         """
         scores: list[Score] = []
-        for start in range(0, len(episodes), MAX_ROWS):
+        for start in range(0, len(episodes), self.most_rows):
             before = sum(score.steps for score in scores)
-            tile = episodes[start : start + MAX_ROWS]
+            tile = episodes[start : start + self.most_rows]
             scores += self._dream(tile, lambda made, before=before: on_step(before + made), start)  # type: ignore[misc]
         return scores
 
     def _dream(self, episodes: Sequence[Episode], on_step: Callable[[int], None], start: int) -> list[Score]:
-        parameters = np.stack([vector for vector, _ in episodes]).astype(np.float32)
-        if parameters.shape[1] != self._size or not np.isfinite(parameters).all():
-            raise UsageError(f"a dream needs controllers of {self._size} finite parameters")
-        world, rows = self._world, np.arange(len(episodes))
-        noise = SharedNoise(np.array([seed for _, seed in episodes]), world.chance, world.start_states, world.bars)
-        fitness, steps = np.zeros(len(rows)), np.zeros(len(rows), dtype=np.int64)
-        tally = self._measurer.begin(len(rows))
-        latent, state, made = noise.first.latent, world.begin(len(rows), noise.first.memory), 0
+        parameters, world, rows = self._stack(episodes), self._world, np.arange(len(episodes))
+        noise, sums = self._draw_noise(episodes), self._begin_sums(len(episodes))
+        latent, state = noise.first.latent, world.begin(len(rows), noise.first.memory)
         for step in range(self._horizon):
             moment = world.step_controllers(latent, parameters, state, noise.next(rows))
             if self._observer is not None and self._observer.is_due():
                 first = int(rows[0])
-                seen = StepSnapshot(step, float(fitness[first]), moment.action[0], None, latent[0], state[0])
+                seen = StepSnapshot(step, float(sums.fitness[first]), moment.action[0], None, latent[0], state[0])
                 self._observer.observe(start + first, lambda seen=seen: seen)  # type: ignore[misc]
-            # No world takes such an action, and a model of integers would see a number in it.
-            fitness[rows] += np.where(np.isfinite(moment.action).all(axis=1), moment.reward, np.nan)
-            steps[rows] += 1
-            if self._measurer.names:
-                tally.add(rows, moment.action)
-            made += len(rows)
-            on_step(made)
+            sums.add(rows, moment.reward, moment.action)
+            on_step(sums.made)
             latent, state = moment.latent, moment.state
             if moment.done.any():
                 going = ~moment.done
@@ -80,7 +74,43 @@ class DreamBatch:
                 latent, state = latent[going], state[going]
             if not len(rows):
                 break
+        return sums.scores()
+
+    def _stack(self, episodes: Sequence[Episode]) -> NDArray[np.float32]:
+        """The controllers' parameters `(rows, size)`; `UsageError` for others than this world model's."""
+        parameters = np.stack([vector for vector, _ in episodes]).astype(np.float32)
+        if parameters.shape[1] != self._size or not np.isfinite(parameters).all():
+            raise UsageError(f"a dream needs controllers of {self._size} finite parameters")
+        return parameters
+
+    def _draw_noise(self, episodes: Sequence[Episode]) -> SharedNoise:
+        world, seeds = self._world, np.array([seed for _, seed in episodes])
+        return SharedNoise(seeds, world.chance, world.start_states, world.bars)
+
+    def _begin_sums(self, rows: int) -> DreamSums:
+        return DreamSums(self._measurer, rows)
+
+
+class DreamSums:
+    """The sums of dreams' rewards, steps and measures, one row a dream."""
+
+    def __init__(self, measurer: Measurer, rows: int) -> None:
+        self.fitness, self.made = np.zeros(rows), 0
+        self._steps = np.zeros(rows, dtype=np.int64)
+        self._measurer, self._tally = measurer, measurer.begin(rows)
+
+    def add(self, rows: NDArray[np.int64], reward: NDArray[np.float64], action: NDArray[np.float32]) -> None:
+        """Add a step of `rows`: its rewards `(rows,)` and actions `(rows, actions)`."""
+        # No world takes such an action, and a model of integers would see a number in it.
+        self.fitness[rows] += np.where(np.isfinite(action).all(axis=1), reward, np.nan)
+        self._steps[rows] += 1
+        self.made += len(rows)
+        if self._measurer.names:
+            self._tally.add(rows, action)
+
+    def scores(self) -> list[Score]:
+        """The score of each row."""
         return [
-            Score(float(total), int(count), self._measurer.values(tally, row, int(count)))
-            for row, (total, count) in enumerate(zip(fitness, steps, strict=True))
+            Score(float(total), int(count), self._measurer.values(self._tally, row, int(count)))
+            for row, (total, count) in enumerate(zip(self.fitness, self._steps, strict=True))
         ]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.world_facts import DRAWN, EndRule
-from dreamfleet.worker.dream.noise import Bars, Draw
+from dreamfleet.worker.dream.noise import Bars
 
 
 class DreamEnds:
@@ -31,11 +31,12 @@ class DreamEnds:
         if self.rule.kind == DRAWN:
             self.bars = partial(self.rule.bars, temperature=temperature)
 
-    def are_reached(self, predicted: NDArray[np.float32], draw: Draw) -> NDArray[np.bool_]:
-        """Whether each dream ends `(N,)`, by predicted probabilities `(N,)` and the step's draw.
+    def are_reached(
+        self, predicted: NDArray[np.float32], bar: NDArray[np.float32] | None
+    ) -> NDArray[np.bool_]:  # fmt: skip
+        """Whether each dream ends `(N,)`, by predicted probabilities `(N,)` and the bars `(N, 1)` of the step's draw.
 
-        A draw without bars, which no `EpisodeNoise` with these ends makes, has the threshold.
+        Without bars, which every `EpisodeNoise` with drawn ends has, the threshold decides.
         """
-        bar = np.float32(self.rule.at) if draw.bar is None else draw.bar[:, 0]
-        reached: NDArray[np.bool_] = predicted > bar
+        reached: NDArray[np.bool_] = predicted > (np.float32(self.rule.at) if bar is None else bar[:, 0])
         return reached

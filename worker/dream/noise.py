@@ -101,17 +101,21 @@ class SharedNoise:
         self, seeds: NDArray[np.int64], chance: NoiseSize, start_states: StartStates, bars: Bars | None = None
     ) -> None:
         """`seeds` `(rows,)`, one for each row."""
-        unique, self._episode = np.unique(seeds, return_inverse=True)
+        unique, self.episode = np.unique(seeds, return_inverse=True)  # each row's column in `next_block`
         self._sources = [EpisodeNoise(int(seed), chance, bars) for seed in unique]
         begun = zip(*(source.begin(start_states) for source in self._sources), strict=True)
-        self.first = DreamStart(*(np.stack(parts)[self._episode] for parts in begun))
+        self.first = DreamStart(*(np.stack(parts)[self.episode] for parts in begun))
         self._left = 0
 
     def next(self, rows: NDArray[np.int64]) -> Draw:
         """The draw of the next step for the rows with these indices."""
         if self._left == 0:
-            self._blocks = stack_draws([source.draw_block() for source in self._sources], axis=1)
+            self._blocks = self.next_block()
             self._left = BLOCK_STEPS
-        step, episode = BLOCK_STEPS - self._left, self._episode[rows]
+        step, episode = BLOCK_STEPS - self._left, self.episode[rows]
         self._left -= 1
         return self._blocks.map(lambda part: part[step].take(episode, axis=0))
+
+    def next_block(self) -> Draw:
+        """The draws of the next `BLOCK_STEPS` steps `(steps, seeds, ...)`, one column a seed; not beside `next`."""
+        return stack_draws([source.draw_block() for source in self._sources], axis=1)

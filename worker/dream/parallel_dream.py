@@ -54,7 +54,7 @@ class ParallelDream:
             dreamt, self._parameters, self._state, draw.uniform, draw.normal, self._config.temperature, draw.mask
         )
         self._latent, self._state = dream.latent, dream.state
-        self._over = bool(self._ends.are_reached(dream.done, draw)[0])
+        self._over = bool(self._ends.are_reached(dream.done, draw.bar)[0])
         return dreamt
 
 
@@ -84,7 +84,7 @@ class DreamContinuation:
                 latent, parameters, state, draw.uniform, draw.normal, self._temperature, draw.mask
             )  # fmt: skip
             latent, state = dream.latent, dream.state
-            if self._ends.are_reached(dream.done, draw)[0]:
+            if self._ends.are_reached(dream.done, draw.bar)[0]:
                 return
             yield latent
 

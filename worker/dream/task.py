@@ -6,18 +6,18 @@ from typing import Any, ClassVar
 
 import gymnasium
 
-from dreamfleet.worker.dream.batch import DreamBatch
+from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.dream.batch import MAX_ROWS, TORCH_ROWS, DreamBatch
 from dreamfleet.worker.tasks.api import Assignment, Policy, Task, World
 from dreamfleet.worker.tasks.registry import task_of
-
-BATCH_SIZE = 256  # larger batches are no faster
 
 
 class DreamTask(Task):
     """The task `dream` for any bundle that can dream. Everything real comes from the task of the bundle's world."""
 
     name = "dream"
-    batch_size: ClassVar[int] = BATCH_SIZE
+    batch_size: ClassVar[int] = MAX_ROWS
+    torch_batch_size: ClassVar[int] = TORCH_ROWS
 
     def world_of(self, assignment: Assignment) -> World:
         """The world of the bundle's task."""
@@ -38,9 +38,16 @@ class DreamTask(Task):
         return self.reality(assignment).make_policy(assignment)
 
     def make_batch(self, assignment: Assignment) -> DreamBatch:
-        """The batch that dreams."""
+        """The batch that dreams; `UsageError` for a torch device that this host lacks."""
         self.make_policy(assignment)  # raises `BundleError` if the bundle does not fit its world
-        return DreamBatch(assignment.world_model, assignment.spec, self.world_of(assignment))
+        model, spec, world = assignment.world_model, assignment.spec, self.world_of(assignment)
+        if not assignment.torch_device:
+            return DreamBatch(model, spec, world)
+        try:
+            from dreamfleet.worker.dream.torch_batch import TorchDreamBatch
+        except ModuleNotFoundError as error:
+            raise UsageError(f"torch_device needs {error.name}: pip install 'dreamfleet[train]'") from error
+        return TorchDreamBatch(model, spec, world, assignment.torch_device)
 
     def reality(self, assignment: Assignment) -> Task:
         """The task that the bundle was trained on; `UsageError` if no package registers it."""

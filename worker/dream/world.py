@@ -57,7 +57,7 @@ class DreamWorld:
         self._reward = _reward_of(bundle, described, self._reward_kind)
         self._step = DreamStep(bundle)
         self._ends = DreamEnds(bundle, temperature, end)
-        self._temperature = temperature
+        self.temperature = temperature
         self.chance, self.bars = self._step.chance, self._ends.bars
         self.memory_size = self._step.memory_size
         self.start_states = StartStates.of(bundle, recorded, self._step.zero_state(1)[0, : self.memory_size])
@@ -75,7 +75,7 @@ class DreamWorld:
     def step_controllers(self, latent: Floats, parameters: Floats, state: Floats, draw: Draw) -> DreamtStep:
         """One step in which controllers `parameters` `(rows, size)` act on `latent` `(rows, latent)` and `state`."""
         step = self._step.step
-        dream = step(latent, parameters, state, draw.uniform, draw.normal, self._temperature, draw.mask)
+        dream = step(latent, parameters, state, draw.uniform, draw.normal, self.temperature, draw.mask)
         return self._make_step(dream, draw)
 
     def imagine(
@@ -83,14 +83,20 @@ class DreamWorld:
     ) -> DreamtStep:
         """One step under given actions `(rows, actions)`; `chosen` are the controllers' own, if those differ."""
         step = self._step.imagine
-        dream = step(latent, action, state, draw.uniform, draw.normal, self._temperature, draw.mask, chosen)
+        dream = step(latent, action, state, draw.uniform, draw.normal, self.temperature, draw.mask, chosen)
         return self._make_step(dream, draw)
 
     def _make_step(self, dream: DreamOutput, draw: Draw) -> DreamtStep:
-        done = self._ends.are_reached(dream.done, draw)
-        value = self._value(dream.reward.astype(np.float64), done)
-        reward = np.asarray(self._reward.gain * value - self._reward.cost)
+        reward, done = self.judge(dream.reward, dream.done, draw.bar)
         return DreamtStep(dream.latent, dream.state, reward, done, dream.action)
+
+    def judge(
+        self, reward: Floats, done: Floats, bar: Floats | None
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:  # fmt: skip
+        """The reward of each dream's step and whether it ends `(N,)`, by the heads' outputs `(N,)`; `bar` of a draw."""
+        ended = self._ends.are_reached(done, bar)
+        value = self._value(reward.astype(np.float64), ended)
+        return np.asarray(self._reward.gain * value - self._reward.cost), ended
 
     def _value(self, predicted: NDArray[np.float64], done: NDArray[np.bool_]) -> NDArray[np.float64]:
         if self._reward.source == "survival":

@@ -59,18 +59,19 @@ class Scorer(Displayed):
     >>> scorer.close()
     """
 
-    def __init__(self, spec: TaskSpec, bundle: Bundle | None = None) -> None:
+    def __init__(self, spec: TaskSpec, bundle: Bundle | None = None, torch_device: str = "") -> None:
+        """With a `torch_device`, such as "cuda", dreams are dreamt there."""
         self._observer: StepObserver | None = None
         task = find_scored_task(spec.task, bundle)
         fitting = None if bundle is None else bundle.with_options(spec.controller, spec.options)
-        assignment = Assignment(spec, fitting)
+        assignment = Assignment(spec, fitting, torch_device)
         self.world = find_checked_world(assignment)
         self.spec = spec
         self._batch_for: Callable[[TaskSpec], Batch] | None = None
         if isinstance(task, BatchedTask):
             make = task.make_batch
             # The last batch is kept: specifications change rarely, and making a batch takes milliseconds.
-            self._batch_for = lru_cache(maxsize=1)(lambda each: make(Assignment(each, assignment.bundle)))
+            self._batch_for = lru_cache(maxsize=1)(lambda each: make(replace(assignment, spec=each)))
             self._batch_for(spec)  # raises its errors now, not with the first job
         self._task, self._assignment = task, assignment
         self._environment = task.make_environment(assignment)

@@ -35,14 +35,22 @@ class ChildReady:
     together: int = 1
 
 
+@dataclass(frozen=True)
+class ScorerArguments:
+    """What a child makes its scorer of. A task that is not in `allowed_tasks` is never imported."""
+
+    spec: TaskSpec
+    bundle: Path | None
+    allowed_tasks: tuple[str, ...]
+    torch_device: str = ""  # as in `Assignment`
+
+
 def serve_jobs(
-    pipe: Connection[Any, Any], steps: Any, abandoned: Any, is_watched: Any, spec: TaskSpec, bundle: Path | None,
-    allowed_tasks: tuple[str, ...], parent: int,
-) -> None:  # fmt: skip
+    pipe: Connection[Any, Any], steps: Any, abandoned: Any, is_watched: Any, arguments: ScorerArguments, parent: int
+) -> None:
     """Score groups of jobs from the pipe until it closes.
 
-    `steps`, `abandoned` and `is_watched` are memory shared with the parent. A task that is not in `allowed_tasks` is
-    never imported.
+    `steps`, `abandoned` and `is_watched` are memory shared with the parent.
     """
     exit_with_parent(parent)
     os.setsid()  # the worker ends the whole session, and Ctrl-C reaches only the worker
@@ -53,13 +61,11 @@ def serve_jobs(
     make_stderr_nonblocking()  # inherited from the worker, whose reader may be suspended
     make_stdout_nonblocking()
     os.environ["SDL_VIDEODRIVER"] = "dummy"
-    scorer = _make_scorer(pipe, spec, bundle, allowed_tasks)
+    scorer = _make_scorer(pipe, arguments)
     _score_groups(pipe, scorer, steps, abandoned, is_watched)
 
 
-def _make_scorer(
-    pipe: Connection[Any, Any], spec: TaskSpec, bundle: Path | None, allowed_tasks: tuple[str, ...]
-) -> Scorer:
+def _make_scorer(pipe: Connection[Any, Any], arguments: ScorerArguments) -> Scorer:
     """Load the task and the world model and send `ChildReady`; on an error send a `ScoringFailure` and exit."""
     from dreamfleet.common.artifacts.bundle import Bundle
     from dreamfleet.common.errors import DreamfleetError
@@ -67,13 +73,14 @@ def _make_scorer(
     from dreamfleet.worker.service.failure_log import ScoringFailure
     from dreamfleet.worker.tasks.registry import check_task_allowed, check_world_allowed
 
+    spec, bundle, allowed_tasks = arguments.spec, arguments.bundle, arguments.allowed_tasks
     try:
         check_task_allowed(spec.task, allowed_tasks)
         opened = None
         if bundle is not None:
             opened = Bundle.open(bundle, spec.bundle)
             check_world_allowed(opened, allowed_tasks)
-        scorer = Scorer(spec, opened)
+        scorer = Scorer(spec, opened, arguments.torch_device)
         pipe.send(ChildReady(scorer.drawn_by, scorer.host_class, scorer.together))
         return scorer
     except BaseException as error:  # a simulator may raise `SystemExit`

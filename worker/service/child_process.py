@@ -17,8 +17,7 @@ from typing import Any
 from dreamfleet.common.host.descendants import Descendants
 from dreamfleet.common.host.parent_death import signals_blocked
 from dreamfleet.common.host.resource_limits import pin_thread_pools
-from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.worker.service.child import ChildReady, serve_jobs
+from dreamfleet.worker.service.child import ChildReady, ScorerArguments, serve_jobs
 from dreamfleet.worker.service.failure_log import ScoringFailure
 from dreamfleet.worker.service.frame_sampler import SampledFrame
 from dreamfleet.worker.service.job_group import GroupDone, JobWithVector
@@ -34,13 +33,7 @@ ChildMessage = ChildReady | SampledFrame | GroupDone | ScoringFailure | None
 class ChildProcess:
     """A running child; a thread calls `on_message` with each of its messages, and with `None` at the end."""
 
-    def __init__(
-        self,
-        spec: TaskSpec,
-        bundle: Path | None,
-        allowed_tasks: tuple[str, ...],
-        on_message: Callable[[ChildMessage], None],
-    ) -> None:
+    def __init__(self, arguments: ScorerArguments, on_message: Callable[[ChildMessage], None]) -> None:
         pin_thread_pools()
         context = get_context("spawn")
         self._steps: Any = context.Value("Q", 0, lock=False)
@@ -52,7 +45,7 @@ class ChildProcess:
         self._limit_sending()
         self._process = context.Process(
             target=serve_jobs,
-            args=(theirs, self._steps, self._abandoned, self._is_watched, spec, bundle, allowed_tasks, os.getpid()),
+            args=(theirs, self._steps, self._abandoned, self._is_watched, arguments, os.getpid()),
             daemon=False,  # a simulator may start processes with `multiprocessing`, which daemons may not
         )
         self._descendants = Descendants()

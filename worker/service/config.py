@@ -10,6 +10,7 @@ from dreamfleet.common.protocol.keys import check_run_name, check_worker_name
 from dreamfleet.common.protocol.messages import MAX_LEASES
 
 MAX_RUNS = 64  # that a worker serves side by side
+TORCH_MEMORY = 8192  # MiB more that a scoring process may hold with a torch device, whose libraries are large
 
 
 @dataclass(frozen=True)
@@ -26,10 +27,20 @@ class WorkerConfig:
     slot_memory: int = option(
         2048, "MiB that a scoring process may hold; a larger one is replaced between jobs; 0: no limit"
     )
+    torch_device: str = option(
+        "", "dream on this torch device, such as cuda or cuda:1, with one slot unless slots says more; empty: in ONNX "
+        "Runtime, on each slot's core (docs/how-to/gpu.md)", flag=False,
+    )  # fmt: skip
     exit_when_done: bool = option(False, "leave when the run has ended or refuses this worker")
     coordinator_timeout: float = option(
         600.0, "with --exit-when-done: seconds without a coordinator after which it leaves, and exits with 1"
     )
+
+    @property
+    def memory_limit(self) -> int:
+        """Bytes that a scoring process may hold; 0: no limit."""
+        more = TORCH_MEMORY if self.torch_device else 0
+        return (self.slot_memory + more) << 20 if self.slot_memory else 0
 
     def __post_init__(self) -> None:
         if self.run is not None:

@@ -8,7 +8,6 @@ import queue
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from time import monotonic
 from typing import Any
 
@@ -16,9 +15,9 @@ from dreamfleet.common.errors import BundleError, DreamfleetError
 from dreamfleet.common.host.stall_watch import START_LIMIT, StallWatch, describe_slow_start, describe_stall
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol.failures import is_host_failure
-from dreamfleet.common.protocol.messages import Job, Result, TaskSpec
+from dreamfleet.common.protocol.messages import Job, Result
 from dreamfleet.worker.scoring.failure_cause import describe_crash, describe_exit, is_hosts_fault
-from dreamfleet.worker.service.child import ChildReady
+from dreamfleet.worker.service.child import ChildReady, ScorerArguments
 from dreamfleet.worker.service.child_process import EXIT_GRACE, ChildMessage, ChildProcess
 from dreamfleet.worker.service.failure_log import ScoringFailure
 from dreamfleet.worker.service.frame_sampler import SampledFrame
@@ -64,26 +63,22 @@ class Slot:
     def __init__(
         self,
         number: int,
-        spec: TaskSpec,
-        bundle: Path | None,
+        arguments: ScorerArguments,
         events: queue.SimpleQueue[tuple[str, Any]],
-        allowed_tasks: tuple[str, ...],
         memory_limit: int = 0,
         restore_bundle: Callable[[], object] = lambda: None,
         *,
         parked: bool = False,
     ) -> None:
-        """`allowed_tasks` are those that the child may import; `memory_limit` is in bytes, 0 means none.
+        """`memory_limit` is in bytes, 0 means none.
 
-        `restore_bundle` fetches the file `bundle` again after a failed start, because others also write to the cache.
+        `restore_bundle` fetches the bundle's file again after a failed start, because others also write to the cache.
         A `parked` slot has no child until `start`.
         """
         self.number = number
         self.ready = False
         self.drawn_by = "-"
-        self._spec = spec
-        self._bundle = bundle
-        self._allowed_tasks = allowed_tasks
+        self._arguments = arguments
         self._events = events
         self._memory_limit = memory_limit
         self._restore_bundle = restore_bundle
@@ -369,10 +364,7 @@ class Slot:
             if self._failed_starts or self._starved_starts:
                 self._restore_bundle()
             self._child = ChildProcess(
-                self._spec,
-                self._bundle,
-                self._allowed_tasks,
-                lambda message: events.put(("slot", SlotEvent(number, child_number, message))),
+                self._arguments, lambda message: events.put(("slot", SlotEvent(number, child_number, message)))
             )
         except (BundleError, OSError, RuntimeError, MemoryError) as error:
             log.warning("slot %d cannot start a process yet: %s", number, error)

@@ -6,14 +6,13 @@ import logging
 import math
 import queue
 from collections.abc import Callable
-from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from dreamfleet.common.protocol.messages import MAX_LEASES, TAG_BYTES, Job, Result, RunningJob, TaskSpec
+from dreamfleet.common.protocol.messages import MAX_LEASES, TAG_BYTES, Job, Result, RunningJob
 from dreamfleet.common.protocol.result_bounds import clamp_count
 from dreamfleet.worker.service.backlog import Backlog
-from dreamfleet.worker.service.child import ChildReady
+from dreamfleet.worker.service.child import ChildReady, ScorerArguments
 from dreamfleet.worker.service.child_process import EXIT_GRACE
 from dreamfleet.worker.service.failure_log import FailureLog
 from dreamfleet.worker.service.frame_sampler import SampledFrame
@@ -38,24 +37,23 @@ class SlotPool:
     def __init__(
         self,
         share: RunSlots,
-        spec: TaskSpec,
-        bundle: Path | None,
+        arguments: ScorerArguments,
         events: queue.SimpleQueue[tuple[str, Any]],
-        allowed_tasks: tuple[str, ...],
         memory_limit: int,
         restore_bundle: Callable[[], object] = lambda: None,
         *,
         all_at_once: bool = True,
     ) -> None:
-        """`RefusedError` for a task that is not in `allowed_tasks`; `memory_limit` is in bytes a slot, 0 means none.
+        """`RefusedError` for a task that is not allowed; `memory_limit` is in bytes a slot, 0 means none.
 
         With `all_at_once` all children start now and stay.
         """
-        check_task_allowed(spec.task, allowed_tasks)
+        name = arguments.spec.task
+        check_task_allowed(name, arguments.allowed_tasks)
         self._share, self._all_at_once = share, all_at_once
-        self._task = spec.task
-        task = find_task(spec.task)
-        self._batch_size = task.batch_size if isinstance(task, BatchedTask) else None
+        self._task, task = name, find_task(name)
+        size = getattr(task, "torch_batch_size", 0) if arguments.torch_device else 0
+        self._batch_size: int | None = size or task.batch_size if isinstance(task, BatchedTask) else None
         self.together = 1  # candidates' drives that a slot does side by side; reported by the first child that is ready
         self._failures = FailureLog()
         self.host_class = ""  # reported by the first child that is ready
@@ -66,7 +64,7 @@ class SlotPool:
         try:
             for number in range(share.total):
                 parked = number > 0 and not all_at_once
-                slot = Slot(number, spec, bundle, events, allowed_tasks, memory_limit, restore_bundle, parked=parked)
+                slot = Slot(number, arguments, events, memory_limit, restore_bundle, parked=parked)
                 self._slots.append(slot)
         except BaseException:
             self.stop()  # otherwise the interpreter would wait for these children at exit, and they for it

@@ -40,6 +40,7 @@ from dreamfleet.worker.service.admission import (
     request_admission,
 )
 from dreamfleet.worker.service.bundle_fetch import fetch_bundle
+from dreamfleet.worker.service.child import ScorerArguments
 from dreamfleet.worker.service.config import WorkerConfig
 from dreamfleet.worker.service.membership import LeaveConditions, Membership, StopRequests
 from dreamfleet.worker.service.refusal_backoff import SINGLE_RUN_DELAYS, RefusalBackoff
@@ -92,7 +93,7 @@ class Worker:
         self.inbox = CountingDecoder()
         self._config = config
         self._network = network
-        self._slot_count = config.slots or usable_cores()
+        self._slot_count = config.slots or (1 if config.torch_device else usable_cores())
         self._hello = make_request(
             self.identity, (*known_tasks(), *tasks), self._slot_count,
             leaves_with_run=config.exit_when_done or config.any,
@@ -258,13 +259,15 @@ class Worker:
     def _open_slots(self, session: zenoh.Session, served: ServedRun, bundle: Bundle | None) -> SlotPool:
         if bundle is not None:
             check_world_allowed(bundle, self._hello.tasks)
-        admission, events = served.admission, served.events
+        admission, events, config = served.admission, served.events, self._config
+        path = bundle.path if bundle else None
+        arguments = ScorerArguments(admission.spec, path, self._hello.tasks, config.torch_device)
         share = self._slots.open(admission.share, lambda: events.put(("wake", None)))
         try:
             return SlotPool(
-                share, admission.spec, bundle.path if bundle else None, events, self._hello.tasks,
-                self._config.slot_memory << 20, lambda: self._fetch_bundle(session, admission) if bundle else None,
-                all_at_once=not self._config.any or self._config.runs == 1,
+                share, arguments, events, config.memory_limit,
+                lambda: self._fetch_bundle(session, admission) if bundle else None,
+                all_at_once=not config.any or config.runs == 1,
             )  # fmt: skip
         except BaseException:
             share.close()

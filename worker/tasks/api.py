@@ -268,6 +268,7 @@ class Assignment:
 
     spec: TaskSpec
     bundle: Bundle | None = None
+    torch_device: str = ""  # that batches may compute on, such as "cuda"; empty: the processor's core
 
     def __post_init__(self) -> None:
         """`BundleError` if the bundle is not the one that the specification names."""
@@ -325,6 +326,7 @@ class Task:
 
     name: str
     batch_size: ClassVar[int] = 1  # episodes that a slot scores at once
+    torch_batch_size: ClassVar[int] = 0  # the same on a torch device, for tasks whose batches use one; 0: they do not
     # Steps of a short episode with a fixed seed and fixed parameters, by which a worker determines its host class
     # before it scores anything. 0: there is no such episode, and the host's fingerprint determines the class.
     probe_steps: ClassVar[int] = 16

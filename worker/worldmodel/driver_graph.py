@@ -7,7 +7,6 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto
 
-from dreamfleet.common.artifacts.actions import Continuous
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, ENCODER, Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import BundleError, UsageError
@@ -128,12 +127,9 @@ class _Chooser:
             equal = graph.node("Equal", graph.node("Unsqueeze", action, graph.shape(1)), table)
             return str(graph.node("ReduceMin", graph.node("Cast", equal, to=TensorProto.FLOAT), axes=[2], keepdims=0))
         if actions.output_indices:
-            return str(graph.node("MatMul", action, graph.constant(_signs(actions))))
+            return str(
+                graph.node(
+                    "MatMul", action, graph.constant(actions.to_outputs(np.eye(actions.actions, dtype=np.float32)))
+                )
+            )
         return action
-
-
-def _signs(actions: Continuous) -> Floats:
-    """The matrix (actions, outputs) that adds the actions of each output, with the signs of their scales."""
-    signs = np.zeros((actions.actions, actions.outputs), np.float32)
-    signs[range(actions.actions), actions.output_indices] = np.copysign(1, actions.scale)
-    return signs

@@ -9,7 +9,7 @@ from dreamfleet.common.errors import BundleError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.dream.ends import DreamEnds
-from dreamfleet.worker.dream.noise import Draw, EpisodeNoise
+from dreamfleet.worker.dream.noise import EpisodeNoise
 from dreamfleet.worker.dream.parallel_dream import DreamContinuation, ParallelDream, ParallelDreamConfig
 from dreamfleet.worker.dream.world import DreamWorld
 from dreamfleet.worker.worldmodel.inference import DreamStep
@@ -101,6 +101,5 @@ def test_a_reward_that_the_model_does_not_predict_is_refused(tmp_path):
 
 
 def test_a_draw_without_bars_has_the_threshold(choices_bundle):
-    ends, zeros = DreamEnds(choices_bundle, 1.0), np.zeros((2, 3), np.float32)
-    reached = ends.are_reached(np.array([0.49, 0.51], np.float32), Draw(zeros, zeros))
+    reached = DreamEnds(choices_bundle, 1.0).are_reached(np.array([0.49, 0.51], np.float32), None)
     assert reached.tolist() == [False, True]

@@ -13,6 +13,7 @@ from dreamfleet.common.protocol.codec import decode
 from dreamfleet.common.protocol.frame_pictures import unpack_picture
 from dreamfleet.common.protocol.messages import Intervals, TaskSpec, ViewFrame
 from dreamfleet.common.transport.session import Network, open_session
+from dreamfleet.worker.service.child import ScorerArguments
 from dreamfleet.worker.service.frame_sampler import FRAME_INTERVAL, MAX_TIME_SHARE, FrameSampler
 from dreamfleet.worker.service.slot import Slot
 from dreamfleet.worker.tasks.api import StepSnapshot
@@ -184,7 +185,7 @@ def test_a_slot_gives_the_same_bits_watched_and_not(random_bundle, task):
     shape = ControllerShape(4, 2) if path is None else random_bundle.controller_shape
     spec = TaskSpec(task, sha256, 60, 0, controller=None if path else shape)
     vector = np.random.default_rng(0).normal(0, 0.1, shape.size).astype("<f4").tobytes()
-    slot = Slot(0, spec, path, events, announced)
+    slot = Slot(0, ScorerArguments(spec, path, announced), events)
     outcomes, frames = [], 0
     while not slot.ready:
         slot.handle(events.get(timeout=DEADLINE)[1])

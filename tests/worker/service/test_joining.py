@@ -13,6 +13,7 @@ from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES, fingerprint
 from dreamfleet.common.protocol.codec import encode_json
 from dreamfleet.common.protocol.messages import Intervals, ResultBatch, TaskSpec
 from dreamfleet.common.transport.session import Network, open_session
+from dreamfleet.worker.service.child import ScorerArguments
 from dreamfleet.worker.service.config import WorkerConfig
 from dreamfleet.worker.service.slot import Slot
 from dreamfleet.worker.service.worker import Worker
@@ -192,7 +193,7 @@ def test_with_any_a_run_of_an_unannounced_task_is_skipped(stage, said, cached):
 def test_a_child_imports_no_task_that_its_worker_did_not_announce(tmp_path, monkeypatch, task):
     mark, events = foreign(tmp_path, monkeypatch), queue.SimpleQueue()
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
-    slot = Slot(0, TaskSpec(task, "", 100, 0), None, events, (tasks.TOY, "gym"))
+    slot = Slot(0, ScorerArguments(TaskSpec(task, "", 100, 0), None, (tasks.TOY, "gym")), events)
     failure = events.get(timeout=DEADLINE)[1].failure
     assert failure.text.startswith("RefusedError: ")
     slot.stop()

@@ -12,6 +12,7 @@ import pytest
 
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.worker.service.child import ScorerArguments
 from dreamfleet.worker.service.job_group import MOST_TRIED_ALONE
 from dreamfleet.worker.service.slot import Slot
 from dreamfleet.worker.service.slot_budget import SharedSlots
@@ -27,7 +28,7 @@ class Harness:
     def __init__(self, task, bundle):
         self.spec = TaskSpec(task=task, bundle=bundle.sha256, horizon=100, patience=0)
         self.events = queue.SimpleQueue()
-        self.slot = Slot(0, self.spec, bundle.path, self.events, (task,))
+        self.slot = Slot(0, ScorerArguments(self.spec, bundle.path, (task,)), self.events)
 
     def take(self, ahead=0.0):
         """What the slot's next event brings; the worker looks at its slots every moment, here `ahead` of its time."""
@@ -314,7 +315,10 @@ def test_whatever_is_raised_as_a_slot_starts_is_one_clear_error(harness, monkeyp
 def test_many_children_that_cannot_end_do_not_delay_the_end_of_a_pool(random_bundle, monkeypatch):
     spec = TaskSpec(task=tasks.TOY, bundle=random_bundle.sha256, horizon=1, patience=0)
     pool = SlotPool(
-        SharedSlots(3).open(1.0, lambda: None), spec, random_bundle.path, queue.SimpleQueue(), (tasks.TOY,), 0
+        SharedSlots(3).open(1.0, lambda: None),
+        ScorerArguments(spec, random_bundle.path, (tasks.TOY,)),
+        queue.SimpleQueue(),
+        0,
     )
     kills = []
     for slot in pool._slots:

@@ -121,10 +121,10 @@ def test_a_run_that_cannot_be_scored_ends_no_other(stage, said, cached, monkeypa
     good.slots = 1
     real = SlotPool.__init__
 
-    def fails(self, share, spec, *rest, **more):
-        if spec.task == tasks.SECOND_TOY:
+    def fails(self, share, arguments, *rest, **more):
+        if arguments.spec.task == tasks.SECOND_TOY:
             raise OSError("no room on this device")
-        real(self, share, spec, *rest, **more)
+        real(self, share, arguments, *rest, **more)
 
     monkeypatch.setattr(SlotPool, "__init__", fails)
     _, served = stage.worker(run=None, any=True, announced=(*tasks.ALL, tasks.SECOND_TOY))

@@ -20,6 +20,7 @@ import pytest
 from dreamfleet.common.artifacts.bundle import hash_file
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.worker.service.child import ScorerArguments
 from dreamfleet.worker.service.slot import (
     FAILED_STARTS,
     MAX_START_DELAY,
@@ -51,7 +52,7 @@ class Harness:
     def __init__(self, task, bundle, memory_limit, **more):
         self.spec = spec(task, bundle)
         self.events = queue.SimpleQueue()
-        self.slot = Slot(0, self.spec, bundle, self.events, tasks.ALL, memory_limit, **more)
+        self.slot = Slot(0, ScorerArguments(self.spec, bundle, tasks.ALL), self.events, memory_limit, **more)
 
     def pass_time(self):
         """The longest pause before a start, in no time."""
@@ -419,11 +420,12 @@ def test_a_child_dies_with_its_worker(random_bundle, tmp_path):
         "from tests.support import tasks\n"
         "from tests.support.samples import VECTOR, job\n"
         "from tests.worker.service.test_slot import spec\n"
+        "from dreamfleet.worker.service.child import ScorerArguments\n"
         "from dreamfleet.worker.service.slot import Slot\n"
         "if __name__ == '__main__':\n"
         "    events = queue.SimpleQueue()\n"
         "    path = pathlib.Path(sys.argv[1])\n"
-        "    slot = Slot(0, spec(tasks.HANGING, path), path, events, tasks.ALL)\n"
+        "    slot = Slot(0, ScorerArguments(spec(tasks.HANGING, path), path, tasks.ALL), events)\n"
         "    slot.handle(events.get()[1])\n"
         "    slot.submit([(job(spec=spec(tasks.HANGING, path)), VECTOR)])\n"
         "    print(slot.pid, slot.ready, flush=True)\n"

@@ -8,6 +8,7 @@ import pytest
 from dreamfleet.common.protocol.messages import JobBatch, TaskSpec, VectorPart
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.service.backlog import Backlog
+from dreamfleet.worker.service.child import ScorerArguments
 from dreamfleet.worker.service.slot_budget import SharedSlots
 from dreamfleet.worker.service.slot_pool import SlotPool
 from tests.support import rough_tasks, tasks
@@ -23,7 +24,7 @@ class Pool:
         self.spec = TaskSpec(task=task, bundle=bundle.sha256, horizon=100, patience=0)
         self.events = queue.SimpleQueue()
         share = SharedSlots(slots).open(1.0, lambda: None)
-        self.slots = SlotPool(share, self.spec, bundle.path, self.events, (task,), 0)
+        self.slots = SlotPool(share, ScorerArguments(self.spec, bundle.path, (task,)), self.events, 0)
         self.backlog = Backlog(self.spec)
         while self.slots.ready_count < slots:
             self.take()

@@ -14,7 +14,7 @@ import pytest
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.worker.service.child import ChildReady
+from dreamfleet.worker.service.child import ChildReady, ScorerArguments
 from dreamfleet.worker.service.child_process import ChildProcess
 from dreamfleet.worker.takecover import process
 from dreamfleet.worker.takecover.game import TakeCover
@@ -82,7 +82,7 @@ def test_a_game_ends_with_its_process_however_that_ends(doom, temporary, tmp_pat
 def test_a_game_ends_with_its_slot(doom, temporary):
     events = queue.SimpleQueue()
     spec = TaskSpec("takecover", "", horizon=525, patience=0, controller=ControllerShape(128, 3))
-    child = ChildProcess(spec, None, ("takecover",), events.put)
+    child = ChildProcess(ScorerArguments(spec, None, ("takecover",)), events.put)
     assert isinstance(events.get(timeout=DEADLINE), ChildReady)
     running, name = only_game(child.pid)
     os.kill(child.pid, signal.SIGKILL)
