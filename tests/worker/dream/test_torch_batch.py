@@ -1,4 +1,5 @@
 import dataclasses
+import os
 import sys
 
 import numpy as np
@@ -15,6 +16,7 @@ from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
 from tests.support.variants import VARIANTS
 
+DEVICE = os.environ.get("DREAMFLEET_TEST_TORCH_DEVICE", "cpu")
 HORIZON = 70  # more than one block of steps
 SMALL = {"latent": 3, "hidden": 4}
 KINDS = {
@@ -38,7 +40,7 @@ def dreams(bundle, candidates=3, seeds=3):
 def check(bundle, **changes):
     """The torch dream of a bundle is that of ONNX Runtime but for its last bits, and the same bits alone."""
     asked = spec(bundle, **changes)
-    batch, episodes = TorchDreamBatch(bundle, asked, None, "cpu"), dreams(bundle)
+    batch, episodes = TorchDreamBatch(bundle, asked, None, DEVICE), dreams(bundle)
     found, wanted = batch.score(episodes), DreamBatch(bundle, asked).score(episodes)
     assert [score.steps for score in found] == [score.steps for score in wanted]
     np.testing.assert_allclose([s.fitness for s in found], [s.fitness for s in wanted], rtol=1e-3, atol=1e-3)
@@ -69,7 +71,7 @@ def test_measures_are_those_of_the_dream(random_bundle):
 
 
 def test_more_dreams_than_rows_are_dreamt_in_turn(random_bundle):
-    batch = TorchDreamBatch(random_bundle, spec(random_bundle, horizon=2), None, "cpu")
+    batch = TorchDreamBatch(random_bundle, spec(random_bundle, horizon=2), None, DEVICE)
     few, done = dreams(random_bundle, candidates=4, seeds=2), []
     assert batch.score(few * (ROWS // 8 + 1), done.append) == batch.score(few) * (ROWS // 8 + 1)
     assert done == [2 * ROWS, 2 * ROWS + 16]
@@ -84,7 +86,7 @@ def test_a_watched_dream_has_the_same_score_and_shows_the_first_step_of_a_block(
             self.append((episode, look()))
 
     seen, episodes = Seen(), dreams(random_bundle)
-    batch = TorchDreamBatch(random_bundle, spec(random_bundle), None, "cpu")
+    batch = TorchDreamBatch(random_bundle, spec(random_bundle), None, DEVICE)
     assert batch.watched(seen).score(episodes) == batch.score(episodes)
     assert [(episode, snapshot.step) for episode, snapshot in seen] == [(0, 0), (0, 64)]
     plain = Seen()
@@ -99,10 +101,10 @@ def test_a_watched_dream_has_the_same_score_and_shows_the_first_step_of_a_block(
 
 def test_a_scorer_on_a_torch_device_is_of_a_class_of_its_own(random_bundle):
     asked, (vector, seed) = spec(random_bundle), dreams(random_bundle)[0]
-    own, plain = Scorer(asked, random_bundle, "cpu"), Scorer(asked, random_bundle)
+    own, plain = Scorer(asked, random_bundle, DEVICE), Scorer(asked, random_bundle)
     assert own.host_class != plain.host_class
-    assert Scorer(asked, random_bundle, "cpu").host_class == own.host_class
-    assert [own.score("score", vector, seed)] == TorchDreamBatch(random_bundle, asked, None, "cpu").score(
+    assert Scorer(asked, random_bundle, DEVICE).host_class == own.host_class
+    assert [own.score("score", vector, seed)] == TorchDreamBatch(random_bundle, asked, None, DEVICE).score(
         [(vector, seed)]
     )
     driven = asked.with_overrides(driven=True, horizon=5)
@@ -118,7 +120,7 @@ def test_a_device_that_is_not_there_is_an_error(random_bundle, name):
 def test_a_world_model_of_eight_bits_does_not_dream_in_torch():
     bundle = find_bundle("tiny-int8")
     with pytest.raises(BundleError, match="has eight bits, and torch dreams in single precision"):
-        TorchDreamBatch(bundle, spec(bundle), None, "cpu")
+        TorchDreamBatch(bundle, spec(bundle), None, DEVICE)
 
 
 def test_a_host_without_torch_says_what_is_missing(random_bundle, monkeypatch):
@@ -129,7 +131,7 @@ def test_a_host_without_torch_says_what_is_missing(random_bundle, monkeypatch):
 
 
 def test_an_invalid_vector_is_refused(random_bundle):
-    batch = TorchDreamBatch(random_bundle, spec(random_bundle), None, "cpu")
+    batch = TorchDreamBatch(random_bundle, spec(random_bundle), None, DEVICE)
     for vector in (np.zeros(3, np.float32), np.full(random_bundle.controller_shape.size, np.nan, np.float32)):
         with pytest.raises(UsageError, match="finite parameters"):
             batch.score([(vector, 1)])
