@@ -35,6 +35,7 @@ MAX_RECEIVED = 128 * 1024  # bytes of a message; for a larger one Zenoh closes t
 # Bytes of a message that a router forwards; Zenoh drops larger ones silently. More than the protocol's MAX_MESSAGE, so
 # that a slightly oversize message still reaches the coordinator and is counted there.
 MAX_FORWARDED = 64 * 1024
+SEND_QUEUE = 16  # batches of 64 KiB that may wait on a link, Zenoh's most; beyond them it drops messages
 _NO_ROOM = "no network session can be opened: {}; give this host more room (ulimit -n, ulimit -u)"
 __all__ = ["LEASE_MS", "Network", "check_endpoint", "enqueue_into", "open_session", "zenoh_config"]
 
@@ -124,7 +125,10 @@ def zenoh_config(network: Network, timeout: float | None, dictionary: str | None
             "tx": {
                 "lease": LEASE_MS,
                 "keep_alive": 4,
-                "queue": {"congestion_control": {"block": {"wait_before_close": 500_000}}},
+                "queue": {
+                    "size": {"data": SEND_QUEUE},
+                    "congestion_control": {"block": {"wait_before_close": 500_000}},
+                },
             },
         },
     }

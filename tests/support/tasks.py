@@ -364,6 +364,22 @@ class HeavyEnvironment(ToyEnvironment):
         return self.np_random.integers(0, 256, 100_000, np.uint8)
 
 
+class OnTorch(Toy):
+    """A slot scores 256 episodes at once, and 8 on a torch device; each is worth 1."""
+
+    name = f"{MODULE}:OnTorch"
+    batch_size, torch_batch_size = 256, 8
+
+    def make_batch(self, assignment):
+        return OnesBatch()
+
+
+class OnesBatch:
+    def score(self, episodes, on_step):
+        on_step(len(episodes))
+        return [Score(1.0, 1)] * len(episodes)
+
+
 class Optimistic(Toy):
     """The dream rewards ever larger actions, less at higher temperature; in reality these soon cost reward."""
 

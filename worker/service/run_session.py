@@ -36,6 +36,7 @@ from dreamfleet.worker.service.wording import describe_failure
 
 log = logging.getLogger(__name__)
 MAX_WAITING_BATCHES = 1024  # R26: more batches are dropped unread; the coordinator sends unconfirmed ones again
+BATCH_INTERVAL = 0.01  # seconds without another job after which a part of a batch is scored
 CLOCK_GAP = 2.0  # seconds between two passes of the loop that mean that the host was suspended
 
 Events = queue.SimpleQueue[tuple[str, Any]]
@@ -155,6 +156,7 @@ class RunSession:
         """Handle all waiting events; without any, wait for one until something must be sent."""
         timeout = min(max(self._next_heartbeat_at - monotonic(), 0.0), self._admission.intervals.repeat / 4)
         timeout = min(timeout, BURST_INTERVAL) if len(self._uploads) else timeout
+        timeout = min(timeout, BATCH_INTERVAL) if self._slots.awaits_jobs else timeout
         with suppress(queue.Empty):
             self._handle(*self._events.get(timeout=timeout))
             while True:

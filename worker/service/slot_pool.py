@@ -54,6 +54,9 @@ class SlotPool:
         self._task, task = name, find_task(name)
         size = getattr(task, "torch_batch_size", 0) if arguments.torch_device else 0
         self._batch_size: int | None = size or task.batch_size if isinstance(task, BatchedTask) else None
+        self._whole_batches = size > 0  # a torch device takes as long for a part of a batch
+        self._jobs_before = 0  # in the backlog, at the last `fill`
+        self.awaits_jobs = False  # whether a part of a batch waits for the rest, which may be on its way
         self.together = 1  # candidates' drives that a slot does side by side; reported by the first child that is ready
         self._failures = FailureLog()
         self.host_class = ""  # reported by the first child that is ready
@@ -134,6 +137,10 @@ class SlotPool:
 
         R26: nothing starts while too many results, `undelivered`, wait for a verdict, so the outbox stays bounded.
         """
+        before, self._jobs_before = self._jobs_before, len(backlog)
+        self.awaits_jobs = self._whole_batches and before < len(backlog) < self._jobs_a_slot
+        if self.awaits_jobs:
+            return
         room = 4 * len(self._slots) * self._jobs_a_slot - undelivered
         idle = [slot for slot in self._slots if slot.idle and room >= 0]
         groups = self._count_groups(backlog)

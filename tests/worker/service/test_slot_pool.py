@@ -20,11 +20,11 @@ SIDE_BY_SIDE = f"{tasks.MODULE}:SideBySide"
 
 
 class Pool:
-    def __init__(self, task, bundle, slots):
+    def __init__(self, task, bundle, slots, torch_device=""):
         self.spec = TaskSpec(task=task, bundle=bundle.sha256, horizon=100, patience=0)
         self.events = queue.SimpleQueue()
         share = SharedSlots(slots).open(1.0, lambda: None)
-        self.slots = SlotPool(share, ScorerArguments(self.spec, bundle.path, (task,)), self.events, 0)
+        self.slots = SlotPool(share, ScorerArguments(self.spec, bundle.path, (task,), torch_device), self.events, 0)
         self.backlog = Backlog(self.spec)
         while self.slots.ready_count < slots:
             self.take()
@@ -32,12 +32,19 @@ class Pool:
     def take(self):
         return self.slots.handle(self.events.get(timeout=DEADLINE)[1])
 
+    def add(self, jobs):
+        """Put jobs into the backlog, as one batch."""
+        number = self.backlog.seen + 1
+        self.backlog.add_batch(
+            JobBatch(
+                **HEAD, nonce="n", numbering=0, number=number, vectors=(WHOLE,), jobs=jobs, cancels=(), verdicts=()
+            )
+        )
+
     def score(self, count):
         """So many jobs, their fitness by digest, and the sizes of the groups in the order in which they began."""
         jobs = tuple(job(number, spec=self.spec) for number in range(count))
-        self.backlog.add_batch(
-            JobBatch(**HEAD, nonce="n", numbering=0, number=1, vectors=(WHOLE,), jobs=jobs, cancels=(), verdicts=())
-        )
+        self.add(jobs)
         results, sizes, begun = {}, [], set()
         while len(results) < count:
             self.slots.fill(self.backlog, 0)
@@ -54,8 +61,8 @@ class Pool:
 def pool(random_bundle):
     made = []
 
-    def make(task, slots=2):
-        made.append(Pool(task, random_bundle, slots))
+    def make(task, slots=2, **more):
+        made.append(Pool(task, random_bundle, slots, **more))
         return made[-1]
 
     yield make
@@ -88,3 +95,27 @@ def test_jobs_of_a_task_without_such_a_policy_are_scored_one_by_one(pool):
     fleet = pool(f"{tasks.MODULE}:OneByOne")
     assert (fleet.slots.together, fleet.slots.capacity) == (1, 2)
     assert fleet.score(5)[2] == [1] * 5
+
+
+def test_on_a_torch_device_a_part_of_a_batch_waits_for_the_rest_that_arrives(pool):
+    fleet = pool(f"{tasks.MODULE}:OnTorch", slots=1, torch_device="cpu")
+    assert fleet.slots.capacity == 8
+    jobs = [job(number, spec=fleet.spec) for number in range(16)]
+    (slot,) = fleet.slots._slots
+    for part in (jobs[:3], jobs[3:6]):
+        fleet.add(tuple(part))
+        fleet.slots.fill(fleet.backlog, 0)
+        assert (fleet.slots.awaits_jobs, slot.running) == (True, [])
+    fleet.slots.fill(fleet.backlog, 0)  # no more came meanwhile
+    assert (fleet.slots.awaits_jobs, len(slot.running)) == (False, 6)
+    while slot.running:
+        fleet.take()
+    fleet.add(tuple(jobs[6:]))
+    fleet.slots.fill(fleet.backlog, 0)
+    assert (fleet.slots.awaits_jobs, len(slot.running), len(slot.waiting)) == (False, 8, 2)
+
+
+def test_without_a_torch_device_no_part_of_a_batch_waits(pool):
+    fleet = pool(f"{tasks.MODULE}:OnTorch", slots=1)
+    assert fleet.slots.capacity == 256
+    assert fleet.score(3)[2] == [3]
