@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, EIGHT_BITS, Bundle
-from dreamfleet.common.errors import BundleError, UsageError
+from dreamfleet.common.errors import BundleError
 from dreamfleet.common.serialization.validation import from_plain
 from dreamfleet.worker.worldmodel.choice_memory import ChoiceMemory
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, Prediction
@@ -108,8 +108,6 @@ class _Controllers:
 
     def set_parameters(self, parameters: NDArray[np.float32]) -> None:
         """Copy the layers of `parameters` `(N, size)` to the device: a captured graph reads the first call's memory."""
-        if not np.isfinite(parameters).all() or parameters.shape[1] != self._shape.size:
-            raise UsageError(f"a dream needs controllers of {self._shape.size} finite parameters")
         layers = [tuple(torch.from_numpy(np.ascontiguousarray(each)) for each in pair)
                   for pair in self._shape.unpack(parameters)]  # fmt: skip
         if not self._layers:
