@@ -31,12 +31,14 @@ def cpu_features(cpuinfo: Path = Path("/proc/cpuinfo")) -> tuple[str, ...]:
 
 
 @cache
-def fingerprint(packages: tuple[str, ...] = NUMERIC_PACKAGES) -> str:
+def fingerprint(packages: tuple[str, ...] = NUMERIC_PACKAGES, torch_device: str = "") -> str:
     """One line that is equal on hosts that are expected to compute equal bits. Takes 5 ms, and is cached.
 
-    `packages` are those that a fitness of the run's task depends on; other packages do not matter.
+    `packages` are those that a fitness of the run's task depends on; other packages do not matter. A worker's
+    `torch_device`, on which it dreams, is named with torch's version.
     """
     libc, libc_version = platform.libc_ver()
     versions = [f"{name}-{found}" for name in packages if (found := package_version(name))]
     features = "+".join(cpu_features()) or platform.processor() or "unknown"
-    return " ".join([platform.machine(), features, f"{libc or platform.system()}-{libc_version}", *versions])
+    dreams = [f"torch-{package_version('torch')}", f"dreams-on-{torch_device}"] if torch_device else []
+    return " ".join([platform.machine(), features, f"{libc or platform.system()}-{libc_version}", *versions, *dreams])

@@ -73,8 +73,12 @@ def test_who_dreams_on_a_torch_device_changes_no_bit_either(processes, random_bu
     for name in ("plain", "one", "two"):
         with open_run(processes.runs, name) as run:
             classes.append({each.host_class for each in run.classes.largest})
+            named = [name for each in run.classes.largest for name in each.fingerprints]
+            assert all(("dreams-on-cpu" in each) == (name != "plain") for each in named)
     assert classes[1] == classes[2]
     assert not classes[0] & classes[1]
+    code, out, err = processes.call("verify", "candidate", "two", "--runs-dir", processes.runs, "--candidate", "2/3")
+    assert (code, out.count("same bits")) == (0, EPISODES), err
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.bundle import EIGHT_BITS, Bundle
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.bench.matrix_products import Size, fastest, product_cases
 from dreamfleet.worker.bench.measurement import TimedCall, time_alternately
@@ -47,7 +47,7 @@ def bench_dream(bundle: Bundle) -> dict[str, Any]:
         from dreamfleet.worker.dream.torch_batch import TorchDreamBatch
 
         cases["torch"] = make_torch_dream(bundle, TILE)
-        if has_cuda():
+        if has_cuda() and EIGHT_BITS not in bundle.manifest.models:
             cases["cuda"] = dream(TORCH_ROWS, TorchDreamBatch(bundle, spec, None, "cuda"))
     except ModuleNotFoundError as error:
         note = f"torch_naive_ratio needs {error.name}: pip install 'dreamfleet[train]'"

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.printable import one_line, truncate
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.dream.batch import TORCH_ROWS as ROWS
 from dreamfleet.worker.dream.batch import DreamBatch
@@ -29,7 +30,7 @@ WARM_UP = 3  # steps before a CUDA graph is captured, which torch asks for
 
 
 class TorchDreamBatch(DreamBatch):
-    """Scores batches of dreamt episodes on a torch device; an observer sees one step of `BLOCK_STEPS`."""
+    """Scores batches of dreamt episodes on a torch device, in blocks of `BLOCK_STEPS` steps."""
 
     most_rows = ROWS
 
@@ -46,17 +47,18 @@ class TorchDreamBatch(DreamBatch):
         noise, sums = self._draw_noise(full), self._begin_sums(count)
         dreams.begin(self._stack(full), noise.episode, noise.first.latent, world.begin(ROWS, noise.first.memory))
         rows = np.arange(count)
-        block = self._launch(noise, 0, 0)
+        block = self._launch(noise, 0, noise.next_block(), 0)
         while block is not None and len(rows):
-            action, reward, done = dreams.fetch(block.steps)
+            action, reward, done = dreams.fetch(block.begun % BLOCK_STEPS, block.steps)
             # The device goes on while rewards are added up here; once all dreams are over, what it does is not used.
-            after = self._launch(noise, block.begun + block.steps, int(rows[0]))
+            after = self._launch(noise, block.begun + block.steps, block.draw, int(rows[0]))
             if block.seen is not None and self._observer is not None and block.row in rows:
                 score = float(sums.fitness[block.row])
                 shown = StepSnapshot(block.begun, score, action[0, block.row], None, *block.seen)
                 self._observer.observe(start + block.row, lambda shown=shown: shown)  # type: ignore[misc]
             for index in range(block.steps):
-                bar = None if block.draw.bar is None else block.draw.bar[index, noise.episode[rows]]
+                bars, drawn = block.draw.bar, block.begun % BLOCK_STEPS + index
+                bar = None if bars is None else bars[drawn, noise.episode[rows]]
                 paid, ended = world.judge(reward[index, rows], done[index, rows], bar)
                 sums.add(rows, paid, action[index, rows])
                 rows = rows[~ended]
@@ -64,15 +66,20 @@ class TorchDreamBatch(DreamBatch):
             block = after
         return sums.scores()
 
-    def _launch(self, noise: SharedNoise, begun: int, row: int) -> _Block | None:
-        """Begin the block of steps after the first `begun`; `None` after the last one. An observer may see `row`."""
-        steps = min(BLOCK_STEPS, self._horizon - begun)
-        if steps < 1:
+    def _launch(self, noise: SharedNoise, begun: int, draw: Draw, row: int) -> _Block | None:
+        """Begin the block of steps after the first `begun`; `None` after the last one.
+
+        A block ends with its `draw`, and where an observer wants to see `row`, it is a single step.
+        """
+        if begun >= self._horizon:
             return None
+        drawn = begun % BLOCK_STEPS
+        if begun and not drawn:
+            draw = noise.next_block()
         seen = self._rows.show(row) if self._observer is not None and self._observer.is_due() else None
-        block = _Block(begun, steps, noise.next_block(), row, seen)
-        self._rows.launch(block.draw, steps)
-        return block
+        steps = 1 if seen is not None else min(BLOCK_STEPS - drawn, self._horizon - begun)
+        self._rows.launch(draw, drawn, steps)
+        return _Block(begun, steps, draw, row, seen)
 
 
 class _Block(NamedTuple):
@@ -93,8 +100,9 @@ def find_device(name: str) -> torch.device:
     try:
         device = torch.device(name)
         torch.zeros(1, device=device).item()
-    except Exception as error:  # torch's errors share no public base
-        raise UsageError(f"torch_device {name!r}: torch {torch.__version__} cannot use it here ({error})") from error
+    except Exception as error:  # torch's errors share no public base, and some are pages long
+        what = truncate(one_line(str(error).partition("\n")[0]), 200)
+        raise UsageError(f"torch_device {name!r}: torch {torch.__version__} cannot use it here ({what})") from error
     return device
 
 
@@ -114,7 +122,10 @@ class _DreamRows:
         with torch.no_grad():
             actions = step.step(self._latent, self._state, self._take_noise()).action.shape[1]
         self._outputs = (self._zeros(*block, actions), self._zeros(*block), self._zeros(*block))
-        self._graph = self._capture() if device.type == "cuda" else None
+        self._graph = None
+        if device.type == "cuda":
+            with torch.cuda.device(device):  # torch captures what the current device does
+                self._graph = self._capture()
 
     def begin(self, parameters: Floats, episode: NDArray[np.int64], latent: Floats, state: Floats) -> None:
         """Start new dreams, one a row; `episode` `(ROWS,)` is each row's column in the draws."""
@@ -127,18 +138,18 @@ class _DreamRows:
         latent, state = (each[row].to("cpu", copy=True).numpy() for each in (self._latent, self._state))
         return latent, state
 
-    def launch(self, draw: Draw, steps: int) -> None:
-        """Begin to dream so many steps."""
+    def launch(self, draw: Draw, drawn: int, steps: int) -> None:
+        """Begin to dream so many steps, by what a draw has after its first `drawn` ones."""
         for mine, given in zip(self._noise, (draw.uniform, draw.normal, draw.mask), strict=True):
-            if mine is not None and given is not None:
+            if mine is not None and given is not None and not drawn:  # else they are there
                 mine[:, : given.shape[1]].copy_(torch.from_numpy(given))
-        self._index.zero_()
+        self._index.fill_(drawn)
         for _ in range(steps):
             self._graph.replay() if self._graph is not None else self._advance()
 
-    def fetch(self, steps: int) -> tuple[Floats, Floats, Floats]:
+    def fetch(self, drawn: int, steps: int) -> tuple[Floats, Floats, Floats]:
         """Wait for these steps: the actions `(steps, ROWS, actions)`, and both heads' outputs `(steps, ROWS)`."""
-        action, reward, done = (each[:steps].to("cpu", copy=True).numpy() for each in self._outputs)
+        action, reward, done = (each[drawn : drawn + steps].to("cpu", copy=True).numpy() for each in self._outputs)
         return action, reward, done
 
     @torch.no_grad()

@@ -171,7 +171,7 @@ class Scorer(Displayed):
                 found = self._probe(steps)
                 repeat = monotonic() - began < REPEAT_LIMIT
                 return found if not repeat or self._probe(steps) == found else NON_DETERMINISTIC
-        return class_from_fingerprint(fingerprint(self.world.packages))
+        return class_from_fingerprint(fingerprint(self.world.packages, self._assignment.torch_device))
 
     def _probe(self, steps: int) -> str:
         found, size = HostClassProbe(), self._assignment.controller.size

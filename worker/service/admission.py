@@ -54,6 +54,7 @@ def request_admission(
     joined_run_uid: str = "",
     *,
     secured: bool = False,
+    torch_device: str = "",
 ) -> Admission | None:
     """Say hello to `run`, or to the only live run; `None` if nobody answers, `RefusedError` if the answer is a refusal.
 
@@ -64,7 +65,7 @@ def request_admission(
     """
     reply = _send_hello(session, run, request, inbox, joined_run_uid, secured=secured)
     if reply is not None and not reply.accepted and reply.packages != request.packages:
-        named = fingerprint(reply.packages)[:MAX_TEXT]  # the coordinator chooses how many
+        named = fingerprint(reply.packages, torch_device)[:MAX_TEXT]  # the coordinator chooses how many
         about = replace(request, packages=reply.packages, fingerprint=named)
         reply = _send_hello(session, reply.run, about, inbox, joined_run_uid, secured=secured)
     if reply is None:
@@ -145,7 +146,9 @@ def _live_statuses(session: zenoh.Session) -> Iterator[Any]:
             yield json.loads(payload)
 
 
-def make_request(worker: str, tasks: tuple[str, ...], slots: int, *, leaves_with_run: bool = False) -> HelloRequest:
+def make_request(
+    worker: str, tasks: tuple[str, ...], slots: int, *, leaves_with_run: bool = False, torch_device: str = ""
+) -> HelloRequest:
     """The hello request of a worker."""
     return HelloRequest(
         protocol_min=keys.PROTOCOL_VERSION,
@@ -153,7 +156,7 @@ def make_request(worker: str, tasks: tuple[str, ...], slots: int, *, leaves_with
         package=package_version("dreamfleet") or "unknown",
         worker=worker,
         tasks=tasks,
-        fingerprint=fingerprint(),
+        fingerprint=fingerprint(torch_device=torch_device),
         slots=slots,
         leaves_with_run=leaves_with_run,
         reads_end=True,

@@ -10,7 +10,6 @@ from dreamfleet.common.protocol.keys import check_run_name, check_worker_name
 from dreamfleet.common.protocol.messages import MAX_LEASES
 
 MAX_RUNS = 64  # that a worker serves side by side
-TORCH_MEMORY = 8192  # MiB more that a scoring process may hold with a torch device, whose libraries are large
 
 
 @dataclass(frozen=True)
@@ -35,12 +34,6 @@ class WorkerConfig:
     coordinator_timeout: float = option(
         600.0, "with --exit-when-done: seconds without a coordinator after which it leaves, and exits with 1"
     )
-
-    @property
-    def memory_limit(self) -> int:
-        """Bytes that a scoring process may hold; 0: no limit."""
-        more = TORCH_MEMORY if self.torch_device else 0
-        return (self.slot_memory + more) << 20 if self.slot_memory else 0
 
     def __post_init__(self) -> None:
         if self.run is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
@@ -132,11 +131,9 @@ def _score(
 def _results(
     work: Sequence[JobWithVector], scores: list[Score], spent: float, upload: bytes | None, horizon: int
 ) -> tuple[Result, ...]:
-    """One result a job; `ValueError` if the task's scores are not one finite number a job."""
+    """One result a job; `ValueError` if the task's scores are not one a job."""
     if len(scores) != len(work):
         raise ValueError(f"the task gave {len(scores)} scores of {len(work)} episodes")
-    if not all(math.isfinite(score.fitness) for score in scores):
-        raise ValueError("the task gave a fitness that is not a finite number")
     if not all(0 <= int(score.steps) < 2**63 for score in scores):
         raise ValueError("the task gave a number of steps that is not from 0 to 2**63 - 1")
     if not all(abs(each) <= LARGEST_MEASURE for score in scores for each in score.measures):
@@ -148,7 +145,7 @@ def _results(
 def _result(job: Job, score: Score, spent: float, sha256: bytes | None, horizon: int) -> Result:
     """The result of one job.
 
-    R8: a fitness or step count out of bounds becomes this job's error, because a wrong number would mislead the search.
+    R8: a fitness or step count out of bounds, or no number, is this job's error: a wrong one would mislead the search.
     The jobs scored with it keep their results.
     """
     fitness, steps = float(score.fitness), int(score.steps)

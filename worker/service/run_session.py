@@ -31,12 +31,11 @@ from dreamfleet.worker.service.membership import Membership, WorkerLoad
 from dreamfleet.worker.service.outbox import BURST_INTERVAL, Outbox, UploadQueue
 from dreamfleet.worker.service.sender import CoordinatorSender, StepRate
 from dreamfleet.worker.service.slot import SlotEvent
-from dreamfleet.worker.service.slot_pool import SlotPool
+from dreamfleet.worker.service.slot_pool import BATCH_INTERVAL, SlotPool
 from dreamfleet.worker.service.wording import describe_failure
 
 log = logging.getLogger(__name__)
 MAX_WAITING_BATCHES = 1024  # R26: more batches are dropped unread; the coordinator sends unconfirmed ones again
-BATCH_INTERVAL = 0.01  # seconds without another job after which a part of a batch is scored
 CLOCK_GAP = 2.0  # seconds between two passes of the loop that mean that the host was suspended
 
 Events = queue.SimpleQueue[tuple[str, Any]]
@@ -114,7 +113,8 @@ class RunSession:
             session.liveliness().declare_token(keys.live_worker(run, self._link.identity)),
             self._frame_publisher,
         ]
-        log.info("joined run %s as %s, %s", run, self._link.identity, plural(len(self._slots), "slot"))
+        device = f", dreams on {self._slots.torch_device}" if self._slots.torch_device else ""
+        log.info("joined run %s as %s, %s%s", run, self._link.identity, plural(len(self._slots), "slot"), device)
 
     def _main_loop(self) -> str:
         """Work; return why it ended."""

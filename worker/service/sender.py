@@ -56,7 +56,7 @@ class CoordinatorSender:
         batch = ResultBatch(
             run_uid=self._admission.run_uid,
             incarnation=self._admission.incarnation,
-            fingerprint=fingerprint(self._admission.packages),
+            fingerprint=fingerprint(self._admission.packages, slots.torch_device),
             results=results,
             host_class=self._host_class(slots),
         )

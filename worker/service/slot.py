@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
-from dreamfleet.common.errors import BundleError, DreamfleetError
+from dreamfleet.common.errors import BundleError, DreamfleetError, UsageError
 from dreamfleet.common.host.stall_watch import START_LIMIT, StallWatch, describe_slow_start, describe_stall
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol.failures import is_host_failure
@@ -32,6 +32,7 @@ MAX_NAME_LENGTH = 100  # characters of `drawn_by`
 REMEDY = "give it fewer --slots, or this host more room (ulimit -n, ulimit -u, memory, the disk of temporary files)"
 MAX_START_DELAY = 30.0  # the longest pause before a new child, where children end one after another without a result
 LOOK_INTERVAL = 0.5  # seconds between two looks whether the child still runs
+WRONG_USAGE = "UsageError: "  # how the failure of a child begins that was asked for what this host cannot do
 SHORT_GROUP = 0.25  # seconds; after a group that was shorter, a second group is queued in the child
 MAX_PIPELINED_BYTES = 64 * 1024  # bytes of vectors that a pipe accepts while its child is busy
 
@@ -303,6 +304,8 @@ class Slot:
         ended_by = "it closed its pipe and ran on" if status is None else self._last_error or describe_exit(status)
         reason = self._kill_reason or ended_by
         running = self.running if self.ready else []  # before it was ready it ran nothing
+        if not self.ready and reason.startswith(WRONG_USAGE):  # another child would say the same
+            raise UsageError(reason.removeprefix(WRONG_USAGE))
         log.warning("slot %d ended (%s)%s; starting another", self.number, reason, describe_jobs(running))
         if not self.ready and is_host_failure(reason):
             self._count_starved_start(reason)

@@ -25,6 +25,9 @@ from dreamfleet.worker.tasks.registry import check_task_allowed, find_task
 log = logging.getLogger(__name__)
 
 
+TORCH_MEMORY = 8 << 30  # bytes more that a slot may hold that uses a torch device, whose libraries are large
+BATCH_INTERVAL = 0.01  # seconds without another job after which a part of a batch is scored
+LONGEST_WAIT = 0.1  # seconds after which it is scored though jobs go on to trickle in
 IDLE_CHILD = 60.0  # seconds without a job after which a child that is not the last one ends, beside other runs
 
 
@@ -52,10 +55,13 @@ class SlotPool:
         check_task_allowed(name, arguments.allowed_tasks)
         self._share, self._all_at_once = share, all_at_once
         self._task, task = name, find_task(name)
+        self.torch_device = arguments.torch_device
         size = getattr(task, "torch_batch_size", 0) if arguments.torch_device else 0
+        memory_limit += TORCH_MEMORY if size and memory_limit else 0
         self._batch_size: int | None = size or task.batch_size if isinstance(task, BatchedTask) else None
         self._whole_batches = size > 0  # a torch device takes as long for a part of a batch
         self._jobs_before = 0  # in the backlog, at the last `fill`
+        self._grew_at = self._waits_since = 0.0  # when jobs last arrived, and when the first of them did
         self.awaits_jobs = False  # whether a part of a batch waits for the rest, which may be on its way
         self.together = 1  # candidates' drives that a slot does side by side; reported by the first child that is ready
         self._failures = FailureLog()
@@ -137,8 +143,7 @@ class SlotPool:
 
         R26: nothing starts while too many results, `undelivered`, wait for a verdict, so the outbox stays bounded.
         """
-        before, self._jobs_before = self._jobs_before, len(backlog)
-        self.awaits_jobs = self._whole_batches and before < len(backlog) < self._jobs_a_slot
+        self.awaits_jobs = self._must_wait(len(backlog))
         if self.awaits_jobs:
             return
         room = 4 * len(self._slots) * self._jobs_a_slot - undelivered
@@ -164,6 +169,7 @@ class SlotPool:
 
     def yield_idle_slots(self) -> None:
         """Leave the slots that score nothing to the other runs."""
+        self.awaits_jobs = False
         self._settle(0, has_jobs=False)
         self._share.pass_on()
 
@@ -223,6 +229,17 @@ class SlotPool:
         until = monotonic() + EXIT_GRACE
         for slot in self._slots:
             slot.stop(max(0.0, until - monotonic()))
+
+    def _must_wait(self, jobs: int) -> bool:
+        """Whether so many jobs are a part of a batch whose rest is on its way."""
+        now, grew = monotonic(), jobs > self._jobs_before
+        self._jobs_before = jobs
+        if not self._whole_batches or not 0 < jobs < self._jobs_a_slot:
+            return False
+        if grew:
+            self._grew_at = now
+            self._waits_since = self._waits_since if self.awaits_jobs else now
+        return now - self._grew_at < BATCH_INTERVAL and now - self._waits_since < LONGEST_WAIT
 
     def _submit(self, slot: Slot, backlog: Backlog) -> bool:
         """Give a slot the next group, if one is whole."""

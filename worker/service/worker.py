@@ -96,7 +96,7 @@ class Worker:
         self._slot_count = config.slots or (1 if config.torch_device else usable_cores())
         self._hello = make_request(
             self.identity, (*known_tasks(), *tasks), self._slot_count,
-            leaves_with_run=config.exit_when_done or config.any,
+            leaves_with_run=config.exit_when_done or config.any, torch_device=config.torch_device,
         )  # fmt: skip
         lifetime = min(config.lifetime or math.inf, self._seconds_until_expiry)
         self._conditions = LeaveConditions(
@@ -265,7 +265,7 @@ class Worker:
         share = self._slots.open(admission.share, lambda: events.put(("wake", None)))
         try:
             return SlotPool(
-                share, arguments, events, config.memory_limit,
+                share, arguments, events, config.slot_memory << 20,
                 lambda: self._fetch_bundle(session, admission) if bundle else None,
                 all_at_once=not config.any or config.runs == 1,
             )  # fmt: skip
@@ -352,7 +352,9 @@ class Worker:
         self, session: zenoh.Session, run: str | None, host_class: str = "", joined_run_uid: str = ""
     ) -> Admission | None:
         request, secured = replace(self._hello, host_class=host_class), self._network.credentials is not None
-        return request_admission(session, run, request, self.inbox, joined_run_uid, secured=secured)
+        return request_admission(
+            session, run, request, self.inbox, joined_run_uid, secured=secured, torch_device=self._config.torch_device
+        )
 
     def _fetch_bundle(self, session: zenoh.Session, admission: Admission) -> Bundle | None:
         store = BundleStore(default_cache())

@@ -85,7 +85,9 @@ class ReplayedEpisode:
         return None if tolerance is None else abs(self.stored - self.replayed) <= tolerance
 
 
-def replay(run: RunFolder, generation: int, candidate: int, stall: float = STALL_SECONDS) -> Iterator[ReplayedEpisode]:
+def replay(
+    run: RunFolder, generation: int, candidate: int, stall: float = STALL_SECONDS, torch_device: str = ""
+) -> Iterator[ReplayedEpisode]:
     """Drive each stored episode of a candidate again, with its generation's parameters, bundle and seeds.
 
     It drives in a child process: an episode that ends it, or makes no step for `stall` seconds, has that error now. An
@@ -106,7 +108,7 @@ def replay(run: RunFolder, generation: int, candidate: int, stall: float = STALL
         for each in stored
         if not is_crash(failures.get(each.episode, ""))
     ]
-    driven = _drive_all(own, run.bundle_path if own.bundle else None, items, stall)
+    driven = _drive_all(own, run.bundle_path if own.bundle else None, items, stall, torch_device)
     here = {*(each.host_class for each in driven.values()), class_from_fingerprint(fingerprint(run.settings.packages))}
     for each in stored:
         now = driven.get(each.episode, ReplayAttempt(each.episode))
@@ -141,7 +143,9 @@ def _stored_episodes(
     return sorted(filter(is_final, stored), key=lambda each: each.episode)
 
 
-def _drive_all(spec: TaskSpec, bundle: Path | None, items: Sequence[Item], stall: float) -> dict[int, ReplayAttempt]:
+def _drive_all(
+    spec: TaskSpec, bundle: Path | None, items: Sequence[Item], stall: float, torch_device: str
+) -> dict[int, ReplayAttempt]:
     """Drive the episodes one after another in a child process; the attempts by episode."""
 
     def lose(item: Item, reason: int | str) -> ReplayAttempt:
@@ -149,7 +153,7 @@ def _drive_all(spec: TaskSpec, bundle: Path | None, items: Sequence[Item], stall
 
     pin_thread_pools()
     attempts = map_in_processes(
-        1, _Replayer.start, (os.getpid(), spec, bundle), _Replayer.drive, items, lose, stall,
+        1, _Replayer.start, (os.getpid(), spec, bundle, torch_device), _Replayer.drive, items, lose, stall,
         has_failed=lambda attempt: bool(attempt.error),
     )  # fmt: skip
     return {each.episode: each for each in attempts}
@@ -160,15 +164,16 @@ class _Replayer:
 
     spec: ClassVar[TaskSpec]
     bundle: ClassVar[Path | None]
+    torch_device: ClassVar[str]
     scorer: ClassVar[Scorer | None] = None
 
     @classmethod
-    def start(cls, parent: int, spec: TaskSpec, bundle: Path | None) -> None:
+    def start(cls, parent: int, spec: TaskSpec, bundle: Path | None, torch_device: str) -> None:
         """Initialise the process, which ends with its parent."""
         exit_with_parent(parent)
         os.environ["SDL_VIDEODRIVER"] = "dummy"
         outlive_stop_signals()  # Ctrl-C reaches the whole process group; the parent ends this process
-        cls.spec, cls.bundle = spec, bundle
+        cls.spec, cls.bundle, cls.torch_device = spec, bundle, torch_device
 
     @classmethod
     def drive(cls, item: Item) -> ReplayAttempt:
@@ -179,7 +184,8 @@ class _Replayer:
         host_class = ""
         try:
             if cls.scorer is None:
-                cls.scorer = Scorer(cls.spec, None if cls.bundle is None else Bundle.open(cls.bundle, cls.spec.bundle))
+                opened = None if cls.bundle is None else Bundle.open(cls.bundle, cls.spec.bundle)
+                cls.scorer = Scorer(cls.spec, opened, cls.torch_device)
             host_class = cls.scorer.host_class  # before the episode, as it drives the environment too
             count_step()
             score = cls.scorer.score("score", parameters, seed, count_step, spec=spec)

@@ -34,7 +34,9 @@ def run(args: argparse.Namespace) -> int:
     """Replay each episode; exit 1 if one differs, or if this host can check none."""
     import numpy as np
 
+    from dreamfleet.common.cli.config import load
     from dreamfleet.common.runs.run_folder import open_run
+    from dreamfleet.worker.service.config import WorkerConfig
     from dreamfleet.worker.tools.replay import replay
 
     found = re.fullmatch(r"(\d{1,12})/(\d{1,12})", args.candidate)
@@ -43,7 +45,8 @@ def run(args: argparse.Namespace) -> int:
     if args.tolerance is not None and not 0 <= args.tolerance < math.inf:
         raise UsageError(f"--tolerance must be 0 or more, not {args.tolerance}")
     with open_run(args.runs_dir, args.run_name) as stored:
-        episodes = list(replay(stored, int(found[1]), int(found[2])))
+        device = load(WorkerConfig, "worker", **args.sources).torch_device
+        episodes = list(replay(stored, int(found[1]), int(found[2]), torch_device=device))
         stored_fitness = stored.fitness(int(found[1]), int(found[2]))
     if not episodes:
         raise JournalError(f"candidate {args.candidate} of run {args.run_name} has no results yet")

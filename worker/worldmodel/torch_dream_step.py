@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, EIGHT_BITS, Bundle
-from dreamfleet.common.errors import BundleError
+from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, EIGHT_BITS, SINGLE_PRECISION, Bundle, describe_bundle
+from dreamfleet.common.errors import UsageError
 from dreamfleet.common.serialization.validation import from_plain
 from dreamfleet.worker.worldmodel.choice_memory import ChoiceMemory
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, Prediction
@@ -40,11 +40,14 @@ class TorchDreamStep:
     """The same step as `inference.DreamStep`, on a torch device; its last bits differ."""
 
     def __init__(self, bundle: Bundle, device: torch.device, temperature: float) -> None:
-        """`BundleError` for a world model of eight bits, whose products no graphics processor rounds alike."""
+        """`UsageError` for a world model of eight bits: torch dreams in single precision."""
         models = bundle.manifest.models
         if EIGHT_BITS in models:
-            raise BundleError(f"{bundle.path.name} has eight bits, and torch dreams in single precision: take the "
-                              "bundle that it was made of, or a worker without torch_device")  # fmt: skip
+            own, whole = bundle.sha256, str(bundle.manifest.provenance.get(SINGLE_PRECISION, ""))
+            raise UsageError(
+                f"torch_device: {describe_bundle(own)} has eight bits, and torch dreams in single precision: begin the "
+                f"run with {describe_bundle(whole)}, or this worker without torch_device"
+            )
         self._config = from_plain(MDNRNNConfig, models.get("mdnrnn"))
         self._model = MDNRNN(self._config)
         weights = mdnrnn_weights(bundle.read(DREAM_GRAPH), self._config)

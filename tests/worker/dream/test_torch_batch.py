@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.bundle_store import find_bundle
-from dreamfleet.common.errors import BundleError, UsageError
+from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.dream.torch_batch import ROWS, TorchDreamBatch
+from dreamfleet.worker.scoring.host_class_probe import HostClassProbe
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worldmodel.torch_dream_step import TorchDreamStep
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
 from tests.support.variants import VARIANTS
@@ -77,7 +79,7 @@ def test_more_dreams_than_rows_are_dreamt_in_turn(random_bundle):
     assert done == [2 * ROWS, 2 * ROWS + 16]
 
 
-def test_a_watched_dream_has_the_same_score_and_shows_the_first_step_of_a_block(random_bundle):
+def test_a_watched_dream_has_the_same_score_and_shows_each_step_that_is_due(random_bundle):
     class Seen(list):
         def is_due(self):
             return True
@@ -88,7 +90,7 @@ def test_a_watched_dream_has_the_same_score_and_shows_the_first_step_of_a_block(
     seen, episodes = Seen(), dreams(random_bundle)
     batch = TorchDreamBatch(random_bundle, spec(random_bundle), None, DEVICE)
     assert batch.watched(seen).score(episodes) == batch.score(episodes)
-    assert [(episode, snapshot.step) for episode, snapshot in seen] == [(0, 0), (0, 64)]
+    assert [(episode, snapshot.step) for episode, snapshot in seen] == [(0, step) for step in range(HORIZON)]
     plain = Seen()
     DreamBatch(random_bundle, spec(random_bundle)).watched(plain).score(episodes)
     for _, snapshot in seen:
@@ -111,6 +113,23 @@ def test_a_scorer_on_a_torch_device_is_of_a_class_of_its_own(random_bundle):
     assert own.score("score", vector, seed, spec=driven) == plain.score("score", vector, seed, spec=driven)
 
 
+def test_where_the_probe_fails_the_class_is_of_the_device_too(random_bundle, monkeypatch):
+    def fails(*_given):
+        raise RuntimeError("CUDA out of memory")
+
+    monkeypatch.setattr(HostClassProbe, "add_batch", fails)
+    on_torch, plain = Scorer(spec(random_bundle), random_bundle, DEVICE), Scorer(spec(random_bundle), random_bundle)
+    assert on_torch.host_class != plain.host_class
+
+
+def test_what_survives_is_of_another_class_too_if_its_latents_are_others(choices_bundle, monkeypatch):
+    """Its fitness is a number of steps, in which no last bit shows."""
+    before = Scorer(spec(choices_bundle), choices_bundle, DEVICE).host_class
+    sample = TorchDreamStep._sample
+    monkeypatch.setattr(TorchDreamStep, "_sample", lambda *given: sample(*given) * (1 + 2**-20))
+    assert Scorer(spec(choices_bundle), choices_bundle, DEVICE).host_class != before
+
+
 @pytest.mark.parametrize("name", ["cuda:99", "sun", "meta"])
 def test_a_device_that_is_not_there_is_an_error(random_bundle, name):
     with pytest.raises(UsageError, match=rf"torch_device '{name}': torch .* cannot use it here"):
@@ -119,7 +138,8 @@ def test_a_device_that_is_not_there_is_an_error(random_bundle, name):
 
 def test_a_world_model_of_eight_bits_does_not_dream_in_torch():
     bundle = find_bundle("tiny-int8")
-    with pytest.raises(BundleError, match="has eight bits, and torch dreams in single precision"):
+    whole = find_bundle("tiny").sha256[:12]
+    with pytest.raises(UsageError, match=rf"eight bits, and torch dreams in single .* with the world model {whole}"):
         TorchDreamBatch(bundle, spec(bundle), None, DEVICE)
 
 

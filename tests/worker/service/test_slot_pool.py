@@ -1,12 +1,16 @@
 """How the jobs of a backlog are divided among a worker's slots."""
 
+import math
 import queue
+from time import sleep
 
 import numpy as np
 import pytest
 
+from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.messages import JobBatch, TaskSpec, VectorPart
 from dreamfleet.worker.scoring.scorer import Scorer
+from dreamfleet.worker.service import slot_pool
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.child import ScorerArguments
 from dreamfleet.worker.service.slot_budget import SharedSlots
@@ -97,7 +101,9 @@ def test_jobs_of_a_task_without_such_a_policy_are_scored_one_by_one(pool):
     assert fleet.score(5)[2] == [1] * 5
 
 
-def test_on_a_torch_device_a_part_of_a_batch_waits_for_the_rest_that_arrives(pool):
+def test_on_a_torch_device_a_part_of_a_batch_waits_for_the_rest_that_arrives(pool, monkeypatch):
+    monkeypatch.setattr(slot_pool, "BATCH_INTERVAL", math.inf)
+    monkeypatch.setattr(slot_pool, "LONGEST_WAIT", math.inf)
     fleet = pool(f"{tasks.MODULE}:OnTorch", slots=1, torch_device="cpu")
     assert fleet.slots.capacity == 8
     jobs = [job(number, spec=fleet.spec) for number in range(16)]
@@ -106,6 +112,9 @@ def test_on_a_torch_device_a_part_of_a_batch_waits_for_the_rest_that_arrives(poo
         fleet.add(tuple(part))
         fleet.slots.fill(fleet.backlog, 0)
         assert (fleet.slots.awaits_jobs, slot.running) == (True, [])
+    fleet.slots.fill(fleet.backlog, 0)  # of another event
+    assert (fleet.slots.awaits_jobs, slot.running) == (True, [])
+    monkeypatch.setattr(slot_pool, "BATCH_INTERVAL", 0.0)
     fleet.slots.fill(fleet.backlog, 0)  # no more came meanwhile
     assert (fleet.slots.awaits_jobs, len(slot.running)) == (False, 6)
     while slot.running:
@@ -115,7 +124,25 @@ def test_on_a_torch_device_a_part_of_a_batch_waits_for_the_rest_that_arrives(poo
     assert (fleet.slots.awaits_jobs, len(slot.running), len(slot.waiting)) == (False, 8, 2)
 
 
+def test_jobs_that_trickle_in_wait_not_for_ever(pool, monkeypatch):
+    fleet = pool(f"{tasks.MODULE}:OnTorch", slots=1, torch_device="cpu")
+    monkeypatch.setattr(slot_pool, "BATCH_INTERVAL", math.inf)
+    (slot,) = fleet.slots._slots
+    fleet.add((job(0, spec=fleet.spec),))
+    fleet.slots.fill(fleet.backlog, 0)
+    assert (fleet.slots.awaits_jobs, slot.running) == (True, [])
+    sleep(slot_pool.LONGEST_WAIT)
+    fleet.add((job(1, spec=fleet.spec),))
+    fleet.slots.fill(fleet.backlog, 0)
+    assert (fleet.slots.awaits_jobs, len(slot.running)) == (False, 2)
+
+
 def test_without_a_torch_device_no_part_of_a_batch_waits(pool):
     fleet = pool(f"{tasks.MODULE}:OnTorch", slots=1)
     assert fleet.slots.capacity == 256
     assert fleet.score(3)[2] == [3]
+
+
+def test_a_torch_device_that_is_not_there_ends_the_worker_at_once(random_bundle):
+    with pytest.raises(UsageError, match=r"^torch_device 'sun': torch .* cannot use it here"):
+        Pool("dream", random_bundle, 1, torch_device="sun")
