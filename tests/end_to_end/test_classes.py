@@ -37,7 +37,7 @@ def stranger(processes, tmp_path):
     script, started = tmp_path / "stranger.py", []
     script.write_text(
         "import sys\nfrom dreamfleet.worker.service import admission, sender as post\n"
-        f"admission.fingerprint = post.fingerprint = lambda *_: {OTHER!r}\n"
+        f"admission.fingerprint = post.fingerprint = lambda *_, **_more: {OTHER!r}\n"
         "from dreamfleet.common.cli.command_line import main\n"
         "if __name__ == '__main__':\n    sys.exit(main(sys.argv[1:]))\n"  # its children import it too
     )
