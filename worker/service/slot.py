@@ -304,7 +304,7 @@ class Slot:
         ended_by = "it closed its pipe and ran on" if status is None else self._last_error or describe_exit(status)
         reason = self._kill_reason or ended_by
         running = self.running if self.ready else []  # before it was ready it ran nothing
-        if not self.ready and reason.startswith(WRONG_USAGE):  # another child would say the same
+        if not self._was_ready and reason.startswith(WRONG_USAGE):  # another child would say the same
             raise UsageError(reason.removeprefix(WRONG_USAGE))
         log.warning("slot %d ended (%s)%s; starting another", self.number, reason, describe_jobs(running))
         if not self.ready and is_host_failure(reason):
