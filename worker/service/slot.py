@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
-from dreamfleet.common.errors import BundleError, DreamfleetError, UsageError
+from dreamfleet.common.errors import BundleError, DreamfleetError
 from dreamfleet.common.host.stall_watch import START_LIMIT, StallWatch, describe_slow_start, describe_stall
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol.failures import is_host_failure
@@ -305,7 +305,7 @@ class Slot:
         reason = self._kill_reason or ended_by
         running = self.running if self.ready else []  # before it was ready it ran nothing
         if not self._was_ready and reason.startswith(WRONG_USAGE):  # another child would say the same
-            raise UsageError(reason.removeprefix(WRONG_USAGE))
+            raise _cannot_start(reason)
         log.warning("slot %d ended (%s)%s; starting another", self.number, reason, describe_jobs(running))
         if not self.ready and is_host_failure(reason):
             self._count_starved_start(reason)

@@ -7,7 +7,7 @@ from time import sleep
 import numpy as np
 import pytest
 
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.protocol.messages import JobBatch, TaskSpec, VectorPart
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.service import slot_pool
@@ -144,5 +144,6 @@ def test_without_a_torch_device_no_part_of_a_batch_waits(pool):
 
 
 def test_a_torch_device_that_is_not_there_ends_the_worker_at_once(random_bundle):
-    with pytest.raises(UsageError, match=r"^torch_device 'sun': torch .* cannot use it here"):
+    why = r"^a slot cannot start: UsageError: torch_device 'sun': torch .* cannot use it here"
+    with pytest.raises(DreamfleetError, match=why):
         Pool("dream", random_bundle, 1, torch_device="sun")
