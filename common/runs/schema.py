@@ -83,6 +83,21 @@ MIGRATIONS = (
     CREATE INDEX open_batch ON batch (number) WHERE state IN ('running', 'waiting');
     """,
     "ALTER TABLE barred ADD COLUMN by_operator INTEGER NOT NULL DEFAULT 0;",
+    # Results lie in the order in which they come, so a commit changes few pages, however long the run is.
+    """
+    CREATE TABLE placed (
+        digest BLOB NOT NULL, kind TEXT NOT NULL, generation INTEGER NOT NULL, candidate INTEGER NOT NULL,
+        episode INTEGER NOT NULL, seed INTEGER NOT NULL, fitness REAL NOT NULL, steps INTEGER NOT NULL,
+        seconds REAL NOT NULL, worker TEXT NOT NULL, fingerprint TEXT NOT NULL, incarnation INTEGER NOT NULL,
+        host_class TEXT NOT NULL DEFAULT '', measures TEXT,
+        PRIMARY KEY (kind, generation, candidate, episode, digest)
+    ) STRICT, WITHOUT ROWID;
+    INSERT INTO placed SELECT digest, kind, generation, candidate, episode, seed, fitness, steps, seconds, worker,
+        fingerprint, incarnation, host_class, measures FROM result ORDER BY kind, generation, candidate, episode;
+    DROP TABLE result;
+    ALTER TABLE placed RENAME TO result;
+    CREATE INDEX evaluation_digest ON result (digest) WHERE kind = 'evaluate';
+    """,
 )
 """Entry i migrates a journal from version i to i + 1. Append only."""
 VERSION = len(MIGRATIONS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from math import isnan, nan
 
 from dreamfleet.common.protocol.messages import Job
@@ -148,7 +149,7 @@ class BackgroundJobs:
             if not (episodes and finalists):
                 return []
             self._confirmation = Confirmation(self._settings.task, episodes, finalists, closed)
-        work = self._confirmation.advance(self._journal.fitness_of, self._check_again)
+        work = self._confirmation.advance(partial(self._journal.fitness_of, "evaluate"), self._check_again)
         if self._confirmation.failed:
             return []
         if (outcome := self._confirmation.outcome) is not None:
@@ -170,13 +171,13 @@ class BackgroundJobs:
         """An evaluated mean's scores by seed, from the journal (R28), whichever evaluation of that mean had them."""
         vector, settings = self._journal.evaluated_vector(generation), self._settings
         work = Evaluation(generation, vector, settings.evaluation_episodes).work(settings.task)
-        known = self._journal.fitness_of([each.job.digest for each in work])
+        known = self._journal.fitness_of("evaluate", [each.job.digest for each in work])
         scores = {each.job.seeds[0]: known.get(each.job.digest, nan) for each in work}
         return {seed: score for seed, score in scores.items() if not isnan(score)}
 
     def _evaluate(self, evaluation: Evaluation) -> list[Work]:
         wanted = [each.job.digest for each in evaluation.work(self._settings.task)]
-        work = self.evaluations.open(evaluation, self._settings.task, self._journal.fitness_of(wanted))
+        work = self.evaluations.open(evaluation, self._settings.task, self._journal.fitness_of("evaluate", wanted))
         self._verification.restore(evaluation.work(self._settings.task))
         self._finish(evaluation.generation)
         return work

@@ -52,6 +52,7 @@ class ExternalGenerations(Generations):
 
     def begin(self) -> Generation:
         """Restore the open batch of the last incarnation, or open the next one."""
+        self._journal.index_scores()
         stored = self._journal.last_generation()
         self.scoring_params = self._terms(len(self.history))
         if stored is None or self._journal.is_closed(stored.number):
@@ -119,6 +120,6 @@ class ExternalGenerations(Generations):
 
         Their steps belong to the generation that made them.
         """
-        known = self._journal.fitness_of([work.job.digest for work in generation.missing])
+        known = self._journal.fitness_of("score", [work.job.digest for work in generation.missing])
         generation.recall({digest: (fitness, 0, ()) for digest, fitness in known.items()})
         return generation

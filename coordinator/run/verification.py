@@ -112,7 +112,7 @@ class Verification:
         drawn = {
             each.job.digest: each for each in work if each.job.digest not in self._jobs and self.is_drawn(each.job)
         }
-        for digest, known in self._journal.unverified([*drawn]).items():
+        for digest, known in self._journal.unverified([each.job for each in drawn.values()]).items():
             self._jobs.offer_check(drawn[digest], Check(known.host_class, {known.answer.host}))
             self._answers[digest], self._workers[digest] = [known.answer], known.worker
 

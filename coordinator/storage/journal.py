@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.files.atomic_write import atomic_write, fsync_path, reporting_unwritable_folder
 from dreamfleet.common.protocol.host_classes import HostClasses, class_from_fingerprint, count_results
-from dreamfleet.common.protocol.messages import Job, Result
+from dreamfleet.common.protocol.messages import Job, Kind, Result
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS, LONGEST_EPISODE, max_steps, to_finite
 from dreamfleet.common.runs import schema
 from dreamfleet.common.runs.effort import Effort
@@ -369,20 +369,24 @@ class Journal(RecallRecords):
         query = "SELECT digest FROM failure WHERE kind = ? AND generation = ?"
         return found | {digest: (nan, 0, ()) for (digest,) in self._read(query, kind, generation)}
 
-    def fitness_of(self, digests: Sequence[bytes]) -> dict[bytes, float]:
+    def fitness_of(self, kind: Kind, digests: Sequence[bytes]) -> dict[bytes, float]:
         """Fitness of those of these jobs that have an accepted result, whichever generation asked for it.
 
-        NaN for those that failed for good.
+        NaN for those that failed for good. Only `index_scores` makes it fast for candidates' episodes.
         """
         self.take_back(digests)
         found: dict[bytes, float] = {}
         for start in range(0, len(digests), MOST_VARIABLES):
             some = digests[start : start + MOST_VARIABLES]
-            marks = ", ".join("?" * len(some))
-            found.update(self._read(f"SELECT digest, fitness FROM result WHERE digest IN ({marks})", *some))  # noqa: S608
-            failed = self._read(f"SELECT digest FROM failure WHERE digest IN ({marks})", *some)  # noqa: S608
+            where = f"kind = '{kind}' AND digest IN ({', '.join('?' * len(some))})"
+            found.update(self._read(f"SELECT digest, fitness FROM result WHERE {where}", *some))  # noqa: S608
+            failed = self._read(f"SELECT digest FROM failure WHERE {where}", *some)  # noqa: S608
             found.update((digest, nan) for (digest,) in failed)
         return found
+
+    def index_scores(self) -> None:
+        """Let candidates' episodes be found by their digests alone, too: batches of others repeat them."""
+        self._write("CREATE INDEX IF NOT EXISTS score_digest ON result (digest) WHERE kind = 'score'")
 
     def pending_evaluations(self) -> list[Evaluation]:
         """Evaluations that were scheduled and not finished, oldest first."""

@@ -110,8 +110,8 @@ class RecallRecords(VerificationRecords):
             )  # fmt: skip
             self._write(f"DELETE FROM recalled WHERE {where}", REWOUND, *some)  # noqa: S608
         standing = (
-            "UPDATE verification SET stands = 1 WHERE digest = ? AND outcome = 'equal' "
-            "AND digest IN (SELECT digest FROM result)"
+            "UPDATE verification AS own SET stands = 1 WHERE digest = ? AND outcome = 'equal' AND EXISTS "
+            "(SELECT 1 FROM result WHERE kind = own.kind AND generation = own.generation AND digest = own.digest)"
         )
         self._write_all(standing, [(each,) for each in digests])
         self._effort = self._counted = None

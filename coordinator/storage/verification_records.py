@@ -64,17 +64,22 @@ class VerificationRecords(BatchRecords):
         (counts["recalled"],) = self._read_row("SELECT count(*) FROM recalled WHERE because = 'barred'")
         return counts
 
-    def unverified(self, digests: Sequence[bytes]) -> dict[bytes, StoredAnswer]:
-        """The accepted results of those of these jobs that have one, and no outcome of a check."""
+    def unverified(self, jobs: Sequence[Job]) -> dict[bytes, StoredAnswer]:
+        """The accepted results of those of a generation's jobs that have one, and no outcome of a check; by digest."""
         found: dict[bytes, StoredAnswer] = {}
-        for start in range(0, len(digests), MOST_VARIABLES):
-            some = digests[start : start + MOST_VARIABLES]
+        for start in range(0, len(jobs), MOST_VARIABLES):
+            some = [job.digest for job in jobs[start : start + MOST_VARIABLES]]
+            # A mean's evaluation may have been asked for by another generation.
+            among = "kind = 'evaluate'" if jobs[0].kind == "evaluate" else "kind = 'score' AND generation = ?"
+            values = some if jobs[0].kind == "evaluate" else [jobs[0].generation, *some]
             query = (
                 "SELECT digest, worker, host_class, fingerprint, fitness, steps, measures, seconds FROM result WHERE "  # noqa: S608
-                f"digest IN ({', '.join('?' * len(some))}) "
+                f"{among} AND digest IN ({', '.join('?' * len(some))}) "
                 "AND digest NOT IN (SELECT digest FROM verification WHERE stands)"
             )
-            for digest, worker, host_class, fingerprint, fitness, steps, measures, seconds in self._read(query, *some):
+            for digest, worker, host_class, fingerprint, fitness, steps, measures, seconds in self._read(
+                query, *values
+            ):
                 measured = tuple(json.loads(measures or "[]"))
                 answer = Answer(worker.partition("/")[0], to_finite(fitness), steps, measured, seconds)
                 found[digest] = StoredAnswer(worker, host_class or class_from_fingerprint(fingerprint), answer)

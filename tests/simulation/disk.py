@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from dreamfleet.common.protocol.host_classes import HostClasses
-from dreamfleet.common.protocol.messages import Job, Result
+from dreamfleet.common.protocol.messages import Job, Kind, Result
 from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_paths import JOURNAL
@@ -183,11 +183,11 @@ class MemoryJournal:
     def verification_counts(self) -> Counter[str]:
         return Counter(outcome for *_, outcome in self._tables["verification"].values())
 
-    def unverified(self, digests: Sequence[bytes]) -> dict[bytes, StoredAnswer]:
+    def unverified(self, jobs: Sequence[Job]) -> dict[bytes, StoredAnswer]:
         rows, known = self._tables["result"], self._tables["verification"]
         return {
             digest: StoredAnswer(worker, host_class, Answer.of(host_of(worker), result))
-            for digest in digests
+            for digest in (job.digest for job in jobs)
             if digest in rows and digest not in known
             for _, result, worker, host_class in (rows[digest],)
         }
@@ -352,10 +352,13 @@ class MemoryJournal:
                   if job.kind == kind and job.generation == generation}  # fmt: skip
         return found | failed
 
-    def fitness_of(self, digests: Sequence[bytes]) -> dict[bytes, float]:
+    def fitness_of(self, kind: Kind, digests: Sequence[bytes]) -> dict[bytes, float]:
         rows = self._tables["result"]
         failed = {digest: nan for digest in digests if digest in self._tables["failure"]}
         return {digest: rows[digest][1].fitness for digest in digests if digest in rows} | failed
+
+    def index_scores(self) -> None:
+        pass
 
     def pending_evaluations(self) -> list[Evaluation]:
         return [evaluation for _, (evaluation, done) in sorted(self._tables["evaluation"].items()) if done is None]

@@ -28,6 +28,7 @@ CANDIDATES = 200
 GENERATIONS = 6  # the first is not counted: workers join during it
 NULL_JOBS = 4096  # per generation: 64 candidates x 64 episodes
 CROWD_SLOTS, CROWD_ROUNDS = 64, 8  # slots of a simulated worker, and jobs of each slot in a generation
+MOST_EPISODES = 10_000  # of a candidate
 RUN_SECONDS = 300.0
 PEER_SECONDS = 120.0
 ROUNDS = -(-CANDIDATES // SLOTS)
@@ -88,10 +89,14 @@ def measure_crowd(count: int) -> Figures:
 
 
 def measure_long_jobs(slots: int) -> float:
-    """The ideal makespan of a generation of jobs of a second divided by the measured one."""
+    """The ideal makespan of a generation of jobs of a second divided by the measured one, on `slots` or a few more."""
     workers = -(-slots // CROWD_SLOTS)
-    each = -(-slots // workers)
-    with BenchRun(NULL_TASK, CROWD_ROUNDS, workers * each) as run, run.crowd(workers, each, seconds=1.0):
+    slots = workers * CROWD_SLOTS
+    parts = -(-slots // MOST_EPISODES)
+    with (
+        BenchRun(NULL_TASK, CROWD_ROUNDS * parts, slots // parts) as run,
+        run.crowd(workers, CROWD_SLOTS, seconds=1.0),
+    ):
         run.finish()
         return CROWD_ROUNDS / run.generation_seconds()
 

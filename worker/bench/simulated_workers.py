@@ -59,7 +59,8 @@ class SimulatedWorker:
         while self.running and self.running[0][0] <= now:
             self.outbox.add(self.running.popleft()[1])
             finished += 1
-        for job, _ in self.backlog.take(self.slots - len(self.running) if self.seconds else MAX_LEASES):
+        room = self.slots - len(self.running) if self.seconds else MAX_LEASES
+        for job, _ in self.backlog.take(room) if room else ():
             result = Result(job.digest, float(job.seeds[0] % 1000), 1, self.seconds, None, None)
             if self.seconds:
                 self.running.append((now + self.seconds, result))

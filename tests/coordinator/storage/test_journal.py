@@ -72,6 +72,42 @@ def test_it_gives_back_what_was_written(journal, folder):
         assert [each.number for each in run.history()] == [0]
 
 
+def test_results_of_an_older_journal_lie_where_those_of_today_do(journal, folder):
+    fill(journal)
+    job = Evaluation(3, VECTORS[0], 1).work(SPEC)[0].job
+    journal.add_result(job, Result(job.digest, 5.0, 10, 0.5, None, None), "w/00000000", "f", 1)
+    journal.commit()
+    journal.close()
+    path = folder / "journal.sqlite"
+    with sqlite3.connect(path) as old:
+        kept = old.execute("SELECT * FROM result").fetchall()
+        old.executescript(
+            "DROP TABLE result; "
+            "CREATE TABLE result (digest BLOB PRIMARY KEY, kind TEXT NOT NULL, generation INTEGER NOT NULL, candidate "
+            "INTEGER NOT NULL, episode INTEGER NOT NULL, seed INTEGER NOT NULL, fitness REAL NOT NULL, steps INTEGER "
+            "NOT NULL, seconds REAL NOT NULL, worker TEXT NOT NULL, fingerprint TEXT NOT NULL, incarnation INTEGER "
+            "NOT NULL, host_class TEXT NOT NULL DEFAULT '', measures TEXT) STRICT, WITHOUT ROWID; "
+            "CREATE INDEX result_of_candidate ON result (kind, generation, candidate, episode); PRAGMA user_version = 8"
+        )
+        old.executemany(f"INSERT INTO result VALUES ({', '.join('?' * 14)})", kept)
+    old.close()
+    with RunFolder(folder) as run:  # as the older program left it
+        assert [(each.seed, each.fitness) for each in run.results(0, 1)] == [(7, 1.0)]
+    again = Journal(path)
+    assert again._read("SELECT * FROM result") == kept
+    assert {fitness for fitness, *_ in again.results_of("score", 0).values()} == {0.0, 1.0}
+    assert again.fitness_of("evaluate", [job.digest]) == {job.digest: 5.0}
+    again.close()
+
+
+@pytest.mark.parametrize("kind", ["evaluate", "score"])
+def test_jobs_of_any_generation_are_found_by_an_index(journal, kind):
+    journal.index_scores()
+    query = f"EXPLAIN QUERY PLAN SELECT fitness FROM result WHERE kind = '{kind}' AND digest IN (?)"
+    ((*_, plan),) = journal._read(query, b"")
+    assert f"USING INDEX {kind.replace('evaluate', 'evaluation')}_digest" in plan
+
+
 def test_what_was_not_committed_never_happened(folder):
     journal = Journal(folder / "journal.sqlite")
     fill(journal)
