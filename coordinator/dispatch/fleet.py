@@ -19,7 +19,15 @@ from dreamfleet.coordinator.dispatch.event_log import EventLog
 from dreamfleet.coordinator.dispatch.failure_judge import FailureJudge
 from dreamfleet.coordinator.dispatch.failures import JobFailure, host_of
 from dreamfleet.coordinator.dispatch.host_stats import HostRecords
-from dreamfleet.coordinator.dispatch.member import DepartedWorkers, DispatchGroup, Lease, Member, MemberState, SentBatch
+from dreamfleet.coordinator.dispatch.member import (
+    DepartedWorkers,
+    DispatchGroup,
+    Lease,
+    LeaseKind,
+    Member,
+    MemberState,
+    SentBatch,
+)
 from dreamfleet.coordinator.dispatch.packing import BatchContent, OutgoingBatch, pack
 from dreamfleet.coordinator.dispatch.pending_jobs import JobState, PendingJob, PendingJobs
 from dreamfleet.coordinator.dispatch.speculative_execution import Move, SpeculativeExecution
@@ -136,7 +144,7 @@ class Fleet:
         held = DispatchGroup(now, len(member.leases), only_scoring=False)
         for found in listed - member.leases.keys():
             if found is not None and self._may_readopt(found, identity):
-                self._add_lease(member, found, Lease(beat.seen, held, steps=running.get(found), steps_seen_at=now))
+                self._add_lease(member, found, beat.seen, held, now, running.get(found))
         member.resend_before(max((lease.batch for each, lease in member.leases.items() if each in listed), default=0))
 
     def handle_result(
@@ -163,7 +171,7 @@ class Fleet:
             failed = given is not None and result.fitness is None
             self.event_log.add(now, "failed" if failed else verdict, identity, result.digest)
         if member is not None:
-            member.leases.pop(result.digest, None)
+            member.end_lease(result.digest)
             member.verdicts.append(Verdict(result.digest, verdict))
             member.finished += verdict == "accepted"
             if work is not None:
@@ -332,7 +340,7 @@ class Fleet:
             member.number += 1
             member.unconfirmed[member.number] = SentBatch(content, now, now)
             for work in content.work:
-                self._add_lease(member, work.job.digest, Lease(member.number, group))
+                self._add_lease(member, work.job.digest, member.number, group, now)
                 self.event_log.add_given(now, member.identity, work.job)
             yield OutgoingBatch(member.identity, member.numbering, member.number, content)
         member.cancels = []
@@ -401,7 +409,7 @@ class Fleet:
         """
         for holder in pending.holders:
             member = self.members[holder]
-            lease = member.leases.pop(digest, None)
+            lease = member.end_lease(digest)
             if lease is not None:
                 member.record_superseded(lease, self._now)
             if digest not in member.trial_copies:
@@ -457,17 +465,20 @@ class Fleet:
             if self.jobs.record_loss(member.identity, digest, self._now):
                 self._note_failure(digest)
 
-    def _add_lease(self, member: Member, digest: bytes, lease: Lease) -> None:
+    def _add_lease(
+        self, member: Member, digest: bytes, batch: int, group: DispatchGroup, now: float, steps: int | None = None
+    ) -> None:
         pending = self.jobs[digest]
-        lease.is_background, lease.job = pending.is_background, pending.work.job
-        member.leases[digest] = lease
+        job = pending.work.job
+        kind = LeaseKind(pending.is_background, job.runs_alone, bool(job.driven))
+        member.add_lease(digest, Lease(batch, group, kind, steps=steps, steps_seen_at=now))
         self.jobs.add_holder(digest, member.identity)
 
     def _apply_move(self, move: Move, given: dict[str, list[Work]], now: float) -> None:
         """Give a job to an idle slot, as a copy or instead of to its former holder."""
         if move.donor:
             donor = self.members[move.donor]
-            donor.leases.pop(move.digest)
+            donor.end_lease(move.digest)
             donor.cancels.append(move.digest)
             self.jobs.remove_holder(move.digest, donor.identity)
             self.event_log.add(now, "recalled", donor.identity, move.digest)
@@ -484,7 +495,7 @@ class Fleet:
 
         R3: when the last lease of a wanted job ends, the job goes back into the queue.
         """
-        lease = member.leases.pop(digest, None)
+        lease = member.end_lease(digest)
         if lease is not None and not counted and digest in self.jobs:
             self.jobs[digest].lost_steps[member.identity] = None if lease.finished else lease.steps or 0
         if self.jobs.remove_holder(digest, member.identity):

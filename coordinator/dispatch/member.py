@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from enum import Enum, auto
+from typing import NamedTuple
 
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.protocol.messages import MAX_LEASES, MOST_TOGETHER, Heartbeat, Job, Result, Verdict
@@ -38,19 +40,31 @@ class DispatchGroup:
     only_scoring: bool = True  # whether the worker held only candidates' jobs, so that the time measures its speed
 
 
+class LeaseKind(NamedTuple):
+    """What its job takes of a worker depends on."""
+
+    is_background: bool
+    runs_alone: bool
+    driven: bool
+
+
 @dataclass
 class Lease:
     """A job that a worker holds: sent in `batch`, then running once a heartbeat shows its `steps`."""
 
     batch: int
     group: DispatchGroup
-    is_background: bool = False
-    job: Job | None = None  # `Fleet` sets it as it adds the lease
+    kind: LeaseKind
     absent_heartbeats: int = 0  # in a row that confirm the batch and do not list the job
     steps: int | None = None  # environment steps so far, once a heartbeat has shown the job running
     steps_seen_at: float = 0.0  # when the last heartbeat came
     finished: bool = False  # the last heartbeat listed its result, which has not come
     upload_pending_since: float | None = None  # when its result first came, while its upload is still on the way
+
+    @property
+    def is_background(self) -> bool:
+        """Whether its job evaluates or collects."""
+        return self.kind.is_background
 
 
 @dataclass
@@ -97,7 +111,9 @@ class Member:
     finished: int = 0  # accepted results
     was_ready: bool = False  # some heartbeat named a slot that scores
     resent: int = 0  # batches that were sent again
-    leases: dict[bytes, Lease] = field(default_factory=dict)  # by digest, in the order in which they were given
+    # By digest, in the order in which they were given; `add_lease` and `end_lease` change them.
+    leases: dict[bytes, Lease] = field(default_factory=dict)
+    held: Counter[LeaseKind] = field(default_factory=Counter)  # how many of its leases are of each kind
     held_at_silence: set[bytes] = field(default_factory=set)  # its jobs when it became silent
     trial_copies: dict[bytes, DispatchGroup] = field(default_factory=dict)  # copies that measure it, wanted or not
     returned: list[DispatchGroup] = field(default_factory=list)  # groups with a new result since the last dispatch
@@ -169,9 +185,12 @@ class Member:
 
     def share_of(self, job: Job) -> int:
         """How much of its `capacity` a job takes: one that runs alone takes a whole slot, a drive its part of one."""
-        if job.runs_alone:
+        return self._share(runs_alone=job.runs_alone, driven=bool(job.driven))
+
+    def _share(self, *, runs_alone: bool, driven: bool) -> int:
+        if runs_alone:
             return self.batch_size
-        is_driven = job.driven or self.batch_size <= self.together
+        is_driven = driven or self.batch_size <= self.together
         return math.ceil(self.batch_size / min(self.together, self.drives_a_slot)) if is_driven else 1
 
     @property
@@ -179,7 +198,22 @@ class Member:
         """How much of its `capacity` its leases take; more than all of it if some wait there."""
         if self.batch_size == 1:
             return len(self.leases)
-        return sum(self.share_of(lease.job) for lease in self.leases.values() if lease.job)
+        return sum(
+            count * self._share(runs_alone=kind.runs_alone, driven=kind.driven) for kind, count in self.held.items()
+        )
+
+    def add_lease(self, digest: bytes, lease: Lease) -> None:
+        """Note that it is given a job."""
+        self.end_lease(digest)
+        self.leases[digest] = lease
+        self.held[lease.kind] += 1
+
+    def end_lease(self, digest: bytes) -> Lease | None:
+        """Note that it has a job no more; return the lease, `None` if it had none."""
+        lease = self.leases.pop(digest, None)
+        if lease is not None:
+            self.held[lease.kind] -= 1
+        return lease
 
     @property
     def slot_steps_per_second(self) -> float:
@@ -189,7 +223,7 @@ class Member:
     @property
     def background_slots(self) -> int:
         """Slots that evaluations and collected rollouts take."""
-        return sum(lease.is_background for lease in self.leases.values())
+        return sum(count for kind, count in self.held.items() if kind.is_background)
 
     def start_numbering(self, numbering: int) -> None:
         """Number its batches from 1 again, and forget what was to be sent: the worker repeats its results.

@@ -7,6 +7,7 @@ which the run waits go to the least loaded worker, so that no slot idles.
 
 from __future__ import annotations
 
+import heapq
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping
@@ -31,6 +32,7 @@ class WorkerSelection:
     def __init__(self, members: Mapping[str, Member], shares: Mapping[str, int], waiting: int, now: float) -> None:
         self._members = members
         self._shares = shares
+        self._order = {name: number for number, name in enumerate(shares)}
         self._loads = {name: len(members[name].leases) for name in shares}
         self._waiting = waiting
         self._now = now
@@ -46,6 +48,7 @@ class WorkerSelection:
             for name in self._dependable - shares.keys()
         )
         self._soonest_full = min(full, default=math.inf)  # seconds of the fastest member without credit
+        self._late: set[str] = set()  # those that `_queue` lacks
         self._best: dict[int, list[tuple[float, str]]] = {}  # size class of a load -> the two fastest members
 
     def assign(self, name: str) -> None:
@@ -54,13 +57,44 @@ class WorkerSelection:
         self._expected_seconds[name] = self._members[name].host_stats.expected_seconds(self._loads[name] + 1)
         self._waiting -= 1
         self._jobs += name in self._dependable
+        if name in self._late:
+            self._late.discard(name)
+            heapq.heappush(self._queue, (self._rank(name), name))
 
     def pick(self, eligible: Collection[str]) -> str | None:
         """The worker to give the next job to; `None` if it pays to wait for one that is not `eligible` now."""
-        suitable = [name for name in eligible if self._finishes_in_time(name)]
-        if not suitable:
-            return self._soonest(eligible)
-        return self._least_loaded(suitable)
+        if len(eligible) == len(self._shares):
+            found = self._first_in_time()
+        else:
+            found = self._least_loaded([name for name in eligible if self._finishes_in_time(name)])
+        return self._soonest(eligible) if found is None else found
+
+    def _first_in_time(self) -> str | None:
+        """The least loaded member that returns one more job in time.
+
+        One that would be late stays late until it is given a job itself, so it is not asked before.
+        """
+        while self._queue:
+            rank, name = self._queue[0]
+            if name in self._shares and rank != (now := self._rank(name)):
+                heapq.heapreplace(self._queue, (now, name))
+            elif name in self._shares and self._finishes_in_time(name):
+                return name
+            else:
+                heapq.heappop(self._queue)
+                self._late.add(name)
+        return None
+
+    @cached_property
+    def _queue(self) -> list[tuple[tuple[float, float, int], str]]:
+        """A heap of the members with credit by rank; a rank in it may be that of an earlier, smaller load."""
+        found = [(self._rank(name), name) for name in self._shares]
+        heapq.heapify(found)
+        return found
+
+    def _rank(self, name: str) -> tuple[float, float, int]:
+        """How loaded a member is; of equal ones the sooner goes first, then the one that joined first."""
+        return self._shares[name] / self._members[name].capacity, self._expected_seconds[name], self._order[name]
 
     def pick_for_background(self, eligible: Collection[str]) -> str | None:
         """The worker to give an evaluation to, for which the run waits; `None` to wait for one that will stay up.
@@ -73,10 +107,8 @@ class WorkerSelection:
             return None if others_last else self._least_loaded(eligible)
         return self._least_loaded(lasting)
 
-    def _least_loaded(self, names: Collection[str]) -> str:
-        return min(
-            names, key=lambda name: (self._shares[name] / self._members[name].capacity, self._expected_seconds[name])
-        )
+    def _least_loaded(self, names: Collection[str]) -> str | None:
+        return min(names, key=self._rank, default=None)
 
     @cached_property
     def _likely_lost(self) -> set[str]:
@@ -246,7 +278,7 @@ def _allowed_members(
     return members
 
 
-def _eligible_workers(pending: PendingJob, free: Collection[str], members: Mapping[str, Member]) -> list[str]:
+def _eligible_workers(pending: PendingJob, free: Collection[str], members: Mapping[str, Member]) -> Collection[str]:
     """Which of these `free` members may be given a job; `members` are all that may be given it.
 
     R8: not one where it failed, unless every present member is such: then those where it failed least often. A process
@@ -254,6 +286,8 @@ def _eligible_workers(pending: PendingJob, free: Collection[str], members: Mappi
     neither can a worker that was never ready, so guests and these do not count.
     """
     avoided = pending.avoided_workers
+    if not avoided:
+        return free
     if eligible := [name for name in free if name not in avoided]:
         return eligible
     if any(name not in avoided for name, member in members.items() if member.has_been_ready):

@@ -19,8 +19,8 @@ from dreamfleet.coordinator.storage.journal_file import (
     sqlite_side_files,
 )
 
-# Of the write-ahead log, before it is folded into the journal. Commits add to the same last pages: the more of them a fold
-# has, the fewer pages it writes.
+# Of the write-ahead log, before it is folded into the journal. Commits add to the same last pages: the more of them a
+# fold has, the fewer pages it writes.
 LOG_PAGES = 4000
 
 

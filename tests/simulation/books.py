@@ -46,6 +46,8 @@ def check_coordinator(fleet: Fleet) -> None:
             _require(digest in jobs, "a lease is on a job that nobody wants")
             _require(name in jobs[digest].holders, "a lease is on a job that it does not hold")
         _require(not (member.silent and member.leases), "a silent worker holds leases")
+        kinds = Counter(lease.kind for lease in member.leases.values())
+        _require(+member.held == kinds, "a worker's leases are miscounted")
         _require(all(number <= member.number for number in member.unconfirmed), "a batch is unseen that was not sent")
     _require(jobs._background_held == is_background, "what fills the slack is miscounted")
     _require(jobs._tags.keys() == {digest[:TAG_BYTES] for digest in jobs}, "tags are not those of the wanted jobs")

@@ -1,0 +1,51 @@
+"""The choice of a worker asks few of them, and chooses as if it asked all."""
+
+import random
+
+from dreamfleet.coordinator.dispatch.host_stats import HostStats
+from dreamfleet.coordinator.dispatch.member import Lease, LeaseKind, Member
+from dreamfleet.coordinator.dispatch.worker_selection import WorkerSelection
+
+
+def crowd(source):
+    """Members with records, leases, losses and ages of all kinds."""
+    members = {}
+    for number in range(source.randrange(1, 12)):
+        stats = HostStats()
+        for _ in range(source.randrange(4)):
+            stats.record_turnaround(source.randrange(1, 40), source.choice([0.1, 1.0, 1.2, 9.0]), 100.0)
+        for _ in range(source.choice([0, 0, 3])):
+            stats.record_loss(source.choice([5.0, 500.0]))
+        capacity = source.choice([1, 4, 16])
+        member = Member(f"w{number}", capacity, "f", 1, 100.0, source.choice([0.0, 90.0]), stats, capacity)
+        member.is_guest, member.is_held = False, source.random() < 0.1
+        for each in range(source.randrange(2 * capacity + 1)):
+            kind = LeaseKind(source.random() < 0.1, False, False)
+            member.add_lease(bytes([number, each]), Lease(0, member.start_group(100.0), kind))
+        members[member.identity] = member
+    return members
+
+
+def test_it_picks_the_least_loaded_of_those_that_return_a_job_in_time():
+    picked = 0
+    for seed in range(300):
+        source = random.Random(seed)
+        members = crowd(source)
+        shares = {name: member.held_share for name, member in members.items() if member.credit > 0}
+        room = {name: members[name].credit for name in shares}
+        waiting = source.randrange(1, 200)
+        selection = WorkerSelection(members, shares, waiting, 100.0)
+        for _ in range(waiting):
+            in_time = [name for name in shares if selection._finishes_in_time(name)]
+            best = min(in_time, key=selection._rank, default=selection._soonest(shares))
+            name = selection.pick(shares)
+            assert name == best
+            if name is None:
+                break
+            picked += 1
+            selection.assign(name)
+            shares[name] += 1
+            room[name] -= 1
+            if not room[name]:
+                del shares[name]
+    assert picked > 3000
