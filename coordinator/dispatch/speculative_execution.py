@@ -24,6 +24,7 @@ MARGIN = 1.5  # a copy must be expected to finish this many times sooner
 # A job held longer than so many seconds and so many typical times may be copied, whatever progress its worker reports.
 LONGEST_HELD, LONGEST_HELD_TIMES = 60.0, 8.0
 STALE, STALE_TIMES = 10.0, 20.0  # seconds, and turnarounds, after which a host's record is too old
+Straggler = tuple[float, bytes, Member]  # the seconds that a job's holder still needs, the job's digest, the holder
 
 
 @dataclass(frozen=True)
@@ -72,10 +73,11 @@ class SpeculativeExecution:
         loads = {each.identity: each.held_share + _share(each, given.get(each.identity, ())) for each in takers}
         idle = [member for member in takers if loads[member.identity] < member.free_capacity]
         moved: set[bytes] = set()
+        stragglers: dict[tuple[bool, bool], list[Straggler]] = {}
         for taker in sorted(
             idle, key=lambda member: (member.host_stats.expected_seconds(1), -member.slot_steps_per_second)
         ):
-            for move in self._moves(taker, takers, loads, jobs, moved, now):
+            for move in self._moves(taker, takers, loads, jobs, moved, stragglers, now):
                 moved.add(move.digest)
                 job = jobs[move.digest].work.job
                 loads[taker.identity] += taker.share_of(job)
@@ -90,25 +92,23 @@ class SpeculativeExecution:
         loads: Mapping[str, int],
         jobs: Mapping[bytes, PendingJob],
         moved: set[bytes],
+        stragglers: dict[tuple[bool, bool], list[Straggler]],
         now: float,
     ) -> Iterator[Move]:
-        """Moves to one member until its slots are full."""
+        """Moves to one member until its slots are full; `stragglers` are those that other takers found."""
         others = [member for member in members if member is not taker]
         if not taker.host_stats.has_history and any(is_dependable(other, now) for other in others):
             return  # a trial copy measures it first
-        stragglers = self._stragglers(others, taker, jobs, now)
+        known = taker.host_stats.has_history, taker.slot_steps_per_second > 0
+        if known not in stragglers:
+            stragglers[known] = self._stragglers(members, taker, now)
         while loads[taker.identity] < taker.free_capacity:
             jobs_held = len(taker.leases) + loads[taker.identity] - taker.held_share
             expected = self._expected_seconds(taker, jobs_held + 1)
             if (move := self._find_recall(taker, expected, others, loads, jobs, moved, now)) is not None:
                 yield move
                 continue
-            worthwhile = (
-                digest
-                for left, digest in stragglers
-                if digest not in moved and (left > MARGIN * expected or left == math.inf)
-            )
-            if (copied := next(worthwhile, None)) is None:
+            if (copied := _find_straggler(stragglers[known], taker, expected, jobs, moved)) is None:
                 return
             yield Move(copied, taker.identity)
 
@@ -151,17 +151,17 @@ class SpeculativeExecution:
                     return Move(digest, taker.identity, donor.identity)
         return None
 
-    def _stragglers(
-        self, others: Sequence[Member], taker: Member, jobs: Mapping[bytes, PendingJob], now: float
-    ) -> list[tuple[float, bytes]]:
-        """Jobs that `taker` may copy, with the seconds that their holder still needs; the longest first."""
-        known = [member.host_stats for member in (*others, taker) if member.host_stats.has_history]
-        found = []
-        for holder in others:
-            for digest, lease in holder.leases.items():
-                if _may_take(digest, taker, jobs):
-                    left = self._remaining_seconds(holder, lease, taker, known, now)
-                    found.append((left, digest))
+    def _stragglers(self, members: Sequence[Member], taker: Member, now: float) -> list[Straggler]:
+        """Leases with the seconds that their holder still needs; the longest first.
+
+        They are the same for all takers with a record, or without, and whose speed is known, or is not.
+        """
+        known = [member.host_stats for member in members if member.host_stats.has_history]
+        found = [
+            (self._remaining_seconds(holder, lease, taker, known, now), digest, holder)
+            for holder in members
+            for digest, lease in holder.leases.items()
+        ]
         return sorted(found, key=lambda each: -each[0])
 
     def _remaining_seconds(
@@ -185,6 +185,22 @@ class SpeculativeExecution:
             steps = max(self._typical_steps - lease.steps - since, self._typical_steps / 10)
             left = max(left, steps / holder.slot_steps_per_second)
         return left
+
+
+def _find_straggler(
+    stragglers: Sequence[Straggler], taker: Member, expected: float, jobs: Mapping[bytes, PendingJob],
+    moved: Collection[bytes],
+) -> bytes | None:  # fmt: skip
+    """The job of another worker that `taker` should copy, as it would need `expected` seconds; `None` if there is none.
+
+    `stragglers` begin with the longest.
+    """
+    for left, digest, holder in stragglers:
+        if left <= MARGIN * expected and left != math.inf:
+            break
+        if holder is not taker and digest not in moved and _may_take(digest, taker, jobs):
+            return digest
+    return None
 
 
 def _share(member: Member, given: Iterable[Work]) -> int:
