@@ -101,6 +101,7 @@ MIGRATIONS = (
 )
 """Entry i migrates a journal from version i to i + 1. Append only."""
 VERSION = len(MIGRATIONS)
+PLACED_VERSION = 9  # the first version whose results lie in the order in which they come
 OPERATOR_VERSION = 7  # the first version that keeps which hosts the operator barred
 VERIFICATION_VERSION = 6  # the first version with results that were checked, barred hosts and recalled results
 MEASURES_VERSION = 5  # the first version with measures, JSON lists of numbers
@@ -133,6 +134,7 @@ def check_schema(connection: sqlite3.Connection, path: object) -> int:
 
 def migrate(connection: sqlite3.Connection, version: int) -> None:
     """Migrate an open journal from `version` to the current one, each step in a transaction."""
+    connection.execute("PRAGMA secure_delete = OFF")  # else each page of a dropped table is written once more
     for number, script in enumerate(MIGRATIONS[version:], start=version + 1):
         connection.executescript(
             f"BEGIN IMMEDIATE; {script} PRAGMA application_id = {APPLICATION_ID}; "

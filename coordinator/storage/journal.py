@@ -71,6 +71,7 @@ class Journal(RecallRecords):
         self._effort = None
         self._made: dict[tuple[str, str, bool], list[int]] = {}  # steps and microseconds that `_effort` lacks
         self._counted = None
+        self._digest_indices: dict[Kind, str] = {"evaluate": "evaluation_digest"}
 
     @classmethod
     def create(
@@ -372,21 +373,15 @@ class Journal(RecallRecords):
     def fitness_of(self, kind: Kind, digests: Sequence[bytes]) -> dict[bytes, float]:
         """Fitness of those of these jobs that have an accepted result, whichever generation asked for it.
 
-        NaN for those that failed for good. Only `index_scores` makes it fast for candidates' episodes.
+        NaN for those that failed for good. Of candidates' episodes, only after `index_scores`.
         """
         self.take_back(digests)
-        found: dict[bytes, float] = {}
+        found: dict[bytes, float] = dict(self._with_digests(kind, "digest, fitness", digests))
         for start in range(0, len(digests), MOST_VARIABLES):
             some = digests[start : start + MOST_VARIABLES]
-            where = f"kind = '{kind}' AND digest IN ({', '.join('?' * len(some))})"
-            found.update(self._read(f"SELECT digest, fitness FROM result WHERE {where}", *some))  # noqa: S608
-            failed = self._read(f"SELECT digest FROM failure WHERE {where}", *some)  # noqa: S608
-            found.update((digest, nan) for (digest,) in failed)
+            query = f"SELECT digest FROM failure WHERE digest IN ({', '.join('?' * len(some))})"  # noqa: S608
+            found.update((digest, nan) for (digest,) in self._read(query, *some))
         return found
-
-    def index_scores(self) -> None:
-        """Let candidates' episodes be found by their digests alone, too: batches of others repeat them."""
-        self._write("CREATE INDEX IF NOT EXISTS score_digest ON result (digest) WHERE kind = 'score'")
 
     def pending_evaluations(self) -> list[Evaluation]:
         """Evaluations that were scheduled and not finished, oldest first."""

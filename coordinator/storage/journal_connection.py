@@ -13,6 +13,7 @@ from dreamfleet.common.files.atomic_write import fsync_path
 from dreamfleet.common.runs import schema
 from dreamfleet.coordinator.storage.journal_file import (
     check_database,
+    check_room,
     copy_database,
     file_stamp,
     journal_errors,
@@ -39,7 +40,10 @@ class JournalConnection:
         with journal_errors(path):
             self._connection = sqlite3.connect(path, timeout=5)
             try:
-                schema.migrate(self._connection, schema.check_schema(self._connection, path))
+                version = schema.check_schema(self._connection, path)
+                if version < schema.PLACED_VERSION:
+                    check_room(path)
+                schema.migrate(self._connection, version)
                 self._connection.execute("PRAGMA journal_mode = WAL")
                 self._connection.execute("PRAGMA synchronous = FULL")
                 self._connection.execute(f"PRAGMA wal_autocheckpoint = {LOG_PAGES}")

@@ -104,16 +104,13 @@ class RecallRecords(VerificationRecords):
         for start in range(0, len(digests), MOST_VARIABLES):
             some = digests[start : start + MOST_VARIABLES]
             where = f"because = ? AND digest IN ({', '.join('?' * len(some))})"
+            taken = self._read(f"SELECT DISTINCT digest FROM recalled WHERE {where}", REWOUND, *some)  # noqa: S608
             self._write(
                 f"INSERT OR IGNORE INTO result ({COLUMNS}) SELECT {COLUMNS} FROM recalled WHERE {where}",  # noqa: S608
                 REWOUND, *some,
             )  # fmt: skip
             self._write(f"DELETE FROM recalled WHERE {where}", REWOUND, *some)  # noqa: S608
-        standing = (
-            "UPDATE verification AS own SET stands = 1 WHERE digest = ? AND outcome = 'equal' AND EXISTS "
-            "(SELECT 1 FROM result WHERE kind = own.kind AND generation = own.generation AND digest = own.digest)"
-        )
-        self._write_all(standing, [(each,) for each in digests])
+            self._write_all("UPDATE verification SET stands = 1 WHERE digest = ? AND outcome = 'equal'", taken)
         self._effort = self._counted = None
         return True
 

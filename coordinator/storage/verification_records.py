@@ -5,19 +5,20 @@ from __future__ import annotations
 import json
 import secrets
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from time import time
-from typing import Literal
+from typing import Any, Literal
 
 from dreamfleet.common.protocol.host_classes import class_from_fingerprint
-from dreamfleet.common.protocol.messages import Job
+from dreamfleet.common.protocol.messages import Job, Kind
 from dreamfleet.common.protocol.result_bounds import to_finite
 from dreamfleet.coordinator.jobs.checks import Answer
 from dreamfleet.coordinator.storage.batch_records import MOST_VARIABLES, BatchRecords
 
 VERIFY_KEY = "verify_key"  # the fact's name
 Outcome = Literal["equal", "differs", "unchecked"]
+UNCHECKED = "AND NOT EXISTS (SELECT 1 FROM verification WHERE verification.digest = result.digest AND stands)"
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,8 @@ class StoredBar:
 class VerificationRecords(BatchRecords):
     """Reads and writes what a journal holds of checked results."""
 
+    _digest_indices: dict[Kind, str]  # of each kind whose results are found by their digests, the index
+
     def verify_key(self) -> bytes:
         """The secret of the draw: it is the run's own, so that a restart draws the same results."""
         if self.fact(VERIFY_KEY) is None:
@@ -64,22 +67,40 @@ class VerificationRecords(BatchRecords):
         (counts["recalled"],) = self._read_row("SELECT count(*) FROM recalled WHERE because = 'barred'")
         return counts
 
+    def index_scores(self) -> None:
+        """Let candidates' episodes be found by their digests alone, too: batches of others repeat them."""
+        self._write("CREATE INDEX IF NOT EXISTS score_digest ON result (digest) WHERE kind = 'score'")
+        self._digest_indices["score"] = "score_digest"
+
+    def _with_digests(
+        self, kind: Kind, columns: str, digests: Sequence[bytes], also: str = ""
+    ) -> Iterator[tuple[Any, ...]]:
+        """Read these columns of the results of a kind with these digests, whichever generation asked for them.
+
+        The index is named, because SQLite would read all results of the kind.
+        """
+        for start in range(0, len(digests), MOST_VARIABLES):
+            some = digests[start : start + MOST_VARIABLES]
+            yield from self._read(
+                f"SELECT {columns} FROM result INDEXED BY {self._digest_indices[kind]} "  # noqa: S608
+                f"WHERE kind = '{kind}' AND digest IN ({', '.join('?' * len(some))}) {also}",
+                *some,
+            )
+
     def unverified(self, jobs: Sequence[Job]) -> dict[bytes, StoredAnswer]:
         """The accepted results of those of a generation's jobs that have one, and no outcome of a check; by digest."""
+        if not jobs:
+            return {}
+        columns, kind = "digest, worker, host_class, fingerprint, fitness, steps, measures, seconds", jobs[0].kind
+        wanted = {job.digest for job in jobs}
+        if kind in self._digest_indices:
+            rows: Iterable[tuple[Any, ...]] = self._with_digests(kind, columns, [*wanted], UNCHECKED)
+        else:
+            query = f"SELECT {columns} FROM result WHERE kind = ? AND generation = ? {UNCHECKED}"  # noqa: S608
+            rows = self._read(query, kind, jobs[0].generation)
         found: dict[bytes, StoredAnswer] = {}
-        for start in range(0, len(jobs), MOST_VARIABLES):
-            some = [job.digest for job in jobs[start : start + MOST_VARIABLES]]
-            # A mean's evaluation may have been asked for by another generation.
-            among = "kind = 'evaluate'" if jobs[0].kind == "evaluate" else "kind = 'score' AND generation = ?"
-            values = some if jobs[0].kind == "evaluate" else [jobs[0].generation, *some]
-            query = (
-                "SELECT digest, worker, host_class, fingerprint, fitness, steps, measures, seconds FROM result WHERE "  # noqa: S608
-                f"{among} AND digest IN ({', '.join('?' * len(some))}) "
-                "AND digest NOT IN (SELECT digest FROM verification WHERE stands)"
-            )
-            for digest, worker, host_class, fingerprint, fitness, steps, measures, seconds in self._read(
-                query, *values
-            ):
+        for digest, worker, host_class, fingerprint, fitness, steps, measures, seconds in rows:
+            if digest in wanted:
                 measured = tuple(json.loads(measures or "[]"))
                 answer = Answer(worker.partition("/")[0], to_finite(fitness), steps, measured, seconds)
                 found[digest] = StoredAnswer(worker, host_class or class_from_fingerprint(fingerprint), answer)

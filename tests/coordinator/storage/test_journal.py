@@ -16,6 +16,8 @@ from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.jobs.work import vector_bytes
 from dreamfleet.coordinator.storage.journal import Journal
+from dreamfleet.coordinator.storage.recall_records import REWOUND
+from dreamfleet.coordinator.storage.verification_records import UNCHECKED
 from tests.support.disks import read_only_view
 from tests.support.samples import SPEC
 
@@ -72,7 +74,7 @@ def test_it_gives_back_what_was_written(journal, folder):
         assert [each.number for each in run.history()] == [0]
 
 
-def test_results_of_an_older_journal_lie_where_those_of_today_do(journal, folder):
+def test_results_of_an_older_journal_lie_where_those_of_today_do(journal, folder, monkeypatch):
     fill(journal)
     job = Evaluation(3, VECTORS[0], 1).work(SPEC)[0].job
     journal.add_result(job, Result(job.digest, 5.0, 10, 0.5, None, None), "w/00000000", "f", 1)
@@ -93,6 +95,10 @@ def test_results_of_an_older_journal_lie_where_those_of_today_do(journal, folder
     old.close()
     with RunFolder(folder) as run:  # as the older program left it
         assert [(each.seed, each.fitness) for each in run.results(0, 1)] == [(7, 1.0)]
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(0, 0, 10_000))
+    with pytest.raises(JournalError, match=r"of an earlier version and is rewritten once: make room for \d MB more"):
+        Journal(path)
+    monkeypatch.undo()
     again = Journal(path)
     assert again._read("SELECT * FROM result") == kept
     assert {fitness for fitness, *_ in again.results_of("score", 0).values()} == {0.0, 1.0}
@@ -100,12 +106,44 @@ def test_results_of_an_older_journal_lie_where_those_of_today_do(journal, folder
     again.close()
 
 
-@pytest.mark.parametrize("kind", ["evaluate", "score"])
-def test_jobs_of_any_generation_are_found_by_an_index(journal, kind):
+def test_jobs_of_any_generation_are_found_by_an_index(journal, monkeypatch):
     journal.index_scores()
-    query = f"EXPLAIN QUERY PLAN SELECT fitness FROM result WHERE kind = '{kind}' AND digest IN (?)"
-    ((*_, plan),) = journal._read(query, b"")
-    assert f"USING INDEX {kind.replace('evaluate', 'evaluation')}_digest" in plan
+    plans, read = [], journal._read
+
+    def explain(query, *values):
+        plans.append([each[-1] for each in read(f"EXPLAIN QUERY PLAN {query}", *values)])
+        return []
+
+    monkeypatch.setattr(journal, "_read", explain)
+    for kind in ("evaluate", "score"):
+        list(journal._with_digests(kind, "fitness", [bytes([each]) for each in range(100)], UNCHECKED))
+    assert [plan[0] for plan in plans] == [
+        "SEARCH result USING INDEX evaluation_digest (digest=? AND kind=?)",
+        "SEARCH result USING INDEX score_digest (digest=? AND kind=?)",
+    ]
+    assert all("verification_digest" in plan[-1] for plan in plans)
+
+
+def test_results_of_a_run_of_batches_wait_for_their_check_in_any_generation(journal):
+    journal.index_scores()
+    fill(journal)
+    early, late = (Generation(number, SPEC, VECTORS, [7]).work for number in (0, 5))
+    assert journal.unverified([each.job for each in late]).keys() == {each.job.digest for each in early}
+    journal.add_verification(early[0].job, "w/00000000", "v", "equal")
+    assert journal.unverified([each.job for each in late]).keys() == {early[1].job.digest}
+    assert journal.fitness_of("score", [each.job.digest for each in late]) == {
+        each.job.digest: float(value) for value, each in enumerate(early)
+    }
+
+
+def test_a_check_stands_again_with_its_result_though_another_generation_asked_for_it(journal):
+    first, again = (Evaluation(number, VECTORS[0], 1).work(SPEC)[0].job for number in (3, 5))
+    journal.add_result(first, Result(first.digest, 5.0, 10, 0.5, None, None), "w/00000000", "f", 1)
+    journal.add_verification(again, "w/00000000", "v", "equal")
+    journal._set_aside(REWOUND, "generation = 3")
+    journal._settle_recall()
+    assert journal.fitness_of("evaluate", [again.digest]) == {again.digest: 5.0}
+    assert journal.unverified([again]) == {}
 
 
 def test_what_was_not_committed_never_happened(folder):
