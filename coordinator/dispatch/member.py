@@ -41,7 +41,7 @@ class DispatchGroup:
 
 
 class LeaseKind(NamedTuple):
-    """What its job takes of a worker depends on."""
+    """What decides how much of a worker a job takes."""
 
     is_background: bool
     runs_alone: bool
