@@ -100,7 +100,7 @@ class FailureJudge:
 
     @property
     def _failed_proofs(self) -> list[JobFailure]:
-        return [each for each in self._jobs.failures if self._jobs[each.work.job.digest].is_proof]
+        return [each for each in self._jobs.failures if self._jobs[each.work.digest].is_proof]
 
     @property
     def has_hope(self) -> bool:

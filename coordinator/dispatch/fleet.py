@@ -79,7 +79,7 @@ class Fleet:
 
     def give_up(self, failure: JobFailure) -> None:
         """Withdraw a job whose episode fails wherever it is scored."""
-        self.withdraw([failure.work.job.digest])
+        self.withdraw([failure.work.digest])
 
     def add_worker(self, identity: str, slots: int, fingerprint: str, now: float) -> int:
         """Welcome a worker as a guest; return the numbering of its batches.
@@ -135,7 +135,7 @@ class Fleet:
         beat = self._check_numbering(member, beat)
         for sent in member.apply_heartbeat(beat, now):
             for work in sent.content.work:
-                self.event_log.add(now, "seen", identity, work.job.digest)
+                self.event_log.add(now, "seen", identity, work.digest)
         running = {self.jobs.digest_of_tag(run.tag): run.steps for run in beat.running}
         finished = {self.jobs.digest_of_tag(tag) for tag in beat.unacked}
         listed = {self.jobs.digest_of_tag(tag) for tag in beat.queued} | finished | running.keys()
@@ -175,7 +175,7 @@ class Fleet:
             member.verdicts.append(Verdict(result.digest, verdict))
             member.finished += verdict == "accepted"
             if work is not None:
-                member.host_stats.record_duration(work.job.kind, result.seconds)
+                member.host_stats.record_duration(work.kind, result.seconds)
         if verdict == "accepted":
             self._speculation.record_episode(result.steps)
         self.counts["accepted_steps" if verdict == "accepted" else "discarded_steps"] += result.steps
@@ -327,7 +327,7 @@ class Fleet:
         for number, sent in member.take_overdue_batches(now, RESEND_AFTER * self._interval):
             self.counts["resent_batches"] += 1
             for work in sent.content.work:
-                self.event_log.add(now, "sent again", member.identity, work.job.digest)
+                self.event_log.add(now, "sent again", member.identity, work.digest)
             yield OutgoingBatch(member.identity, member.numbering, number, sent.content)
 
     def _new_batches(self, member: Member, given: Sequence[Work], durable: bool, now: float) -> Iterator[OutgoingBatch]:
@@ -340,7 +340,7 @@ class Fleet:
             member.number += 1
             member.unconfirmed[member.number] = SentBatch(content, now, now)
             for work in content.work:
-                self._add_lease(member, work.job.digest, member.number, group, now)
+                self._add_lease(member, work.digest, member.number, group, now)
                 self.event_log.add_given(now, member.identity, work.job)
             yield OutgoingBatch(member.identity, member.numbering, member.number, content)
         member.cancels = []
@@ -372,8 +372,8 @@ class Fleet:
             return "duplicate", None
         pending = self.jobs.accept(result)
         self.counts["discarded_steps"] += pending.steps_lost_to(identity, result.steps)
-        pending.holders.discard(identity)
-        if self.jobs.is_drawn(pending.work.job) and not pending.is_proof:
+        pending.holders -= {identity}
+        if self.jobs.is_drawn(pending.work) and not pending.is_proof:
             self.check_again(pending, Check(host_class, {host_of(identity)}))
         else:
             self._cancel(result.digest, pending)
@@ -382,7 +382,7 @@ class Fleet:
 
     def check_again(self, pending: PendingJob, check: Check) -> None:
         """Want an accepted job again from hosts that the check may ask; of its holders only these go on."""
-        digest = pending.work.job.digest
+        digest = pending.work.digest
         if digest in self.jobs:
             self.jobs.remove(digest)
         members = self.members
@@ -497,7 +497,7 @@ class Fleet:
         """
         lease = member.end_lease(digest)
         if lease is not None and not counted and digest in self.jobs:
-            self.jobs[digest].lost_steps[member.identity] = None if lease.finished else lease.steps or 0
+            self.jobs.record_lost_steps(digest, member.identity, None if lease.finished else lease.steps or 0)
         if self.jobs.remove_holder(digest, member.identity):
             self.counts["reissued"] += 1
             self.event_log.add(self._now, "reissued", member.identity, digest)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum, auto
 
 from dreamfleet.common.protocol.failures import HOST_PREFIX
-from dreamfleet.common.protocol.messages import TAG_BYTES, Job, Kind, Result
+from dreamfleet.common.protocol.messages import TAG_BYTES, Kind, Result
 from dreamfleet.coordinator.dispatch.deficit_round_robin import DeficitCounter
 from dreamfleet.coordinator.dispatch.failures import Attempt, JobFailure, host_of, pause_before_retry
 from dreamfleet.coordinator.jobs.checks import Check
@@ -28,23 +28,23 @@ class JobState(Enum):
     COPIED = auto()  # leased to two workers
 
 
-@dataclass
+@dataclass(slots=True)
 class PendingJob:
-    """A job without a result."""
+    """A job without a result. A generation has many, so what most of them lack is shared."""
 
     work: Work
     order: int
     in_queue: bool = False  # whether a queue has an entry for it; the entry may outlive the state `QUEUED`
-    holders: set[str] = field(default_factory=set)  # workers that have a lease
-    given_to: set[str] = field(default_factory=set)  # workers that hold it or held it
+    holders: frozenset[str] = frozenset()  # workers that have a lease
+    given_to: frozenset[str] = frozenset()  # workers that hold it or held it
     overrun_by: frozenset[str] = frozenset()  # workers that reported more steps than it can have
     attempts: tuple[Attempt, ...] = ()  # the failed ones
-    lost_with: list[str] = field(default_factory=list)  # workers that ended while they held it
+    lost_with: tuple[str, ...] = ()  # workers that ended while they held it
     is_proof: bool = False  # it was scored before: who scores it again shows that a host can score
     check: Check | None = None  # it has an accepted result, which another host is to repeat
     retry_at: float = 0.0  # seconds of the monotonic clock before which it is not tried again
-    # Worker that lost its lease -> environment steps it had made; `None`: it had finished.
-    lost_steps: dict[str, int | None] = field(default_factory=dict)
+    # Workers that lost their lease, and the environment steps that each had made; `None`: it had finished.
+    lost_steps: tuple[tuple[str, int | None], ...] = ()
 
     @property
     def state(self) -> JobState:
@@ -56,7 +56,7 @@ class PendingJob:
     @property
     def is_background(self) -> bool:
         """Whether it is an evaluation or a kept rollout: it uses idle slots, and a share of busy ones."""
-        return self.work.job.kind != "score"
+        return self.work.kind != "score"
 
     @property
     def is_suspect(self) -> bool:
@@ -75,8 +75,8 @@ class PendingJob:
         """What former holders had done of the job that `scorer` has now scored in `steps`."""
         if not self.lost_steps:
             return 0
-        gone = self.lost_steps.keys() - self.holders - {scorer}
-        return sum(min(steps if (made := self.lost_steps[each]) is None else made, steps) for each in gone)
+        gone = [made for worker, made in self.lost_steps if worker not in self.holders and worker != scorer]
+        return sum(steps if made is None else min(made, steps) for made in gone)
 
     @property
     def failure(self) -> JobFailure:
@@ -108,7 +108,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         self._waiting: set[bytes] = set()  # failing jobs before their next attempt
         self._accepted: dict[bytes, int] = {}  # digest -> generation, of this generation and the last
         self.checks: dict[bytes, PendingJob] = {}  # wanted jobs whose accepted result another host is to repeat
-        self.is_drawn: Callable[[Job], bool] = lambda _: False  # whether a job's result is to be checked
+        self.is_drawn: Callable[[Work], bool] = lambda _: False  # whether a job's result is to be checked
 
     def __getitem__(self, digest: bytes) -> PendingJob:
         return self._pending[digest]
@@ -152,13 +152,13 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         R3: a wanted job goes into the queue, so some worker will get it.
         """
         for each in work:
-            digest = each.job.digest
+            digest = each.digest
             if digest in self._pending or digest in self._accepted:
                 continue
             self._add(PendingJob(each, self._next_order))
 
     def _add(self, pending: PendingJob) -> None:
-        digest = pending.work.job.digest
+        digest = pending.work.digest
         self._pending[digest] = pending
         self._tags[digest[:TAG_BYTES]] = digest
         self._next_order += 1
@@ -166,7 +166,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
 
     def offer_proof(self, work: Work) -> bool:
         """Want a job again that was scored before; `False` if it is wanted already."""
-        digest = work.job.digest
+        digest = work.digest
         if digest in self._pending:
             return False
         pending = PendingJob(work, self._next_order, is_proof=True)
@@ -176,7 +176,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
 
     def offer_check(self, work: Work, check: Check, holders: Iterable[str] = ()) -> None:
         """Want a job again whose result was accepted; the `holders` may finish it."""
-        digest, pending = work.job.digest, PendingJob(work, self._next_order, check=check)
+        digest, pending = work.digest, PendingJob(work, self._next_order, check=check)
         self._pending[digest] = self.checks[digest] = pending
         self._tags[digest[:TAG_BYTES]] = digest
         for holder in holders:
@@ -191,7 +191,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
 
     def digests_of_kind(self, kind: Kind) -> Sequence[bytes]:
         """The digests of the wanted jobs of a kind."""
-        return [digest for digest, pending in self._pending.items() if pending.work.job.kind == kind]
+        return [digest for digest, pending in self._pending.items() if pending.work.kind == kind]
 
     def enqueue(self, digest: bytes) -> None:
         """Put a wanted job into its queue: in order of offer, or behind the others if it failed; it may wait before."""
@@ -225,8 +225,8 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         """Note that a worker has this job, or is about to be sent it."""
         pending = self._pending[digest]
         self._background_held += not pending.holders and pending.is_background
-        pending.holders.add(worker)
-        pending.given_to.add(worker)
+        pending.holders |= {worker}
+        pending.given_to |= {worker}
         if by_share:
             self._share.reserve(digest)
 
@@ -235,7 +235,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         pending = self._pending.get(digest)
         if pending is None or worker not in pending.holders:
             return False
-        pending.holders.discard(worker)
+        pending.holders -= {worker}
         self._background_held -= not pending.holders and pending.is_background
         return not pending.holders
 
@@ -254,7 +254,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         """
         pending = self._pending[digest]
         is_failure = pending.is_suspect or pending.is_proof
-        pending.lost_with.append(worker)
+        pending.lost_with = (*pending.lost_with, worker)
         if is_failure:
             self._add_attempt(digest, Attempt(worker, WORKER_ENDED), now)
         return is_failure
@@ -267,7 +267,8 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         """Forget the ends of a worker that is back: its link was cut."""
         for pending in self._pending.values():
             if worker in pending.lost_with:
-                pending.lost_with.remove(worker)
+                first = pending.lost_with.index(worker)
+                pending.lost_with = pending.lost_with[:first] + pending.lost_with[first + 1 :]
                 ended = Attempt(worker, WORKER_ENDED)
                 pending.attempts = tuple(each for each in pending.attempts if each != ended)
         self._failing = {digest: pending for digest, pending in self._failing.items() if pending.attempts}
@@ -297,6 +298,11 @@ class PendingJobs(Mapping[bytes, PendingJob]):
     def record_overrun(self, digest: bytes, worker: str) -> None:
         """Note that a worker reported more steps of this job than it can have."""
         self._pending[digest].overrun_by |= {worker}
+
+    def record_lost_steps(self, digest: bytes, worker: str, steps: int | None) -> None:
+        """Note what a worker that lost its lease of a wanted job had done; `None`: it had finished."""
+        pending = self._pending[digest]
+        pending.lost_steps = (*(each for each in pending.lost_steps if each[0] != worker), (worker, steps))
 
     def accept(self, result: Result) -> PendingJob:
         """Take a wanted job's first valid result, and want the job no more.

@@ -21,6 +21,7 @@ from dreamfleet.coordinator.jobs.work import Work
 
 PEER_RATIO = 1.5  # workers at most this many times slower than the best share jobs evenly with it
 REST_FRACTION = 0.8  # a slower worker must return a job within this part of the time that the rest takes
+MANY_IDLE = 1_000  # slots: planning for so many takes some 20 ms
 
 
 class WorkerSelection:
@@ -168,6 +169,11 @@ class JobAssignment:
         """Whether a member with credit has a slot without a job."""
         return bool(self._idle)
 
+    @property
+    def idle_slots(self) -> int:
+        """Slots without a job of the members with credit."""
+        return sum(self._members[name].capacity - self.shares[name] for name in self._idle)
+
     def give(self, digest: bytes, name: str, *, by_share: bool = False) -> None:
         """Give a job to a member."""
         job = self._jobs[digest].work.job
@@ -183,7 +189,7 @@ class JobAssignment:
     def give_checks(self) -> None:
         """Give jobs whose accepted results another host is to repeat, each to the least loaded one that may (R32)."""
         for pending in [each for each in self._jobs.checks.values() if not each.holders]:
-            digest = pending.work.job.digest
+            digest = pending.work.digest
             able = [name for name, member in self._members.items() if self._may_check(pending, member)]
             if able:
                 self.give(digest, min(able, key=lambda name: self._load(name) / self._members[name].capacity))
@@ -224,7 +230,8 @@ def assign_jobs(
     """Take queued jobs one by one and choose a member with credit for each; the work by member.
 
     With `drain_background` background jobs may use all slots. `for_suspects` are the hosts that may be given suspects:
-    the working ones by default, any host if it is empty. A job without a suitable member stays queued.
+    the working ones by default, any host if it is empty. A job without a suitable member stays queued. Where very many
+    slots are idle, they alone get jobs, so that they begin sooner; the next turn gives what workers hold in advance.
     """
     for_suspects = working_hosts if for_suspects is None else for_suspects
     assignment = JobAssignment(jobs, members)
@@ -233,7 +240,8 @@ def assign_jobs(
     selection = WorkerSelection(members, shares, jobs.queue_length, now)
     slots = sum(member.slots for member in members.values() if member.takes_jobs)
     passed_over = []
-    while shares:
+    is_large = assignment.idle_slots >= MANY_IDLE
+    while shares and (assignment.has_idle or not is_large):
         if (next_job := jobs.next(slots, idle=assignment.has_idle, drain_background=drain_background)) is None:
             break
         pending = jobs[next_job.digest]
@@ -255,7 +263,7 @@ def assign_jobs(
         name = name or min(eligible, key=lambda name: shares[name])
         selection.assign(name)
         assignment.give(next_job.digest, name, by_share=next_job.by_share)
-        if jobs.is_drawn(pending.work.job) and not pending.is_suspect and not pending.is_proof:
+        if jobs.is_drawn(pending.work) and not pending.is_suspect and not pending.is_proof:
             assignment.give_copy(next_job.digest, name)
     for digest in passed_over:
         jobs.enqueue(digest)

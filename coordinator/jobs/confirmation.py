@@ -100,7 +100,7 @@ class Confirmation:
         failed = {digest for digest, score in self._scores.items() if isnan(score)}
         for digest in failed:
             del self._scores[digest]
-        return [each for each in self._work if each.job.digest in failed]
+        return [each for each in self._work if each.digest in failed]
 
     def advance(self, known: FindScores, is_checking: Callable[[Sequence[Work]], bool] = lambda _: False) -> list[Work]:
         """Close a complete round and open the next one; return its missing jobs, none once there is an outcome.
@@ -138,9 +138,9 @@ class Confirmation:
             for job in make_work(self._spec, "evaluate", each.generation, 0, each.vector, seeds, first=first)
         ]
         self._work = work
-        self._digests = [each.job.digest for each in work]
+        self._digests = [each.digest for each in work]
         self._scores = dict(known(self._digests))
-        return [each for each in work if each.job.digest not in self._scores]
+        return [each for each in work if each.digest not in self._scores]
 
     def _close(self) -> None:
         scores = np.array([self._scores[digest] for digest in self._digests]).reshape(len(self._remaining), -1)

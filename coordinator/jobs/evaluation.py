@@ -85,11 +85,11 @@ class Evaluations:
     def open(self, evaluation: Evaluation, spec: TaskSpec, known: Mapping[bytes, float]) -> list[Work]:
         """Open an evaluation with the scores that are known already; return its missing jobs."""
         work = evaluation.work(spec)
-        digests = [each.job.digest for each in work]
+        digests = [each.digest for each in work]
         wanted = {digest for each in self._open.values() for digest in each.digests}
         scores = {digest: known[digest] for digest in digests if digest in known}
         self._open[evaluation.generation] = OpenEvaluation(evaluation, digests, scores)
-        return [each for each in work if each.job.digest not in scores and each.job.digest not in wanted]
+        return [each for each in work if each.digest not in scores and each.digest not in wanted]
 
     def record(self, digest: bytes, score: float) -> list[int]:
         """Record one score, NaN for an episode that failed for good; return the generations of its evaluations.

@@ -56,7 +56,7 @@ class Generation:
         # Equal vectors have equal digests: one job then fills the place of each of them.
         self._places: dict[bytes, list[tuple[int, int]]] = {}
         for work in self.work:
-            self._places.setdefault(work.job.digest, []).append((work.job.candidate, work.job.episode))
+            self._places.setdefault(work.digest, []).append((work.template.candidate, work.episode))
         self._scores = np.full((len(vectors), len(seeds)), np.nan)
         self._first = -(-len(seeds) // 2) if racing else len(seeds)
         self._wanted = np.zeros(self._scores.shape, dtype=bool)
@@ -86,7 +86,7 @@ class Generation:
     def find_scored(self) -> Work | None:
         """A job that has a score; `None` if there is none."""
         return next(
-            (each for each in self.work if np.isfinite(self._scores[each.job.candidate, each.job.episode])), None
+            (each for each in self.work if np.isfinite(self._scores[each.template.candidate, each.episode])), None
         )
 
     @property
@@ -108,7 +108,7 @@ class Generation:
     @property
     def missing(self) -> list[Work]:
         """Wanted jobs without a result, each digest once, candidate by candidate."""
-        first = {work.job.digest: work for work in reversed(self.work)}
+        first = {work.digest: work for work in reversed(self.work)}
         is_open = self._open_places.tolist()
         return [
             first[digest]

@@ -41,9 +41,9 @@ class RolloutCollections:
 
     def open(self, work: list[Work], known: Container[bytes]) -> list[Work]:
         """Want these rollouts; return the jobs of those that are not kept already."""
-        missing = [each for each in work if each.job.digest not in known]
+        missing = [each for each in work if each.digest not in known]
         self._scheduled += len(work)
-        self._missing.update(each.job.digest for each in missing)
+        self._missing.update(each.digest for each in missing)
         return missing
 
     def remove(self, recalled: Iterable[tuple[int, int]]) -> None:
@@ -71,7 +71,7 @@ class RolloutCollections:
 
         R6: the rollout is on disk before the result can get a verdict, so a crash loses no rollout.
         """
-        if work is None or work.job.kind != "collect" or result.fitness is None:
+        if work is None or work.kind != "collect" or result.fitness is None:
             return result
         if result.upload is None:
             return replace(result, fitness=None, error="the rollout was not kept: update dreamfleet on this host")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
@@ -17,11 +17,50 @@ from dreamfleet.common.protocol.tasks import is_function_task
 
 
 @dataclass(frozen=True)
-class Work:
-    """A job and the vector `(size,)` that it scores, as float32 little-endian bytes."""
+class JobTemplate:
+    """What the jobs of one vector `(size,)` share; the vector is float32 little-endian bytes."""
 
-    job: Job
+    kind: Kind
+    task: str
+    generation: int
+    candidate: int
     vector: bytes
+    identity: bytes  # the vector's SHA-256
+    stall: float
+    overrides: Mapping[str, Any]
+
+
+@dataclass(slots=True)
+class Work:
+    """A job and the vector that it scores. The job is made when it is first asked for: a generation has many."""
+
+    template: JobTemplate
+    episode: int
+    seed: int
+    digest: bytes
+    _job: Job | None = field(default=None, init=False, repr=False, compare=False)
+
+    @property
+    def vector(self) -> bytes:
+        """The vector `(size,)` as float32 little-endian bytes."""
+        return self.template.vector
+
+    @property
+    def kind(self) -> Kind:
+        """The job's kind."""
+        return self.template.kind
+
+    @property
+    def job(self) -> Job:
+        """The job as workers get it."""
+        if self._job is None:
+            shared = self.template
+            self._job = Job(
+                kind=shared.kind, task=shared.task, generation=shared.generation, candidate=shared.candidate,
+                episode=self.episode, seeds=(self.seed,), vector=shared.identity, digest=self.digest,
+                stall=shared.stall, **shared.overrides,
+            )  # fmt: skip
+        return self._job
 
 
 def vector_bytes(vector: NDArray[np.float64]) -> bytes:
@@ -46,23 +85,11 @@ def make_work(
     overrides: dict[str, Any] = {
         name: given for name in names if (given := getattr(spec, name)) != getattr(run_spec, name)
     }
+    template = JobTemplate(kind, spec.task, generation, candidate, vector, identity, stall, overrides)
+    texts = _digest_texts(spec, kind, tuple(seeds))
     return [
-        Work(
-            Job(
-                kind=kind,
-                task=spec.task,
-                generation=generation,
-                candidate=candidate,
-                episode=episode,
-                seeds=(seed,),
-                vector=identity,
-                digest=hashlib.sha256(identity + text).digest(),
-                stall=stall,
-                **overrides,
-            ),
-            vector,
-        )
-        for episode, (seed, text) in enumerate(zip(seeds, _digest_texts(spec, kind, tuple(seeds)), strict=True), first)
+        Work(template, episode, seed, hashlib.sha256(identity + text).digest())
+        for episode, (seed, text) in enumerate(zip(seeds, texts, strict=True), first)
     ]
 
 

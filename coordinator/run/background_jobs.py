@@ -61,7 +61,7 @@ class BackgroundJobs:
         work = self.evaluations.retry_failed(self._settings.task)
         if self._confirmation is not None:
             work += self._confirmation.retry_failed()
-        self._journal.drop_failures_of([each.job.digest for each in work])
+        self._journal.drop_failures_of([each.digest for each in work])
         return work
 
     @property
@@ -161,7 +161,7 @@ class BackgroundJobs:
     def _check_again(self, work: Sequence[Work]) -> bool:
         """Check what an earlier life accepted of these jobs and did not check; whether any waits for its check."""
         self._verification.restore(work)
-        return self._verification.is_checking(each.job.digest for each in work)
+        return self._verification.is_checking(each.digest for each in work)
 
     def have_fallen_behind(self, count: int) -> bool:
         """Whether each of the last `count` evaluated means is clearly below the best one before them."""
@@ -171,12 +171,12 @@ class BackgroundJobs:
         """An evaluated mean's scores by seed, from the journal (R28), whichever evaluation of that mean had them."""
         vector, settings = self._journal.evaluated_vector(generation), self._settings
         work = Evaluation(generation, vector, settings.evaluation_episodes).work(settings.task)
-        known = self._journal.fitness_of("evaluate", [each.job.digest for each in work])
-        scores = {each.job.seeds[0]: known.get(each.job.digest, nan) for each in work}
+        known = self._journal.fitness_of("evaluate", [each.digest for each in work])
+        scores = {each.job.seeds[0]: known.get(each.digest, nan) for each in work}
         return {seed: score for seed, score in scores.items() if not isnan(score)}
 
     def _evaluate(self, evaluation: Evaluation) -> list[Work]:
-        wanted = [each.job.digest for each in evaluation.work(self._settings.task)]
+        wanted = [each.digest for each in evaluation.work(self._settings.task)]
         work = self.evaluations.open(evaluation, self._settings.task, self._journal.fitness_of("evaluate", wanted))
         self._verification.restore(evaluation.work(self._settings.task))
         self._finish(evaluation.generation)

@@ -96,12 +96,12 @@ class ExternalGenerations(Generations):
     def find_errors(self, generation: Generation, candidates: list[int]) -> dict[int, str]:
         """Why each of these failed candidates of the open generation failed."""
         wanted = set(candidates)
-        digests = {each.job.digest: each.job.candidate for each in generation.work if each.job.candidate in wanted}
-        found = self._journal.errors_of([*digests])
+        digests = [each.digest for each in generation.work if each.template.candidate in wanted]
+        found = self._journal.errors_of(digests)
         named: dict[int, str] = {}
         for work in generation.work:
-            if work.job.candidate in wanted and work.job.digest in found:
-                named.setdefault(work.job.candidate, found[work.job.digest])
+            if work.template.candidate in wanted and work.digest in found:
+                named.setdefault(work.template.candidate, found[work.digest])
         return {each: named.get(each, CANCELLED) for each in candidates}
 
     def can_reseed(self, _generation: Generation) -> bool:
@@ -120,6 +120,6 @@ class ExternalGenerations(Generations):
 
         Their steps belong to the generation that made them.
         """
-        known = self._journal.fitness_of("score", [work.job.digest for work in generation.missing])
+        known = self._journal.fitness_of("score", [work.digest for work in generation.missing])
         generation.recall({digest: (fitness, 0, ()) for digest, fitness in known.items()})
         return generation

@@ -113,7 +113,7 @@ class Generations:
         self._journal.open_generation(number, state, sigma, seeds, vectors)
         self.redrawn, self._rounds, self._reseeds = set(), 0, 0
         generation = self._generation(number, vectors, seeds, scoring_params)
-        if self._journal.take_back([each.job.digest for each in generation.work]):
+        if self._journal.take_back([each.digest for each in generation.work]):
             generation.recall(self._journal.results_of("score", number))
         return generation
 

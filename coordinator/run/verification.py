@@ -62,11 +62,11 @@ class Verification:
             self._key = journal.verify_key()
             fleet.jobs.is_drawn = self.is_drawn
 
-    def is_drawn(self, job: Job) -> bool:
+    def is_drawn(self, work: Work) -> bool:
         """Whether a job's accepted result is to be checked. Kept rollouts are not: no fitness depends on them."""
-        if job.kind == "collect":
+        if not self.share or work.kind == "collect":
             return False
-        number = int.from_bytes(hmac.digest(self._key, job.digest, "sha256")[:8], "big")
+        number = int.from_bytes(hmac.digest(self._key, work.digest, "sha256")[:8], "big")
         return number < self.share * 2**64
 
     @property
@@ -87,7 +87,7 @@ class Verification:
     @property
     def holds_generation(self) -> bool:
         """Whether a candidate's job of the open generation waits for its check."""
-        return any(each.work.job.kind == "score" for each in self._jobs.checks.values())
+        return any(each.work.kind == "score" for each in self._jobs.checks.values())
 
     @property
     def waiting(self) -> str:
@@ -109,19 +109,17 @@ class Verification:
         """Check again what an earlier life of the coordinator accepted and did not check."""
         if not self.share:
             return
-        drawn = {
-            each.job.digest: each for each in work if each.job.digest not in self._jobs and self.is_drawn(each.job)
-        }
+        drawn = {each.digest: each for each in work if each.digest not in self._jobs and self.is_drawn(each)}
         for digest, known in self._journal.unverified([each.job for each in drawn.values()]).items():
             self._jobs.offer_check(drawn[digest], Check(known.host_class, {known.answer.host}))
             self._answers[digest], self._workers[digest] = [known.answer], known.worker
 
     def record(self, work: Work, result: Result, worker: str) -> None:
         """Compare a result of a job whose result was accepted before; a repeated message changes nothing."""
-        answers, answer = self._answers[work.job.digest], Answer.of(host_of(worker), result)
-        if answer not in answers and work.job.digest not in self._findings:
+        answers, answer = self._answers[work.digest], Answer.of(host_of(worker), result)
+        if answer not in answers and work.digest not in self._findings:
             answers.append(answer)
-            self._decide(self._jobs.checks[work.job.digest])
+            self._decide(self._jobs.checks[work.digest])
 
     def settle(self, now: float) -> None:
         """Let checks wait no longer for hosts that are not here, or that do not answer."""
@@ -133,7 +131,7 @@ class Verification:
         self._forget(*(self._answers.keys() - self._jobs.checks.keys()))  # jobs that were withdrawn
         for worker in self._fleet.members.values():
             worker.is_held = any(host_of(worker.identity) in hosts for hosts in self._held.values())
-        is_scoring = any(each.work.job.kind == "score" and each.check is None for each in self._jobs.values())
+        is_scoring = any(each.work.kind == "score" and each.check is None for each in self._jobs.values())
         for digest, pending in list(self._jobs.checks.items()):
             job = pending.work.job
             if is_scoring and job.kind == "score":
@@ -166,7 +164,7 @@ class Verification:
     def _pass_over(self, pending: PendingJob, now: float) -> None:
         """Ask those who have the job no more: they took too long."""
         assert pending.check is not None
-        digest = pending.work.job.digest
+        digest = pending.work.digest
         check, late = pending.check, {host_of(name) for name in pending.holders}
         self._due_since[digest] = now
         if digest in self._held and late:
@@ -177,7 +175,7 @@ class Verification:
 
     def _decide(self, pending: PendingJob) -> None:
         """Go on as the answers so far say."""
-        digest, check = pending.work.job.digest, pending.check
+        digest, check = pending.work.digest, pending.check
         assert check is not None
         answers = self._answers[digest]
         able = [each for each in self._scoring_members() if each.host_class == check.host_class]
@@ -195,7 +193,7 @@ class Verification:
 
     def _hold(self, pending: PendingJob, hosts: set[str]) -> None:
         """Neither is believed until a further host answers; that one is asked as soon as it comes."""
-        digest, check = pending.work.job.digest, pending.check
+        digest, check = pending.work.digest, pending.check
         assert check is not None
         if self._held.get(digest, frozenset()) != frozenset(hosts):
             self._held[digest] = frozenset(hosts)
@@ -204,7 +202,7 @@ class Verification:
 
     def _finish(self, pending: PendingJob, decision: Decision) -> None:
         """Write what came of a check; if hosts are wrong, keep it until `condemn` bars them."""
-        job, answers = pending.work.job, self._answers[pending.work.job.digest]
+        job, answers = pending.work.job, self._answers[pending.work.digest]
         values = {each.value for each in answers}
         outcome: Outcome = "differs" if len(values) > 1 else "equal" if len(answers) > 1 else "unchecked"
         checkers = ",".join(sorted({each.host for each in answers} - {answers[0].host}))

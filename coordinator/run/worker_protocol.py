@@ -103,7 +103,7 @@ class WorkerProtocol:
             digest = self._fleet.jobs.digest_of_tag(running.tag)
             work = None if digest is None else self._fleet.jobs.work(digest)
             if work is not None and running.steps > self._most_steps(work.job):
-                self._fleet.overrun(worker, work.job.digest)
+                self._fleet.overrun(worker, work.digest)
 
     def handle_results(self, worker: str, batch: ResultBatch, now: float) -> None:
         """Judge a worker's results; the first accepted result of each job is journalled and counted.
@@ -131,7 +131,7 @@ class WorkerProtocol:
     def handle_upload(self, worker: str, part: UploadPart, now: float) -> None:
         """Keep part of a rollout, if the worker holds the job and the run still wants it."""
         uploads, pending = self._collections.uploads, self._fleet.jobs.get(part.digest)
-        if pending is None or pending.work.job.kind != "collect" or worker not in pending.holders:
+        if pending is None or pending.work.kind != "collect" or worker not in pending.holders:
             uploads.dropped["unwanted upload"] += 1
         else:
             uploads.add(worker, part, now)
@@ -159,7 +159,7 @@ class WorkerProtocol:
         self, worker: str, reported: Result, work: Work | None, fingerprint: str, host_class: str, now: float
     ) -> None:
         """Judge one result; `work` is the wanted job that it names, `None` if it names none."""
-        kind, horizon = ("evaluate", None) if work is None else (work.job.kind, work.job.horizon)
+        kind, horizon = ("evaluate", None) if work is None else (work.kind, work.job.horizon)
         bounded = fail_if_excessive(reported, kind, horizon or self._horizon, self._measures)
         result: Result | None = bounded
         if kind == "collect":

@@ -41,7 +41,7 @@ __all__ = ["EXTRAS", "SUMMARY", "configure", "run"]
 EXTRAS: tuple[str, ...] = ()
 LEFT_OPEN = 130
 # Python looks for cycles after every 700 new objects by default. A generation's jobs are many and have none.
-COLLECTION = (20_000, 10, 10)
+COLLECTION = (100_000, 10, 10)
 log = logging.getLogger("dreamfleet.coordinator")
 
 

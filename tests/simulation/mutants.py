@@ -204,7 +204,10 @@ def fleet_sends_verdicts_before_they_are_durable(original):
 
 @mutant(PendingJobs, "add_holder")
 def jobs_that_fill_the_slack_are_not_counted(_original):
-    return lambda self, digest, worker, **_: self[digest].holders.add(worker)
+    def add_holder(self, digest, worker, **_):
+        self[digest].holders |= {worker}
+
+    return add_holder
 
 
 @mutant(Fleet, "handle_result")

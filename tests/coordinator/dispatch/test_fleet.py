@@ -96,7 +96,8 @@ def test_credit_is_twice_the_capacity_and_a_result_returns_it():
 @pytest.mark.parametrize(("driven", "together", "given"), [(None, 1, 50), (True, 1, 4), (True, 4, 16)])
 def test_of_drives_a_wide_worker_is_given_as_many_as_its_slots_do_at_once_and_once_more(driven, together, given):
     fleet = fleet_of(A, jobs=0)
-    fleet.jobs.offer([replace(each, job=replace(each.job, driven=driven)) for each in work(50)])
+    spec = SPEC.with_overrides(driven=driven)
+    fleet.jobs.offer(make_work(spec, "score", 0, 0, vector_bytes(np.arange(4.0)), range(1000, 1050), SPEC))
     fleet.handle_heartbeat(A, replace(beat(capacity=200), slots=2, together=together), 1.0)
     assert len(digests(fleet.dispatch(1.0), A)) == given
 

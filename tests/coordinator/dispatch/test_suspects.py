@@ -12,7 +12,7 @@ def fleet_with_suspect(*names):
     """A has scored one of two jobs and failed the other, a suspect; then the other workers joined. And both jobs."""
     fleet = fleet_of(A, jobs=2)
     scored, suspect = digests(fleet.dispatch(0.0), A)
-    fleet.jobs[suspect].lost_with += STRANGERS
+    fleet.jobs[suspect].lost_with += tuple(STRANGERS)
     proof = fleet.jobs[scored].work
     fleet.handle_result(A, result(scored), 0.1)
     fleet.handle_result(A, result(suspect, error="OSError: once"), 0.2)
@@ -115,7 +115,7 @@ def test_a_new_host_waits_for_the_job_that_shows_that_it_can_score():
 def test_a_new_host_shows_that_it_can_score_as_soon_as_only_failed_jobs_are_open():
     """Else its attempts would prove nothing, and the host that has scored would have to fail again, minutes later."""
     fleet, proof, failed = fleet_with_suspect(B)
-    fleet.jobs[failed].lost_with.clear()
+    fleet.jobs[failed].lost_with = ()
     assert fleet.failure_judge.awaits_proof
     assert fleet.jobs.offer_proof(proof)
     assert not fleet.failure_judge.awaits_proof

@@ -579,7 +579,7 @@ def test_a_run_ends_though_a_suspect_failed_on_the_only_host_that_has_scored(
     bench.run.fleet.handle_departure(B, bench.now)
     bench.hosts, answer, failed = [A], bench.answer_one, set()
     for each in bench.run.fleet.jobs.values():
-        each.lost_with += ["x/1", "y/2"] if each.work.job.candidate == 3 else []
+        each.lost_with += ("x/1", "y/2") if each.work.job.candidate == 3 else ()
 
     def answer_one(name, job):
         is_first = job.candidate == 3 and job.generation == 0 and job.digest not in failed
