@@ -274,7 +274,7 @@ class Fleet:
         able = [member for member in self.members.values() if member.together > 1]
         slots = sum(member.slots for member in self.members.values() if member.takes_jobs) if able else 0
         for member in able:
-            member.drives_a_slot = max(1, len(self.jobs) // max(2 * slots, 1))
+            member.drives_a_slot = max(1, (len(self.jobs) + self.jobs.unmade) // max(2 * slots, 1))
 
     def longest_held(self, *, is_background: bool) -> float:
         """Seconds after which a job has been away for too long."""

@@ -103,6 +103,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         self._background_queue: list[tuple[int, bytes]] = []
         self._share = DeficitCounter(evaluation_share)
         self._next_order = 0
+        self.unmade = 0  # candidates' jobs of the open generation that are still to be offered
         self._background_held = 0  # background jobs with a holder
         self._failing: dict[bytes, PendingJob] = {}  # wanted jobs that failed somewhere
         self._waiting: set[bytes] = set()  # failing jobs before their next attempt
@@ -143,8 +144,8 @@ class PendingJobs(Mapping[bytes, PendingJob]):
 
     @property
     def queue_length(self) -> int:
-        """Entries of the candidates' queue. Background jobs have another; an entry may outlive the state `QUEUED`."""
-        return len(self._queue)
+        """Candidates' jobs that wait, those included that are not made yet; an entry may outlive the state `QUEUED`."""
+        return len(self._queue) + self.unmade
 
     def offer(self, work: Iterable[Work]) -> None:
         """Want these jobs, except those that are wanted or accepted already.

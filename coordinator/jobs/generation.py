@@ -15,6 +15,7 @@ from dreamfleet.coordinator.jobs.work import Work, make_work
 
 KnownResult = tuple[float, int, tuple[float, ...]]
 """Fitness, steps and measures of an episode, NaN for one that failed for good."""
+PART_JOBS = 16_384  # jobs that are made at a time, in some 60 ms
 
 
 @dataclass(frozen=True)
@@ -35,28 +36,26 @@ class Generation:
     specification, if `spec` differs from it: at a raised temperature or in a later stage. In a dream the first `driven`
     episodes are driven in the real world. R8: a candidate of which an episode failed for good has no fitness, needs no
     more episodes, and ranks last.
+
+    `work` are the jobs that are made so far. With `in_parts` they are those of the first candidates, and `make_more`
+    makes the others, so that workers may begin meanwhile; not where vectors are equal.
     """
 
     def __init__(
         self, number: int, spec: TaskSpec, vectors: Sequence[bytes], seeds: Sequence[int], *, racing: bool = False,
-        run_spec: TaskSpec | None = None, driven: int = 0,
+        run_spec: TaskSpec | None = None, driven: int = 0, in_parts: bool = False,
     ) -> None:  # fmt: skip
         self.number = number
         self.spec = spec
-        self.is_one_point = (
-            len(set(vectors)) == 1 < len(vectors)
-        )  # compared as float32: nothing can be learned from equal ones
-        parts = (spec.with_overrides(driven=True), seeds[:driven], 0), (spec, seeds[driven:], driven)
-        self.work = [
-            work
-            for candidate, vector in enumerate(vectors)
-            for part_spec, part_seeds, first in parts
-            for work in make_work(part_spec, "score", number, candidate, vector, part_seeds, run_spec or spec, first)
-        ]
+        distinct = len(set(vectors))
+        self.is_one_point = distinct == 1 < len(vectors)  # compared as float32: nothing can be learned from equal ones
+        self.work: list[Work] = []
+        self._vectors = vectors
+        self._parts = (spec.with_overrides(driven=True), seeds[:driven], 0), (spec, seeds[driven:], driven)
+        self._run_spec = run_spec or spec
+        self._made = 0  # candidates whose jobs are made
         # Equal vectors have equal digests: one job then fills the place of each of them.
         self._places: dict[bytes, list[tuple[int, int]]] = {}
-        for work in self.work:
-            self._places.setdefault(work.digest, []).append((work.template.candidate, work.episode))
         self._scores = np.full((len(vectors), len(seeds)), np.nan)
         self._first = -(-len(seeds) // 2) if racing else len(seeds)
         self._wanted = np.zeros(self._scores.shape, dtype=bool)
@@ -64,6 +63,30 @@ class Generation:
         self._steps = np.zeros(self._scores.shape, dtype=np.int64)  # a result's steps stand in the first of its places
         self._measures = np.full((*self._scores.shape, len(spec.measures)), np.nan)
         self._failed = np.zeros(len(vectors), dtype=bool)
+        if in_parts and distinct == len(vectors):
+            self.make_more()
+        else:
+            self._make(len(vectors))
+
+    @property
+    def unmade(self) -> int:
+        """How many jobs are not made yet."""
+        return self._wanted.size - len(self.work)
+
+    def make_more(self) -> list[Work]:
+        """Make the jobs of further candidates, some `PART_JOBS`; those that are wanted."""
+        made = len(self.work)
+        self._make(self._made + max(1, PART_JOBS // max(self.episodes, 1)))
+        wanted = self._wanted
+        return [each for each in self.work[made:] if wanted[each.template.candidate, each.episode]]
+
+    def _make(self, until: int) -> None:
+        for candidate, vector in enumerate(self._vectors[self._made : until], self._made):
+            for spec, seeds, first in self._parts:
+                for work in make_work(spec, "score", self.number, candidate, vector, seeds, self._run_spec, first):
+                    self.work.append(work)
+                    self._places.setdefault(work.digest, []).append((candidate, work.episode))
+        self._made = min(until, len(self._vectors))
 
     @property
     def steps(self) -> int:
@@ -107,7 +130,7 @@ class Generation:
 
     @property
     def missing(self) -> list[Work]:
-        """Wanted jobs without a result, each digest once, candidate by candidate."""
+        """Wanted jobs without a result, of those that are made, each digest once, candidate by candidate."""
         first = {work.digest: work for work in reversed(self.work)}
         is_open = self._open_places.tolist()
         return [

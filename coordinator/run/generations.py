@@ -112,8 +112,10 @@ class Generations:
         seeds = self._seeds(number, scoring_params.stage.episodes)
         self._journal.open_generation(number, state, sigma, seeds, vectors)
         self.redrawn, self._rounds, self._reseeds = set(), 0, 0
-        generation = self._generation(number, vectors, seeds, scoring_params)
-        if self._journal.take_back([each.digest for each in generation.work]):
+        may_have_results = self._journal.has_set_aside
+        generation = self._generation(number, vectors, seeds, scoring_params, in_parts=not may_have_results)
+        if may_have_results:
+            self._journal.take_back([each.digest for each in generation.work])
             generation.recall(self._journal.results_of("score", number))
         return generation
 
@@ -264,8 +266,9 @@ class Generations:
         return generation
 
     def _generation(
-        self, number: int, vectors: Sequence[bytes], seeds: Sequence[int], scoring_params: ScoringParams
-    ) -> Generation:
+        self, number: int, vectors: Sequence[bytes], seeds: Sequence[int], scoring_params: ScoringParams, *,
+        in_parts: bool = False,
+    ) -> Generation:  # fmt: skip
         run_spec, stage = self._settings.task, scoring_params.stage
         return Generation(
             number,
@@ -275,6 +278,7 @@ class Generations:
             racing=stage.racing,
             run_spec=run_spec,
             driven=stage.driven_episodes,
+            in_parts=in_parts,
         )
 
 

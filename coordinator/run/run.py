@@ -183,6 +183,8 @@ class Run:
             return False
         self.background_jobs.settle()
         has_opened = self._open_batch()
+        if self.generation.unmade and self._ending is None:
+            self.fleet.jobs.offer(self.generation.make_more())
         while self.ended is None and self.paused is None and self.generation.complete and not self._is_waiting:
             if self.verification.holds_generation:
                 break
@@ -195,6 +197,7 @@ class Run:
             else:
                 self._close(now)
         self.fleet.drain_background = self._is_waiting
+        self.fleet.jobs.unmade = self.generation.unmade if self._ending is None else 0
         self._finish()
         return has_opened or len(self.history) > closed
 

@@ -94,13 +94,18 @@ class RecallRecords(VerificationRecords):
         self._opened = number
         self._settle_recall()
 
-    def take_back(self, digests: Sequence[bytes]) -> bool:
-        """Count results of dropped generations again that these jobs want; whether there may have been any."""
+    @property
+    def has_set_aside(self) -> bool:
+        """Whether there may be results of dropped generations that `take_back` could count again."""
         if self._has_set_aside is None:
             row = self._read_row("SELECT 1 FROM recalled WHERE because = ? LIMIT 1", REWOUND)
             self._has_set_aside = row is not None
-        if not self._has_set_aside:
-            return False
+        return self._has_set_aside
+
+    def take_back(self, digests: Sequence[bytes]) -> None:
+        """Count results of dropped generations again that these jobs want."""
+        if not self.has_set_aside:
+            return
         for start in range(0, len(digests), MOST_VARIABLES):
             some = digests[start : start + MOST_VARIABLES]
             where = f"because = ? AND digest IN ({', '.join('?' * len(some))})"
@@ -112,7 +117,6 @@ class RecallRecords(VerificationRecords):
             self._write(f"DELETE FROM recalled WHERE {where}", REWOUND, *some)  # noqa: S608
             self._write_all("UPDATE verification SET stands = 1 WHERE digest = ? AND outcome = 'equal'", taken)
         self._effort = self._counted = None
-        return True
 
     def recalled_rollouts(self) -> list[tuple[int, int]]:
         """Generation and episode of the rollouts that count no more, and that were not collected again."""

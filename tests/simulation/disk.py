@@ -261,14 +261,17 @@ class MemoryJournal:
         )
         self._settle_recall()
 
-    def take_back(self, digests: Sequence[bytes]) -> bool:
+    @property
+    def has_set_aside(self) -> bool:
+        return any(because == "rewound" for because, _ in self._tables["recalled"].values())
+
+    def take_back(self, digests: Sequence[bytes]) -> None:
         found = {digest: (key, row) for key, (because, row) in self._tables["recalled"].items()
                  for digest in [key[0]] if because == "rewound" and digest in digests}  # fmt: skip
         for digest, (key, row) in found.items():
             self._put("recalled", key, None)
             if digest not in self._tables["result"]:
                 self._put("result", digest, row)
-        return bool(found)
 
     def recalled_rollouts(self) -> list[tuple[int, int]]:
         """Nothing reads them, and the simulated folder is not there."""

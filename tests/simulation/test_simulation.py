@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from dreamfleet.coordinator.dispatch.fleet import Fleet
+from dreamfleet.coordinator.jobs import generation
 from dreamfleet.coordinator.storage.journal import Journal
 from tests.simulation.campaign import run, shrunk
 from tests.simulation.disk import MemoryJournal
@@ -26,6 +27,12 @@ def assert_no_violation(tally, report):
 @pytest.mark.slow
 def test_no_schedule_of_faults_breaks_a_rule():
     assert_no_violation(*run(schedules=300, seed=1, jobs=1))
+
+
+@pytest.mark.slow
+def test_no_schedule_breaks_a_rule_where_generations_are_made_in_parts(monkeypatch):
+    monkeypatch.setattr(generation, "PART_JOBS", 3)
+    assert_no_violation(*run(schedules=300, seed=2, jobs=1))
 
 
 @pytest.mark.long

@@ -6,6 +6,7 @@ import queue
 import time
 from collections import deque
 from dataclasses import dataclass, field
+from math import inf
 from typing import Any
 
 import zenoh
@@ -28,6 +29,8 @@ from dreamfleet.worker.bench.sleep_tasks import NULL_TASK
 from dreamfleet.worker.service.admission import Admission, make_request, request_admission
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.outbox import Outbox
+
+LONGEST_WAIT = 0.02  # seconds between two looks at what is due
 
 
 @dataclass
@@ -101,7 +104,8 @@ def run_simulated_workers(endpoint: str, count: int, slots: int, seconds: float 
         declarations.append(session.liveliness().declare_token(keys.live_worker(admission.run, identity)))
         _handle_and_send(session, crowd, events, inbox, wait=0.0)
     while True:
-        _handle_and_send(session, crowd, events, inbox, wait=0.02)
+        ends = min((worker.running[0][0] for worker in crowd.values() if worker.running), default=inf)
+        _handle_and_send(session, crowd, events, inbox, wait=min(max(ends - time.monotonic(), 0.0), LONGEST_WAIT))
 
 
 def _connect(endpoint: str) -> zenoh.Session:

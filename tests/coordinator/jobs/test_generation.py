@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dreamfleet.coordinator.jobs import generation as generation_module
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.jobs.work import make_work, vector_bytes
 from tests.support.samples import SPEC
@@ -44,6 +45,31 @@ def test_equal_candidates_share_one_job():
     generation.record(work.job.digest, 3.0, steps=1)
     assert generation.complete
     assert np.array_equal(generation.fitness(), [3.0, 3.0])
+
+
+@pytest.mark.parametrize("racing", [False, True])
+def test_made_in_parts_a_generation_has_the_same_jobs_in_the_same_order(monkeypatch, racing):
+    monkeypatch.setattr(generation_module, "PART_JOBS", 5)
+    whole = Generation(0, SPEC, VECTORS, (100, 200, 300, 400), racing=racing)
+    parts = Generation(0, SPEC, VECTORS, (100, 200, 300, 400), racing=racing, in_parts=True)
+    offered = parts.missing
+    assert (parts.unmade, parts.total, parts.complete) == (8, whole.total, False)
+    for work in offered:  # before the others are made
+        parts.record(work.digest, 3.0, steps=1)
+    assert not parts.missing and not parts.complete
+    while parts.unmade:
+        offered += parts.make_more()
+    assert [work.job for work in offered] == [work.job for work in whole.missing]
+    assert parts.work == whole.work
+    for work in offered:
+        parts.record(work.digest, 3.0, steps=1)
+    assert len(parts.missing) == (4 if racing else 0)
+
+
+def test_equal_candidates_are_made_at_once(monkeypatch):
+    monkeypatch.setattr(generation_module, "PART_JOBS", 1)
+    generation = Generation(0, SPEC, [VECTORS[0], VECTORS[1], VECTORS[0]], (100,), in_parts=True)
+    assert (generation.unmade, len(generation.work)) == (0, 3)
 
 
 def race(order, scores):
