@@ -56,7 +56,8 @@ def test_made_in_parts_a_generation_has_the_same_jobs_in_the_same_order(monkeypa
     assert (parts.unmade, parts.total, parts.complete) == (8, whole.total, False)
     for work in offered:  # before the others are made
         parts.record(work.digest, 3.0, steps=1)
-    assert not parts.missing and not parts.complete
+    assert not parts.missing
+    assert not parts.complete
     while parts.unmade:
         offered += parts.make_more()
     assert [work.job for work in offered] == [work.job for work in whole.missing]
