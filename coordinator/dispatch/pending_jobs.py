@@ -56,7 +56,7 @@ class PendingJob:
     @property
     def is_background(self) -> bool:
         """Whether it is an evaluation or a kept rollout: it uses idle slots, and a share of busy ones."""
-        return self.work.kind != "score"
+        return self.work.template.kind != "score"
 
     @property
     def is_suspect(self) -> bool:

@@ -38,7 +38,19 @@ class Work:
     episode: int
     seed: int
     digest: bytes
-    _job: Job | None = field(default=None, init=False, repr=False, compare=False)
+    job: Job = field(init=False, repr=False, compare=False)
+
+    def __getattr__(self, name: str) -> Job:
+        """Make the job: this is called only while it is missing."""
+        if name != "job":
+            raise AttributeError(name)
+        shared = self.template
+        self.job = Job(
+            kind=shared.kind, task=shared.task, generation=shared.generation, candidate=shared.candidate,
+            episode=self.episode, seeds=(self.seed,), vector=shared.identity, digest=self.digest, stall=shared.stall,
+            **shared.overrides,
+        )  # fmt: skip
+        return self.job
 
     @property
     def vector(self) -> bytes:
@@ -49,18 +61,6 @@ class Work:
     def kind(self) -> Kind:
         """The job's kind."""
         return self.template.kind
-
-    @property
-    def job(self) -> Job:
-        """The job as workers get it."""
-        if self._job is None:
-            shared = self.template
-            self._job = Job(
-                kind=shared.kind, task=shared.task, generation=shared.generation, candidate=shared.candidate,
-                episode=self.episode, seeds=(self.seed,), vector=shared.identity, digest=self.digest,
-                stall=shared.stall, **shared.overrides,
-            )  # fmt: skip
-        return self._job
 
 
 def vector_bytes(vector: NDArray[np.float64]) -> bytes:
