@@ -1,4 +1,4 @@
-"""Why a run ends: its limits, or a population that has collapsed to one point."""
+"""Why a run ends: its limits, or a search that has converged to one point."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ def find_stop_reason(
 ) -> str | None:
     """Why the run of `task` ends before `generation` is scored, in words; `None` if it continues."""
     if generation.is_one_point:
-        collapsed = f"the population of generation {generation.number} collapsed to one point"
-        return f"{collapsed}; start another --from it with a larger --sigma0"
+        converged = f"the search has converged: all candidates of generation {generation.number} are equal"
+        return f"{converged}; a run --from it with a larger --sigma0 searches on"
     return _find_reached_limit(limits, history, jobs, task)
 
 

@@ -6,8 +6,11 @@ function's arguments. What the coordinates mean stands in the task's options (`c
 
 from __future__ import annotations
 
+import inspect
 import math
+import traceback
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium
@@ -117,8 +120,19 @@ class FunctionEnvironment(gymnasium.Env[Any, Any]):
         try:
             returned = self._function(action, seed=self._seed) if self._takes_seed else self._function(action)
         except (Exception, SystemExit) as error:
-            raise ObjectiveError(f"{self._name} raised {one_line(f'{type(error).__name__}: {error}')}") from error
+            what = one_line(f"{type(error).__name__}: {error}")
+            raise ObjectiveError(f"{self._name} raised {what}{_find_line(self._function, error)}") from error
         return _to_number(self._name, returned)
+
+
+def _find_line(function: Callable[..., Any], error: BaseException) -> str:
+    """The last line of the function's own file that led to the error, as " (FILE:LINE)"; empty if there is none."""
+    code = getattr(inspect.unwrap(function), "__code__", None)
+    if code is None:
+        return ""
+    frames = ((frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(error.__traceback__))
+    lines = [line for file, line in frames if file == code.co_filename]
+    return f" ({Path(code.co_filename).name}:{lines[-1]})" if lines else ""
 
 
 def _to_number(name: str, returned: Any) -> float:

@@ -330,7 +330,7 @@ def test_a_run_whose_population_is_one_point_ends_with_that_reason(tmp_path, ran
             for send in bench.run.fleet.dispatch(bench.now):
                 for work in send.content.work:
                     bench.deliver(send.identity, Result(work.job.digest, 1.0, 10, 0.1, None, None))
-        assert "collapsed to one point; start another --from it" in bench.run.ended
+        assert "are equal; a run --from it" in bench.run.ended
         closed = len(bench.run.history)
         bench.restart()
         assert len(bench.run.history) == closed

@@ -1,5 +1,7 @@
 """The task of a Python function: one call is an episode of one step."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -54,7 +56,7 @@ def test_a_function_that_writes_into_its_argument_changes_nothing_else():
 @pytest.mark.parametrize(
     ("function", "says"),
     [
-        ("raising", "raising raised ZeroDivisionError"),
+        ("raising", r"raising raised ZeroDivisionError: .*\(objectives\.py:\d+\)"),
         ("exiting", "exiting raised SystemExit: 3"),
         ("nothing", "nothing returned NoneType None: it must return one number"),
         ("vector", r"vector returned an array of shape \(2,\)"),
@@ -65,7 +67,7 @@ def test_a_function_that_writes_into_its_argument_changes_nothing_else():
 def test_what_is_no_number_fails_the_candidate_and_refuses_the_run_before_it_begins(function, says):
     with pytest.raises(ObjectiveError, match=says):
         score(function)
-    assert says.replace("\\", "") in try_task(name(function), {"environment": TWO}).fault
+    assert re.search(says, try_task(name(function), {"environment": TWO}).fault)
     assert ObjectiveError.__name__ == OF_FUNCTION
 
 
