@@ -194,6 +194,14 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         """The digests of the wanted jobs of a kind."""
         return [digest for digest, pending in self._pending.items() if pending.work.kind == kind]
 
+    def plain_scores(self) -> Sequence[bytes]:
+        """The digests of the wanted jobs of candidates that are no proof and no check."""
+        return [
+            digest
+            for digest, pending in self._pending.items()
+            if not (pending.is_background or pending.is_proof or pending.check)
+        ]
+
     def enqueue(self, digest: bytes) -> None:
         """Put a wanted job into its queue: in order of offer, or behind the others if it failed; it may wait before."""
         pending = self._pending[digest]
@@ -353,6 +361,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
             by_share = bool(self._background_queue) and self._share.is_due(slots)
             return (self._background_queue, True) if by_share else (self._queue, False)
         limit = max(1, int(slots * self._share.share))
-        if self._background_queue and (drain_background or (idle and self._background_held < limit)):
+        may_fill = idle and not self.unmade and self._background_held < limit
+        if self._background_queue and (drain_background or may_fill):
             return self._background_queue, False
         return None

@@ -70,8 +70,8 @@ class Generation:
 
     @property
     def unmade(self) -> int:
-        """How many jobs are not made yet."""
-        return self._wanted.size - len(self.work)
+        """How many wanted jobs are not made yet."""
+        return int(self._wanted[self._made :].sum())
 
     def make_more(self) -> list[Work]:
         """Make the jobs of further candidates, some `PART_JOBS`; those that are wanted."""

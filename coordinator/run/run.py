@@ -175,6 +175,8 @@ class Run:
         closed = len(self.history)
         if self.is_rewound or self.stalled is not None or (self.generation.complete and not self._take_lock()):
             return False
+        if self.generation.unmade and self._ending is None:  # first, for others judge by the open jobs
+            self.fleet.jobs.offer(self.generation.make_more())
         self._settle_failures()
         self.verification.settle(now)
         if self.verification.has_findings:
@@ -183,8 +185,6 @@ class Run:
             return False
         self.background_jobs.settle()
         has_opened = self._open_batch()
-        if self.generation.unmade and self._ending is None:
-            self.fleet.jobs.offer(self.generation.make_more())
         while self.ended is None and self.paused is None and self.generation.complete and not self._is_waiting:
             if self.verification.holds_generation:
                 break
@@ -368,9 +368,11 @@ class Run:
         self.fleet.jobs.begin_generation(generation.number)
 
     def _replace_generation(self, generation: Generation) -> None:
-        """Score the open generation as it is now."""
-        self.generation = generation
-        self.fleet.jobs.offer(generation.missing)
+        """Score the open generation as it is now: of a race whose first half is open again, nothing of the second."""
+        self.generation, missing = generation, generation.missing
+        wanted = {each.digest for each in missing}
+        self.fleet.withdraw(each for each in self.fleet.jobs.plain_scores() if each not in wanted)
+        self.fleet.jobs.offer(missing)
 
     def take_notes(self) -> list[str]:
         """What happened since the last call, for the log; the journal keeps it too."""

@@ -9,9 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dreamfleet.common.protocol.messages import Result
+from dreamfleet.common.protocol.messages import Result, ResultBatch
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.seeds import CONFIRMING_OFFSET, training_seed
+from dreamfleet.coordinator.jobs import generation
 from dreamfleet.coordinator.run.run import BY_HAND
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from tests.coordinator.run.test_run import SETTINGS as TWO
@@ -597,3 +598,36 @@ def test_a_run_ends_though_a_suspect_failed_on_the_only_host_that_has_scored(
     assert bench.run.ended
     assert [each.failed for each in bench.run.history.rows] == [0] * GENERATIONS
     bench.journal.close()
+
+
+def test_a_resume_in_the_second_half_of_a_race_wants_the_first_half_before(tmp_path, random_bundle):
+    racing = replace(SETTINGS, racing=True, population=4)
+    bench = Failing(tmp_path / "night", random_bundle.path, racing, fails=lambda job: job.candidate == 0, limit=1.0)
+    bench.serve(stop=lambda run: any(each.work.episode == 1 for each in run.fleet.jobs.values()))
+    bench.run.pause("by hand")
+    bench.run.resume()  # it forgets the failures, so the better half is not known
+    assert [(each.work.template.candidate, each.work.episode) for each in bench.run.fleet.jobs.values()] == [(0, 0)]
+    bench.journal.close()
+
+
+class Quiet(Failing):
+    """A bench in which all answers of a turn arrive before the run goes on."""
+
+    def deliver(self, name, result):
+        batch = ResultBatch(
+            run_uid=self.run.uid, incarnation=1, fingerprint="f", results=(result,), host_class=self.host_class
+        )
+        self.worker_protocol.handle_results(name, batch, self.now)
+
+
+def test_where_all_that_was_made_has_failed_the_rest_of_the_generation_goes_on(tmp_path, random_bundle, monkeypatch):
+    stories = []
+    for part in (10_000, 1):
+        monkeypatch.setattr(generation, "PART_JOBS", part)
+        bench = Quiet(
+            tmp_path / str(part), random_bundle.path, SETTINGS, fails=lambda job: job.candidate < 3, limit=1.0
+        )
+        bench.serve()
+        stories.append(bench.story())
+        bench.journal.close()
+    assert stories[0] == stories[1]
