@@ -53,7 +53,7 @@ def test_made_in_parts_a_generation_has_the_same_jobs_in_the_same_order(monkeypa
     whole = Generation(0, SPEC, VECTORS, (100, 200, 300, 400), racing=racing)
     parts = Generation(0, SPEC, VECTORS, (100, 200, 300, 400), racing=racing, in_parts=True)
     offered = parts.missing
-    assert (parts.unmade, parts.total, parts.complete) == (8, whole.total, False)
+    assert (parts.unmade, parts.total, parts.complete) == (4 if racing else 8, whole.total, False)
     for work in offered:  # before the others are made
         parts.record(work.digest, 3.0, steps=1)
     assert not parts.missing
