@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _row(each: Finding) -> dict[str, object]:
-    state = "ok" if each.ok else "missing" if each.needed else "absent"
+    state = "ok" if each.ok else "missing" if each.needed else "optional"
     return {"state": state, "check": each.name, "found": each.found, "for": each.role,
             "remedy": "" if each.ok else each.remedy}  # fmt: skip
 

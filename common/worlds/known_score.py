@@ -27,12 +27,12 @@ class KnownScore:
 
         >>> known = KnownScore(786.1, 50.7, 100, median_seed=10055)
         >>> known.describe_beside(10055, "game"), known.describe_beside(7, "game")
-        (', the median of 100 games, whose mean is 786.1 ± 50.7', '; its mean over 100 games: 786.1 ± 50.7')
+        (', the median of 100 games, whose mean is 786.1 ± 50.7', "; the controller's mean over 100 games: 786.1 ± 50.7")
         """
         mean, episodes = format_with_error(self.mean, self.error), plural(self.episodes, word)
         if seed == self.median_seed:
             return f", the median of {episodes}, whose mean is {mean}"
-        return f"; its mean over {episodes}: {mean}"
+        return f"; the controller's mean over {episodes}: {mean}"
 
 
 def first_seed(known: KnownScore | None) -> int:

@@ -123,11 +123,12 @@ def _window(name: str) -> Iterator[SendFrame]:
 @contextmanager
 def _open_pictures(args: argparse.Namespace) -> Iterator[Iterator[CaptionedFrame | None]]:
     from dreamfleet.common.monitoring.client import Client
+    from dreamfleet.common.runs.lookup import naming_the_stored_run
 
     if args.controller:
         yield _drive_pictures(args, _named_driver(args))
         return
-    with Client(resolve_network(args)) as client:
+    with naming_the_stored_run(args.runs_dir, args.run_name), Client(resolve_network(args)) as client:
         if args.best:
             name = args.run_name or client.status().run
             yield _drive_pictures(args, lambda: _best_driver(client, name))
