@@ -26,8 +26,10 @@ class KnownScore:
         """What to say beside the score of one seed, so that nobody takes it for the mean; `word`: one seed.
 
         >>> known = KnownScore(786.1, 50.7, 100, median_seed=10055)
-        >>> known.describe_beside(10055, "game"), known.describe_beside(7, "game")
-        (', the median of 100 games, whose mean is 786.1 ± 50.7', "; the controller's mean over 100 games: 786.1 ± 50.7")
+        >>> known.describe_beside(10055, "game")
+        ', the median of 100 games, whose mean is 786.1 ± 50.7'
+        >>> known.describe_beside(7, "game")
+        "; the controller's mean over 100 games: 786.1 ± 50.7"
         """
         mean, episodes = format_with_error(self.mean, self.error), plural(self.episodes, word)
         if seed == self.median_seed:
