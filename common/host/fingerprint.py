@@ -40,5 +40,6 @@ def fingerprint(packages: tuple[str, ...] = NUMERIC_PACKAGES, torch_device: str 
     libc, libc_version = platform.libc_ver()
     versions = [f"{name}-{found}" for name in packages if (found := package_version(name))]
     features = "+".join(cpu_features()) or platform.processor() or "unknown"
-    dreams = [f"torch-{package_version('torch')}", f"dreams-on-{torch_device}"] if torch_device else []
-    return " ".join([platform.machine(), features, f"{libc or platform.system()}-{libc_version}", *versions, *dreams])
+    dreams = [f"dreams-on-{torch_device}", f"torch-{package_version('torch')}"] if torch_device else []
+    # The device is named early: a status cuts long fingerprints.
+    return " ".join([platform.machine(), *dreams, features, f"{libc or platform.system()}-{libc_version}", *versions])
