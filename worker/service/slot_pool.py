@@ -14,6 +14,7 @@ from dreamfleet.common.protocol.result_bounds import clamp_count
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.child import ChildReady, ScorerArguments
 from dreamfleet.worker.service.child_process import EXIT_GRACE
+from dreamfleet.worker.service.drive_count import DriveCount
 from dreamfleet.worker.service.failure_log import FailureLog
 from dreamfleet.worker.service.frame_sampler import SampledFrame
 from dreamfleet.worker.service.job_group import JobWithVector
@@ -63,7 +64,7 @@ class SlotPool:
         self._jobs_before = 0  # in the backlog, at the last `fill`
         self._grew_at = self._waits_since = 0.0  # when jobs last arrived, and when the first of them did
         self.awaits_jobs = False  # whether a part of a batch waits for the rest, which may be on its way
-        self.together = 1  # candidates' drives that a slot does side by side; reported by the first child that is ready
+        self._drive_count = DriveCount()  # the first child that is ready reports the most
         self._failures = FailureLog()
         self.host_class = ""  # reported by the first child that is ready
         self._watched = False
@@ -105,6 +106,11 @@ class SlotPool:
         R14: the coordinator gives this worker at most twice as many jobs, so that little is lost with it.
         """
         return min(min(self.ready_count, self._share.allowance) * self._jobs_a_slot, MAX_LEASES // 2)
+
+    @property
+    def together(self) -> int:
+        """Candidates' drives that a slot does side by side."""
+        return self._drive_count.best
 
     @property
     def taken(self) -> int:
@@ -191,13 +197,17 @@ class SlotPool:
         slot = self._slots[event.slot]
         if isinstance(event.message, ChildReady):
             self.host_class = self.host_class or event.message.host_class
-            self.together = event.message.together
+            self._drive_count.most = event.message.together
         if event.failure is not None:
             # A child that is not ready yet has started no job, so none is named.
             text = self._failures.format_if_new(event.failure, self._task, slot.running if slot.ready else ())
             if text is not None:
                 log.error("%s", text)
-        return slot.handle(event)
+        results = slot.handle(event)
+        if results and self._batch_size is None and all(each.fitness is not None for each in results):
+            steps, seconds = sum(each.steps for each in results), sum(each.seconds for each in results)
+            self._drive_count.add(len(results), steps, seconds)
+        return results
 
     def check(self, now: float, gap: float) -> None:
         """Kill children that hang; `gap` is for how many seconds before `now` this host was suspended."""
@@ -261,7 +271,7 @@ class SlotPool:
         A drive beside others saves less time than a slot without any loses. So as the drives run out, their groups
         shrink.
         """
-        return max(1, min(self.together, math.ceil(len(backlog) / len(self._slots))))
+        return max(1, min(self._drive_count.next, math.ceil(len(backlog) / len(self._slots))))
 
     def _count_groups(self, backlog: Backlog) -> int:
         """How many slots the waiting jobs could use, about."""

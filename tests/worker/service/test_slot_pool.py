@@ -13,6 +13,7 @@ from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.service import slot_pool
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.child import ScorerArguments
+from dreamfleet.worker.service.drive_count import ENOUGH
 from dreamfleet.worker.service.slot_budget import SharedSlots
 from dreamfleet.worker.service.slot_pool import SlotPool
 from tests.support import rough_tasks, tasks
@@ -83,6 +84,19 @@ def test_groups_of_episodes_that_are_driven_side_by_side_shrink_as_the_jobs_run_
     alone = Scorer(fleet.spec, random_bundle)
     parameters = np.frombuffer(VECTOR, dtype="<f4")
     assert results == {each.digest: alone.score("score", parameters, each.seeds[0]).fitness for each in jobs}
+
+
+def test_a_slot_finds_from_its_drives_how_many_it_should_do_side_by_side(pool, monkeypatch):
+    fleet = pool(SIDE_BY_SIDE, slots=1)
+    add = fleet.slots._drive_count.add
+    # Two take the least here, whatever this host takes.
+    monkeypatch.setattr(
+        fleet.slots._drive_count, "add", lambda drives, steps, _: add(drives, steps, steps * abs(drives - 2))
+    )
+    sizes = fleet.score(60)[2]
+    assert set(sizes[: 4 * ENOUGH]) == {4, 2, 1}
+    assert sizes[-8:-1] == [2] * 7
+    assert (fleet.slots.together, fleet.slots.capacity) == (2, 2)
 
 
 def test_a_few_jobs_go_to_as_many_slots(pool):

@@ -1,0 +1,59 @@
+"""How many drives a slot does side by side."""
+
+import pytest
+
+from dreamfleet.worker.service.drive_count import ENOUGH, MEASURE_AGAIN, DriveCount
+
+
+def drive(count, costs, groups):
+    """The numbers that are asked for by groups that take as long as `costs`: seconds a step by number of drives."""
+    asked = []
+    for _ in range(groups):
+        drives = count.next
+        asked.append(drives)
+        count.add(drives, 1000 * drives, 1000 * drives * costs[drives])
+    return asked
+
+
+def counting(most):
+    count = DriveCount()
+    count.most = most
+    return count
+
+
+@pytest.mark.parametrize(
+    ("costs", "best"),
+    [({4: 3, 2: 4, 1: 5}, 4), ({4: 5, 2: 3, 1: 4}, 2), ({4: 5, 2: 5, 1: 4}, 1)],
+)
+def test_the_number_whose_steps_take_least_time_is_found_and_kept(costs, best):
+    count = counting(4)
+    assert drive(count, costs, 3 * ENOUGH) == [4] * ENOUGH + [2] * ENOUGH + [1] * ENOUGH
+    assert drive(count, costs, MEASURE_AGAIN // 2) == [best] * (MEASURE_AGAIN // 2)
+
+
+def test_a_host_that_changes_is_measured_again():
+    count = counting(4)
+    drive(count, {4: 3, 2: 4, 1: 5}, 3 * ENOUGH)
+    asked = drive(count, {4: 6, 2: 4, 1: 5}, 8 * MEASURE_AGAIN)
+    assert count.best == 2
+    assert asked.count(1) < len(asked) / 20
+
+
+def test_what_is_not_compared_changes_nothing():
+    count = counting(2)
+    for _ in range(ENOUGH):
+        count.add(2, 0, 100.0)  # episodes that are over at once
+        count.add(3, 1000, 0.1)  # no number that is asked for: the jobs ran out
+    assert (count.next, count.best) == (1, 2)
+
+
+def test_a_slot_that_drives_one_by_one_goes_on_so():
+    count = DriveCount()
+    assert drive(count, {1: 3}, 100) == [1] * 100
+    assert count.best == count.most == 1
+
+
+def test_a_number_that_is_no_power_of_two_is_tried_too():
+    count = counting(6)
+    assert drive(count, {6: 1, 4: 2, 2: 3, 1: 4}, 4 * ENOUGH)[::ENOUGH] == [6, 4, 2, 1]
+    assert count.best == 6
