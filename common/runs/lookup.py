@@ -31,7 +31,7 @@ from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, resume_command, run_paths
 
-SUBSPACES = "subspaces"  # the folder of shipped subspaces, each named as its world model
+SUBSPACES = "subspaces"  # the folder of shipped subspaces: of a world model, by its name, or of a controller
 
 
 def find_controller(name: str, runs_dir: Path) -> tuple[Controller, Path | None]:

@@ -8,12 +8,12 @@ from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING
 from dreamfleet.common.runs.records import StageSettings
 from dreamfleet.common.worlds.profile import DemoPlan, PublishedScore, PublishedScores, ShippedScore, WorldProfile
 
-# Reality from nothing, in the features that ship: one track a candidate by large steps until a mean is able, then ever
+# Reality from nothing, in features of able drivers: one track a candidate by large steps until a mean is able, then ever
 # more tracks. A candidate pays for the grass, because who drives there soon misses tiles (docs/lab/results.md).
 REAL: dict[str, Any] = {
     "task": "car-racing",
     "bundle": "tiny-int8",
-    "subspace": "tiny",
+    "subspace": "real",
     "preset_variant": ("offroad_cost=0.5",),
     "population": 24,
     "episodes": 1,

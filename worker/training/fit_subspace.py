@@ -200,7 +200,8 @@ def _standardise(sums: LeastSquaresSums, solved: Doubles, names: Sequence[str], 
     squares = (solved * (sums.inputs @ solved)).sum(axis=0) / sums.steps
     deviation = np.sqrt(squares - mean**2)
     weights, offsets = solved[:-1] / deviation, (solved[-1] - mean) / deviation
-    return Subspace(weights.T.astype(np.float32), offsets.astype(np.float32), tuple(names), bundle.sha256)
+    owner = bundle.same_models[-1]  # of a rounded bundle the whole one, so that it fits both
+    return Subspace(weights.T.astype(np.float32), offsets.astype(np.float32), tuple(names), owner)
 
 
 def _feature_name(name: str, window: tuple[int, int]) -> str:

@@ -9,6 +9,7 @@ import pytest
 from dreamfleet.common.artifacts.actions import Continuous, Discrete
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.common.runs.lookup import find_bundle
 from dreamfleet.worker.tasks.api import World
 from dreamfleet.worker.training.drive_regression import DriveArrays, FeatureExtractor
 from dreamfleet.worker.training.fit_subspace import PredictionTarget, find_subspace, make_targets
@@ -128,6 +129,10 @@ def test_unpredictable_drives_are_refused(bundle, drives, tmp_path):
         find_subspace(bundle, drives[:4], ignore)
     with pytest.raises(DatasetError, match="holds pictures"):
         find_subspace(bundle, [write_drive(tmp_path / "wide", 0, picture=96)], ignore)
+
+
+def test_the_features_of_a_rounded_world_model_fit_the_whole_one_too(drives):
+    assert find_subspace(find_bundle("tiny-int8"), drives, ignore).subspace.bundle == find_bundle("tiny").sha256
 
 
 def call(*arguments):
