@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import queue
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from time import monotonic
 from typing import Any
 
@@ -203,10 +203,10 @@ class SlotPool:
             text = self._failures.format_if_new(event.failure, self._task, slot.running if slot.ready else ())
             if text is not None:
                 log.error("%s", text)
+        jobs = slot.running
         results = slot.handle(event)
-        if results and self._batch_size is None and all(each.fitness is not None for each in results):
-            steps, seconds = sum(each.steps for each in results), sum(each.seconds for each in results)
-            self._drive_count.add(len(results), steps, seconds)
+        if self._batch_size is None and slot is not self._shown_slot:
+            self._measure(jobs, results)
         return results
 
     def check(self, now: float, gap: float) -> None:
@@ -264,6 +264,13 @@ class SlotPool:
     def _jobs_a_slot(self) -> int:
         """Candidates' jobs that a slot scores at once."""
         return self._batch_size or self.together
+
+    def _measure(self, jobs: Sequence[Job], results: Sequence[Result]) -> None:
+        """Note how long a group took, if all its jobs were candidates' and none failed."""
+        if results and all(job.kind == "score" for job in jobs) and all(each.fitness is not None for each in results):
+            self._drive_count.add(
+                len(results), sum(each.steps for each in results), sum(each.seconds for each in results)
+            )
 
     def _count_drives(self, backlog: Backlog) -> int:
         """How many drives a slot takes at once.
