@@ -11,10 +11,10 @@ from typing import Any
 
 from dreamfleet.common.protocol.messages import MAX_LEASES, TAG_BYTES, Job, Result, RunningJob
 from dreamfleet.common.protocol.result_bounds import clamp_count
+from dreamfleet.worker.scoring.drive_count import DriveCount
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.child import ChildReady, ScorerArguments
 from dreamfleet.worker.service.child_process import EXIT_GRACE
-from dreamfleet.worker.service.drive_count import DriveCount
 from dreamfleet.worker.service.failure_log import FailureLog
 from dreamfleet.worker.service.frame_sampler import SampledFrame
 from dreamfleet.worker.service.job_group import JobWithVector

@@ -9,11 +9,11 @@ import pytest
 
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.protocol.messages import JobBatch, TaskSpec, VectorPart
+from dreamfleet.worker.scoring.drive_count import ENOUGH
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.service import slot_pool
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.child import ScorerArguments
-from dreamfleet.worker.service.drive_count import ENOUGH
 from dreamfleet.worker.service.slot_budget import SharedSlots
 from dreamfleet.worker.service.slot_pool import SlotPool
 from tests.support import rough_tasks, tasks

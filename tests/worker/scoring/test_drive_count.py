@@ -2,7 +2,7 @@
 
 import pytest
 
-from dreamfleet.worker.service.drive_count import ENOUGH, MEASURE_AGAIN, DriveCount
+from dreamfleet.worker.scoring.drive_count import ENOUGH, MEASURE_AGAIN, DriveCount
 
 
 def drive(count, costs, groups):
