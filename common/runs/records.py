@@ -55,6 +55,9 @@ class StageSettings:
     racing: bool | None = stage_option(None, "as --racing")
     driven: Share | None = stage_option(None, "as --driven")
     whole: bool = stage_option(False, "leave the run's subspace at the mean; needs a sigma0")
+    restart: bool = stage_option(
+        False, "search anew from the run's first mean, unless the stage before reached its score"
+    )
 
     @property
     def overrides(self) -> dict[str, Any]:
@@ -74,7 +77,7 @@ class StageSettings:
 
 
 _END = ("generations", "steps", "score")
-STAGE_FIELDS = tuple(each.name for each in fields(StageSettings) if each.name not in (*_END, "whole"))
+STAGE_FIELDS = tuple(each.name for each in fields(StageSettings) if each.name not in (*_END, "whole", "restart"))
 
 
 @dataclass(frozen=True)

@@ -32,10 +32,11 @@ class Stage:
     search: int  # number of the stage that started this stage's search
     end: StageSettings
     whole: bool = True  # whether it searches all parameters, not the run's subspace
+    restart: bool = False  # whether its search begins at the run's first mean
 
     @property
     def starts_new_search(self) -> bool:
-        """Whether it starts a new search, from the last mean of the stage before."""
+        """Whether it starts a new search: from the last mean, or, as a `restart`, from the first one of the run."""
         return self.search == self.number
 
     @property
@@ -51,7 +52,8 @@ class Stage:
     def description(self) -> str:
         """The settings as a text."""
         patience = f", patience {self.patience}" if self.patience else ""
-        search = f"a new search with step size {self.sigma0:g}" if self.starts_new_search else "the search continues"
+        anew = "a search from the start" if self.restart else "a new search"
+        search = f"{anew} with step size {self.sigma0:g}" if self.starts_new_search else "the search continues"
         raced = ", racing" if self.racing else ""
         driven = ", all driven" if self.driven == 1 else f", {self.driven:.0%} of them driven" if self.driven else ""
         search += "" if self.whole else " in the subspace"
@@ -95,9 +97,10 @@ def stages_of(settings: RunSettings) -> tuple[Stage, ...]:
 def _next_stage(before: Stage, each: StageSettings) -> Stage:
     named: dict[str, Any] = {name: getattr(before, name) for name in STAGE_FIELDS} | each.overrides
     whole = before.whole or each.whole
-    starts_new_search = each.sigma0 is not None or named["population"] != before.population or whole != before.whole
+    is_changed = each.sigma0 is not None or named["population"] != before.population or whole != before.whole
     number = before.number + 1
-    return Stage(number, **named, search=number if starts_new_search else before.search, end=each.end, whole=whole)
+    search = number if is_changed or each.restart else before.search
+    return Stage(number, **named, search=search, end=each.end, whole=whole, restart=each.restart)
 
 
 def begun_stages(
@@ -111,9 +114,11 @@ def begun_stages(
 
 def describe_stages(settings: RunSettings, begun: Sequence[BegunStage]) -> dict[str, str]:
     """Describe each stage of a schedule and when it began, by the stage's name."""
-    found = {}
+    found, first = {}, {each.stage.number: each.since for each in begun}
     for stage in stages_of(settings) if settings.stages else ():
-        since = f"since generation {begun[stage.number - 1].since}" if stage.number <= len(begun) else "not begun"
+        is_left_out = stage.number < max(first, default=0)
+        otherwise = "left out" if is_left_out else "not begun"
+        since = f"since generation {first[stage.number]}" if stage.number in first else otherwise
         found[f"stage {stage.number}"] = f"{since}, {stage.end_condition}: {stage.description}"
     return found
 
@@ -186,8 +191,8 @@ class StageTracker:
         while self._generation < generation:
             self._generation += 1
             self._steps += sum(each.steps for each in history[self._generation - 1 : self._generation])
-            if len(self._begun) < len(self._stages) and (why := self._end_reason(finished)):
-                self._begun.append(BegunStage(self._stages[len(self._begun)], self._generation, why))
+            if self._begun[-1].stage.number < len(self._stages) and (why := self._end_reason(finished)):
+                self._begun.append(BegunStage(self._next_stage(finished), self._generation, why))
                 self._steps = 0
         return self._begun[-1]
 
@@ -203,6 +208,12 @@ class StageTracker:
         latest, last = self._begun[-1], latest_usable_evaluation(self._every, generation)
         return last if latest.stage.end.score is not None and last >= latest.since else -1
 
+    def _next_stage(self, finished: Mapping[int, StoredEvaluation]) -> Stage:
+        """The stage after the current one; restarts are left out where its score was reached."""
+        following = self._stages[self._begun[-1].stage.number :]
+        is_reached = self._find_reached(finished) is not None
+        return next(each for each in following if not (each.restart and is_reached))
+
     def _end_reason(self, finished: Mapping[int, StoredEvaluation]) -> str:
         """The end condition of the current stage that is met before `_generation`; empty if none is."""
         end, since = self._begun[-1].stage.end, self._begun[-1].since
@@ -210,7 +221,11 @@ class StageTracker:
             return plural(self._generation - since, "generation")
         if end.steps and self._steps >= end.steps:
             return f"{self._steps} environment steps"
-        found = finished.get(self.required_evaluation(self._generation))
-        if found is not None and end.score is not None and found.mean >= end.score and found.is_sound:
+        if (found := self._find_reached(finished)) is not None:
             return f"the mean of generation {found.generation} reached {format_number(found.mean)}"
         return ""
+
+    def _find_reached(self, finished: Mapping[int, StoredEvaluation]) -> StoredEvaluation | None:
+        """The evaluation that counts at `_generation`, if it reached the current stage's score."""
+        score, found = self._begun[-1].stage.end.score, finished.get(self.required_evaluation(self._generation))
+        return found if found is not None and score is not None and found.mean >= score and found.is_sound else None

@@ -8,8 +8,8 @@ from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING
 from dreamfleet.common.runs.records import StageSettings
 from dreamfleet.common.worlds.profile import DemoPlan, PublishedScore, PublishedScores, ShippedScore, WorldProfile
 
-# Reality from nothing, in features of able drivers: one track a candidate by large steps until a mean is able, then ever
-# more tracks. A candidate pays for the grass, because who drives there soon misses tiles (docs/lab/results.md).
+# Reality from nothing, in features of able drivers: one track a candidate by large steps until a mean is able, then
+# ever more tracks. A candidate pays for the grass, because who drives there soon misses tiles (docs/lab/results.md).
 REAL: dict[str, Any] = {
     "task": "car-racing",
     "bundle": "tiny-int8",

@@ -51,7 +51,8 @@ class Generations:
         self._agenda = agenda
         self._evaluations = evaluations
         self._subspace = stored_subspace(journal.fact(SUBSPACE_FACT), settings, journal.path)
-        self._strategy = self._search(stages_of(settings)[0], stored_start_mean(journal))
+        self._first_mean = stored_start_mean(journal)
+        self._strategy = self._search(stages_of(settings)[0], self._first_mean)
         self.archive = EliteArchive.empty(settings)  # of the closed generations
         for each in history.rows if self.archive is not None else ():
             self._add_elites(each.number, *journal.scores_of(each.number, len(settings.archive)))
@@ -235,7 +236,8 @@ class Generations:
         """The scoring parameters of a generation that opens; a stage may begin with a new search."""
         self.scoring_params = scoring_params = self._terms(number)
         if number and scoring_params.begun.since == number and scoring_params.stage.starts_new_search:
-            self._strategy = self._search(scoring_params.stage, self._strategy.mean)
+            stage = scoring_params.stage
+            self._strategy = self._search(stage, self._first_mean if stage.restart else self._strategy.mean)
         return scoring_params
 
     def _terms(self, number: int) -> ScoringParams:

@@ -49,6 +49,8 @@ def split_first_stage(stages: tuple[StageSettings, ...]) -> tuple[dict[str, Any]
     if not stages:
         return {}, ()
     first = stages[0]
+    if first.restart:
+        raise UsageError("stage 1: restart is for a later stage, which searches anew where the run began; omit it")
     if first.whole:
         raise UsageError("stage 1: whole is for a later stage, which leaves the subspace; omit --subspace instead")
     return first.overrides, (first.end, *stages[1:]) if first.has_end or len(stages) > 1 else ()
@@ -64,6 +66,11 @@ def check_schedule(settings: RunSettings) -> None:
     """`UsageError` for a stage that never ends before the last one, or by what can never be reached."""
     stages = stages_of(settings)
     for before, stage, each in zip(stages, stages[1:], settings.stages[1:], strict=False):
+        if stage.restart and before.end.score is None:
+            raise UsageError(
+                f"stage {stage.number} is a restart, which is left out once a score is reached: give stage "
+                f"{before.number} a score, and steps or generations"
+            )
         if each.whole and before.whole:
             raise UsageError(f"stage {stage.number}: the search is whole already; omit that, or give --subspace")
         if each.whole and each.sigma0 is None:
@@ -77,6 +84,8 @@ def check_schedule(settings: RunSettings) -> None:
                 "generations, steps or a score"
             )
         _check_end(stage, settings.evaluate_every)
+    if stages[-1].restart:
+        raise UsageError(f"stage {stages[-1].number} is the last and a restart: add a stage that begins at its mean")
     if stages[-1].end.has_end:
         raise UsageError(
             f"stage {stages[-1].number} is the last and names an end: omit it there; the run itself ends by "

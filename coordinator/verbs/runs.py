@@ -161,7 +161,7 @@ def show_run(args: argparse.Namespace) -> int:
     if is_function_task(settings.task.task):
         facts |= _function_facts(stored_mean, settings.task.options)
     facts |= {} if archive is None else {"archive found": archive.description}
-    facts |= {"stage": f"{len(begun)} of {len(settings.stages)}"} if begun else {}
+    facts |= {"stage": f"{begun[-1].stage.number} of {len(settings.stages)}"} if begun else {}
     shown_settings = {**_flatten_settings(settings), **describe_stages(settings, begun)}
     if source := describe_limit(settings.task.horizon, limit):
         shown_settings["task.horizon"] = f"{settings.task.horizon}; an episode has {limit} steps at most{source}"

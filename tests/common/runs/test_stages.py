@@ -6,7 +6,7 @@ import pytest
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.runs.records import RunSettings, StageSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.scoring_params import ScheduleState, scoring_params_at
-from dreamfleet.common.runs.stages import begun_stages, longest_horizon, stages_of
+from dreamfleet.common.runs.stages import begun_stages, describe_stages, longest_horizon, stages_of
 from tests.support.samples import SPEC
 
 EVERY = 2
@@ -75,6 +75,38 @@ def test_scores_of_earlier_stages_or_unscheduled_evaluations_end_no_stage():
     stray = evaluated({1: 90.0, 3: 90.0, 4: 90.0, 5: 10.0, 6: 90.0})
     assert numbers(settings, history(*[10] * 9), stray) == [1] * 4 + [2] * 6
     assert numbers(settings, history(*[10] * 9), [*stray[:3], *evaluated({5: 50.0})]) == [1] * 4 + [2] * 4 + [3] * 2
+
+
+RESTARTED = (
+    StageSettings(generations=4, score=50.0), *[StageSettings(generations=4, score=50.0, restart=True)] * 2,
+    StageSettings(horizon=50),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("means", "stages"),
+    [
+        ({1: 90.0}, [1] * 4 + [4] * 9),
+        ({3: 90.0}, [1] * 4 + [2] * 4 + [3] * 4 + [4]),  # it would count from generation 6 on, in another search
+        ({5: 90.0}, [1] * 4 + [2] * 4 + [4] * 5),
+        ({1: 10.0, 5: 10.0, 9: 90.0}, [1] * 4 + [2] * 4 + [3] * 4 + [4]),
+    ],
+)
+def test_a_search_that_does_not_reach_its_score_is_restarted_and_one_that_does_is_not(means, stages):
+    settings = scheduled(*RESTARTED)
+    assert numbers(settings, history(*[10] * 12), evaluated(means)) == stages
+    found = begun_stages(settings, history(*[10] * 12), evaluated(means))
+    assert [each.stage.number for each in found] == sorted(set(stages))
+    shown = describe_stages(settings, found)
+    assert [name for name, text in shown.items() if text.startswith("left out")] == [
+        f"stage {number}" for number in (1, 2, 3, 4) if number not in stages
+    ]
+
+
+def test_a_restart_is_a_search_of_its_own():
+    stages = stages_of(scheduled(*RESTARTED))
+    assert [each.search for each in stages] == [1, 2, 3, 3]
+    assert "a search from the start with step size 0.1" in stages[2].description
 
 
 def test_later_evaluations_and_their_order_do_not_matter():

@@ -101,6 +101,9 @@ def test_what_no_schedule_can_be_is_one_line(read, text, says):
     [
         ("[[stage]]\nhorizon = 3\n" + NEXT, "stage 1 never ends, and stage 2 would never begin"),
         ("[[stage]]\ngenerations = 3\n[[stage]]\ngenerations = 3\n", "stage 2 is the last and names an end"),
+        ("[[stage]]\nrestart = true\nscore = 1.0\n" + NEXT, "stage 1: restart is for a later stage"),
+        ("[[stage]]\ngenerations = 3\n[[stage]]\nrestart = true\nscore = 1.0\n" + NEXT, "give stage 1 a score"),
+        ("[[stage]]\nscore = 1.0\n[[stage]]\nrestart = true\n", "stage 2 is the last and a restart"),
         ("[[stage]]\ngenerations = 3\n", "stage 1 is the last and names an end"),
         (
             "[[stage]]\ngenerations = 25\nscore = 1.0\n" + NEXT,

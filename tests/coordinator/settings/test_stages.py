@@ -13,6 +13,8 @@ from dreamfleet.common.runs.records import StageSettings
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.scoring_params import scoring_params_of
 from dreamfleet.common.runs.stages import begun_stages
+from dreamfleet.coordinator.jobs.work import vector_bytes
+from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
 from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.settings.fork import Fork
 from dreamfleet.coordinator.settings.limits import LimitsConfig
@@ -116,6 +118,28 @@ def test_a_generation_waits_for_the_check_that_may_end_its_stage_and_for_no_othe
     in_time = [(number, each) for number, each in waited if number < GENERATIONS - 1]
     assert {number for number, _ in in_time} == {5, 7}, "of the stage that a score may end, and asked in it"
     assert bench.outcome() == undisturbed
+
+
+def test_a_restart_begins_at_the_runs_first_mean_with_other_random_numbers_also_after_a_kill(staged):
+    again = StageSettings(3, score=1e6, restart=True)
+    settings = replace(STAGED, stages=(StageSettings(3, score=1e6), again, again, StageSettings(sigma0=0.05)))
+    calm, bench = staged("calm", settings=settings), staged("night", settings=settings)
+    calm.drive(lambda _: 0)
+    with RunFolder(calm.path) as run:
+        begun = begun_stages(run.settings, run.history(), run.evaluations())
+        found = {
+            number: [run.candidate(number, index).tobytes() for index in range(6)] for number in range(GENERATIONS)
+        }
+    assert [(each.stage.number, each.since) for each in begun] == [(1, 0), (2, 3), (3, 6), (4, 9)]
+    anew = [Evolution(EvolutionConfig.of(settings, each.stage), None).ask() for each in begun[:3]]
+    assert [found[each.since] for each in begun[:3]] == [list(map(vector_bytes, each)) for each in anew]
+    assert found[0] != found[3] != found[6]
+    bench.die_by(random.Random(1))
+    bench.drive(lambda _: 0)
+    with RunFolder(bench.path) as run:
+        assert found == {
+            number: [run.candidate(number, index).tobytes() for index in range(6)] for number in range(GENERATIONS)
+        }
 
 
 def test_limits_count_over_the_whole_run(staged):
