@@ -116,8 +116,7 @@ def describe_stages(settings: RunSettings, begun: Sequence[BegunStage]) -> dict[
     """Describe each stage of a schedule and when it began, by the stage's name."""
     found, first = {}, {each.stage.number: each.since for each in begun}
     for stage in stages_of(settings) if settings.stages else ():
-        is_left_out = stage.number < max(first, default=0)
-        otherwise = "left out" if is_left_out else "not begun"
+        otherwise = "left out" if stage.number < max(first, default=0) else "not begun"
         since = f"since generation {first[stage.number]}" if stage.number in first else otherwise
         found[f"stage {stage.number}"] = f"{since}, {stage.end_condition}: {stage.description}"
     return found

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections import deque
 
@@ -15,7 +14,7 @@ class DriveCount:
     """Finds, from the drives themselves, how many side by side take least time a step on this host.
 
     That depends on the processor and its caches, on the world and on the other slots. No score depends on it. The
-    powers of two up to `most` are tried in turn, from the largest down.
+    powers of two up to `most`, and `most` itself, are tried in turn, from the largest down.
 
     >>> count = DriveCount()
     >>> count.most = 4
@@ -62,6 +61,6 @@ class DriveCount:
     def next(self) -> int:
         """The number for the next group: one that lacks measurements, or the best."""
         for size, costs in self._costs.items():
-            if len(costs) < ENOUGH or self._groups - self._measured_at.get(size, -math.inf) >= MEASURE_AGAIN:
+            if len(costs) < ENOUGH or self._groups - self._measured_at[size] >= MEASURE_AGAIN:
                 return size
         return self.best
