@@ -36,7 +36,10 @@ class Stage:
 
     @property
     def starts_new_search(self) -> bool:
-        """Whether it starts a new search: from the last mean, or, as a `restart`, from the first one of the run."""
+        """Whether it starts a new search: from the last mean, as a `restart` from the run's first one.
+
+        After restarts it starts from the best evaluated mean of them all.
+        """
         return self.search == self.number
 
     @property
@@ -77,6 +80,12 @@ class BegunStage:
     stage: Stage
     since: int  # its first generation
     why: str = ""  # the end condition of the stage before that was met
+    origin: int | None = None  # its search begins at this generation's evaluated mean; `None`: see `starts_new_search`
+
+    @property
+    def beginning(self) -> str:
+        """When and where it began, as a text."""
+        return f"since generation {self.since}" + ("" if self.origin is None else f" from {self.origin}'s mean")
 
 
 def stages_of(settings: RunSettings) -> tuple[Stage, ...]:
@@ -114,10 +123,10 @@ def begun_stages(
 
 def describe_stages(settings: RunSettings, begun: Sequence[BegunStage]) -> dict[str, str]:
     """Describe each stage of a schedule and when it began, by the stage's name."""
-    found, first = {}, {each.stage.number: each.since for each in begun}
+    found, first = {}, {each.stage.number: each for each in begun}
     for stage in stages_of(settings) if settings.stages else ():
         otherwise = "left out" if stage.number < max(first, default=0) else "not begun"
-        since = f"since generation {first[stage.number]}" if stage.number in first else otherwise
+        since = first[stage.number].beginning if stage.number in first else otherwise
         found[f"stage {stage.number}"] = f"{since}, {stage.end_condition}: {stage.description}"
     return found
 
@@ -170,6 +179,7 @@ class StageTracker:
         self._begun = [BegunStage(self._stages[0], 0)]
         self._generation = 0  # the latest one requested
         self._steps = 0  # environment steps of the current stage before it
+        self._best: StoredEvaluation | None = None  # of those that counted in the current stage and what it restarts
 
     def __len__(self) -> int:
         return len(self._stages)
@@ -190,9 +200,9 @@ class StageTracker:
         while self._generation < generation:
             self._generation += 1
             self._steps += sum(each.steps for each in history[self._generation - 1 : self._generation])
+            self._best = self._better(finished.get(self.required_evaluation(self._generation)))
             if self._begun[-1].stage.number < len(self._stages) and (why := self._end_reason(finished)):
-                self._begun.append(BegunStage(self._next_stage(finished), self._generation, why))
-                self._steps = 0
+                self._begin(self._next_stage(finished), why)
         return self._begun[-1]
 
     def stage_of(self, generation: int) -> BegunStage:
@@ -206,6 +216,18 @@ class StageTracker:
         """
         latest, last = self._begun[-1], latest_usable_evaluation(self._every, generation)
         return last if latest.stage.end.score is not None and last >= latest.since else -1
+
+    def _begin(self, stage: Stage, why: str) -> None:
+        """Begin a stage: a new search after restarts begins at the best mean of them all that counted."""
+        follows_restarts = self._stages[stage.number - 2].restart and stage.starts_new_search and not stage.restart
+        origin = self._best.generation if follows_restarts and self._best is not None else None
+        self._begun.append(BegunStage(stage, self._generation, why, origin))
+        self._steps, self._best = 0, self._best if stage.restart else None
+
+    def _better(self, counted: StoredEvaluation | None) -> StoredEvaluation | None:
+        if counted is None or (self._best is not None and counted.rank <= self._best.rank):
+            return self._best
+        return counted
 
     def _next_stage(self, finished: Mapping[int, StoredEvaluation]) -> Stage:
         """The stage after the current one; restarts are left out where its score was reached."""

@@ -13,7 +13,7 @@ from dreamfleet.common.protocol.tasks import is_function_task
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.scoring_params import ScheduleState, ScoringParams
 from dreamfleet.common.runs.seeds import training_seed
-from dreamfleet.common.runs.stages import Stage, stages_of
+from dreamfleet.common.runs.stages import BegunStage, Stage, stages_of
 from dreamfleet.coordinator.jobs.generation import CandidateScores, Generation
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.jobs.work import Work, vector_bytes
@@ -236,9 +236,14 @@ class Generations:
         """The scoring parameters of a generation that opens; a stage may begin with a new search."""
         self.scoring_params = scoring_params = self._terms(number)
         if number and scoring_params.begun.since == number and scoring_params.stage.starts_new_search:
-            stage = scoring_params.stage
-            self._strategy = self._search(stage, self._first_mean if stage.restart else self._strategy.mean)
+            self._strategy = self._search(scoring_params.stage, self._start_of(scoring_params.begun))
         return scoring_params
+
+    def _start_of(self, begun: BegunStage) -> NDArray[np.float64] | None:
+        """Where a new search starts; `None`: at zeros."""
+        if begun.origin is not None:
+            return np.frombuffer(self._journal.evaluated_vector(begun.origin), dtype="<f4").astype(np.float64)
+        return self._first_mean if begun.stage.restart else self._strategy.mean
 
     def _terms(self, number: int) -> ScoringParams:
         return self._agenda.scoring_params(number, self.history.rows, self._evaluations)

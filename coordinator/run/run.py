@@ -439,7 +439,8 @@ class Run:
         """Note for the log that a generation opens in another stage, and why."""
         begun, number = self.generations.scoring_params.begun, generation.number
         if begun.since == number:
-            self.fleet.notes.append(f"{self._stage_text} begins with generation {number} after {begun.why}")
+            origin = "" if begun.origin is None else f", from the mean of generation {begun.origin}"
+            self.fleet.notes.append(f"{self._stage_text} begins with generation {number} after {begun.why}{origin}")
 
     @property
     def _stage_text(self) -> str:

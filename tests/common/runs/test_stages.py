@@ -103,6 +103,25 @@ def test_a_search_that_does_not_reach_its_score_is_restarted_and_one_that_does_i
     ]
 
 
+@pytest.mark.parametrize(
+    ("means", "origin"),
+    [
+        ({}, None),
+        ({1: 10.0, 3: 40.0, 5: 20.0, 9: 15.0}, 5),  # generation 3's would count from 6 on, in another search
+        ({1: 20.0, 5: 20.0}, 1),
+        ({1: 10.0, 5: 90.0}, 5),
+        ({1: 90.0, 3: 95.0}, 1),
+    ],
+)
+def test_a_new_search_after_restarts_begins_at_the_best_mean_of_them_all(means, origin):
+    for last, expected in ((StageSettings(sigma0=0.2), origin), (StageSettings(horizon=50), None)):
+        found = begun_stages(scheduled(*RESTARTED[:-1], last), history(*[10] * 12), evaluated(means))
+        assert [each.origin for each in found] == [None] * (len(found) - 1) + [expected]
+        assert found[-1].beginning.endswith("" if expected is None else f" from {origin}'s mean")
+    plain = [replace(each, restart=False, sigma0=0.2) for each in RESTARTED]
+    assert {each.origin for each in begun_stages(scheduled(*plain), history(*[10] * 12), evaluated(means))} == {None}
+
+
 def test_a_restart_is_a_search_of_its_own():
     stages = stages_of(scheduled(*RESTARTED))
     assert [each.search for each in stages] == [1, 2, 3, 3]

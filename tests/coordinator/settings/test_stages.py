@@ -4,6 +4,7 @@ import io
 import random
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -120,7 +121,7 @@ def test_a_generation_waits_for_the_check_that_may_end_its_stage_and_for_no_othe
     assert bench.outcome() == undisturbed
 
 
-def test_a_restart_begins_at_the_runs_first_mean_with_other_random_numbers_also_after_a_kill(staged):
+def test_a_restart_begins_at_the_first_mean_and_what_follows_at_the_best_also_after_a_kill(staged):
     again = StageSettings(3, score=1e6, restart=True)
     settings = replace(STAGED, stages=(StageSettings(3, score=1e6), again, again, StageSettings(sigma0=0.05)))
     calm, bench = staged("calm", settings=settings), staged("night", settings=settings)
@@ -131,8 +132,10 @@ def test_a_restart_begins_at_the_runs_first_mean_with_other_random_numbers_also_
             number: [run.candidate(number, index).tobytes() for index in range(6)] for number in range(GENERATIONS)
         }
     assert [(each.stage.number, each.since) for each in begun] == [(1, 0), (2, 3), (3, 6), (4, 9)]
-    anew = [Evolution(EvolutionConfig.of(settings, each.stage), None).ask() for each in begun[:3]]
-    assert [found[each.since] for each in begun[:3]] == [list(map(vector_bytes, each)) for each in anew]
+    best = np.frombuffer(calm.journal.evaluated_vector(3), "<f4").astype(float)  # the only one that counted in time
+    starts = [None] * 3 + [best]
+    anew = [Evolution(EvolutionConfig.of(settings, each.stage), at).ask() for each, at in zip(begun, starts, strict=True)]
+    assert [found[each.since] for each in begun] == [list(map(vector_bytes, each)) for each in anew]
     assert found[0] != found[3] != found[6]
     bench.die_by(random.Random(1))
     bench.drive(lambda _: 0)
