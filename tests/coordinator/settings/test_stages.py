@@ -133,8 +133,8 @@ def test_a_restart_begins_at_the_first_mean_and_what_follows_at_the_best_also_af
         }
     assert [(each.stage.number, each.since) for each in begun] == [(1, 0), (2, 3), (3, 6), (4, 9)]
     best = np.frombuffer(calm.journal.evaluated_vector(3), "<f4").astype(float)  # the only one that counted in time
-    starts = [None] * 3 + [best]
-    anew = [Evolution(EvolutionConfig.of(settings, each.stage), at).ask() for each, at in zip(begun, starts, strict=True)]
+    starts = zip(begun, [None] * 3 + [best], strict=True)
+    anew = [Evolution(EvolutionConfig.of(settings, each.stage), at).ask() for each, at in starts]
     assert [found[each.since] for each in begun] == [list(map(vector_bytes, each)) for each in anew]
     assert found[0] != found[3] != found[6]
     bench.die_by(random.Random(1))
