@@ -48,7 +48,7 @@ class RunLog:
         """The run is served from now on."""
         run, listen = self._run, self._network.listen
         facts = {"event": "begin", "run": self._name, "run_uid": run.uid, "incarnation": run.incarnation}
-        log.info("run %s, incarnation %d, generation %d", self._name, run.incarnation, run.generation.number,
+        log.info("incarnation %d begins with generation %d", run.incarnation, run.generation.number,
                  extra={"facts": facts})  # fmt: skip
         if run.settings.confirm_episodes and not is_function_task(run.settings.task.task):
             log.info("once its last generation is closed, %s or more confirm the best mean (--confirm-episodes)",

@@ -121,7 +121,7 @@ def test_a_fork_goes_on_in_it_or_leaves_it_with_a_step_of_its_own(processes, beg
     forked.wait_for("in the subspace")
     forked.end()
     forked = processes.start(*fork, "--run", "free", "--subspace", "none", "--sigma0", 0.1)
-    forked.wait_for("run free, incarnation 1")
+    forked.wait_for("run free: incarnation 1")
     forked.end()
     with open_run(processes.runs, "same") as same, open_run(processes.runs, "free") as free:
         assert (same.settings.subspace, free.settings.subspace) == (subspace.sha256, "")
