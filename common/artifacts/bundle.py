@@ -147,6 +147,8 @@ class Bundle(Displayed):
         except DamagedArchiveError as error:
             if path.suffix in ("", ".zip"):
                 raise BundleError(f"{path} is not a whole bundle ({error}); fetch or build it again") from error
+            if path.suffix == ".npz":
+                raise BundleError(f"{path} is not a bundle; a controller goes to --init or --controller") from error
             folder = path.parent.parent if path.suffix == ".tar" else path.parent
             raise BundleError(f"{path} is not a bundle; {import_hint(folder, TO_BUNDLE)}") from error
         return cls(path, found, manifest)

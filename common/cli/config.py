@@ -130,15 +130,16 @@ def read_table(section: type[Any], where: str, table: Table) -> dict[str, Any]:
 
 
 def read_toml(
-    path: Path | None, tables: Iterable[str], top: Iterable[str] = (), arrays: Iterable[str] = ()
-) -> dict[str, Any]:
+    path: Path | None, tables: Iterable[str], top: Iterable[str] = (), arrays: Iterable[str] = (), *,
+    kind: str = "configuration file",
+) -> dict[str, Any]:  # fmt: skip
     """Read a configuration file with these tables, arrays of tables and top-level keys; `UsageError` for others."""
     if path is None:
         return {}
     try:
         table = tomllib.loads(read_text(path, MAX_BYTES).removeprefix("\ufeff"))  # an editor may mark UTF-8
     except FileNotFoundError:
-        raise UsageError(f"no configuration file at {path}") from None
+        raise UsageError(f"no {kind} at {path}") from None
     except OSError as error:
         raise UsageError(f"{path} cannot be read as TOML: {error.strerror}") from error
     except (ValueError, RecursionError) as error:  # a number of 5,000 digits is a plain ValueError

@@ -239,9 +239,9 @@ class StageTracker:
         """The end condition of the current stage that is met before `_generation`; empty if none is."""
         end, since = self._begun[-1].stage.end, self._begun[-1].since
         if end.generations and self._generation - since >= end.generations:
-            return plural(self._generation - since, "generation")
+            return f"{plural(self._generation - since, 'generation')} of stage {self._begun[-1].stage.number}"
         if end.steps and self._steps >= end.steps:
-            return f"{self._steps} environment steps"
+            return f"{self._steps:,} environment steps of stage {self._begun[-1].stage.number}"
         if (found := self._find_reached(finished)) is not None:
             return f"the mean of generation {found.generation} reached {format_number(found.mean)}"
         return ""

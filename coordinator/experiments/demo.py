@@ -165,7 +165,12 @@ class Demo:
         ended = "stopped: all its processes have ended"
         if not kept:
             return f"{ended}, and no run had begun"
-        return f"{ended}; run {kept[-1]} is kept: continue it with: {resume_command(self._runs_dir / kept[-1])}"
+        folder = self._runs_dir / kept[-1]
+        with open_run(self._runs_dir, kept[-1]) as run:
+            if run.ended is None:
+                return f"{ended}; run {kept[-1]} is kept: continue it with: {resume_command(folder)}"
+        score = shell_command("evaluate", "--controller", folder / CONTROLLER)
+        return f"{ended}; run {kept[-1]} had ended; score its controller with: {score}"
 
     def _show_page(self, stack: ExitStack) -> None:
         """Serve a page about the runs until `stack` closes; none without its packages or a free port."""

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite
 from dreamfleet.common.runs.records import StoredGeneration
 
-LEAST_IMPROVEMENT = 1e-11  # of the best fitness that counts, as pycma's `tolfun`
+LEAST_IMPROVEMENT = 1e-11  # of the best fitness that counts, as pycma's `tolfun`; less where fitness spans less than 1
 
 
 class History:
@@ -19,6 +19,7 @@ class History:
         self.failed = 0  # candidates
         self.best: float | None = None  # fitness of a candidate
         self.improved = 0  # the last generation whose best candidate beat the one of the last such generation
+        self.least_improvement = LEAST_IMPROVEMENT  # of the best fitness that counts
         self._level = 0.0  # the fitness of that
         self._rows: list[StoredGeneration] = []
         for row in rows:
@@ -26,7 +27,9 @@ class History:
 
     def append(self, row: StoredGeneration) -> None:
         """Add the generation that was just closed."""
-        if self.best is None or row.best > self._level + LEAST_IMPROVEMENT:
+        if self.best is None and row.best > row.worst:
+            self.least_improvement = LEAST_IMPROVEMENT * min(1.0, row.best - row.worst)
+        if self.best is None or row.best > self._level + self.least_improvement:
             self._level, self.improved = row.best, len(self._rows)
         self.best = row.best if self.best is None else max(self.best, row.best)
         self._rows.append(row)

@@ -34,7 +34,8 @@ def _find_reached_limit(limits: LimitsConfig, history: History, jobs: Background
     if limits.candidate_target is not None and history.best is not None and history.best >= limits.candidate_target:
         return f"a candidate reached {format_number(value_of(history.best, task))}"
     if limits.stagnation and len(history) - history.improved > limits.stagnation:
-        return f"no candidate beat generation {history.improved}'s best for {plural(limits.stagnation, 'generation')}"
+        than = f"generation {history.improved}'s best by more than {history.least_improvement:.1g}"
+        return f"no candidate beat {than} for {plural(limits.stagnation, 'generation')}"
     if limits.target is not None and best is not None and best.mean >= limits.target and best.is_sound:
         return f"the mean of generation {best.generation} reached {format_number(value_of(best.mean, task))}"
     if best is not None and limits.parted and jobs.have_fallen_behind(limits.parted):

@@ -20,7 +20,7 @@ def find_schedule(name: str | None, file: Table) -> tuple[StageSettings, ...] | 
     if name == NO_SCHEDULE:
         return ()
     if name is not None:
-        return read_stages(read_toml(Path(name), (), arrays=(STAGE,)).get(STAGE, ()), name)
+        return read_stages(read_toml(Path(name), (), arrays=(STAGE,), kind="schedule").get(STAGE, ()), name)
     return read_stages(file[STAGE], "the configuration file") if STAGE in file else None
 
 

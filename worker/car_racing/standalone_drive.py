@@ -3,11 +3,14 @@
 pip install 'gymnasium[box2d]' onnxruntime numpy
 """
 
+import os
 import sys
 from pathlib import Path
 
 import gymnasium
 import numpy as np
+
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # read when ONNX Runtime is imported; else it reports to its maker
 import onnxruntime
 
 options = onnxruntime.SessionOptions()

@@ -70,7 +70,8 @@ class WaitingText:
         if not self._has_begun:
             self._has_begun = True
             if self.ended:
-                return f"{self.ended}; waiting for the next run at {address}"
+                awaited = f"run {self._run} to go on" if self._run else "the next run"
+                return f"{self.ended}; waiting for {awaited} at {address}"
             awaited = (f"run {self._run}" if self._run else "a run") if answered else "a coordinator"
             revoked = "; if it is served already, this join file was revoked" if self._secured and answered else ""
             names = join_some([each for each in others() if each != self._run], SHOWN_RUNS) if answered else ""

@@ -1,1 +1,7 @@
 """The world model: frozen in ONNX Runtime for inference, as torch modules for training, and the export between them."""
+
+import os
+
+# ONNX Runtime reads it when it is first imported, which only modules of this package do. By default it would keep an
+# identifier in the user's cache folder, and report each process to its maker.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")

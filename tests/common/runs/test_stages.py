@@ -152,7 +152,8 @@ def test_stages_and_their_reasons_are_described():
     settings = scheduled(StageSettings(2), StageSettings(steps=15), StageSettings(score=50.0), StageSettings())
     begun = begun_stages(settings, history(*[10] * 9), evaluated({5: 51.25}))
     assert [(each.since, each.why) for each in begun] == [
-        (0, ""), (2, "2 generations"), (4, "20 environment steps"), (8, "the mean of generation 5 reached 51.25"),
+        (0, ""), (2, "2 generations of stage 1"), (4, "20 environment steps of stage 2"),
+        (8, "the mean of generation 5 reached 51.25"),
     ]  # fmt: skip
     assert begun[0].stage.end_condition == "until 2 generations"
     assert begun[3].stage.end_condition == "to the end"

@@ -17,8 +17,8 @@ NO_JOBS = SimpleNamespace(evaluations=SimpleNamespace(best=None))
 OPEN = SimpleNamespace(is_one_point=False, number=9)
 
 
-def reason(limits, *best, task="gym:CartPole-v1", options=""):
-    rows = (StoredGeneration(number, each - 1, 1.0, each, each - 2, 0.1, 10, 1.0) for number, each in enumerate(best))
+def reason(limits, *best, task="gym:CartPole-v1", options="", spread=2.0):
+    rows = (StoredGeneration(number, each, 1.0, each, each - spread, 0.1, 10, 1.0) for number, each in enumerate(best))
     return find_stop_reason(limits, History(rows), NO_JOBS, OPEN, replace(SPEC, task=task, options=options))
 
 
@@ -32,11 +32,14 @@ def test_a_run_ends_after_so_many_generations_without_a_better_candidate():
     limits = LimitsConfig(stagnation=3)
     assert reason(limits) is None
     assert reason(limits, 1, 2, 1, 2) is None
-    assert reason(limits, 1, 2, 1, 2, 2) == "no candidate beat generation 1's best for 3 generations"
+    assert reason(limits, 1, 2, 1, 2, 2) == "no candidate beat generation 1's best by more than 1e-11 for 3 generations"
     assert reason(limits, 1, 2, 1, 2, 2.5) is None
     creeping = [1 + 1e-12 * number for number in range(20)]
     assert reason(limits, *creeping[:4]) is not None, "less than any use"
     assert reason(limits, *(1 + 4e-12 * number for number in range(20))) is None, "but many small steps count"
+    small = [1e-14 * each for each in (1, 2, 1, 2, 2.1)]
+    assert reason(limits, *small) is not None
+    assert reason(limits, *small, spread=2e-14) is None, "of a function whose values differ by less than 1"
 
 
 def test_a_functions_steps_are_its_evaluations():

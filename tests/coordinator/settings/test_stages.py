@@ -161,11 +161,11 @@ def test_the_log_says_when_a_stage_begins_and_why(staged):
     assert said == [
         "generation 0 is in stage 1 of 4 (1,000 steps, patience 100, 6 x 1 episode, a new search with step size 0.1)",
         "stage 2 of 4 (400 steps, 6 x 2 episodes, racing, the search continues) begins with generation 2 after "
-        "2 generations",
+        "2 generations of stage 1",
         "stage 3 of 4 (600 steps, 8 x 2 episodes, racing, a new search with step size 0.1) begins with generation 8 "
         "after the mean of generation 5 reached 510.5",
         "stage 4 of 4 (600 steps, 8 x 2 episodes, racing, a new search with step size 0.05) begins with generation 10 "
-        "after 240 environment steps",
+        "after 240 environment steps of stage 3",
     ]
 
 

@@ -64,6 +64,13 @@ def test_a_worker_whose_run_has_ended_says_so_once():
     assert text == f"run night ended after 2 generations; waiting for the next run at {ADDRESS}"
 
 
+def test_a_worker_of_a_named_run_waits_for_it_alone():
+    texts = WaitingText(WorkerConfig(run="night"), Network(connect=(ADDRESS,)), 0.0, "run night ended: 2 generations")
+    assert said(texts, (0.0, 1.0), answered=False) == [
+        f"run night ended: 2 generations; waiting for run night to go on at {ADDRESS}"
+    ]
+
+
 def test_a_worker_that_waits_for_its_run_names_those_that_are_served_there():
     waiting = WaitingText(WorkerConfig(run="mine"), Network(connect=("tcp/a:1",)), 0.0)
     said = waiting.next(0.0, answered=True, others=lambda: ["mine", "night"])

@@ -1,3 +1,7 @@
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -22,6 +26,13 @@ def inputs():
             np.float32
         ),
     )
+
+
+def test_the_runtime_keeps_no_identifier_and_reports_nothing(tmp_path):
+    surroundings = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
+    words = [sys.executable, "-c", "import dreamfleet.worker.worldmodel.inference, onnxruntime"]
+    subprocess.run(words, env={**surroundings, "HOME": str(tmp_path)}, check=True)
+    assert not list(tmp_path.rglob("*onnxruntime*"))
 
 
 @pytest.mark.parametrize("batch", [1, 3, 8, 64])
