@@ -112,6 +112,11 @@ def _next_stage(before: Stage, each: StageSettings) -> Stage:
     return Stage(number, **named, search=search, end=each.end, whole=whole, restart=each.restart)
 
 
+def is_try(stages: Sequence[Stage | StageSettings], number: int) -> bool:
+    """Whether this stage is one of several searches of which the best mean counts: a restart, or what it repeats."""
+    return any(each.restart for each in stages[number - 1 : number + 1])
+
+
 def begun_stages(
     settings: RunSettings, history: Sequence[StoredGeneration], evaluations: Iterable[StoredEvaluation]
 ) -> Sequence[BegunStage]:
@@ -179,7 +184,8 @@ class StageTracker:
         self._begun = [BegunStage(self._stages[0], 0)]
         self._generation = 0  # the latest one requested
         self._steps = 0  # environment steps of the current stage before it
-        self._best: StoredEvaluation | None = None  # of those that counted in the current stage and what it restarts
+        self._tries_since = 0 if is_try(self._stages, 1) else None  # first generation of searches that restart
+        self._best: StoredEvaluation | None = None  # evaluation of their means
 
     def __len__(self) -> int:
         return len(self._stages)
@@ -200,7 +206,8 @@ class StageTracker:
         while self._generation < generation:
             self._generation += 1
             self._steps += sum(each.steps for each in history[self._generation - 1 : self._generation])
-            self._best = self._better(finished.get(self.required_evaluation(self._generation)))
+            if self._tries_since is not None:
+                self._best = self._better(finished.get(self.required_evaluation(self._generation)))
             if self._begun[-1].stage.number < len(self._stages) and (why := self._end_reason(finished)):
                 self._begin(self._next_stage(finished), why)
         return self._begun[-1]
@@ -210,19 +217,23 @@ class StageTracker:
         return self._begun[bisect(self._begun, generation, key=lambda each: each.since) - 1]
 
     def required_evaluation(self, generation: int) -> int:
-        """The generation of the evaluation that may start another stage at `generation`; negative: none.
+        """The generation of the evaluation that may start another stage at `generation`, or say where; negative: none.
 
         `generation` must be the one after the latest requested one.
         """
-        latest, last = self._begun[-1], latest_usable_evaluation(self._every, generation)
-        return last if latest.stage.end.score is not None and last >= latest.since else -1
+        since = self._begun[-1].since if self._tries_since is None else self._tries_since
+        is_scored = self._begun[-1].stage.end.score is not None
+        last = latest_usable_evaluation(self._every, generation)
+        return last if (is_scored or self._tries_since is not None) and last >= since else -1
 
     def _begin(self, stage: Stage, why: str) -> None:
-        """Begin a stage: a new search after restarts begins at the best mean of them all that counted."""
-        follows_restarts = self._stages[stage.number - 2].restart and stage.starts_new_search and not stage.restart
-        origin = self._best.generation if follows_restarts and self._best is not None else None
+        """Begin a stage: a new search after restarts begins at the best mean of them all that was evaluated in time."""
+        is_start = stage.starts_new_search and not stage.restart
+        origin = self._best.generation if is_start and self._best is not None else None
         self._begun.append(BegunStage(stage, self._generation, why, origin))
-        self._steps, self._best = 0, self._best if stage.restart else None
+        self._steps = 0
+        if not stage.restart:
+            self._tries_since, self._best = self._generation if is_try(self._stages, stage.number) else None, None
 
     def _better(self, counted: StoredEvaluation | None) -> StoredEvaluation | None:
         if counted is None or (self._best is not None and counted.rank <= self._best.rank):
@@ -248,5 +259,8 @@ class StageTracker:
 
     def _find_reached(self, finished: Mapping[int, StoredEvaluation]) -> StoredEvaluation | None:
         """The evaluation that counts at `_generation`, if it reached the current stage's score."""
-        score, found = self._begun[-1].stage.end.score, finished.get(self.required_evaluation(self._generation))
-        return found if found is not None and score is not None and found.mean >= score and found.is_sound else None
+        latest, found = self._begun[-1], finished.get(self.required_evaluation(self._generation))
+        score = latest.stage.end.score
+        if found is None or score is None or found.generation < latest.since:
+            return None
+        return found if found.mean >= score and found.is_sound else None

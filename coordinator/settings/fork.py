@@ -11,6 +11,7 @@ from typing import Any
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.scoring_params import scoring_params_of
+from dreamfleet.common.runs.stages import is_try
 from dreamfleet.coordinator.settings.config import RunConfig, config_values
 from dreamfleet.coordinator.settings.schedule import remaining_settings
 from dreamfleet.coordinator.settings.start import (
@@ -41,13 +42,19 @@ class Fork:
                 )
             start, (_, sigma), heat = start_from_run(stored), latest_mean_and_sigma(stored), stored.settings.heat
             scoring_params = scoring_params_of(stored, len(stored.history()))
+            stage = scoring_params.stage
+            if is_try(stored.settings.stages, stage.number) and "schedule" not in given:
+                raise UsageError(
+                    f"run {source} is in stage {stage.number}, one of several searches of which the best counts, and a "
+                    "new run would know this one alone: continue it beyond the restarts, or give --schedule"
+                )
             present = {
-                **remaining_settings(stored.settings, scoring_params.stage),
+                **remaining_settings(stored.settings, stage),
                 "sigma0": sigma,
                 "temperature": scoring_params.spec.temperature,
             }
             settings = {**config_values(stored.settings, stored.bundle_path), **present}
-            if not scoring_params.stage.whole:
+            if not stage.whole:
                 settings["loaded_subspace"] = stored_subspace(stored.fact(SUBSPACE_FACT), stored.settings, stored.path)
         if heat != 1.0:
             log.warning(

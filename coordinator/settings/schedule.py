@@ -71,6 +71,12 @@ def check_schedule(settings: RunSettings) -> None:
                 f"stage {stage.number} is a restart, which is left out once a score is reached: give stage "
                 f"{before.number} a score, and steps or generations"
             )
+        if each.restart and (each.whole or each.overrides):
+            named = ", ".join([*each.overrides, *["whole"] * each.whole])
+            raise UsageError(
+                f"stage {stage.number} is a restart, which searches as stage {before.number} does and may be left out: "
+                f"omit {named}"
+            )
         if each.whole and before.whole:
             raise UsageError(f"stage {stage.number}: the search is whole already; omit that, or give --subspace")
         if each.whole and each.sigma0 is None:

@@ -14,7 +14,7 @@ class DriveCount:
     """Finds, from the drives themselves, how many side by side take least time a step on this host.
 
     That depends on the processor and its caches, on the world and on the other slots. No score depends on it. The
-    powers of two up to `most`, and `most` itself, are tried in turn, from the largest down.
+    largest number that there is work for is tried, then the powers of two below it.
 
     >>> count = DriveCount()
     >>> count.most = 4
@@ -25,10 +25,8 @@ class DriveCount:
     """
 
     def __init__(self) -> None:
-        self._most = 1
-        self._costs: dict[int, deque[float]] = {1: deque(maxlen=WINDOW)}  # seconds a step, by number of drives
-        self._groups = 0
-        self._measured_at: dict[int, int] = {}  # by number of drives, the group that was measured last
+        self._most = 0
+        self.most = 1
 
     @property
     def most(self) -> int:
@@ -39,9 +37,10 @@ class DriveCount:
     def most(self, most: int) -> None:
         if most != self._most:
             self._most = most
-            sizes = {2**power for power in range(most.bit_length())} | {most}
-            self._costs = {size: deque(maxlen=WINDOW) for size in sorted(sizes, reverse=True)}
-            self._groups, self._measured_at = 0, {}
+            # Seconds a step, and the group that was measured last, by number of drives.
+            self._costs = {size: deque[float](maxlen=WINDOW) for size in range(1, most + 1)}
+            self._measured_at = dict.fromkeys(self._costs, 0)
+            self._groups = 0
 
     def add(self, drives: int, steps: int, seconds: float) -> None:
         """Note a finished group: its number of drives, the steps of all of them, and how long it took."""
@@ -53,14 +52,23 @@ class DriveCount:
     @property
     def best(self) -> int:
         """The number whose step takes least; the largest until all are measured."""
-        if any(len(costs) < ENOUGH for costs in self._costs.values()):
-            return self._most
-        return min(self._costs, key=lambda size: statistics.median(self._costs[size]))
+        sizes = self._sizes(self._most)
+        return self._cheapest(sizes) if all(map(self._is_measured, sizes)) else self._most
 
-    @property
-    def next(self) -> int:
-        """The number for the next group: one that lacks measurements, or the best."""
-        for size, costs in self._costs.items():
-            if len(costs) < ENOUGH or self._groups - self._measured_at[size] >= MEASURE_AGAIN:
+    def choose(self, waiting: int) -> int:
+        """The number for the next group of at most `waiting` drives: one that lacks measurements, or the best."""
+        sizes = self._sizes(max(1, min(waiting, self._most)))
+        for size in sizes:
+            if not self._is_measured(size) or self._groups - self._measured_at[size] >= MEASURE_AGAIN:
                 return size
-        return self.best
+        return self._cheapest(sizes)
+
+    def _sizes(self, largest: int) -> list[int]:
+        """The largest number, and the powers of two below it, in falling order."""
+        return [largest, *(2**power for power in reversed(range((largest - 1).bit_length())))]
+
+    def _is_measured(self, size: int) -> bool:
+        return len(self._costs[size]) >= ENOUGH
+
+    def _cheapest(self, sizes: list[int]) -> int:
+        return min(sizes, key=lambda size: statistics.median(self._costs[size]))

@@ -278,7 +278,7 @@ class SlotPool:
         A drive beside others saves less time than a slot without any loses. So as the drives run out, their groups
         shrink.
         """
-        return max(1, min(self._drive_count.next, math.ceil(len(backlog) / len(self._slots))))
+        return self._drive_count.choose(math.ceil(len(backlog) / len(self._slots)))
 
     def _count_groups(self, backlog: Backlog) -> int:
         """How many slots the waiting jobs could use, about."""

@@ -107,10 +107,11 @@ def test_a_search_that_does_not_reach_its_score_is_restarted_and_one_that_does_i
     ("means", "origin"),
     [
         ({}, None),
-        ({1: 10.0, 3: 40.0, 5: 20.0, 9: 15.0}, 5),  # generation 3's would count from 6 on, in another search
+        ({1: 10.0, 3: 40.0, 5: 20.0, 9: 15.0, 11: 45.0}, 3),  # generation 11's is not known for certain in time
         ({1: 20.0, 5: 20.0}, 1),
         ({1: 10.0, 5: 90.0}, 5),
         ({1: 90.0, 3: 95.0}, 1),
+        ({1: 10.0, 3: 95.0, 5: 90.0}, 3),
     ],
 )
 def test_a_new_search_after_restarts_begins_at_the_best_mean_of_them_all(means, origin):
@@ -118,6 +119,9 @@ def test_a_new_search_after_restarts_begins_at_the_best_mean_of_them_all(means, 
         found = begun_stages(scheduled(*RESTARTED[:-1], last), history(*[10] * 12), evaluated(means))
         assert [each.origin for each in found] == [None] * (len(found) - 1) + [expected]
         assert found[-1].beginning.endswith("" if expected is None else f" from {origin}'s mean")
+    last = [replace(RESTARTED[2], score=None), StageSettings(sigma0=0.2)]  # the last restart needs no score
+    found = begun_stages(scheduled(*RESTARTED[:2], *last), history(*[10] * 12), evaluated({**means, 9: 30.0}))
+    assert found[-1].origin == (9 if max(means.values(), default=0) < 30 else origin)
     plain = [replace(each, restart=False, sigma0=0.2) for each in RESTARTED]
     assert {each.origin for each in begun_stages(scheduled(*plain), history(*[10] * 12), evaluated(means))} == {None}
 

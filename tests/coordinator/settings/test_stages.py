@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from dreamfleet.common.errors import UsageError
 from dreamfleet.common.monitoring.status_panel import RunPanel
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.records import StageSettings
@@ -132,7 +133,7 @@ def test_a_restart_begins_at_the_first_mean_and_what_follows_at_the_best_also_af
             number: [run.candidate(number, index).tobytes() for index in range(6)] for number in range(GENERATIONS)
         }
     assert [(each.stage.number, each.since) for each in begun] == [(1, 0), (2, 3), (3, 6), (4, 9)]
-    best = np.frombuffer(calm.journal.evaluated_vector(3), "<f4").astype(float)  # the only one that counted in time
+    best = np.frombuffer(calm.journal.evaluated_vector(1), "<f4").astype(float)
     starts = zip(begun, [None] * 3 + [best], strict=True)
     anew = [Evolution(EvolutionConfig.of(settings, each.stage), at).ask() for each, at in starts]
     assert [found[each.since] for each in begun] == [list(map(vector_bytes, each)) for each in anew]
@@ -239,6 +240,17 @@ def test_a_fork_begins_with_the_stage_that_its_run_is_in_and_goes_on_with_the_ot
     assert settings["stages"] == (StageSettings(score=500.0), *STAGES[2:])
     assert [settings[name] for name in ("horizon", "patience", "episodes", "racing")] == [400, 0, 2, True]
     assert settings["sigma0"] == bench.run.generations.sigma
+
+
+@pytest.mark.parametrize("generations", [1, 5])
+def test_a_run_among_several_searches_is_forked_only_with_a_schedule(staged, generations):
+    ends = StageSettings(3, score=1e6)
+    stages = (ends, replace(ends, restart=True), StageSettings(sigma0=0.05))
+    bench = staged("night", generations=generations, settings=replace(STAGED, stages=stages))
+    bench.drive(lambda _: 0)
+    with pytest.raises(UsageError, match="one of several searches of which the best counts"):
+        forked(bench)
+    assert forked(bench, {"schedule"})
 
 
 def test_a_fork_of_the_last_stage_has_no_schedule(staged):

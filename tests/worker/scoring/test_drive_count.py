@@ -5,11 +5,11 @@ import pytest
 from dreamfleet.worker.scoring.drive_count import ENOUGH, MEASURE_AGAIN, DriveCount
 
 
-def drive(count, costs, groups):
+def drive(count, costs, groups, waiting=99):
     """The numbers that are asked for by groups that take as long as `costs`: seconds a step by number of drives."""
     asked = []
     for _ in range(groups):
-        drives = count.next
+        drives = count.choose(waiting)
         asked.append(drives)
         count.add(drives, 1000 * drives, 1000 * drives * costs[drives])
     return asked
@@ -43,8 +43,18 @@ def test_what_is_not_compared_changes_nothing():
     count = counting(2)
     for _ in range(ENOUGH):
         count.add(2, 0, 100.0)  # episodes that are over at once
-        count.add(3, 1000, 0.1)  # no number that is asked for: the jobs ran out
-    assert (count.next, count.best) == (1, 2)
+        count.add(3, 1000, 0.1)  # more than a slot can do
+    assert (count.choose(99), count.best) == (1, 2)
+
+
+@pytest.mark.parametrize(
+    ("waiting", "costs", "asked"),
+    [(3, {3: 2, 2: 1, 1: 3}, [3, 2, 1, 2]), (2, {2: 2, 1: 1}, [2, 1, 1, 1]), (0, {1: 1}, [1] * 4)],
+)
+def test_with_few_jobs_a_slot_it_is_found_among_the_numbers_that_can_be(waiting, costs, asked):
+    count = counting(4)
+    assert drive(count, costs, 4 * ENOUGH, waiting)[::ENOUGH] == asked
+    assert drive(count, {4: 1, **costs}, ENOUGH) == [4] * ENOUGH
 
 
 def test_a_slot_that_drives_one_by_one_goes_on_so():
