@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.function_values import is_minimised, spans_decades, value_of
@@ -56,14 +56,20 @@ def draw_fitness(panels: Sequence[Any], run: RunFolder) -> list[Any]:
     number, mean, std, best, worst = np.array(
         [(each.number, each.mean, each.std, each.best, each.worst) for each in history]
     ).T
+    in_decades = is_minimised(task) and spans_decades(
+        [*best, *worst, *(value_of(each.mean, task) for each in evaluations)]
+    )
     axes, scores = panels[0], panels[-1]
     marker = "o" if len(history) == 1 else ""
     smooth = running_median(mean, [each.since for each in stages])
     thin = {} if smooth is None else {"linewidth": 0.8, "alpha": 0.6}
+    jumps = [each.since for each in stages if each.stage.restart or each.origin is not None]
+    smoothed = mean if smooth is None else smooth
+    number, mean, std, best, worst, smoothed = _break_lines(jumps, number, mean, std, best, worst, smoothed)
     axes.plot(number, mean, color="tab:blue", marker=marker, label="mean of the candidates", **thin)
     if smooth is not None:
         label = f"its running median over {WINDOW} generations"
-        axes.plot(number, smooth, color="tab:blue", linewidth=2.2, label=label)
+        axes.plot(number, smoothed, color="tab:blue", linewidth=2.2, label=label)
     spread = "± 1 standard deviation (cut at worst and best)"
     ends = np.minimum(best, worst), np.maximum(best, worst)
     low, high = np.fmax(mean - std, ends[0]), np.fmin(mean + std, ends[1])
@@ -78,8 +84,8 @@ def draw_fitness(panels: Sequence[Any], run: RunFolder) -> list[Any]:
         panel.grid(alpha=0.3)
     scores.set_xlabel("generation")
     if evaluations:
-        _draw_evaluations(scores, run)
-    if is_minimised(task) and spans_decades([*best, *worst, *(value_of(each.mean, task) for each in evaluations)]):
+        _draw_evaluations(scores, run, jumps)
+    if in_decades:
         axes.set_yscale("log")
     return [handle for each in dict.fromkeys(panels) for handle in each.get_legend_handles_labels()[0]]
 
@@ -115,6 +121,12 @@ def running_median(values: NDArray[np.float64], begins: Sequence[int] = (0,)) ->
     return smooth
 
 
+def _break_lines(jumps: Sequence[int], number: ArrayLike, *values: ArrayLike) -> list[NDArray[np.float64]]:
+    """`number` and what is drawn over it, with a gap before each of `jumps`, where the search goes on elsewhere."""
+    places = np.searchsorted(number, jumps)
+    return [np.insert(np.asarray(each, dtype=np.float64), places, np.nan) for each in (number, *values)]
+
+
 def error_bars(found: Iterable[ScoreWithError]) -> list[float]:
     """The lengths of error bars; a score without a standard error has no bar."""
     return [np.nan if each.error is None else each.error for each in found]
@@ -125,15 +137,17 @@ def _stages(run: RunFolder) -> Sequence[BegunStage]:
     return [each for each in begun_stages(run.settings, history, run.evaluations()) if each.since < len(history)]
 
 
-def _draw_evaluations(axes: Any, run: RunFolder) -> None:
+def _draw_evaluations(axes: Any, run: RunFolder, jumps: Sequence[int]) -> None:
     """Draw the evaluated means and the confirmed score, which is often below the best of them, as that is luck too."""
     evaluations = [in_values(each, run.spec) for each in run.evaluations()]
     confirmed = in_values(run.confirmation(), run.spec)
     word, episodes = score_word_of_run(run.spec, run.bundle_path), run.settings.evaluation_episodes
     seeds = "" if episodes == 1 else f" ± standard error, {episodes} {word}s"
+    number, mean, error = _break_lines(
+        jumps, [each.generation for each in evaluations], [each.mean for each in evaluations], error_bars(evaluations)
+    )
     axes.errorbar(
-        [each.generation for each in evaluations], [each.mean for each in evaluations], error_bars(evaluations),
-        fmt="o-", color="tab:green", capsize=3, linewidth=1, zorder=3,
+        number, mean, error, fmt="o-", color="tab:green", capsize=3, linewidth=1, zorder=3,
         label=f"evaluated mean{seeds}",
     )  # fmt: skip
     if confirmed is not None:

@@ -2,12 +2,14 @@
 
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from dreamfleet.common.monitoring.fitness_chart import WINDOW, running_median
 from dreamfleet.common.runs.learning import LearningCurve
+from dreamfleet.common.runs.records import StageSettings
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.coordinator.analysis.plot import fitness_figure, learning_figure
 
@@ -95,3 +97,16 @@ def test_a_confirmed_score_at_the_end_of_a_learning_curve_is_within_the_panel(ru
     box = figure.legends[0].get_window_extent()
     assert figure.bbox.x0 <= box.x0
     assert box.x1 <= figure.bbox.x1
+
+
+def test_a_line_has_a_gap_where_the_search_goes_on_elsewhere(runs):
+    ends = StageSettings(generations=4, score=1e6)
+    with open_run(runs, "dream") as run:
+        stages = (ends, replace(ends, restart=True), StageSettings(sigma0=0.1))
+        settings = replace(run.settings, stages=stages, evaluate_every=2)
+    change(runs, "dream", ("UPDATE run SET value = ? WHERE key = 'settings'", (settings.to_json(),)))
+    for panel in draw(runs, "dream").axes:
+        for line in panel.lines:
+            if len(line.get_xdata()) > 2:
+                found = np.array(line.get_xdata(), dtype=float)
+                assert [found[place + 1] for place in np.flatnonzero(np.isnan(found))] in ([4, 8], [5, 9])
