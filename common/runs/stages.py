@@ -130,8 +130,10 @@ def describe_stages(settings: RunSettings, begun: Sequence[BegunStage]) -> dict[
     """Describe each stage of a schedule and when it began, by the stage's name."""
     found, first = {}, {each.stage.number: each for each in begun}
     for stage in stages_of(settings) if settings.stages else ():
-        otherwise = "left out" if stage.number < max(first, default=0) else "not begun"
-        since = first[stage.number].beginning if stage.number in first else otherwise
+        if stage.number not in first and stage.number < max(first, default=0):
+            found[f"stage {stage.number}"] = "left out"
+            continue
+        since = first[stage.number].beginning if stage.number in first else "not begun"
         found[f"stage {stage.number}"] = f"{since}, {stage.end_condition}: {stage.description}"
     return found
 
