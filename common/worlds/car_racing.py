@@ -13,7 +13,7 @@ from dreamfleet.common.worlds.profile import DemoPlan, PublishedScore, Published
 REAL: dict[str, Any] = {
     "task": "car-racing",
     "bundle": "tiny-int8",
-    "subspace": "tiny",
+    "subspace": "real",
     "preset_variant": ("offroad_cost=0.5",),
     "population": 24,
     "episodes": 1,
@@ -23,9 +23,10 @@ REAL: dict[str, Any] = {
     "patience": 100,
     "evaluate_every": 3,
     "evaluation_episodes": 32,
-    "confirm_episodes": 64,
+    "confirm_episodes": 256,
     "stages": (
-        StageSettings(score=800.0, steps=600_000),
+        StageSettings(score=870.0, steps=300_000),
+        *[StageSettings(score=870.0, steps=300_000, restart=True)] * 9,
         StageSettings(steps=1_200_000, episodes=4, sigma0=0.06),
         StageSettings(steps=2_500_000, episodes=8),
         StageSettings(episodes=16),
