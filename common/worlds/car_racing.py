@@ -101,6 +101,7 @@ PROFILE = WorldProfile(
     end_texts={"finished": "lap finished", "terminated": "left the track", "truncated": "time's up"},
     shipped_scores=(
         ShippedScore("102a4956f6d4", 915.2, 3.0, 100, 10012),  # real
+        ShippedScore("d362a710afb1", 914.0, 2.9, 100, 10015),  # real-from-nothing
         ShippedScore("7d07a615d149", 905.5, 3.3, 100, 10076),  # dream
         ShippedScore("e987f25edac2", 832.1, 14.3, 100, 10060),  # tiny
     ),
