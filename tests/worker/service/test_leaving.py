@@ -160,7 +160,7 @@ def test_late_events_of_the_last_runs_slots_do_not_reach_the_next_run(stage, sai
 
 
 @pytest.mark.slow
-def test_without_a_flag_it_says_why_its_run_ended_and_waits_for_the_next_one(stage, said, cached):
+def test_without_a_flag_it_says_why_its_run_ended_and_waits_for_it(stage, said, cached):
     hand = stage.hand(tasks.SLOW_TOY)
     _, served = stage.worker()
     assert hand.hello().reads_end
@@ -169,6 +169,6 @@ def test_without_a_flag_it_says_why_its_run_ended_and_waits_for_the_next_one(sta
     hand.send(0, vectors=(), ended=True, why="2 generations")
     assert hand.beat(lambda beat: beat.reason).reason == "the run has ended after 2 generations"
     hand.vanish()
-    wait_for(said, f"run test ended after 2 generations; waiting for the next run at {hand.endpoint}")
+    wait_for(said, f"run test ended after 2 generations; waiting for run test to go on at {hand.endpoint}")
     stage.also(hand, tasks.SLOW_TOY).ready()
     assert not served.done()
