@@ -14,7 +14,14 @@ from typing import Any
 
 from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.common.runs.records import STAGE_FIELDS, RunSettings, StageSettings, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs.records import (
+    STAGE_FIELDS,
+    RunSettings,
+    StageSettings,
+    StoredEvaluation,
+    StoredGeneration,
+    best_evaluation,
+)
 
 
 @dataclass(frozen=True)
@@ -209,7 +216,8 @@ class StageTracker:
             self._generation += 1
             self._steps += sum(each.steps for each in history[self._generation - 1 : self._generation])
             if self._tries_since is not None:
-                self._best = self._better(finished.get(self.required_evaluation(self._generation)))
+                counted = finished.get(self.required_evaluation(self._generation))
+                self._best = best_evaluation(each for each in (self._best, counted) if each is not None)
             if self._begun[-1].stage.number < len(self._stages) and (why := self._end_reason(finished)):
                 self._begin(self._next_stage(finished), why)
         return self._begun[-1]
@@ -236,11 +244,6 @@ class StageTracker:
         self._steps = 0
         if not stage.restart:
             self._tries_since, self._best = self._generation if is_try(self._stages, stage.number) else None, None
-
-    def _better(self, counted: StoredEvaluation | None) -> StoredEvaluation | None:
-        if counted is None or (self._best is not None and counted.rank <= self._best.rank):
-            return self._best
-        return counted
 
     def _next_stage(self, finished: Mapping[int, StoredEvaluation]) -> Stage:
         """The stage after the current one; restarts are left out where its score was reached."""
