@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from statistics import median
+from statistics import mean, median
 from typing import Any
 
 from dreamfleet.common.monitoring.status import EpisodeProgress, Status, WorkerCount
@@ -13,9 +14,9 @@ from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.protocol.function_values import value_of
 from dreamfleet.common.protocol.tasks import step_unit
 from dreamfleet.common.runs.effort import format_steps
-from dreamfleet.common.runs.records import describe_score, format_mean, in_values
+from dreamfleet.common.runs.records import StoredGeneration, describe_score, format_mean, in_values
 
-PACE_WINDOW = 10  # closed generations whose median is the pace; the median ignores one that was paused for hours
+PACE_WINDOW = 10  # closed generations that tell the pace, or three intervals of evaluations if these are more
 ACTIVE_STATES = ("running", "evaluating")
 
 
@@ -64,8 +65,7 @@ class Eta:
 
 def estimate_eta(status: Status) -> Eta:
     """Estimate a run's end from its limits, its progress, the last generations' pace and the present workers' speed."""
-    recent = status.recent[-PACE_WINDOW:]
-    pace = median(each.seconds for each in recent) if recent else None
+    pace = _pace(status)
     next_seconds = _next_generation_seconds(status, pace)
     bounds = tuple(_counted_limits(status, pace, next_seconds))
     if next_seconds is not None:
@@ -119,6 +119,27 @@ def format_duration(seconds: float) -> str:
         return f"{hours} h {minutes} min" if minutes else f"{hours} h"
     days, hours = divmod(round(seconds / 3600), 24)
     return f"{days:,} d {hours} h" if hours else f"{days:,} d"
+
+
+def _pace(status: Status) -> float | None:
+    """Seconds a generation of late; `None` before the first is closed.
+
+    Every few generations an evaluation makes one longer. So it is the mean over an interval of evaluations, of medians
+    over several such intervals. A median ignores a generation that was paused for hours.
+    """
+    alike: dict[int, list[float]] = defaultdict(list)
+    for each in _paced(status):
+        alike[each.number % _interval(status)].append(each.seconds)
+    return mean(median(seconds) for seconds in alike.values()) if alike else None
+
+
+def _paced(status: Status) -> tuple[StoredGeneration, ...]:
+    """The last closed generations, which tell the pace."""
+    return status.recent[-max(PACE_WINDOW, 3 * _interval(status)) :]
+
+
+def _interval(status: Status) -> int:
+    return max(status.settings.evaluate_every, 1)
 
 
 def _next_generation_seconds(status: Status, pace: float | None) -> float | None:
@@ -189,7 +210,7 @@ def _is_limit_reached(status: Status) -> bool:
 
 def _closed_steps_per_second(status: Status) -> float:
     """Environment steps a second in the last closed generations."""
-    recent = status.recent[-PACE_WINDOW:]
+    recent = _paced(status)
     seconds = sum(each.seconds for each in recent)
     return sum(each.steps for each in recent) / seconds if seconds else 0.0
 

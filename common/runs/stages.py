@@ -240,6 +240,8 @@ class StageTracker:
         """Begin a stage: a new search after restarts begins at the best mean of them all that was evaluated in time."""
         is_start = stage.starts_new_search and not stage.restart
         origin = self._best.generation if is_start and self._best is not None else None
+        if is_start and self._tries_since is not None and self._best is None:
+            why += ", from the last mean, because none was evaluated"
         self._begun.append(BegunStage(stage, self._generation, why, origin))
         self._steps = 0
         if not stage.restart:

@@ -16,7 +16,7 @@ class LimitsConfig:
     """When a run ends: at the first limit reached; all are checked as a generation ends. 0: no such limit."""
 
     generations: int = option(0, "stop after so many generations")
-    steps: int = option(0, "stop with the generation that reaches so many environment steps")
+    steps: int = option(0, "stop with the generation that reaches so many environment steps of candidates")
     minutes: float = option(
         0.0,
         "stop with the generation that closes after so many minutes of work: its episodes are finished, and the last "

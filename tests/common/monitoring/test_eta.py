@@ -37,6 +37,15 @@ def test_a_paused_generation_does_not_change_the_pace():
     assert estimate_eta(status()).pace == 4.6
 
 
+def test_the_pace_counts_the_evaluations_between():
+    settings = dataclasses.replace(STATUS.settings, evaluate_every=4)
+    recent = tuple(dataclasses.replace(CLOSED, number=n, seconds=45.0 if n % 4 == 0 else 5.0) for n in range(1, 13))
+    paused = (*recent[:-1], dataclasses.replace(recent[-1], seconds=9000.0))
+    for each in (recent, paused):
+        eta = estimate_eta(dataclasses.replace(status({"generations": 9}), settings=settings, recent=each))
+        assert eta.pace == pytest.approx((45 + 5 + 5 + 5) / 4)
+
+
 def test_the_open_generations_elapsed_time_counts():
     assert estimate_eta(status({"generations": 9}, gone=1.6)).seconds == pytest.approx(3.0 + 4.6)
     assert estimate_eta(status({"generations": 8}, gone=99.0)).seconds == 0

@@ -119,6 +119,7 @@ def test_a_new_search_after_restarts_begins_at_the_best_mean_of_them_all(means, 
         found = begun_stages(scheduled(*RESTARTED[:-1], last), history(*[10] * 12), evaluated(means))
         assert [each.origin for each in found] == [None] * (len(found) - 1) + [expected]
         assert found[-1].beginning.endswith("" if expected is None else f" from {origin}'s mean")
+        assert found[-1].why.endswith("because none was evaluated") == (not means and last.sigma0 is not None)
     last = [replace(RESTARTED[2], score=None), StageSettings(sigma0=0.2)]  # the last restart needs no score
     found = begun_stages(scheduled(*RESTARTED[:2], *last), history(*[10] * 12), evaluated({**means, 9: 30.0}))
     assert found[-1].origin == (9 if max(means.values(), default=0) < 30 else origin)
