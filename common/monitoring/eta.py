@@ -43,7 +43,7 @@ class Eta:
     bounds: tuple[LimitProgress, ...]  # countable limits, the nearest first
     others: tuple[str, ...]  # limits whose time cannot be estimated, in words
     pace: float | None  # seconds a generation; `None` before the first is closed
-    limit: float | None  # seconds until the first limit; `None` if unknown, or while nobody scores
+    limit: float | None  # seconds until the first limit; `None` if unknown, or while nobody scores or nothing moves
     seconds: float | None  # until the run's end; `None` also if the speed of evaluations is unknown
     closing: int = 0  # episodes of evaluations between the limit and the run's end
 
@@ -71,7 +71,7 @@ def estimate_eta(status: Status) -> Eta:
     if next_seconds is not None:
         bounds = tuple(sorted(bounds, key=lambda each: math.inf if each.seconds is None else each.seconds))
     known = [0.0] if _is_limit_reached(status) else [each.seconds for each in bounds if each.seconds is not None]
-    limit = min(known) if known and status.state in ACTIVE_STATES else None
+    limit = min(known) if known and status.state in ACTIVE_STATES and not _is_stalled(status, pace) else None
     closing = _closing_seconds(status)
     seconds = None if limit is None or closing is None else limit + closing
     return Eta(bounds, tuple(_uncounted_limits(status)), pace, limit, seconds, _closing_episodes(status))
@@ -198,6 +198,12 @@ def _counted_limits(status: Status, pace: float | None, next_seconds: float | No
         elapsed += spent.seconds
         text = f"{_format_minutes(elapsed / 60)} of {_format_minutes(minutes)} minute{'' if minutes == 1 else 's'}"
         yield LimitProgress("minutes", elapsed / 60, minutes, max(60 * minutes - elapsed, open_seconds or 0.0), text)
+
+
+def _is_stalled(status: Status, pace: float | None) -> bool:
+    """Whether the open generation is overdue and no step is made: an environment hangs, say."""
+    is_overdue = pace is not None and status.generation.seconds > 2 * pace
+    return is_overdue and status.state == "running" and not status.throughput.steps_per_second
 
 
 def _is_limit_reached(status: Status) -> bool:

@@ -28,7 +28,7 @@ from dreamfleet.common.errors import (
 )
 from dreamfleet.common.files.regular_files import is_file, is_folder, path_exists
 from dreamfleet.common.printable import plural
-from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, resume_command, run_paths
 
 SUBSPACES = "subspaces"  # the folder of shipped subspaces: of a world model, by its name, or of a controller
@@ -56,16 +56,27 @@ def find_agent(name: str, runs_dir: Path) -> tuple[Controller | TrainedAgent, Pa
     if is_file(shipped):
         return Controller.load(shipped), None
     if is_file(run / JOURNAL):
-        raise ControllerError(
-            f"run {name} has no controller yet: it is written when the first generation closes; an older run's is "
-            f"written when it is resumed: {resume_command(run)}; a run of submitted batches has none"
-        )
+        raise _no_controller_yet(run)
     if is_folder(path):
         raise ControllerError(f"{name} is a folder without {CONTROLLER}; {import_hint(path, '--out OUT')}")
     names = ", ".join(sorted(each.stem for each in pretrained_folder().glob("*.npz"))) or "none"
     raise ControllerError(
         f"no controller {name!r}: no file, no run in {runs_dir.absolute()} (--runs-dir names another folder), and none "
         f"that ships: {names}"
+    )
+
+
+def load_controller_of(run: RunFolder) -> Controller:
+    """The controller that a run reports; `ControllerError` before it has one."""
+    if not path_exists(run.controller_path):
+        raise _no_controller_yet(run.path)
+    return Controller.load(run.controller_path)
+
+
+def _no_controller_yet(run: Path) -> ControllerError:
+    return ControllerError(
+        f"run {run.name} has no controller yet: it is written when the first generation closes; an older run's is "
+        f"written when it is resumed: {resume_command(run)}; a run of submitted batches has none"
     )
 
 

@@ -307,11 +307,12 @@ def count_failed(history: Iterable[StoredGeneration]) -> int:
     return sum(each.failed for each in history)
 
 
-def describe_failed(settings: RunSettings, history: Sequence[StoredGeneration]) -> str:
-    """How many candidates failed, and the setting that says what becomes of them."""
-    return (
-        f"{count_failed(history)} in {plural(len(history), 'closed generation')} (--on-failure {settings.on_failure})"
-    )
+def describe_failed(settings: RunSettings, history: Sequence[StoredGeneration], reseeds: int) -> str:
+    """How many candidates failed, how many sets of seeds too, and the setting that says what becomes of candidates."""
+    found = f"{count_failed(history)} in {plural(len(history), 'closed generation')}"
+    found += f" (--on-failure {settings.on_failure})"
+    sets = plural(reseeds, "set of seeds", "sets of seeds")
+    return f"{found}; {sets} on which all candidates failed, replaced" if reseeds else found
 
 
 def with_error(found: StoredEvaluation | StoredConfirmation) -> dict[str, Any]:

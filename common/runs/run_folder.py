@@ -46,7 +46,7 @@ from dreamfleet.common.runs.records import (
 )
 from dreamfleet.common.runs.run_lock import is_run_locked
 from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, rollout_path, run_paths
-from dreamfleet.common.runs.seeds import CHOOSING_OFFSET, CONFIRMING_OFFSET, VALIDATION
+from dreamfleet.common.runs.seeds import CHOOSING_OFFSET, CONFIRMING_OFFSET, VALIDATION, count_reseeds
 from dreamfleet.common.runs.stages import begun_stages
 from dreamfleet.common.serialization.display import Displayed
 from dreamfleet.common.serialization.times import elapsed_seconds
@@ -271,6 +271,11 @@ class RunFolder(Displayed):
             if isinstance(seeds, list) and all(isinstance(each, int) for each in seeds):
                 return tuple(seeds)
         raise self._journal.damage_error(f"generation {generation} has no seeds")
+
+    def count_reseeds(self, history: Iterable[StoredGeneration]) -> int:
+        """The sets of seeds in these generations that others replaced, because all candidates failed on them."""
+        run_seed = self.settings.seed
+        return sum(count_reseeds(run_seed, each.number, self.training_seeds(each.number)) for each in history)
 
     def result_count(self) -> int:
         """Accepted results of every kind."""

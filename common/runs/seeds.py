@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 
 TEST = range(10_000, 20_000)
 VALIDATION = range(20_000, 1_000_000)
@@ -14,6 +15,7 @@ CHOOSING_OFFSET, CONFIRMING_OFFSET = 10_000, 20_000
 TRAINING_FIRST = 2**20
 FOLDED_END = 2**31  # seeds below it fit into a signed number of 32 bits
 TRAINING_LAST = 2**53 - 1  # the largest integer that JSON represents exactly
+MAX_RESEEDS = 3  # times that a generation gets other seeds
 
 
 def training_seed(run_seed: int, generation: int, episode: int) -> int:
@@ -22,6 +24,18 @@ def training_seed(run_seed: int, generation: int, episode: int) -> int:
     A hash and not a sum, so that runs with neighbouring seeds share no track.
     """
     return _derive_seed(f"dreamfleet training {run_seed} {generation} {episode}")
+
+
+def training_seeds(run_seed: int, generation: int, episodes: int, reseeds: int = 0) -> list[int]:
+    """The seeds of a generation that got other ones so many times: those that follow."""
+    first = reseeds * episodes
+    return [training_seed(run_seed, generation, each) for each in range(first, first + episodes)]
+
+
+def count_reseeds(run_seed: int, generation: int, seeds: Sequence[int]) -> int:
+    """How many times a generation with these seeds got other ones, because all its candidates failed."""
+    tries = range(1, MAX_RESEEDS + 1) if seeds else ()
+    return next((each for each in tries if list(seeds) == training_seeds(run_seed, generation, len(seeds), each)), 0)
 
 
 def collection_seed(run_seed: int, generation: int, episode: int) -> int:

@@ -15,6 +15,7 @@ from dreamfleet.common.errors import BundleError
 from dreamfleet.common.monitoring.eta import format_duration
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.tasks import module_of, step_unit
+from dreamfleet.common.runs.lookup import load_controller_of
 from dreamfleet.common.runs.records import (
     SUBMITTED,
     RunSettings,
@@ -40,15 +41,16 @@ AUTHORS = "The dreamfleet authors"
 
 def citation_facts(run: RunFolder) -> dict[str, Any]:
     """The run and its provenance as JSON values; `ControllerError` before the run has a controller."""
-    controller = Controller.load(run.controller_path)
+    controller = load_controller_of(run)
     receipt, settings = read_run_provenance(controller), read_run_settings(controller)
-    score, spent = _reported(run), run.total_effort()
+    score, spent, history = _reported(run), run.total_effort(), run.history()
     return {
         "run": run.name, "run_uid": run.uid, "created": run.created, "ended": run.ended,
         "ended_at": run.ended_at, "lasted_seconds": run.duration_seconds,
         "controller": controller.sha256, "bundle": settings.task.bundle or None,
         "score": _describe_score(run), "failed_episodes": score.failed if score else 0,
-        "failed_candidates": count_failed(run.history()), "on_failure": settings.on_failure,
+        "failed_candidates": count_failed(history), "replaced_seeds": run.count_reseeds(history),
+        "on_failure": settings.on_failure,
         "spent": {**asdict(spent), "core_hours": spent.core_hours},
         "settings": to_dict(settings), "receipt": to_dict(receipt), "commands": _commands(run),
         "software": software_facts(receipt),
@@ -65,7 +67,7 @@ def software_facts(receipt: RunProvenance) -> dict[str, str]:
 
 def format_markdown(run: RunFolder) -> str:
     """The same as Markdown: a list, the commands, and BibTeX entries of the run and the software."""
-    controller = Controller.load(run.controller_path)
+    controller = load_controller_of(run)
     receipt, settings = read_run_provenance(controller), read_run_settings(controller)
     lines = [
         f"# Run {run.name}",
@@ -108,7 +110,8 @@ def _rows(
         size = f"population {settings.population} x {plural(settings.episodes, 'episode')}, sigma0 {settings.sigma0:g}"
         own = f"{settings.optimiser}, {settings.covariance}, {size}, {generations}"
         yield "search", f"{SUBMITTED}, {generations}" if settings.is_external else own
-    yield "failed candidates", describe_failed(settings, run.history())
+    history = run.history()
+    yield "failed candidates", describe_failed(settings, history, run.count_reseeds(history))
     so_far = "" if run.ended else "; so far, with the results of the open generation"
     yield "spent", f"{run.total_effort().describe(run.spec.task)}{so_far}"
     yield "seed", f"{settings.seed}; training seeds follow from it, from {TRAINING_FIRST} up"

@@ -13,7 +13,7 @@ from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.bridge.app import make_app
 from dreamfleet.coordinator.bridge.changes import Changes
 from dreamfleet.coordinator.bridge.config import BridgeConfig
-from dreamfleet.coordinator.dashboard.server import HttpConnection, open_socket, server_config
+from dreamfleet.coordinator.dashboard.server import HttpConnection, open_socket, run_server, server_config
 
 KEEP_ALIVE = 60  # seconds
 
@@ -29,7 +29,7 @@ def serve(config: BridgeConfig, network: Network, on_ready: Callable[[str], None
             changes,
         )
         on_ready(config.address(listening.getsockname()[1]))
-        server.run(sockets=[listening])
+        run_server(server, listening)
 
 
 class BridgeConnection(HttpConnection):

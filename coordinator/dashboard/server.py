@@ -6,6 +6,7 @@ import asyncio
 import errno
 import socket
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from dreamfleet.common.errors import ConnectionFailedError
+from dreamfleet.common.host.stop_signals import interrupted_by_signals
 from dreamfleet.coordinator.dashboard.app import make_app
 from dreamfleet.coordinator.dashboard.config import DashboardConfig
 from dreamfleet.coordinator.dashboard.feed import Feed
@@ -38,6 +40,12 @@ def serve(
             views,
         )
         on_ready(config.address(listening.getsockname()[1]))
+        run_server(server, listening)
+
+
+def run_server(server: uvicorn.Server, listening: socket.socket) -> None:
+    """Serve until Ctrl-C or SIGTERM. uvicorn sends this process the signal again, once it has shut down."""
+    with suppress(KeyboardInterrupt), interrupted_by_signals():
         server.run(sockets=[listening])
 
 

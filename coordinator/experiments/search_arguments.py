@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,10 @@ OTHER_NAMES = {
     "integer": "integers integrality integer_variables",
     "run": "name run_name",
 }  # fmt: skip
+# Parameters of `minimise` that are no settings of a run.
+OWN_NAMES = (
+    "bounds", "integer", "log", "ftarget", "maxfevals", "popsize", "restarts", "restart", "penalty", "callback"
+)  # fmt: skip
 ADVICE = {
     **{name: f"did you mean {right!r}?" for right, names in OTHER_NAMES.items() for name in names.split()},
     **dict.fromkeys(
@@ -52,6 +57,8 @@ def check_names(settings: Mapping[str, Any]) -> None:
     for name in settings:
         if name in ADVICE:
             raise UsageError(f"unknown setting {name!r}: {ADVICE[name]}")
+        if near := get_close_matches(name, OWN_NAMES, n=1, cutoff=0.85):
+            raise UsageError(f"unknown setting {name!r}: did you mean {near[0]!r}?")
 
 
 def read_seed(value: Any) -> int:

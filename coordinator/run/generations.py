@@ -12,7 +12,7 @@ from dreamfleet.common.monitoring.elites import EliteArchive
 from dreamfleet.common.protocol.tasks import is_function_task
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.scoring_params import ScheduleState, ScoringParams
-from dreamfleet.common.runs.seeds import training_seed
+from dreamfleet.common.runs.seeds import MAX_RESEEDS, count_reseeds, training_seeds
 from dreamfleet.common.runs.stages import BegunStage, Stage, stages_of
 from dreamfleet.coordinator.jobs.generation import CandidateScores, Generation
 from dreamfleet.coordinator.jobs.history import History
@@ -23,7 +23,6 @@ from dreamfleet.coordinator.settings.start import SUBSPACE_FACT, stored_start_me
 from dreamfleet.coordinator.storage.journal import Journal, StoredOpenGeneration
 
 MAX_REDRAWS = 3  # rounds in a generation; what fails after them ranks last
-MAX_RESEEDS = 3  # times that a generation gets other seeds
 RECENT = 5  # generations, the open one included, whose failures `--failure-limit` counts
 
 
@@ -93,7 +92,7 @@ class Generations:
         self.seconds = stored.seconds
         self.redrawn = {index for indices in stored.redrawn for index in indices}
         self._rounds = len(stored.redrawn)
-        self._reseeds = self._count_reseeds(stored)
+        self._reseeds = count_reseeds(self._settings.seed, stored.number, stored.seeds)
         vectors = tuple(vector_bytes(x) for x in population)
         if vectors != stored.vectors:
             raise JournalError(
@@ -252,20 +251,7 @@ class Generations:
         return Evolution(EvolutionConfig.of(self._settings, stage, self._subspace), start)
 
     def _seeds(self, number: int, episodes: int, reseeds: int = 0) -> list[int]:
-        """The seeds of a generation that got other ones so many times: those that follow."""
-        first = reseeds * episodes
-        return [training_seed(self._settings.seed, number, each) for each in range(first, first + episodes)]
-
-    def _count_reseeds(self, stored: StoredOpenGeneration) -> int:
-        """How many times a restored generation got other seeds."""
-        return next(
-            (
-                each
-                for each in range(1, MAX_RESEEDS + 1)
-                if list(stored.seeds) == self._seeds(stored.number, len(stored.seeds), each)
-            ),
-            0,
-        )
+        return training_seeds(self._settings.seed, number, episodes, reseeds)
 
     def _recall(self, stored: StoredOpenGeneration, scoring_params: ScoringParams) -> Generation:
         generation = self._generation(stored.number, stored.vectors, stored.seeds, scoring_params)

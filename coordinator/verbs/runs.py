@@ -131,6 +131,7 @@ def show_run(args: argparse.Namespace) -> int:
             "lasted_seconds": duration_seconds,
             "fingerprint": stored.fingerprint,
             "failed_candidates": count_failed(history),
+            "replaced_seeds": (reseeds := stored.count_reseeds(history)),
         }
         unscored = stored.unscored_generations()
         best = best_evaluation(evaluations)
@@ -150,10 +151,10 @@ def show_run(args: argparse.Namespace) -> int:
         rows |= {} if archive is None else {"archive": archive.facts}
         print(json.dumps({**facts, "settings": asdict(settings), "confirmed": reported, **rows}, indent=2))
         return 0
-    del facts["lasted_seconds"]
+    del facts["lasted_seconds"], facts["replaced_seeds"]
     if duration_seconds is not None:
         facts["ended_at"] = f"{facts['ended_at']}, {format_duration(duration_seconds)} after it began"
-    facts["failed_candidates"] = describe_failed(settings, history)
+    facts["failed_candidates"] = describe_failed(settings, history, reseeds)
     facts["hosts"] = classes.description
     facts |= {f"class {name}": hosts for name, hosts in classes.rows}
     facts |= {} if checks is None else {"checks": checks.description}

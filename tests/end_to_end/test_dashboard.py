@@ -421,7 +421,7 @@ def test_it_leaves_at_once_although_pages_are_open(processes):
         assert stream.readline().startswith(b"event: hello")
         assert "digest" in json.loads(stream.readline().removeprefix(b"data: "))
         started.popen.send_signal(signal.SIGTERM)
-        assert started.popen.wait(DEADLINE) is not None
+        assert started.popen.wait(DEADLINE) == 0
         with pytest.raises(urllib.error.URLError):
             urllib.request.urlopen(started.address, timeout=DEADLINE)
 

@@ -51,6 +51,13 @@ def test_the_open_generations_elapsed_time_counts():
     assert estimate_eta(status({"generations": 8}, gone=99.0)).seconds == 0
 
 
+def test_an_overdue_generation_without_a_step_has_no_estimate():
+    overdue = status({"generations": 9}, gone=9.3)
+    stalled = dataclasses.replace(overdue, throughput=dataclasses.replace(overdue.throughput, steps_per_second=0.0))
+    assert estimate_eta(overdue).seconds is not None
+    assert estimate_eta(stalled).description == "7 of 9 generations, 4.6 s a generation"
+
+
 def test_a_failed_job_that_waits_for_its_next_attempt_counts():
     failure = FailureStatus("7/1", "score", (1,), {"a": "no memory"}, {"a": 3}, retry_in=64.0)
     evaluation = dataclasses.replace(failure, kind="evaluate")

@@ -13,8 +13,10 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC
 from dreamfleet.common.runs.effort import Effort
+from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL
 from dreamfleet.common.runs.run_provenance import RECEIPT, RunProvenance
+from dreamfleet.common.runs.seeds import training_seeds
 from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.coordinator.storage.journal import Journal
 
@@ -51,6 +53,24 @@ def test_failed_candidates_are_counted(change, printed):
         assert "4 in " in said
         assert "closed generations (--on-failure " in said
         assert json.loads(printed(verb, "reality", "--json"))["failed_candidates"] == 4
+
+
+def test_a_run_without_a_controller_says_why(change, tmp_path, capsys):
+    change()
+    (tmp_path / "runs" / "reality" / CONTROLLER).unlink()
+    assert command_line.main(["runs", "receipt", "reality", "--runs-dir", str(tmp_path / "runs")]) == 1
+    assert "run reality has no controller yet: it is written when" in capsys.readouterr().err
+
+
+def test_replaced_seeds_are_counted(change, printed, tmp_path):
+    with open_run(tmp_path / "runs", "reality") as run:
+        later = training_seeds(run.settings.seed, 1, run.settings.episodes, 2)
+    for count in (0, 2):
+        for verb in ("receipt", "show"):
+            said = "2 sets of seeds on which all candidates failed, replaced" in printed(verb, "reality")
+            assert said == (count == 2)
+            assert json.loads(printed(verb, "reality", "--json"))["replaced_seeds"] == count
+        change(("UPDATE generation SET seeds = ? WHERE number = 1", (json.dumps(later),)))
 
 
 def test_no_bits_are_promised_where_there_are_none(change, printed):

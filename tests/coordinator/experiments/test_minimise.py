@@ -134,6 +134,8 @@ def test_a_callback_ends_the_search(tmp_path):
         ({"maxiter": 3}, "did you mean 'generations'?"),
         ({"maxfun": 3}, "did you mean 'maxfevals'?"),
         ({"n_calls": 3}, "did you mean 'maxfevals'?"),
+        ({"maxfeval": 3}, "did you mean 'maxfevals'?"),
+        ({"call_back": print}, "did you mean 'callback'?"),
         ({"sigma": 3}, "did you mean 'sigma0'?"),
         ({"n_jobs": 3}, "did you mean 'workers'?"),
         ({"tol": 3}, "'ftarget' ends it by a value"),
