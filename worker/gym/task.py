@@ -112,6 +112,7 @@ class GymTask(Task):
         arguments = dict(options.get("environment") or {})
         environment, world = self._open(arguments)
         try:
+            self._check_version(environment)
             frozen: dict[str, Any] = {"environment": arguments} if arguments else {}
             if options.get("normalise"):
                 mean, deviation = _measure_normalisation(environment, int(options.get("seed", 0)))
@@ -122,6 +123,13 @@ class GymTask(Task):
             close_environment(environment)
         text = json.dumps(frozen, sort_keys=True) if frozen else ""
         return Description(observations, world.actions.outputs, world.packages, world.version, text, steps)
+
+    def _check_version(self, environment: gymnasium.Env[Any, Any]) -> None:
+        """`UsageError` for a name without a version: gymnasium takes its newest, and a later gymnasium another one."""
+        module, colon, name = self._id.rpartition(":")
+        found = name if environment.spec is None else environment.spec.id
+        if found != name:
+            raise UsageError(f"task {self.name} names no version: write {GYM}:{module}{colon}{found}")
 
     def _open(
         self, arguments: Mapping[str, Any], render_mode: str | None = None

@@ -204,6 +204,14 @@ def test_an_environment_without_a_time_limit_is_bounded(strange):
     scorer.close()
 
 
+@pytest.mark.filterwarnings("ignore:.*latest versioned")
+def test_a_run_names_the_environments_version():
+    with pytest.raises(UsageError, match="names no version: write gym:CartPole-v1"):
+        describe_task("gym:CartPole", {})
+    with pytest.raises(UsageError, match="write gym:gymnasium:CartPole-v1"):
+        describe_task("gym:gymnasium:CartPole", {})
+
+
 def test_unknown_options_and_arguments_are_refused():
     with pytest.raises(UsageError, match="knows no option wings: environment, normalise"):
         describe_task(CARTPOLE, {"wings": 2})
