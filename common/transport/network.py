@@ -103,7 +103,8 @@ def check_endpoint(endpoint: str) -> str:
     found = _ENDPOINT.fullmatch(endpoint)
     if not found or int(found[3]) > 65535:
         hint = "" if "/" in endpoint or ":" in endpoint else "; a run's name goes elsewhere: see --help"
-        raise UsageError(f"{endpoint!r} is not an endpoint: write tcp/HOST:PORT, such as {DEFAULT_ENDPOINT}{hint}")
+        example = f"tcp/127.0.0.1:{endpoint}" if endpoint.isdecimal() else f"{DEFAULT_ENDPOINT}{hint}"
+        raise UsageError(f"{endpoint!r} is not an endpoint: write tcp/HOST:PORT, such as {example}")
     return endpoint
 
 
