@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from statistics import mean, median
+from itertools import groupby
+from statistics import median, median_low
 from typing import Any
 
 from dreamfleet.common.monitoring.status import EpisodeProgress, Status, WorkerCount
@@ -14,9 +14,10 @@ from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.protocol.function_values import value_of
 from dreamfleet.common.protocol.tasks import step_unit
 from dreamfleet.common.runs.effort import format_steps
-from dreamfleet.common.runs.records import StoredGeneration, describe_score, format_mean, in_values
+from dreamfleet.common.runs.records import describe_score, format_mean, in_values
 
-PACE_WINDOW = 10  # closed generations that tell the pace, or three intervals of evaluations if these are more
+PACE_WINDOW = 10  # closed generations that tell the pace
+STALL_SECONDS = 60.0  # how long a generation that is overdue makes no step until its end is unknown
 ACTIVE_STATES = ("running", "evaluating")
 
 
@@ -124,22 +125,17 @@ def format_duration(seconds: float) -> str:
 def _pace(status: Status) -> float | None:
     """Seconds a generation of late; `None` before the first is closed.
 
-    Every few generations an evaluation makes one longer. So it is the mean over an interval of evaluations, of medians
-    over several such intervals. A median ignores a generation that was paused for hours.
+    That is the median of the last ones, which ignores a generation that was paused for hours. In some of them the
+    fleet drives an evaluation too. What this takes is the median of what the last intervals of evaluations took beyond
+    their own medians: of three, or the less of two. One alone may hold the run's first generation, a long one.
     """
-    alike: dict[int, list[float]] = defaultdict(list)
-    for each in _paced(status):
-        alike[each.number % _interval(status)].append(each.seconds)
-    return mean(median(seconds) for seconds in alike.values()) if alike else None
-
-
-def _paced(status: Status) -> tuple[StoredGeneration, ...]:
-    """The last closed generations, which tell the pace."""
-    return status.recent[-max(PACE_WINDOW, 3 * _interval(status)) :]
-
-
-def _interval(status: Status) -> int:
-    return max(status.settings.evaluate_every, 1)
+    recent, every = status.recent, max(status.settings.evaluate_every, 1)
+    if not recent:
+        return None
+    pace = median(each.seconds for each in recent[-PACE_WINDOW:])
+    intervals = [[each.seconds for each in group] for _, group in groupby(recent, lambda each: each.number // every)]
+    beyond = [sum(each) - every * median(each) for each in intervals if len(each) == every][-3:]
+    return pace + (max(median_low(beyond), 0.0) / every if len(beyond) > 1 else 0.0)
 
 
 def _next_generation_seconds(status: Status, pace: float | None) -> float | None:
@@ -202,7 +198,7 @@ def _counted_limits(status: Status, pace: float | None, next_seconds: float | No
 
 def _is_stalled(status: Status, pace: float | None) -> bool:
     """Whether the open generation is overdue and no step is made: an environment hangs, say."""
-    is_overdue = pace is not None and status.generation.seconds > 2 * pace
+    is_overdue = pace is not None and status.generation.seconds > 2 * pace + STALL_SECONDS
     return is_overdue and status.state == "running" and not status.throughput.steps_per_second
 
 
@@ -216,7 +212,7 @@ def _is_limit_reached(status: Status) -> bool:
 
 def _closed_steps_per_second(status: Status) -> float:
     """Environment steps a second in the last closed generations."""
-    recent = _paced(status)
+    recent = status.recent[-max(PACE_WINDOW, status.settings.evaluate_every) :]
     seconds = sum(each.seconds for each in recent)
     return sum(each.steps for each in recent) / seconds if seconds else 0.0
 

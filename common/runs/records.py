@@ -58,7 +58,6 @@ class StageSettings:
     restart: bool = stage_option(
         False, "search anew from the run's first mean, unless the stage before reached its score"
     )
-    from_best: bool = stage_option(False, "a restart's search begins at the best evaluated mean of those before it")
 
     @property
     def overrides(self) -> dict[str, Any]:
@@ -78,9 +77,7 @@ class StageSettings:
 
 
 _END = ("generations", "steps", "score")
-STAGE_FIELDS = tuple(
-    each.name for each in fields(StageSettings) if each.name not in (*_END, "whole", "restart", "from_best")
-)
+STAGE_FIELDS = tuple(each.name for each in fields(StageSettings) if each.name not in (*_END, "whole", "restart"))
 
 
 @dataclass(frozen=True)

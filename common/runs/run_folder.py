@@ -274,8 +274,11 @@ class RunFolder(Displayed):
 
     def count_reseeds(self, history: Iterable[StoredGeneration]) -> int:
         """The sets of seeds in these generations that others replaced, because all candidates failed on them."""
-        run_seed = self.settings.seed
-        return sum(count_reseeds(run_seed, each.number, self.training_seeds(each.number)) for each in history)
+        found, run_seed = 0, self.settings.seed
+        for each in history:
+            with suppress(JournalError):  # damaged seeds: the rest of the run can be shown
+                found += count_reseeds(run_seed, each.number, self.training_seeds(each.number))
+        return found
 
     def result_count(self) -> int:
         """Accepted results of every kind."""

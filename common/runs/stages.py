@@ -39,14 +39,13 @@ class Stage:
     search: int  # number of the stage that started this stage's search
     end: StageSettings
     whole: bool = True  # whether it searches all parameters, not the run's subspace
-    restart: bool = False  # whether it searches anew, and is left out if the stage before reached its score
-    from_best: bool = False  # whether a restart begins at the best mean so far, not at the run's first one
+    restart: bool = False  # whether its search begins at the run's first mean
 
     @property
     def starts_new_search(self) -> bool:
         """Whether it starts a new search: from the last mean, as a `restart` from the run's first one.
 
-        After restarts, or as a restart with `from_best`, it starts from the best evaluated mean of them all.
+        After restarts it starts from the best evaluated mean of them all.
         """
         return self.search == self.number
 
@@ -64,7 +63,6 @@ class Stage:
         """The settings as a text."""
         patience = f", patience {self.patience}" if self.patience else ""
         anew = "a search from the start" if self.restart else "a new search"
-        anew = "a search from the best mean" if self.from_best else anew
         search = f"{anew} with step size {self.sigma0:g}" if self.starts_new_search else "the search continues"
         raced = ", racing" if self.racing else ""
         driven = ", all driven" if self.driven == 1 else f", {self.driven:.0%} of them driven" if self.driven else ""
@@ -118,9 +116,7 @@ def _next_stage(before: Stage, each: StageSettings) -> Stage:
     is_changed = each.sigma0 is not None or named["population"] != before.population or whole != before.whole
     number = before.number + 1
     search = number if is_changed or each.restart else before.search
-    return Stage(
-        number, **named, search=search, end=each.end, whole=whole, restart=each.restart, from_best=each.from_best
-    )
+    return Stage(number, **named, search=search, end=each.end, whole=whole, restart=each.restart)
 
 
 def is_try(stages: Sequence[Stage | StageSettings], number: int) -> bool:
@@ -242,9 +238,9 @@ class StageTracker:
 
     def _begin(self, stage: Stage, why: str) -> None:
         """Begin a stage: a new search after restarts begins at the best mean of them all that was evaluated in time."""
-        is_start = stage.starts_new_search and (stage.from_best or not stage.restart)
+        is_start = stage.starts_new_search and not stage.restart
         origin = self._best.generation if is_start and self._best is not None else None
-        if is_start and not stage.restart and self._tries_since is not None and self._best is None:
+        if is_start and self._tries_since is not None and self._best is None:
             why += ", from the last mean, because none was evaluated"
         self._begun.append(BegunStage(stage, self._generation, why, origin))
         self._steps = 0

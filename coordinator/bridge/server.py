@@ -28,8 +28,8 @@ def serve(config: BridgeConfig, network: Network, on_ready: Callable[[str], None
             server_config(app, BridgeConnection, timeout_keep_alive=KEEP_ALIVE),
             changes,
         )
-        on_ready(config.address(listening.getsockname()[1]))
-        run_server(server, listening)
+        address = config.address(listening.getsockname()[1])
+        run_server(server, listening, lambda: on_ready(address))
 
 
 class BridgeConnection(HttpConnection):

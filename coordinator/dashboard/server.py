@@ -39,13 +39,14 @@ def serve(
             feed,
             views,
         )
-        on_ready(config.address(listening.getsockname()[1]))
-        run_server(server, listening)
+        address = config.address(listening.getsockname()[1])
+        run_server(server, listening, lambda: on_ready(address))
 
 
-def run_server(server: uvicorn.Server, listening: socket.socket) -> None:
+def run_server(server: uvicorn.Server, listening: socket.socket, on_ready: Callable[[], None]) -> None:
     """Serve until Ctrl-C or SIGTERM. uvicorn sends this process the signal again, once it has shut down."""
     with suppress(KeyboardInterrupt), interrupted_by_signals():
+        on_ready()
         server.run(sockets=[listening])
 
 

@@ -51,8 +51,6 @@ def split_first_stage(stages: tuple[StageSettings, ...]) -> tuple[dict[str, Any]
     first = stages[0]
     if first.restart:
         raise UsageError("stage 1: restart is for a later stage, which searches anew where the run began; omit it")
-    if first.from_best:
-        raise UsageError("stage 1: from_best is for a later stage; omit it")
     if first.whole:
         raise UsageError("stage 1: whole is for a later stage, which leaves the subspace; omit --subspace instead")
     return first.overrides, (first.end, *stages[1:]) if first.has_end or len(stages) > 1 else ()
@@ -79,8 +77,6 @@ def check_schedule(settings: RunSettings) -> None:
                 f"stage {stage.number} is a restart, which searches as stage {before.number} does and may be left out: "
                 f"omit {named}"
             )
-        if each.from_best and not each.restart:
-            raise UsageError(f"stage {stage.number}: from_best is for a restart; give it restart = true, or omit that")
         if each.whole and before.whole:
             raise UsageError(f"stage {stage.number}: the search is whole already; omit that, or give --subspace")
         if each.whole and each.sigma0 is None:

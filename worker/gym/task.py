@@ -7,6 +7,7 @@ imported first, `gym:my_package:MyWorld-v0`. `with_options` makes of it the task
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -127,8 +128,8 @@ class GymTask(Task):
     def _check_version(self, environment: gymnasium.Env[Any, Any]) -> None:
         """`UsageError` for a name without a version: gymnasium takes its newest, and a later gymnasium another one."""
         module, colon, name = self._id.rpartition(":")
-        found = name if environment.spec is None else environment.spec.id
-        if found != name:
+        found = "" if environment.spec is None else environment.spec.id
+        if re.fullmatch(rf"{re.escape(name)}-v\d+", found, re.ASCII):
             raise UsageError(f"task {self.name} names no version: write {GYM}:{module}{colon}{found}")
 
     def _open(

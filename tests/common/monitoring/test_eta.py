@@ -39,11 +39,16 @@ def test_a_paused_generation_does_not_change_the_pace():
 
 def test_the_pace_counts_the_evaluations_between():
     settings = dataclasses.replace(STATUS.settings, evaluate_every=4)
-    recent = tuple(dataclasses.replace(CLOSED, number=n, seconds=45.0 if n % 4 == 0 else 5.0) for n in range(1, 13))
-    paused = (*recent[:-1], dataclasses.replace(recent[-1], seconds=9000.0))
-    for each in (recent, paused):
-        eta = estimate_eta(dataclasses.replace(status({"generations": 9}), settings=settings, recent=each))
-        assert eta.pace == pytest.approx((45 + 5 + 5 + 5) / 4)
+
+    def pace(seconds):
+        recent = tuple(dataclasses.replace(CLOSED, number=n, seconds=each) for n, each in enumerate(seconds))
+        return estimate_eta(dataclasses.replace(status(), settings=settings, recent=recent)).pace
+
+    assert pace([5.0, 5.0, 5.0, 45.0] * 3) == pytest.approx((45 + 5 + 5 + 5) / 4)
+    assert pace([5.0, 5.0, 5.0, 45.0] * 2 + [5.0, 5.0, 5.0, 9000.0]) == pytest.approx(15.0)
+    assert pace([300.0, 5.0, 5.0, 45.0]) == pytest.approx(25.0), "one interval tells nothing yet"
+    assert pace([300.0, 5.0, 5.0, 45.0, 5.0, 5.0, 5.0, 45.0]) == pytest.approx(15.0)
+    assert pace([5.0] * 12 + [60.0] * 6) == pytest.approx(60.0), "a new stage shows after six generations"
 
 
 def test_the_open_generations_elapsed_time_counts():
@@ -52,7 +57,7 @@ def test_the_open_generations_elapsed_time_counts():
 
 
 def test_an_overdue_generation_without_a_step_has_no_estimate():
-    overdue = status({"generations": 9}, gone=9.3)
+    overdue = status({"generations": 9}, gone=69.3)
     stalled = dataclasses.replace(overdue, throughput=dataclasses.replace(overdue.throughput, steps_per_second=0.0))
     assert estimate_eta(overdue).seconds is not None
     assert estimate_eta(stalled).description == "7 of 9 generations, 4.6 s a generation"

@@ -127,29 +127,6 @@ def test_a_new_search_after_restarts_begins_at_the_best_mean_of_them_all(means, 
     assert {each.origin for each in begun_stages(scheduled(*plain), history(*[10] * 12), evaluated(means))} == {None}
 
 
-@pytest.mark.parametrize(
-    ("means", "origins"),
-    [
-        ({}, [None, None, None, None]),
-        ({1: 10.0, 3: 20.0, 5: 40.0, 7: 45.0}, [None, 1, 5, 7]),  # that of generation 3 counts from 6 on, of 7 from 10
-        ({1: 40.0, 3: 20.0, 5: 10.0}, [None, 1, 1, 1]),
-        ({1: 10.0, 3: 20.0, 5: 60.0}, [None, 1, 5]),
-    ],
-)
-def test_a_restart_from_the_best_goes_on_where_the_searches_before_it_came_highest(means, origins):
-    first, *again, last = RESTARTED
-    stages = [first, *(replace(each, from_best=True) for each in again), replace(last, sigma0=0.2)]
-    found = begun_stages(scheduled(*stages), history(*[10] * 12), evaluated(means))
-    assert [each.origin for each in found] == origins
-    assert not any("none was evaluated" in each.why for each in found[:-1])
-    assert [each.description.count("a search from the best mean") for each in stages_of(scheduled(*stages))] == [
-        0,
-        1,
-        1,
-        0,
-    ]
-
-
 def test_a_restart_is_a_search_of_its_own():
     stages = stages_of(scheduled(*RESTARTED))
     assert [each.search for each in stages] == [1, 2, 3, 3]

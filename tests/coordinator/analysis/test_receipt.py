@@ -71,6 +71,8 @@ def test_replaced_seeds_are_counted(change, printed, tmp_path):
             assert said == (count == 2)
             assert json.loads(printed(verb, "reality", "--json"))["replaced_seeds"] == count
         change(("UPDATE generation SET seeds = ? WHERE number = 1", (json.dumps(later),)))
+    change(("UPDATE generation SET seeds = '[0.5]' WHERE number = 1",))
+    assert json.loads(printed("show", "reality", "--json"))["replaced_seeds"] == 0, "the rest is shown all the same"
 
 
 def test_no_bits_are_promised_where_there_are_none(change, printed):

@@ -104,8 +104,6 @@ def test_what_no_schedule_can_be_is_one_line(read, text, says):
         ("[[stage]]\nrestart = true\nscore = 1.0\n" + NEXT, "stage 1: restart is for a later stage"),
         ("[[stage]]\ngenerations = 3\n[[stage]]\nrestart = true\nscore = 1.0\n" + NEXT, "give stage 1 a score"),
         ("[[stage]]\nscore = 1.0\n[[stage]]\nrestart = true\n", "stage 2 is the last and a restart"),
-        ("[[stage]]\nfrom_best = true\nscore = 1.0\n" + NEXT, "stage 1: from_best is for a later stage"),
-        ("[[stage]]\nscore = 1.0\n[[stage]]\nfrom_best = true\n", "stage 2: from_best is for a restart"),
         (
             "[[stage]]\nscore = 1.0\n[[stage]]\nrestart = true\nsteps = 9\npopulation = 8\nsigma0 = 0.2\n" + NEXT,
             "stage 2 is a restart, which searches as stage 1 does and may be left out: omit population, sigma0",

@@ -122,9 +122,8 @@ def test_a_generation_waits_for_the_check_that_may_end_its_stage_and_for_no_othe
     assert bench.outcome() == undisturbed
 
 
-@pytest.mark.parametrize("from_best", [False, True])
-def test_a_restart_begins_where_it_says_and_what_follows_at_the_best_also_after_a_kill(staged, from_best):
-    again = StageSettings(3, score=1e6, restart=True, from_best=from_best)
+def test_a_restart_begins_at_the_first_mean_and_what_follows_at_the_best_also_after_a_kill(staged):
+    again = StageSettings(3, score=1e6, restart=True)
     settings = replace(STAGED, stages=(StageSettings(3, score=1e6), again, again, StageSettings(sigma0=0.05)))
     calm, bench = staged("calm", settings=settings), staged("night", settings=settings)
     calm.drive(lambda _: 0)
@@ -134,9 +133,8 @@ def test_a_restart_begins_where_it_says_and_what_follows_at_the_best_also_after_
             number: [run.candidate(number, index).tobytes() for index in range(6)] for number in range(GENERATIONS)
         }
     assert [(each.stage.number, each.since) for each in begun] == [(1, 0), (2, 3), (3, 6), (4, 9)]
-    assert [each.origin for each in begun] == ([None, None, 1, 1] if from_best else [None, None, None, 1])
     best = np.frombuffer(calm.journal.evaluated_vector(1), "<f4").astype(float)
-    starts = zip(begun, [None if each.origin is None else best for each in begun], strict=True)
+    starts = zip(begun, [None] * 3 + [best], strict=True)
     anew = [Evolution(EvolutionConfig.of(settings, each.stage), at).ask() for each, at in starts]
     assert [found[each.since] for each in begun] == [list(map(vector_bytes, each)) for each in anew]
     assert found[0] != found[3] != found[6]

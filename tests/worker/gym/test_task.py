@@ -212,6 +212,12 @@ def test_a_run_names_the_environments_version():
         describe_task("gym:gymnasium:CartPole", {})
 
 
+def test_a_name_with_a_version_is_taken_although_the_environment_shows_that_of_another(monkeypatch):
+    inside = gymnasium.make("CartPole-v1")
+    monkeypatch.setattr("dreamfleet.worker.gym.task.make_environment", lambda *_: inside)
+    assert describe_task("gym:MyCart-v0", {}).observations == 4
+
+
 def test_unknown_options_and_arguments_are_refused():
     with pytest.raises(UsageError, match="knows no option wings: environment, normalise"):
         describe_task(CARTPOLE, {"wings": 2})
