@@ -125,9 +125,10 @@ def format_duration(seconds: float) -> str:
 def _pace(status: Status) -> float | None:
     """Seconds a generation of late; `None` before the first is closed.
 
-    That is the median of the last ones, which ignores a generation that was paused for hours. In some of them the
-    fleet drives an evaluation too. What this takes is the median of what the last intervals of evaluations took beyond
-    their own medians: of three, or the less of two. One alone may hold the run's first generation, a long one.
+    That is the median of the last ones, which ignores a generation that was paused for hours, and a share of an
+    evaluation. Each interval between evaluations has a generation that its evaluation makes longer. The interval's
+    time beyond its own median is the evaluation's. Of the last three intervals the median counts, of two the smaller.
+    One interval alone does not count: the run's first generation is often a long one.
     """
     recent, every = status.recent, max(status.settings.evaluate_every, 1)
     if not recent:

@@ -308,11 +308,11 @@ def count_failed(history: Iterable[StoredGeneration]) -> int:
 
 
 def describe_failed(settings: RunSettings, history: Sequence[StoredGeneration], reseeds: int) -> str:
-    """How many candidates failed, how many sets of seeds too, and the setting that says what becomes of candidates."""
+    """How many candidates failed, the setting that says what becomes of them, and how many sets of seeds failed."""
     found = f"{count_failed(history)} in {plural(len(history), 'closed generation')}"
     found += f" (--on-failure {settings.on_failure})"
     sets = plural(reseeds, "set of seeds", "sets of seeds")
-    return f"{found}; {sets} on which all candidates failed, replaced" if reseeds else found
+    return f"{found}; {sets} replaced, because all candidates failed" if reseeds else found
 
 
 def with_error(found: StoredEvaluation | StoredConfirmation) -> dict[str, Any]:

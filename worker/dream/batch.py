@@ -101,10 +101,8 @@ class DreamSums:
 
     def add(self, rows: NDArray[np.int64], reward: NDArray[np.float64], action: NDArray[np.float32]) -> None:
         """Add a step of `rows`: its rewards `(rows,)` and actions `(rows, actions)`."""
-        finite = np.isfinite(action)
-        if not finite.all():  # no world takes such an action, and a model of integers would see a number in it
-            reward = np.where(finite.all(axis=1), reward, np.nan)
-        self.fitness[rows] += reward
+        # No world takes such an action, and a model of integers would see a number in it.
+        self.fitness[rows] += np.where(np.isfinite(action).all(axis=1), reward, np.nan)
         self._steps[rows] += 1
         self.made += len(rows)
         if self._measurer.names:

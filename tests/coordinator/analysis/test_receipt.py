@@ -67,7 +67,7 @@ def test_replaced_seeds_are_counted(change, printed, tmp_path):
         later = training_seeds(run.settings.seed, 1, run.settings.episodes, 2)
     for count in (0, 2):
         for verb in ("receipt", "show"):
-            said = "2 sets of seeds on which all candidates failed, replaced" in printed(verb, "reality")
+            said = "2 sets of seeds replaced, because all candidates failed" in printed(verb, "reality")
             assert said == (count == 2)
             assert json.loads(printed(verb, "reality", "--json"))["replaced_seeds"] == count
         change(("UPDATE generation SET seeds = ? WHERE number = 1", (json.dumps(later),)))
