@@ -91,7 +91,7 @@ def test_each_may_do_what_its_role_says_and_the_run_is_none_the_worse(processes,
         assert not heard
         operator.control("safe", "resume")
         worker = work(processes, access, endpoint, "first")
-        worker.wait_for("joined")
+        until(lambda: operator.workers("safe"), "the worker is not listed")
         assert {each.worker.split("/")[0].rpartition(".")[2] for each in operator.workers("safe")} == {"1"}
         assert operator.status().expires > time.time() + 80 * 86400
         until(lambda: not operator.runs(), "the run does not end")

@@ -51,8 +51,9 @@ def test_a_worker_drops_what_is_malformed_or_of_another_coordinator(processes, r
         "--generations", 5,
     )  # fmt: skip
     worker = processes.worker("--task", tasks.SLOW_TOY, "--exit-when-done")
-    worker.wait_for("joined")
-    identity = processes.status()["worker_list"][0]["worker"]
+    while not (workers := processes.status()["worker_list"]):
+        pass
+    identity = workers[0]["worker"]
     with open_session(Network(connect=(processes.endpoint,))) as session:
         for payload in (b"", b"\xc1\xff", bytes(MAX_MESSAGE + 1), encode(MSGPACK["job"]), encode(MSGPACK["beat"])):
             session.put(keys.job("test", identity), payload)

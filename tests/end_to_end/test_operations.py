@@ -26,8 +26,7 @@ def test_a_run_ends_with_its_workers_and_one_of_any_run_waits_for_the_next(proce
     coordinator = processes.coordinator("--task", tasks.SLOW_TOY, "--generations", 10**6, "--evaluate-every", 0)
     flags = ("--task", tasks.SLOW_TOY)
     own, anyone = processes.worker(*flags), processes.worker("--any", *flags)
-    own.wait_for("joined")
-    anyone.wait_for("joined")
+    coordinator.wait_for(" joined", times=2)  # the workers' own logs say it sooner
     code, out, _ = processes.call("stop", "test", "--workers", "--connect", processes.endpoint, "--json")
     assert code == 0
     assert json.loads(out)["asked"] == "disband"
