@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import difflib
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, NoReturn
@@ -16,17 +16,19 @@ from dreamfleet.common.cli.removed import FLAGS_ELSEWHERE, REMOVED_FLAGS
 from dreamfleet.common.errors import UsageError
 
 MIN_LIKENESS = 0.65  # of an unknown flag and the one that is suggested
+MAX_LONGER = 3  # flags that are suggested for one that shortens them
 
 
 class Parser(argparse.ArgumentParser):
     """A verb's parser: each error is one line, and the one for an unknown flag suggests the nearest.
 
-    `--help` shows the flags that most people need, `--help-all` all of them.
+    `--help` shows the flags that most people need, `--help-all` all of them. A flag is written whole: a short form
+    of today may mean another flag tomorrow.
     """
 
     def __init__(self, *, verb: str, **more: Any) -> None:
         """`verb` is the name of its entry point; `more` is as of `ArgumentParser`."""
-        super().__init__(add_help=False, formatter_class=_Formatter, **more)
+        super().__init__(add_help=False, allow_abbrev=False, formatter_class=_Formatter, **more)
         self._verb = verb
         self.keys: dict[str, Mapping[str, str]] = {}  # texts of settings that are no flags, by the group's title
         self.add_argument("-h", "--help", action="help", help="show the first flags")
@@ -56,13 +58,8 @@ class Parser(argparse.ArgumentParser):
         """An error that suggests the nearest flag, if one of `words` is an unknown flag like a known one."""
         for word in words:
             flag = word.split("=")[0]
-            known = any(each.startswith(flag) for each in self._option_string_actions)
-            if (
-                flag.startswith("--")
-                and flag != "--"
-                and not known
-                and _nearest_flag(flag, self._option_string_actions)
-            ):
+            known = self._option_string_actions
+            if flag.startswith("--") and flag != "--" and flag not in known and _near_flags(flag, known):
                 self._refuse([word], words)
 
     def format_help(self) -> str:
@@ -125,7 +122,7 @@ class Parser(argparse.ArgumentParser):
             if word.startswith("--") and (answer := self._describe_moved(word, unknown[at + 1 :])):
                 raise UsageError(answer)
         flags = [word.split("=")[0] for word in unknown if word.startswith("--")]
-        near = [each for flag in flags for each in _nearest_flag(flag, self._option_string_actions)]
+        near = [each for flag in flags for each in _near_flags(flag, self._option_string_actions)]
         if near:
             raise UsageError(f"{said}; did you mean {', '.join(dict.fromkeys(near))}?")
         self.error(said)
@@ -183,8 +180,11 @@ def _is_value(word: str) -> bool:
     return not word.startswith("--")
 
 
-def _nearest_flag(flag: str, known: Iterable[str]) -> list[str]:
-    """The known flag that is most like an unknown one, if any is: an equal beginning counts most."""
+def _near_flags(flag: str, known: Collection[str]) -> list[str]:
+    """The known flags that an unknown one shortens, or the one that is most like it: an equal beginning counts most."""
+    longer = [each for each in known if each.startswith(flag)]
+    if 0 < len(longer) <= MAX_LONGER:
+        return longer
 
     def likeness(other: str) -> float:
         begins = len(list(takewhile(lambda pair: pair[0] == pair[1], zip(flag[2:], other[2:], strict=False))))

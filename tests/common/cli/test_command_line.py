@@ -41,6 +41,8 @@ def points(*more):
         (("runs", "export", "dream", "--csv", "out.csv"), "--csv takes no value, and 'out.csv' stands behind it"),
         (("runs", "export", "--csv", "out.csv"), "write dreamfleet runs export RUN --csv --out FOLDER"),
         (("worker", "--conect", "tcp/a:1"), "did you mean --connect?"),
+        (("coordinator", "--gen", "3"), "unrecognized arguments: --gen 3; did you mean --generations?"),
+        (("evaluate", "--ep", "3"), "did you mean --episodes?"),
         (("train", "vae", "--data", "x", "--updats", "3"), "did you mean --updates?"),
         (("status", "--xyzzy"), "unrecognized arguments: --xyzzy; `dreamfleet status --help` lists the flags\n"),
     ],
