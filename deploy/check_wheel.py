@@ -18,6 +18,7 @@ EXPECTED = (
     "dreamfleet/py.typed",
     "dreamfleet/common/pretrained/tiny.zip",
     "dreamfleet/coordinator/dashboard/page/index.html",
+    "dreamfleet/deploy/systemd/dreamfleet-coordinator@.service",
     "dreamfleet/docs/index.md",
     "dreamfleet/docs/tutorials/own-environment.md",
     "dreamfleet/coordinator/dashboard/page/main.js",

@@ -14,6 +14,7 @@ LAST_STREAM = 2  # file descriptor of stderr
 def prepare_streams() -> None:
     """Open closed streams on nothing, write what an encoding lacks as escape sequences, and let stderr lose text."""
     _open_closed_streams()
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # it greets on stdout, where a document may go
     if sys.stderr is sys.__stderr__ and isinstance(sys.stderr, TextIOWrapper):
         buffer = BufferedWriter(_LossyFile(LAST_STREAM, "w", closefd=False))
         sys.stderr = TextIOWrapper(buffer, sys.stderr.encoding, line_buffering=True, write_through=True)

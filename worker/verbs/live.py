@@ -65,7 +65,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Show until it is over, closed, or stopped."""
     _check(args)
-    os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"  # a greeting on stdout, where a stream may go
     if args.out is not None:
         os.environ["SDL_VIDEODRIVER"] = "dummy"
     from dreamfleet.common.host.stop_signals import stop_on_signals
