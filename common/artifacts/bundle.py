@@ -228,6 +228,8 @@ class Bundle(Displayed):
         """
         found = self.with_options(controller.shape, controller.options)
         if controller.bundle not in self.same_models:
+            from dreamfleet.common.artifacts.bundle_store import describe_bundle  # imports this module
+
             raise ControllerError(
                 f"the controller belongs to {describe_bundle(controller.bundle)}, not to {self.path.name} "
                 f"({self.sha256[:12]}...): omit --bundle, or fit it to this one by `dreamfleet lab refit`"
@@ -381,8 +383,3 @@ def _read_manifest(archive: Archive, path: Path) -> BundleManifest:
 
 def _is_number(value: Any) -> bool:
     return type(value) in (int, float) and bool(np.isfinite(value))
-
-
-def describe_bundle(sha256: str) -> str:
-    """Name a world model by its hash for an error text; an empty hash is none."""
-    return f"the world model {sha256[:12]}" if sha256 else "no world model"

@@ -148,6 +148,15 @@ def shipped_names() -> tuple[str, ...]:
     return (*shipped_bundles(), *(path.stem for path, _ in _shipped_deltas()))
 
 
+def describe_bundle(sha256: str) -> str:
+    """Name a world model for an error text, by its hash and, if it ships, by its name; an empty hash is none."""
+    if not sha256:
+        return "no world model"
+    named = [name for name, path in shipped_bundles().items() if hash_file(path) == sha256]
+    named += [path.stem for path, delta in _shipped_deltas() if delta.sha256 == sha256]
+    return f"the world model {named[0]} ({sha256[:12]})" if named else f"the world model {sha256[:12]}"
+
+
 def find_bundle(name: str) -> Bundle:
     """A shipped bundle by name, or any bundle by path; `BundleError` if there is none.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.bundle_store import describe_bundle
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.errors import UsageError
@@ -16,9 +17,9 @@ NO_SUBSPACE = "none"
 def check_subspace(subspace: Subspace, spec: TaskSpec, shape: ControllerShape, bundle: Bundle | None) -> None:
     """`UsageError` for a subspace of another world model, or of controllers with other inputs."""
     if bundle is None or subspace.bundle not in bundle.same_models:
-        own = f"world model {spec.bundle[:12]}" if spec.bundle else "a task without a world model"
         raise UsageError(
-            f"--subspace (given, or the preset's) belongs to world model {subspace.bundle[:12]}, the run uses {own}: "
+            f"--subspace (given, or the preset's) belongs to {describe_bundle(subspace.bundle)}, "
+            f"the run uses {describe_bundle(spec.bundle)}: "
             f"give its own --bundle, or --subspace {NO_SUBSPACE}"
         )
     if (inputs := subspace.weights.shape[1]) != shape.features:

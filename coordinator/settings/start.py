@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.bundle import Bundle, describe_bundle
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.bundle_store import describe_bundle
 from dreamfleet.common.artifacts.driving import Variant
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.errors import ControllerError, DreamfleetError, JournalError

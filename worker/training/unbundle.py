@@ -18,8 +18,8 @@ from dreamfleet.common.artifacts.bundle import (
     SINGLE_PRECISION,
     WEIGHTS,
     Bundle,
-    describe_bundle,
 )
+from dreamfleet.common.artifacts.bundle_store import describe_bundle
 from dreamfleet.common.errors import BundleError, DatasetError, UsageError
 from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.printable import one_line

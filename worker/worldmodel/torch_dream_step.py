@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, EIGHT_BITS, SINGLE_PRECISION, Bundle, describe_bundle
+from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, EIGHT_BITS, SINGLE_PRECISION, Bundle
+from dreamfleet.common.artifacts.bundle_store import describe_bundle
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.serialization.validation import from_plain
 from dreamfleet.worker.worldmodel.choice_memory import ChoiceMemory

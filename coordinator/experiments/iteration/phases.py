@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.bundle import SINGLE_PRECISION, WEIGHTS, Bundle, describe_bundle
+from dreamfleet.common.artifacts.bundle import SINGLE_PRECISION, WEIGHTS, Bundle
+from dreamfleet.common.artifacts.bundle_store import describe_bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli.model_commands import Model, Words
 from dreamfleet.common.errors import BundleError, DatasetError, UsageError

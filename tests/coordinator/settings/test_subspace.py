@@ -115,11 +115,11 @@ def test_without_one_there_is_nothing_to_leave(random_bundle):
 
 def test_one_of_another_world_model_or_of_other_eyes_is_refused(random_bundle):
     features = random_bundle.controller_shape.features
-    with pytest.raises(UsageError, match="belongs to world model abababababab"):
+    with pytest.raises(UsageError, match="belongs to the world model abababababab"):
         RunConfig(loaded_subspace=few(features)).settings(random_bundle)
     with pytest.raises(UsageError, match=f"see {features - 1} numbers, .* and this run's see {features}"):
         RunConfig(loaded_subspace=few(features - 1, random_bundle.sha256)).settings(random_bundle)
-    with pytest.raises(UsageError, match="without a world model"):
+    with pytest.raises(UsageError, match="uses no world model"):
         RunConfig(task="gym:CartPole-v1", loaded_subspace=few(4)).settings(None)
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from dreamfleet.common.artifacts.actions import Continuous
 from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.bundle_store import describe_bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ControllerError
 from dreamfleet.worker.scoring.actors import ControllerActor
@@ -26,7 +27,7 @@ class Pilot:
         """`ControllerError` unless its task is the data set's world and its pictures have this preprocessing."""
         if self.controller.bundle != self.bundle.sha256:
             raise ControllerError(
-                f"the controller belongs to the world model {self.controller.bundle[:12]}..., not to {self.bundle.path}"
+                f"the controller belongs to {describe_bundle(self.controller.bundle)}, not to {self.bundle.path}"
             )
         own, seen = DataWorld.of(self.bundle), self.bundle.manifest.preprocessing
         if (own, seen) != (world, preprocessing):
