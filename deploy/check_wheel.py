@@ -18,6 +18,7 @@ EXPECTED = (
     "dreamfleet/py.typed",
     "dreamfleet/common/pretrained/tiny.zip",
     "dreamfleet/coordinator/dashboard/page/index.html",
+    "dreamfleet/deploy/begin.sh",
     "dreamfleet/deploy/systemd/dreamfleet-coordinator@.service",
     "dreamfleet/docs/index.md",
     "dreamfleet/docs/tutorials/own-environment.md",

@@ -152,8 +152,10 @@ def describe_bundle(sha256: str) -> str:
     """Name a world model for an error text, by its hash and, if it ships, by its name; an empty hash is none."""
     if not sha256:
         return "no world model"
-    named = [name for name, path in shipped_bundles().items() if hash_file(path) == sha256]
-    named += [path.stem for path, delta in _shipped_deltas() if delta.sha256 == sha256]
+    named: list[str] = []
+    with suppress(OSError, BundleError):  # a damaged file that ships is another error than this one
+        named += [name for name, path in shipped_bundles().items() if hash_file(path) == sha256]
+        named += [path.stem for path, delta in _shipped_deltas() if delta.sha256 == sha256]
     return f"the world model {named[0]} ({sha256[:12]})" if named else f"the world model {sha256[:12]}"
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import NoReturn, Protocol
 
 from dreamfleet.common.cli.parser import Parser
-from dreamfleet.common.cli.removed import describe_removed
+from dreamfleet.common.cli.removed import OTHER_NAMES, describe_removed
 from dreamfleet.common.errors import DreamfleetError, MissingExtraError, UsageError
 from dreamfleet.common.host.logs import configure_logging, report_failure
 from dreamfleet.common.host.packages import extra_of
@@ -186,7 +186,7 @@ class _Overview(argparse.ArgumentParser):
     """The parser of no verb: its help lists all verbs by what people do."""
 
     def __init__(self, points: Mapping[str, EntryPoint]) -> None:
-        super().__init__(prog="dreamfleet", usage="dreamfleet VERB ...")
+        super().__init__(prog="dreamfleet", usage="dreamfleet VERB ...", allow_abbrev=False)
         self._points = points
 
     def format_help(self) -> str:
@@ -199,7 +199,7 @@ class _Overview(argparse.ArgumentParser):
 
 def _help_parser(prog: str, names: Iterable[str], points: Mapping[str, EntryPoint]) -> argparse.ArgumentParser:
     """A parser whose help lists a group's verbs; one that cannot be loaded is marked as broken."""
-    parser = argparse.ArgumentParser(prog=prog, description=DESCRIPTION, epilog=EXIT_CODES)
+    parser = argparse.ArgumentParser(prog=prog, description=DESCRIPTION, epilog=EXIT_CODES, allow_abbrev=False)
     verbs = parser.add_subparsers(metavar="VERB")
     for name in sorted(names):
         verbs.add_parser(name.rpartition(".")[2], help=_summary(points[name]).replace("%", "%%"))
@@ -219,7 +219,8 @@ def _unknown_verb_text(words: Sequence[str], spoken: Sequence[str], points: Iter
     same = sorted(verb for verb in verbs if " " in verb and verb.split()[1] == spoken[-1])  # without its group
     two = difflib.get_close_matches(" ".join(words[:2]), [verb for verb in verbs if " " in verb], n=1, cutoff=0.8)
     known = sorted({*verbs, *_top_level_names(points)})
-    near = two or same or difflib.get_close_matches(" ".join(spoken), known, n=1)
+    other = [OTHER_NAMES[words[0]]] if words[0] in OTHER_NAMES else []
+    near = two or other or same or difflib.get_close_matches(" ".join(spoken), known, n=1)
     meant = " or ".join(f"{each!r}" for each in near)
     return f"unknown verb {' '.join(spoken)!r}" + (
         f": did you mean {meant}?" if near else "; `dreamfleet --help` lists them"

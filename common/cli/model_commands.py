@@ -121,7 +121,7 @@ def split_flags(flag: str, text: str, owner: str = "", reserved: Sequence[str] =
     except ValueError as error:
         raise UsageError(f"{flag} {text!r}: {error}") from error
     given = {word.partition("=")[0] for word in words if word.startswith("--")}
-    if taken := [each for each in reserved if any(each.startswith(word) for word in given)]:  # argparse takes prefixes
+    if taken := [each for each in reserved if any(each.startswith(word) for word in given)]:  # a short form too
         raise UsageError(f"{flag}: omit {', '.join(taken)}, which {owner} sets itself")
     return words
 

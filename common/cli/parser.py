@@ -16,7 +16,6 @@ from dreamfleet.common.cli.removed import FLAGS_ELSEWHERE, REMOVED_FLAGS
 from dreamfleet.common.errors import UsageError
 
 MIN_LIKENESS = 0.65  # of an unknown flag and the one that is suggested
-MAX_LONGER = 3  # flags that are suggested for one that shortens them
 
 
 class Parser(argparse.ArgumentParser):
@@ -46,9 +45,9 @@ class Parser(argparse.ArgumentParser):
         """Parse `words`; exits with an error on an unknown one."""
         try:
             args, unknown = self.parse_known_args(words)
-        except UsageError as error:
-            if "are required:" in str(error):  # perhaps because one is misspelt
-                self._refuse_misspelt(words)
+        except UsageError:
+            self._refuse_misspelt(words)  # perhaps its value was taken for a verb's word
+            self._refuse_bare(words)
             raise
         if unknown:
             self._refuse(unknown, words)
@@ -57,10 +56,17 @@ class Parser(argparse.ArgumentParser):
     def _refuse_misspelt(self, words: Sequence[str]) -> None:
         """An error that suggests the nearest flag, if one of `words` is an unknown flag like a known one."""
         for word in words:
-            flag = word.split("=")[0]
-            known = self._option_string_actions
-            if flag.startswith("--") and flag != "--" and flag not in known and _near_flags(flag, known):
+            flag, known = word.split("=")[0], self._option_string_actions
+            if " " in word or flag in (*known, "--"):  # flags of another verb, given as one text
+                continue
+            if flag.startswith("--") and _near_flags(flag, known):
                 self._refuse([word], words)
+
+    def _refuse_bare(self, words: Sequence[str]) -> None:
+        """An error that names the flag, if the first of `words` is a controller and stands without one."""
+        takes_words = any(not each.option_strings for each in self._actions)
+        if words and not words[0].startswith("-") and not takes_words and "--controller" in self._option_string_actions:
+            raise UsageError(f"{words[0]!r} is no flag; did you mean --controller {words[0]}?")
 
     def format_help(self) -> str:
         """The help text with the first flags; where some are left out it says how to see them."""
@@ -125,6 +131,7 @@ class Parser(argparse.ArgumentParser):
         near = [each for flag in flags for each in _near_flags(flag, self._option_string_actions)]
         if near:
             raise UsageError(f"{said}; did you mean {', '.join(dict.fromkeys(near))}?")
+        self._refuse_bare(words)
         self.error(said)
 
     def _describe_moved(self, word: str, following: Sequence[str]) -> str | None:
@@ -183,8 +190,8 @@ def _is_value(word: str) -> bool:
 def _near_flags(flag: str, known: Collection[str]) -> list[str]:
     """The known flags that an unknown one shortens, or the one that is most like it: an equal beginning counts most."""
     longer = [each for each in known if each.startswith(flag)]
-    if 0 < len(longer) <= MAX_LONGER:
-        return longer
+    if longer and flag != "--":
+        return [flag] if flag in known else longer
 
     def likeness(other: str) -> float:
         begins = len(list(takewhile(lambda pair: pair[0] == pair[1], zip(flag[2:], other[2:], strict=False))))

@@ -22,6 +22,16 @@ REMOVED_VERBS = {
     "up": "spawn --hosts",
 }
 
+# What other programs call a verb of ours.
+OTHER_NAMES = {
+    "evolve": "coordinator",
+    "help": "--help",
+    "kill": "stop",
+    "run": "coordinator",
+    "search": "coordinator",
+    "start": "coordinator",
+}
+
 # By the verb's entry point and the flag: what to do instead.
 REMOVED_FLAGS = {
     ("evaluate", "--data"): "name the training's folder as --controller FOLDER",
@@ -31,6 +41,7 @@ REMOVED_FLAGS = {
 
 # Flags that people look for in a verb, and where they are.
 FLAGS_ELSEWHERE = {
+    ("evaluate", "--tracks"): "give --episodes N, the number of tracks",
     ("coordinator", "--workers"): "workers are programs of their own: `dreamfleet worker --run NAME --slots N`",
     ("coordinator", "--slots"): "slots are a worker's: `dreamfleet worker --run NAME --slots N`",
     ("coordinator", "--log-to"): "give DREAMFLEET_NETWORK_LOG_TO=tensorboard, or `log_to` in a file's [network]",

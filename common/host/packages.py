@@ -23,6 +23,7 @@ PACKAGES = {
     "box2d": ("Box2D", "worker"),
     "onnxruntime": ("onnxruntime", "worker"),
     "vizdoom": ("vizdoom", "doom"),
+    "cryptography": ("cryptography", "access"),
     "av": ("av", "views"),
     "matplotlib": ("matplotlib", "views"),
     "torch": ("torch", "train"),

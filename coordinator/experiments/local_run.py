@@ -196,7 +196,10 @@ def parse_run_flags(flags: Sequence[str], sources: Mapping[str, Any], verb: str)
     from dreamfleet.common.cli.command_line import build_parser
     from dreamfleet.coordinator.settings import run_setup
 
-    parsed = build_parser("coordinator", run_setup).parse_all(list(flags))
+    try:
+        parsed = build_parser("coordinator", run_setup).parse_all(list(flags))
+    except UsageError as error:
+        raise UsageError(f"--run-flags: {error}") from error
     if taken := [flag for name, flag in RESERVED.items() if getattr(parsed, name, None) is not None]:
         raise UsageError(f"{', '.join(taken)} in --run-flags: {verb} sets them for each run; give --config to {verb}")
     config, limits = load_parsed_flags(parsed, sources)

@@ -119,6 +119,7 @@ def minimise(
     >>> found.fun <= 0.01, found.success, bool(np.abs(found.x).max() <= 0.01)
     (True, True, True)
     """
+    check_names(settings)
     given = {"penalty": penalty, "minimise": True, "integer": integer, "log": log}
     objective = read_objective(x0, sigma0, bounds, given)
     return _Searches(
@@ -140,6 +141,7 @@ def maximise(
     >>> found.fun >= 1.9
     True
     """
+    check_names(settings)
     given = {"penalty": penalty, "minimise": False, "integer": integer, "log": log}
     objective = read_objective(x0, sigma0, bounds, given)
     return _Searches(
@@ -202,7 +204,6 @@ class _Searches:
         self, name: str | None, popsize: int | None, restarts: int, kind: Restart, settings: dict[str, Any]
     ) -> SearchResult:
         """Search, restart while nothing else ends it, and say what was found; `UsageError` for wrong settings."""
-        check_names(settings)
         if kind not in ("ipop", "bipop"):
             raise UsageError(f"restart must be 'ipop' or 'bipop', not {kind!r}")
         for what, value, least in (
