@@ -6,6 +6,7 @@ import numpy as np
 import onnx
 import pytest
 
+from dreamfleet.common.artifacts import bundle_store
 from dreamfleet.common.artifacts.bundle import (
     DECODER,
     DREAM_GRAPH,
@@ -17,7 +18,7 @@ from dreamfleet.common.artifacts.bundle import (
     hash_file,
     write_bundle,
 )
-from dreamfleet.common.artifacts.bundle_store import BundleStore, find_bundle, shipped_bundles
+from dreamfleet.common.artifacts.bundle_store import BundleStore, describe_bundle, find_bundle, shipped_bundles
 from dreamfleet.common.errors import BundleError
 from tests.support.bundles import states, write_random_bundle
 
@@ -186,3 +187,16 @@ def test_an_invalid_hash_never_becomes_a_path(tmp_path, name):
     with pytest.raises(BundleError, match="not the hash of a bundle"), store.lock_download(name):
         pass
     assert not list(tmp_path.iterdir())
+
+
+def test_an_error_text_names_what_ships_and_is_no_error_of_a_file_that_is_damaged(tmp_path, monkeypatch):
+    for name in ("tiny", "able"):
+        sha256 = find_bundle(name).sha256
+        assert describe_bundle(sha256) == f"the world model {name} ({sha256[:12]})"
+    assert describe_bundle("") == "no world model"
+    monkeypatch.setattr(bundle_store, "pretrained_folder", lambda: tmp_path)
+    (tmp_path / "folder.zip").mkdir()
+    assert describe_bundle("ab" * 32) == "the world model abababababab"
+    (tmp_path / "folder.zip").rmdir()
+    (tmp_path / "damaged.lean").write_bytes(b"x")
+    assert describe_bundle("ab" * 32) == "the world model abababababab"
