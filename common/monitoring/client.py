@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
-from dreamfleet.common.errors import ConnectionFailedError, ControllerError, RefusedError, UsageError
+from dreamfleet.common.errors import ConnectionFailedError, ControllerError, DreamfleetError, RefusedError, UsageError
 from dreamfleet.common.monitoring.status import (
     FINAL_STATES,
     Event,
@@ -24,6 +24,7 @@ from dreamfleet.common.monitoring.status import (
     read_status,
 )
 from dreamfleet.common.monitoring.status_card import show_live
+from dreamfleet.common.printable import join_some
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import decode_json
 from dreamfleet.common.protocol.messages import ControlReply
@@ -34,6 +35,7 @@ from dreamfleet.common.transport.query import query_all
 from dreamfleet.common.transport.session import Network, enqueue_into, open_session
 
 QUERY_TIMEOUT = 3.0
+NAMES_TIMEOUT, SHOWN_RUNS = 1.0, 4  # of the names of other runs in an error text
 PATIENCE = 1.0  # seconds without an answer after which a watched run counts as gone
 MAX_PARAMETERS = 16 << 20  # of a controller; the same as in a controller file
 MAX_RESTARTS = 5  # of fetching a controller in parts while new controllers replace it
@@ -245,12 +247,15 @@ class Client(Displayed):
         return about
 
     def _no_answer_error(self, run: str | None) -> ConnectionFailedError:
-        whose, again = "any run", "--run NAME` begins one"
+        whose, again, others = "any run", "--run NAME` begins one", []
         if run:
             whose, again = f"run {run!r}", f"--resume {run}` continues one that was stopped or killed"
+            with suppress(DreamfleetError):
+                others = sorted({str(each.get("run")) for each in self.statuses(NAMES_TIMEOUT)} - {run})
         right = ", or the join file gives no right to ask" if self._secured else ""
+        there = f"what is served there: {join_some(others, SHOWN_RUNS)}; " if others else ""
         return ConnectionFailedError(
-            f"no coordinator of {whose} answers through {self._where}: it is not running{right}; "
+            f"no coordinator of {whose} answers through {self._where}: it is not running{right}; {there}"
             f"`dreamfleet coordinator {again}"
         )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 
-from dreamfleet.common.cli.config import Table, add_flags, load
+from dreamfleet.common.cli.config import Table, add_flags, configurable_fields, load
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag
 from dreamfleet.common.errors import UsageError
@@ -48,10 +48,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def load_run_config(args: argparse.Namespace, base: Table) -> tuple[RunConfig, LimitsConfig]:
     """What a new run is, and when it ends, as its flags, the environment and the file say."""
+    _check_tables(args.sources["file"] or {})
     config = _with_subspace(_with_stages(args, load(RunConfig, "run", base=base, preset=find_preset, **args.sources)))
     limits = load(LimitsConfig, "limits", **args.sources)
     check_limits(limits, config.evaluate_every, is_external=config.optimiser == EXTERNAL)
     return config, limits
+
+
+def _check_tables(file: Table) -> None:
+    """`UsageError` for a key of [limits] in [run], or one of [run] in [limits]."""
+    own = {"run": RunConfig, "limits": LimitsConfig}
+    keys = {name: {each.name for each in configurable_fields(section)} for name, section in own.items()}
+    for name, other in (("run", "limits"), ("limits", "run")):
+        if misplaced := [key for key in file.get(name, ()) if key in keys[other] - keys[name]]:
+            raise UsageError(f"unknown key {misplaced[0]!r} in [{name}]: write it in [{other}]")
 
 
 def _with_stages(args: argparse.Namespace, config: RunConfig) -> RunConfig:

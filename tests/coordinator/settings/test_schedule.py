@@ -10,7 +10,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.records import RunSettings, StageSettings
 from dreamfleet.common.runs.stages import stages_of
 from dreamfleet.coordinator.settings.config import RunConfig, config_values
-from dreamfleet.coordinator.settings.run_setup import _with_stages
+from dreamfleet.coordinator.settings.run_setup import _with_stages, load_run_config
 from dreamfleet.coordinator.settings.schedule import find_schedule, remaining_settings
 
 WHOLE = """
@@ -142,6 +142,18 @@ def test_stages_may_stand_in_the_configuration_file_beside_other_tables(tmp_path
     path.write_text("[run]\nhorizon = 500\n" + WHOLE + "\n[limits]\nminutes = 30\n")
     file = read_toml(path, TABLES, arrays=ARRAYS)
     assert [each.horizon for each in _with_stages(args(file), RunConfig()).stages] == [400, 1000]
+
+
+@pytest.mark.parametrize(
+    ("file", "said"),
+    [
+        ({"run": {"generations": 3}}, r"unknown key 'generations' in \[run\]: write it in \[limits\]"),
+        ({"limits": {"minutes": 3, "population": 8}}, r"unknown key 'population' in \[limits\]: write it in \[run\]"),
+    ],
+)
+def test_a_key_in_the_wrong_table_is_told_the_right_one(file, said):
+    with pytest.raises(UsageError, match=said):
+        load_run_config(args(file), {})
 
 
 def test_a_schedule_of_its_own_is_stronger_than_the_configuration_file(tmp_path):
