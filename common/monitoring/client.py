@@ -74,9 +74,9 @@ class Client(Displayed):
     ) -> None:
         self.session.close()  # type: ignore[no-untyped-call]
 
-    def runs(self) -> list[str]:
-        """Names of the live runs."""
-        return sorted(str(document["run"]) for document in self.statuses() if "run" in document)
+    def runs(self, timeout: float = QUERY_TIMEOUT) -> list[str]:
+        """Names of the live runs that answer within `timeout` seconds."""
+        return sorted(str(document["run"]) for document in self.statuses(timeout) if "run" in document)
 
     def status(self, run: str | None = None) -> Status:
         """The status of `run`, or of the only live run; `MalformedError` if its version is not understood."""
@@ -251,7 +251,7 @@ class Client(Displayed):
         if run:
             whose, again = f"run {run!r}", f"--resume {run}` continues one that was stopped or killed"
             with suppress(DreamfleetError):
-                others = sorted({str(each.get("run")) for each in self.statuses(NAMES_TIMEOUT)} - {run})
+                others = [each for each in self.runs(NAMES_TIMEOUT) if each != run]
         right = ", or the join file gives no right to ask" if self._secured else ""
         there = f"what is served there: {join_some(others, SHOWN_RUNS)}; " if others else ""
         return ConnectionFailedError(
