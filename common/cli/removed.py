@@ -1,4 +1,4 @@
-"""Names that verbs and flags once had, and what stands for them now: an old command is answered with the new one."""
+"""Names that verbs and flags once had, or have in other programs: the answer to such a command is the name here."""
 
 from __future__ import annotations
 

@@ -151,7 +151,7 @@ def test_stages_may_stand_in_the_configuration_file_beside_other_tables(tmp_path
         ({"limits": {"minutes": 3, "population": 8}}, r"unknown key 'population' in \[limits\]: write it in \[run\]"),
     ],
 )
-def test_a_key_in_the_wrong_table_is_told_the_right_one(file, said):
+def test_the_error_for_a_key_in_the_wrong_table_names_the_right_one(file, said):
     with pytest.raises(UsageError, match=said):
         load_run_config(args(file), {})
 
