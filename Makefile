@@ -31,7 +31,7 @@ test-doom: $(VENV)/.doom  ## the tests that play Doom; they need the package viz
 NEWEST ?= $(shell deploy/newest_python.sh)
 test-newest:  ## a short part of the tests on the newest Python that is here, in an environment of its own
 	@if [ -z "$(NEWEST)" ]; then echo "neither Python 3.13 nor 3.12 is here: nothing was run"; \
-	else $(MAKE) test VENV=.venv-newest PYTHON=$(NEWEST) ARGS="$(or $(ARGS),$(SHORT))"; fi
+	else $(MAKE) test VENV=.venv-newest PYTHON=$(NEWEST) ARGS="$(SHORT) $(ARGS)"; fi
 # What another version of Python breaks first: syntax, dataclasses, threads and processes, pickles, warnings, one run.
 SHORT := tests/common/files tests/common/host tests/common/protocol tests/common/serialization tests/common/cli/test_config.py \
   tests/coordinator/settings tests/coordinator/storage tests/coordinator/run tests/coordinator/experiments/test_minimise.py \

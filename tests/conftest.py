@@ -1,4 +1,5 @@
 import os
+import re
 import signal
 import tempfile
 from pathlib import Path
@@ -17,6 +18,18 @@ if (
     signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 ):  # as in a script's background job: all that is started inherits it
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+EXACT = re.compile(r"(^|_)(bits?|same|equals?|identical|replay\w*|reproduc\w*|determin\w*|exact\w*)(_|$)")
+
+
+@pytest.hookimpl(tryfirst=True)  # before those that `-m` leaves out are left out
+def pytest_collection_modifyitems(items):
+    """Mark the tests of equal bits, of the simulation and of chaos, and those that search for a counterexample."""
+    for item in items:
+        is_exact = {"simulation", "chaos"} & {*item.path.parts} or EXACT.search(item.name.partition("[")[0])
+        if is_exact or getattr(getattr(item, "obj", None), "is_hypothesis_test", False):
+            item.add_marker("exact")
 
 
 @pytest.hookimpl(tryfirst=True)
