@@ -123,7 +123,7 @@ $(SUPPLY)/.done:
 lock: $(SUPPLY)/.done  ## deploy/*.lock: exact versions and hashes of what stands in the images
 	$(SUPPLY)/bin/python deploy/lock.py
 
-audit: $(SUPPLY)/.done  ## known vulnerabilities of a worker's packages; says so where the advisories cannot be reached
+audit: $(SUPPLY)/.done  ## known vulnerabilities of the oldest allowed and of all locked versions, by a dated copy and by the package index
 	$(SUPPLY)/bin/python deploy/audit.py
 
 sbom: $(SUPPLY)/.done  ## build/worker.cdx.json: what a worker's environment is made of, as CycloneDX

@@ -66,11 +66,11 @@ def test_a_lock_has_the_versions_that_are_tested(name):
 
 @pytest.mark.long
 @pytest.mark.timeout(1200)
-def test_the_bill_of_materials_is_the_lock_and_an_audit_says_whether_it_ran():
+def test_the_bill_of_materials_is_the_lock_and_the_audit_finds_nothing():
     subprocess.run(["make", "sbom"], cwd=ROOT, check=True, capture_output=True)
     document = json.loads((ROOT / "build" / "worker.cdx.json").read_text())
     assert document["metadata"]["component"]["name"] == "dreamfleet"
     found = {canonicalize_name(each["name"]): each["version"] for each in document["components"]}
     assert found == pins(DEPLOY / "worker.lock")
     done = subprocess.run(["make", "audit"], cwd=ROOT, check=False, capture_output=True, text=True)
-    assert "known vulnerabilities" in done.stdout if "not audited" not in done.stderr else done.returncode == 2
+    assert done.returncode == 0, done.stdout + done.stderr
