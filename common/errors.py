@@ -58,6 +58,10 @@ class JournalError(DreamfleetError):
     """A run's journal is missing, damaged, locked, not writable, or not a journal."""
 
 
+class DamagedJournalError(JournalError):
+    """A run's journal is damaged, and only a copy helps."""
+
+
 class NotWritableNowError(JournalError):
     """The disk of a run is full, or its journal locked; what was not written can be written later."""
 

@@ -10,9 +10,11 @@ from pathlib import Path
 from types import NoneType
 from typing import Any
 
-from dreamfleet.common.errors import JournalError
+from dreamfleet.common.errors import DamagedJournalError, JournalError
 from dreamfleet.common.files.file_system import lock_problem
 from dreamfleet.common.files.regular_files import check_regular
+from dreamfleet.common.files.sqlite_verdicts import is_damage, is_locked
+from dreamfleet.common.files.thread_connections import ThreadConnections
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.runs import schema
 from dreamfleet.common.runs.seeds import CHOOSING_OFFSET
@@ -29,29 +31,33 @@ CANDIDATES_QUERY = (
 
 
 class JournalReader:
-    """A read-only connection to the journal at `path`; every failure is a `JournalError`."""
+    """A read-only journal at `path`, with a connection for each thread; every failure is a `JournalError`."""
 
     def __init__(self, path: Path) -> None:
-        self._run, self._path, self._closed = path.parent.name, path, False
-        self._connection, self.version = _connect_read_only(path)
+        self._run, self._path = path.parent.name, path
+        self._connections = ThreadConnections(lambda: _connect_read_only(path)[0])
+        connection, self.version = _connect_read_only(path)
+        self._connections.add_own(connection)
 
     def close(self) -> None:
-        """Release the journal."""
-        self._closed = True
-        self._connection.close()
+        """Release the journal, for all threads."""
+        self._connections.close()
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """Queries inside see one state of the journal, whatever a coordinator writes meanwhile; may be nested."""
-        if not self._closed and self._connection.in_transaction:
+        """Queries inside see one state of the journal, whatever a coordinator writes meanwhile; may be nested.
+
+        It holds for the calling thread.
+        """
+        if not self._connections.is_closed and self._connections.own.database.in_transaction:
             yield
             return
         self._fetch("BEGIN")  # deferred: the first query fixes the state
         try:
             yield
         finally:
-            with suppress(sqlite3.Error):
-                self._connection.rollback()
+            with suppress(JournalError):
+                self._fetch("ROLLBACK")
 
     def rows(self, kinds: str, query: str, *values: Any) -> list[Any]:
         """All rows of a query, checked for their column types.
@@ -74,21 +80,28 @@ class JournalReader:
         row = self.row("SELECT value FROM run WHERE key = ?", key)
         return None if row is None else str(row[0])
 
-    def damage_error(self, what: str) -> JournalError:
+    def damage_error(self, what: str) -> DamagedJournalError:
         """The error for a damaged journal."""
-        return JournalError(f"the journal of run {self._run} is damaged: {what}; restore it from a copy")
+        return DamagedJournalError(f"the journal of run {self._run} is damaged: {what}; restore it from a copy")
 
     def _fetch(self, query: str, *values: Any) -> list[Any]:
-        if self._closed:
-            raise JournalError(f"run {self._run} was closed here: open it again")
+        if self._connections.is_closed:
+            raise self._closed_error()
+        own = self._connections.own
         try:
-            return self._connection.execute(query, values).fetchall()
+            with own.lock:
+                return own.database.execute(query, values).fetchall()
         except (sqlite3.Error, OverflowError, UnicodeError) as error:
-            if _is_locked(error):
-                raise JournalError(
-                    f"the journal of run {self._run} cannot be read: {_describe_with_remedy(error, self._path)}"
-                ) from error
-            raise self.damage_error(one_line(str(error))) from error
+            if self._connections.is_closed:  # meanwhile, by another thread
+                raise self._closed_error() from error
+            if is_damage(error):
+                raise self.damage_error(one_line(str(error))) from error
+            raise JournalError(
+                f"the journal of run {self._run} cannot be read: {_describe_with_remedy(error, self._path)}"
+            ) from error
+
+    def _closed_error(self) -> JournalError:
+        return JournalError(f"run {self._run} was closed here: open it again")
 
 
 def class_counts_query(class_column: str = "host_class") -> str:
@@ -129,7 +142,8 @@ def _connect_read_only(path: Path, *, rolled_back: bool = False) -> tuple[sqlite
     immutable = "" if os.access(path.parent, os.W_OK) or _has_log(path) else "&immutable=1"
     try:
         check_regular(path)  # SQLite would block on a pipe
-        connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{immutable}", uri=True)
+        where = f"{path.absolute().as_uri()}?mode=ro{immutable}"
+        connection = sqlite3.connect(where, uri=True, check_same_thread=False)  # another thread may close it
     except (sqlite3.Error, OSError) as error:
         raise JournalError(f"{path} cannot be read: {error}") from error
     try:
@@ -139,7 +153,8 @@ def _connect_read_only(path: Path, *, rolled_back: bool = False) -> tuple[sqlite
         if getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_READONLY_ROLLBACK and not rolled_back:
             _roll_back(path)
             return _connect_read_only(path, rolled_back=True)
-        raise JournalError(f"{path} cannot be read: {_describe_with_remedy(error, path)}") from error
+        kind = DamagedJournalError if is_damage(error) else JournalError
+        raise kind(f"{path} cannot be read: {_describe_with_remedy(error, path)}") from error
     except JournalError:
         connection.close()
         raise
@@ -159,16 +174,12 @@ def _roll_back(path: Path) -> None:
         connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
 
 
-def _is_locked(error: Exception) -> bool:
-    """Whether another program, such as SQLite's shell, locks the journal."""
-    return isinstance(error, sqlite3.Error) and getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_BUSY
-
-
 def _describe_with_remedy(error: Exception, path: Path) -> str:
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
     if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_IOERR) and (problem := lock_problem(path.parent)):
         return f"{one_line(str(error))}; {problem}"
     if code == sqlite3.SQLITE_CANTOPEN and _has_log(path):
         return f"its last part is in {path.name}-wal, which cannot be read in a read-only folder: copy the folder first"
-    what = "end the program that keeps it locked" if _is_locked(error) else "restore it from a copy"
-    return f"{one_line(str(error))}; {what}"
+    if is_locked(error):
+        return f"{one_line(str(error))}; end the program that keeps it locked"
+    return one_line(str(error)) + ("; restore it from a copy" if is_damage(error) else "")

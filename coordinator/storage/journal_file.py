@@ -8,8 +8,10 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from dreamfleet.common.errors import DreamfleetError, JournalError, NotWritableNowError
+from dreamfleet.common.errors import DamagedJournalError, DreamfleetError, JournalError, NotWritableNowError
 from dreamfleet.common.files.file_system import lock_problem
+from dreamfleet.common.files.sqlite_verdicts import is_damage
+from dreamfleet.common.printable import one_line
 
 REMEDIES = {
     sqlite3.SQLITE_FULL: "make room",
@@ -63,16 +65,18 @@ def journal_errors(path: Path) -> Iterator[None]:
         yield
     except DreamfleetError:
         raise
-    except sqlite3.OperationalError as error:
+    except sqlite3.IntegrityError as error:
+        raise JournalError(
+            f"{path} was not written: {error}; what was committed before is whole, and the run can be continued"
+        ) from error
+    except (sqlite3.Error, UnicodeError) as error:
+        if is_damage(error):
+            raise DamagedJournalError(
+                f"{path} is damaged or no journal: {one_line(str(error))}; restore it from a copy"
+            ) from error
         if (remedy := REMEDIES.get(getattr(error, "sqlite_errorcode", 0) & 0xFF)) is not None:
             raise NotWritableNowError(f"cannot write {path}: {error}; {remedy}") from error
         problem = f"; {text}" if (text := lock_problem(path.parent)) else ""
         raise JournalError(
             f"cannot write {path}: {error}; nothing counted that was not written before{problem}"
         ) from error
-    except sqlite3.IntegrityError as error:
-        raise JournalError(
-            f"{path} was not written: {error}; what was committed before is whole, and the run can be continued"
-        ) from error
-    except sqlite3.DatabaseError as error:
-        raise JournalError(f"{path} is damaged or no journal: {error}; restore it from a copy") from error

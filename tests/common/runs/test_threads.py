@@ -1,0 +1,175 @@
+"""One open run in many threads; and what of SQLite's errors is damage, and what is not."""
+
+import asyncio
+import gc
+import resource
+import shutil
+import sqlite3
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from threading import Barrier, Thread
+
+import pytest
+
+from dreamfleet.common.errors import DamagedJournalError, JournalError, NotWritableNowError
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.coordinator.storage.journal import Journal
+from dreamfleet.coordinator.storage.journal_file import journal_errors
+
+RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
+THREADS = 4
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return shutil.copytree(RUNS / "dream", tmp_path / "night")
+
+
+def in_thread(call, *given):
+    """What a call gives in a thread of its own, which then ends."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(call, *given).result()
+
+
+def descriptors(folder):
+    """The open files of this process that lie in the folder."""
+    found = []
+    for each in Path("/proc/self/fd").iterdir():
+        with suppress(OSError):  # the one that lists them
+            found.append(str(each.readlink()))
+    return [each for each in found if each.startswith(str(folder))]
+
+
+def look(run):
+    with run.read_transaction():
+        return run.history(), run.candidates(), run.evaluations(), run.uid, run.results(0, 0)
+
+
+def test_threads_read_a_run_that_another_one_opened(folder):
+    together = Barrier(THREADS)
+
+    def at_once(run):
+        together.wait()
+        return [look(run) for _ in range(5)]
+
+    with RunFolder(folder) as run:
+        here = look(run)
+        with ThreadPoolExecutor(THREADS) as pool:
+            there = [each.result() for each in [pool.submit(at_once, run) for _ in range(THREADS)]]
+        assert all(found == here for some in there for found in some)
+
+        async def served():
+            return await asyncio.gather(*(asyncio.to_thread(look, run) for _ in range(THREADS)))
+
+        assert asyncio.run(served()) == [here] * THREADS
+
+
+def test_a_transaction_is_its_threads_own(folder):
+    with RunFolder(folder) as run, run.read_transaction():
+        before = run.uid
+        with closing(sqlite3.connect(folder / "journal.sqlite")) as other, other:
+            other.execute("UPDATE run SET value = 'another' WHERE key = 'uid'")
+        assert run.uid == before
+        assert in_thread(lambda: run.uid) == "another"
+        assert run.uid == before
+
+
+def test_any_thread_closes_it_for_all(folder):
+    run = RunFolder(folder)
+    run.history()
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(run.history).result()
+        in_thread(run.close)
+        for look_again in (run.history, lambda: pool.submit(run.history).result()):
+            with pytest.raises(JournalError) as found:
+                look_again()
+            assert not isinstance(found.value, DamagedJournalError)
+        assert not descriptors(folder)
+
+
+def test_threads_that_ended_hold_nothing(folder):
+    with RunFolder(folder) as run:
+        opened = len(descriptors(folder))
+        for _ in range(5):
+            in_thread(run.history)
+        gc.collect()
+        assert len(descriptors(folder)) <= opened + 1  # SQLite keeps a file until nobody in the process has it
+
+
+@contextmanager
+def no_more_files():
+    """Inside, this process can open no further file."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (0, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_only_sqlites_own_verdict_is_damage(folder):
+    """A number that no journal holds, and a process without a free file, say nothing about the journal."""
+    with RunFolder(folder) as run:
+        for call in (lambda: run.candidate(2**80, 0), lambda: run.results(0, 0, "\ud800")):
+            with pytest.raises(JournalError) as found:
+                call()
+            assert not isinstance(found.value, DamagedJournalError)
+        errors = []
+
+        def read():
+            try:
+                run.history()
+            except JournalError as error:
+                errors.append(error)
+
+        thread = Thread(target=read)
+        with no_more_files():
+            thread.start()
+            thread.join()
+        assert len(errors) == 1
+        assert not isinstance(errors[0], DamagedJournalError)
+        assert look(run)[0]
+
+
+@pytest.mark.parametrize("content", [b"SQLite format 3\0" + b"\xff" * 5000, b"no journal" * 500])
+def test_a_file_that_sqlite_cannot_read_is_damaged(folder, content):
+    (folder / "journal.sqlite").write_bytes(content)
+    with pytest.raises(DamagedJournalError):
+        RunFolder(folder)
+
+
+def test_pages_that_sqlite_cannot_read_are_damage(folder):
+    path = folder / "journal.sqlite"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:4096] + b"\xff" * (len(whole) - 4096))
+    with RunFolder(folder) as run, pytest.raises(DamagedJournalError):
+        look(run)
+    with pytest.raises(DamagedJournalError), closing(Journal(path)) as journal:
+        journal.generation(0)
+
+
+def test_text_of_other_bytes_is_damage(folder):
+    with closing(sqlite3.connect(folder / "journal.sqlite")) as other, other:
+        other.execute("UPDATE run SET value = CAST(x'ff' AS TEXT) WHERE key = 'uid'")
+    with RunFolder(folder) as run, pytest.raises(DamagedJournalError):
+        run.uid  # noqa: B018
+    with closing(Journal(folder / "journal.sqlite")) as journal, pytest.raises(DamagedJournalError):
+        journal.fact("uid")
+
+
+@pytest.mark.parametrize(
+    "misuse",
+    [
+        lambda database: in_thread(database.execute, "SELECT 1"),  # of another thread
+        lambda database: (database.close(), database.execute("SELECT 1")),
+        lambda database: database.execute("SELECT ?"),
+        lambda database: database.execute("SELECT ?", (object(),)),
+        lambda database: database.execute("SELECT zeroblob(1 << 40)"),
+    ],
+)
+def test_what_this_program_does_wrong_is_no_damage(folder, misuse):
+    path = folder / "journal.sqlite"
+    with closing(sqlite3.connect(path)) as database, pytest.raises(JournalError) as found, journal_errors(path):
+        misuse(database)
+    assert not isinstance(found.value, DamagedJournalError | NotWritableNowError)
