@@ -51,6 +51,40 @@ class Grey(Dodge):
         return super().render()[..., 0]
 
 
+class ChannelsFirst(Dodge):
+    """Observes `(3, H, W)`, and draws floats from 0 to 1 with opacity."""
+
+    observation_space = spaces.Box(0, 255, (3, HEIGHT, WIDTH), np.uint8)
+
+    def reset(self, *, seed=None, options=None):
+        picture, info = super().reset(seed=seed, options=options)
+        return self.observe(picture), info
+
+    def step(self, action):
+        picture, *rest = super().step(action)
+        return (self.observe(picture), *rest)
+
+    def observe(self, picture):
+        return np.moveaxis(np.rint(picture[..., :3] * 255).astype(np.uint8), -1, 0)
+
+    def render(self):
+        return np.dstack([super().render() / 255, np.full((HEIGHT, WIDTH), 0.5)])
+
+
+class Stacked(ChannelsFirst):
+    """Observes its last four pictures, grey."""
+
+    observation_space = spaces.Box(0, 1, (4, HEIGHT, WIDTH), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        self.seen = np.zeros((4, HEIGHT, WIDTH), np.float32)
+        return super().reset(seed=seed, options=options)
+
+    def observe(self, picture):
+        self.seen = np.float32([*self.seen[1:], picture[..., 0]])
+        return self.seen
+
+
 class Reporting(Dodge):
     """Reports the action that it gets."""
 
@@ -116,6 +150,25 @@ class Unseen(Dodge):
 
     def step(self, action):
         return (np.zeros(2, np.float32), *super().step(action)[1:])
+
+
+class Glass(Unseen):
+    """Draws floats from 0 to 1 with opacity."""
+
+    def render(self):
+        return np.dstack([super().render() / 255, np.full((HEIGHT, WIDTH), 0.5)])
+
+
+class Board(Unseen):
+    """Observes a table of codes."""
+
+    observation_space = spaces.Box(0, 9, (24, 18), np.uint8)
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros((24, 18), np.uint8), super().reset(seed=seed, options=options)[1]
+
+    def step(self, action):
+        return (np.zeros((24, 18), np.uint8), *super().step(action)[1:])
 
 
 class Gauges(gymnasium.Env):
@@ -212,5 +265,9 @@ class Rude(Dodge):
         raise RuntimeError("closing is broken\nwith details")
 
 
-for each in (Faulty, Rude, InDict, InTwo, Grey, Floats, Buttons, Switches, BothEnds, Unseen, Gauges, Telling):
+KINDS = (
+    Faulty, Rude, InDict, InTwo, Grey, ChannelsFirst, Stacked, Floats, Buttons, Switches, BothEnds, Unseen, Glass,
+    Board, Gauges, Telling,
+)  # fmt: skip
+for each in KINDS:
     gymnasium.register(f"{each.__name__}-v0", each, max_episode_steps=200)

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.wrappers import AddRenderObservation, TransformObservation
+from gymnasium.wrappers import TransformObservation
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import Continuous
@@ -33,20 +33,26 @@ from dreamfleet.worker.tasks.api import Assignment, Driver, Policy, Preprocessin
 from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tasks.drivers import HeldActions, UniformActions
 from dreamfleet.worker.tasks.pictures import (
+    KINDS,
     Crop,
     CropAndResize,
     FrameDifference,
+    LookAtDrawn,
     Pixels,
     SkipFrames,
+    TileFrames,
     VectorActions,
     cut_and_resize,
     frame_difference,
     is_picture,
+    is_stack,
+    tile_frames,
 )
 from dreamfleet.worker.tasks.registry import preprocessing_for
 from dreamfleet.worker.worldmodel.policy import ModelPolicy
 
 RENDERED = "render"  # as an observation: what the environment draws
+EVERY_FRAME = "all"  # as an observation: all frames of the only picture, which is a stack
 SIZES = (64, 96)
 _CROP = re.compile(r"(\d{1,5}):(\d{1,5}),(\d{1,5}):(\d{1,5})", re.ASCII)
 
@@ -60,7 +66,9 @@ class PixelOptions:
     """
 
     environment: dict[str, Any] = field(default_factory=dict, metadata=OPTIONAL)  # arguments of `gymnasium.make`
-    observation: Annotated[str, Length(0, 128)] = field(default="", metadata=OPTIONAL)  # a Dict's key, or `render`
+    observation: Annotated[str, Length(0, 128)] = field(
+        default="", metadata=OPTIONAL
+    )  # a Dict's key, `render` or `all`
     crop: str = field(default="", metadata=OPTIONAL)  # `top:bottom,left:right`; empty: the whole picture
     size: int = field(default=SIZES[0], metadata=OPTIONAL)  # height and width
     skip: Annotated[int, Between(1, 1000)] = field(default=1, metadata=OPTIONAL)  # steps for which an action is held
@@ -152,10 +160,14 @@ class GymPixelTask(Task):
         name, size, crop = self._options.preprocessing, self._options.size, self._options.rows_and_columns
 
         def picture(seen: NDArray[Any]) -> Pixels:
-            small = cut_and_resize(seen, size, crop)
+            small = cut_and_resize(tile_frames(seen) if self._tiles else seen, size, crop)
             return frame_difference(small, small) if self._options.difference else small
 
         return {name: Preprocessing(name, size, picture, mirrors=False)}
+
+    @property
+    def _tiles(self) -> bool:
+        return self._options.observation == EVERY_FRAME
 
     @property
     def drivers(self) -> Mapping[str, Callable[[np.random.Generator], Driver]]:
@@ -212,24 +224,27 @@ class GymPixelTask(Task):
 
     def _choose_picture(self, environment: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
         space, wanted = environment.observation_space, self._options.observation
-        entries = space.spaces if isinstance(space, spaces.Dict) else {}
+        entries = space.spaces if isinstance(space, spaces.Dict) else {"": space}
         pictures = [key for key, each in entries.items() if is_picture(each)]
-        if not wanted and is_picture(space):
-            return environment
-        if wanted in pictures or (not wanted and len(pictures) == 1):
-            key = wanted or pictures[0]
-            return TransformObservation(environment, lambda observation: observation[key], entries[key])
+        only = pictures[0] if len(pictures) == 1 else None
+        every = EVERY_FRAME if only is not None and is_stack(entries[only]) else ""
+        key = only if wanted in ("", every) else wanted
+        if key is not None and key in pictures:
+            seen = environment
+            if isinstance(space, spaces.Dict):
+                seen = TransformObservation(environment, lambda observation: observation[key], entries[key])
+            return TileFrames(seen) if self._tiles else seen
         if wanted == RENDERED:
             try:
-                return AddRenderObservation(environment)
+                return LookAtDrawn(environment)
             except Exception as error:  # environments may raise anything
                 raise UsageError(f"{self._id} draws no pictures: {type(error).__name__}: {error}") from error
         draws = RGB in environment.metadata.get("render_modes", ())
-        known = [*pictures, *([RENDERED] if draws and RENDERED not in pictures else [])]
+        known = [each for each in (*pictures, every) if each] + [RENDERED] * (draws and RENDERED not in pictures)
         remedy = f"choose one with --observation: {', '.join(known)}" if known else "and it draws none"
         raise UsageError(
             f"{self._id} observes {space}, where {repr(wanted) if wanted else 'the picture'} is no picture or not the "
-            f"only one: {remedy}"
+            f"only one: {remedy}. A picture is {KINDS}"
         )
 
 

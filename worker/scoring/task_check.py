@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 MEND = "fix the environment, or wrap it"
 SLOW_RESET = 2.0  # seconds; gymnasium's checker resets a dozen times, so it is left out where resets are slower
-PICTURE_DIMENSIONS = 2
 ADVICE = re.compile(r"infinity|we recommend")  # warnings of gymnasium's checker that are about style
 COLOURS = re.compile(r"\x1b\[\d+m|WARN: ")
 
@@ -214,12 +213,14 @@ def _check_by_gymnasium(environment: Any) -> list[str]:
 
 
 def _describe_pictures(name: str, environment: Any) -> list[str]:
-    shape = getattr(environment.observation_space, "shape", None) or ()
-    if len(shape) < PICTURE_DIMENSIONS:
+    from dreamfleet.worker.tasks.pictures import is_picture
+
+    space = environment.observation_space
+    if not is_picture(space):
         return []
     return [
-        f"it observes pictures of shape {tuple(shape)}, and the controller has a weight for each value: a world model "
-        f"makes few numbers of them (`dreamfleet pipeline --task {name}`)"
+        f"it observes pictures of shape {tuple(space.shape)}, and the controller has a weight for each value: a world "
+        f"model makes few numbers of them (`dreamfleet pipeline --task {name}`)"
     ]
 
 

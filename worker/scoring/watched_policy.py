@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.worker.tasks.api import Policy, StepObserver, StepSnapshot
+from dreamfleet.worker.tasks.pictures import drawn_pixels
 
 Picture = NDArray[np.uint8]
 
@@ -59,8 +60,8 @@ class WatchedPolicy:
         drawn = None
         if self._render is not None:
             with suppress(Exception):
-                drawn = self._render()
-        return drawn if _is_picture(drawn) else None
+                drawn = drawn_pixels(self._render())
+        return drawn
 
 
 def _is_picture(value: Any) -> bool:

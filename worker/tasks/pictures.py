@@ -6,6 +6,7 @@ A recordable task chains them in the order in which they stand here. What is lef
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
@@ -23,6 +24,13 @@ Pixels = NDArray[np.uint8]
 Crop = tuple[int, int, int, int]  # first row, row after the last, first column, column after the last
 SHORTEST = 8  # pixels of a side; smaller boxes hold codes, such as MiniGrid's of 7x7 cells
 MIDDLE = 128  # the difference of equal pictures
+COLOURS = (1, 3, 4)  # channels: grey, colours, colours and opacity
+MOST_FRAMES = 16  # of a stack
+AXES = ("HW", "HWC", "CHW", "NHW", "NHWC", "NCHW")  # of pictures that are taken, in the order in which they are tried
+KINDS = (
+    "uint8 up to 255, or float from 0 to 1, of shape (height, width), with 1, 3 or 4 colours behind or 1 or 3 before, "
+    f"or a stack of up to {MOST_FRAMES} of these; at least {SHORTEST} pixels a side"
+)
 
 
 def is_crop(crop: Crop, height: int, width: int) -> bool:
@@ -35,24 +43,52 @@ def is_crop(crop: Crop, height: int, width: int) -> bool:
     return 0 <= top <= bottom - SHORTEST <= height - SHORTEST and 0 <= left <= right - SHORTEST <= width - SHORTEST
 
 
+def find_axes(shape: tuple[int, ...]) -> str:
+    """What the axes of a picture of this shape are: frames N, height H, width W, colours C; empty if it is none.
+
+    A picture has at least 8 pixels a side, 1, 3 or 4 colours (the last is how opaque it is), and a stack up to 16
+    frames. `(H, W, 4)` is one picture with opacity; `(4, H, W)` is a stack of four grey ones, as gymnasium stacks.
+
+    >>> [find_axes(shape) for shape in ((48, 40), (48, 40, 3), (3, 48, 40), (4, 48, 40), (2, 48, 40, 3), (5, 5))]
+    ['HW', 'HWC', 'CHW', 'NHW', 'NHWC', '']
+    """
+    for axes in AXES:
+        if len(axes) != len(shape):
+            continue
+        sizes = dict(zip(axes, shape, strict=True))
+        is_large = min(sizes["H"], sizes["W"]) >= SHORTEST
+        has_colours = sizes.get("C", 1) in (COLOURS if axes[-1] == "C" or "N" in axes else COLOURS[:2])
+        if is_large and has_colours and 1 <= sizes.get("N", 1) <= MOST_FRAMES:
+            return axes
+    return ""
+
+
 def is_picture(space: Any) -> bool:
-    """Whether a space holds pictures that `to_pixels` takes, of at least 8 pixels a side.
+    """Whether a space holds pictures that `cut_and_resize` takes: uint8 up to 255, or floats from 0 to 1.
+
+    Whole numbers that stay below half of that are codes, such as those of a board.
 
     >>> is_picture(spaces.Box(0, 255, (48, 40), np.uint8)), is_picture(spaces.Box(0, 255, (48,), np.uint8))
     (True, False)
+    >>> is_picture(spaces.Box(0, 9, (24, 18), np.uint8))
+    False
     """
-    if not isinstance(space, spaces.Box) or space.shape[2:] not in ((), (1,), (3,)):
+    if not isinstance(space, spaces.Box) or not find_axes(space.shape):
         return False
-    if len(space.shape) < 2 or min(space.shape[:2]) < SHORTEST:
-        return False
-    floats = np.issubdtype(space.dtype, np.floating) and bool((space.low >= 0).all() and (space.high <= 1).all())
-    return space.dtype == np.uint8 or floats
+    if space.dtype == np.uint8:
+        return bool(space.high.max() >= MIDDLE)
+    return np.issubdtype(space.dtype, np.floating) and bool((space.low >= 0).all() and (space.high <= 1).all())
+
+
+def is_stack(space: Any) -> bool:
+    """Whether a space holds pictures of several frames."""
+    return is_picture(space) and "N" in find_axes(space.shape)
 
 
 def to_pixels(picture: NDArray[Any]) -> Pixels:
     """The picture as uint8 `(H, W, 3)`; grey ones `(H, W)` or `(H, W, 1)` are repeated, floats are of 0 to 1.
 
-    `ValueError` for floats beyond that, or NaN.
+    Opacity is left out. `ValueError` for floats beyond 0 to 1, or NaN.
 
     >>> to_pixels(np.full((1, 2), 0.5)).tolist()
     [[[128, 128, 128], [128, 128, 128]]]
@@ -65,7 +101,58 @@ def to_pixels(picture: NDArray[Any]) -> Pixels:
         picture = levels.astype(np.uint8)
     pixels = picture
     pixels = pixels[..., None] if pixels.ndim == 2 else pixels
-    return pixels if pixels.shape[2] == 3 else np.repeat(pixels, 3, axis=2)
+    return pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
+
+
+def drawn_pixels(drawn: Any) -> Pixels | None:
+    """What an environment's `render` returned as uint8 `(H, W, 3)`; `None` if it is no picture.
+
+    Any numbers are taken: floats up to 1 are scaled to 255, others are cut at 0 and 255. Of several pictures the last
+    counts.
+
+    >>> drawn_pixels(np.ones((1, 1, 4))).tolist(), drawn_pixels("a map")
+    ([[[255, 255, 255]]], None)
+    """
+    if isinstance(drawn, (list, tuple)) and drawn and isinstance(drawn[-1], np.ndarray):
+        drawn = drawn[-1]
+    if not isinstance(drawn, np.ndarray) or drawn.dtype.kind not in "buif" or 0 in drawn.shape:
+        return None
+    one = last_frame(drawn)
+    if one.ndim not in (2, 3) or one.shape[2:] not in ((), *((each,) for each in COLOURS)):
+        return None
+    if one.dtype != np.uint8:
+        whole = one.dtype.kind in "ui" or not (one <= 1).all()
+        levels = np.nan_to_num(one.astype(np.float64)) * (1 if whole else 255)
+        one = np.rint(levels).clip(0, 255).astype(np.uint8)
+    return to_pixels(one)
+
+
+def last_frame(picture: NDArray[Any]) -> NDArray[Any]:
+    """A picture of any of the layouts as `(H, W)` or `(H, W, C)`: the last frame of a stack.
+
+    >>> last_frame(np.zeros((3, 48, 40))).shape, last_frame(np.zeros((4, 48, 40))).shape
+    ((48, 40, 3), (48, 40))
+    """
+    axes = find_axes(picture.shape)
+    if "N" in axes:
+        picture, axes = picture[-1], axes[1:]
+    return np.moveaxis(picture, 0, -1) if axes == "CHW" else picture
+
+
+def tile_frames(stack: NDArray[Any]) -> NDArray[Any]:
+    """All frames of a stack as one picture: in reading order, in as many columns as rows, or one more.
+
+    >>> tile_frames(np.zeros((4, 48, 40))).shape, tile_frames(np.zeros((2, 3, 48, 40))).shape
+    ((96, 80), (48, 80, 3))
+    """
+    if "N" not in find_axes(stack.shape):
+        return stack
+    frames = np.stack([last_frame(each) for each in stack])
+    columns = math.ceil(math.sqrt(len(frames)))
+    rows = -(-len(frames) // columns)
+    filled = np.concatenate([frames, np.zeros((rows * columns - len(frames), *frames.shape[1:]), frames.dtype)])
+    lines = [np.concatenate(list(filled[start : start + columns]), axis=1) for start in range(0, len(filled), columns)]
+    return np.concatenate(lines)
 
 
 def box_resize(picture: Pixels, size: int) -> Pixels:
@@ -108,9 +195,10 @@ def _overlaps(length: int, size: int) -> tuple[NDArray[np.int64], NDArray[np.int
 
 
 def cut_and_resize(picture: NDArray[Any], size: int, crop: Crop | None = None) -> Pixels:
-    """A picture that `to_pixels` takes, or its part `crop`, as `(size, size, 3)`."""
-    top, bottom, left, right = crop or (0, *picture.shape[:1], 0, *picture.shape[1:2])
-    return box_resize(to_pixels(picture[top:bottom, left:right]), size)
+    """A picture of a space for which `is_picture`, or its part `crop`, as `(size, size, 3)`; of a stack the last."""
+    seen = last_frame(picture)
+    top, bottom, left, right = crop or (0, *seen.shape[:1], 0, *seen.shape[1:2])
+    return box_resize(to_pixels(seen[top:bottom, left:right]), size)
 
 
 def frame_difference(now: Pixels, before: Pixels) -> Pixels:
@@ -152,8 +240,48 @@ class SkipFrames(gymnasium.Wrapper[Any, Any, Any, Any]):
         return observation, total, terminated, truncated, info
 
 
+class LookAtDrawn(gymnasium.Wrapper[Pixels, Any, Any, Any]):
+    """Observes what the environment draws, uint8 `(H, W, 3)`; `UsageError` if it draws no pictures."""
+
+    def __init__(self, environment: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(environment)
+        environment.reset()
+        shape = self._draw().shape
+        self.observation_space = spaces.Box(0, 255, shape, np.uint8)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Pixels, dict[str, Any]]:
+        """The environment's reset, and what it draws then."""
+        info = self.env.reset(seed=seed, options=options)[1]
+        return self._draw(), info
+
+    def step(self, action: Any) -> tuple[Pixels, Any, bool, bool, dict[str, Any]]:
+        """The environment's step, and what it draws then."""
+        _, reward, terminated, truncated, info = self.env.step(action)
+        return self._draw(), reward, terminated, truncated, info
+
+    def _draw(self) -> Pixels:
+        drawn = self.env.render()
+        found = drawn_pixels(drawn)
+        if found is None:
+            raise UsageError(f"its `render` returns {type(drawn).__name__}, not an array (height, width, 3)")
+        return found
+
+
+class TileFrames(gymnasium.ObservationWrapper[NDArray[Any], Any, NDArray[Any]]):
+    """Observes all frames of a stack in one picture, as `tile_frames` sets them."""
+
+    def __init__(self, environment: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(environment)
+        space: Any = environment.observation_space
+        self.observation_space = spaces.Box(tile_frames(space.low), tile_frames(space.high), dtype=space.dtype)
+
+    def observation(self, observation: NDArray[Any]) -> NDArray[Any]:
+        """The picture of all frames."""
+        return tile_frames(np.asarray(observation))
+
+
 class CropAndResize(gymnasium.ObservationWrapper[Pixels, Any, NDArray[Any]]):
-    """Observes uint8 `(size, size, 3)`: a part of each picture, or all of it, after `to_pixels` and `box_resize`.
+    """Observes uint8 `(size, size, 3)`: a part of each picture, or all of it, as `cut_and_resize` makes it.
 
     `UsageError` if the environment observes no pictures, or the part lies outside of them.
 
@@ -170,11 +298,9 @@ class CropAndResize(gymnasium.ObservationWrapper[Pixels, Any, NDArray[Any]]):
         super().__init__(environment)
         space = environment.observation_space
         if not is_picture(space):
-            raise UsageError(
-                f"what is observed is {space}, and a picture is uint8, or float from 0 to 1, of shape "
-                "(height, width), (height, width, 1) or (height, width, 3)"
-            )
-        height, width = (space.shape or (0, 0))[:2]
+            raise UsageError(f"what is observed is {space}, and a picture is {KINDS}")
+        axes = find_axes(space.shape or ())
+        height, width = (space.shape or ())[axes.index("H")], (space.shape or ())[axes.index("W")]
         top, bottom, left, right = crop or (0, height, 0, width)
         if not is_crop((top, bottom, left, right), height, width):
             raise UsageError(

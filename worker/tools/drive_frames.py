@@ -19,6 +19,7 @@ from dreamfleet.worker.dream.parallel_dream import ParallelDream, ParallelDreamC
 from dreamfleet.worker.scoring.agents import Agent
 from dreamfleet.worker.scoring.episode import Transition
 from dreamfleet.worker.scoring.failure_cause import describe_exception
+from dreamfleet.worker.tasks.pictures import drawn_pixels
 from dreamfleet.worker.tools.canvas import (
     AWAKE,
     DREAMING,
@@ -138,15 +139,16 @@ class FramePainter:
 
     def _picture(self) -> NDArray[np.uint8]:
         """The environment's picture `(height, width, 3)`; `UsageError` if it draws none."""
-        found: Any = None
+        drawn: Any = None
         with suppress(NotImplementedError):  # gymnasium's default `render`
-            found = self._environment.render()
-        if np.ndim(found) != 3:
+            drawn = self._environment.render()
+        found = drawn_pixels(drawn)
+        if found is None:
             raise UsageError(
                 f"{type(self._environment.unwrapped).__name__} draws no pictures: in the render mode rgb_array its "
                 "`render` must return an array (height, width, 3)"
             )
-        return np.asarray(found)
+        return found
 
 
 @contextmanager

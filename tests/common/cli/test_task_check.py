@@ -86,6 +86,10 @@ def test_gymnasiums_checker_only_warns(fault, code):
     assert found.warnings == (f"gymnasium's checker ended the process (exit code {code})",)
 
 
+def test_a_table_of_codes_is_no_picture():
+    assert not any("picture" in each for each in try_task("gym:tests.support.pixel_fakes:Board-v0", {}).warnings)
+
+
 def test_pictures_are_hinted_at():
     found = try_task("gym:CarRacing-v3", {})
     assert found.fault == ""

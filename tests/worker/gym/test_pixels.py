@@ -47,6 +47,10 @@ def needs_package(name):
         ("Switches", {}),
         ("BothEnds", {}),
         ("Unseen", {"observation": "render"}),
+        ("ChannelsFirst", {"crop": "8:48,0:40"}),
+        ("ChannelsFirst", {"observation": "render"}),
+        ("Stacked", {}),
+        ("Stacked", {"observation": "all"}),
     ],
 )
 def test_an_environment_with_pictures_keeps_the_contract(kind, options):
@@ -56,6 +60,28 @@ def test_an_environment_with_pictures_keeps_the_contract(kind, options):
     assert task.world.packages[:2] == ("numpy", "gymnasium")
     assert task.world.frames_per_second == 10 // options.get("skip", 1)
     assert task.world.horizon == 200 // options.get("skip", 1)
+
+
+def test_channels_first_the_last_of_a_stack_and_what_is_drawn_are_the_same_picture():
+    first, drawn, last, plain = (
+        drive(task, 4)[0].seen
+        for task in (
+            fake("ChannelsFirst"),
+            fake("ChannelsFirst", observation="render"),
+            fake("Stacked"),
+            fake("Unseen", observation="render"),
+        )
+    )
+    assert np.array_equal(first, plain)
+    assert np.array_equal(drawn, plain)
+    assert np.array_equal(last[..., 0], plain[..., 0])
+
+
+def test_all_frames_of_a_stack_are_seen_where_they_are_wanted():
+    seen = drive(fake("Stacked", observation="all"), 4)[0].seen
+    assert not seen[:32].any()
+    assert not seen[32:, :32].any()
+    assert seen[32:, 32:].any()
 
 
 def test_the_pixel_world_is_one_without_a_line_of_code():
@@ -84,6 +110,9 @@ def test_an_action_is_a_vector_that_the_simulator_gets_as_its_own(kind, outputs,
         (f"{pixel_fakes.MODULE}:InTwo-v0", {}, "choose one with --observation: map, screen, render"),
         (f"{pixel_fakes.MODULE}:InTwo-v0", {"observation": "radar"}, "'radar' is no picture"),
         (f"{pixel_fakes.MODULE}:Grey-v0", {"observation": "screen"}, "'screen' is no picture"),
+        (f"{pixel_fakes.MODULE}:Grey-v0", {"observation": "all"}, "--observation: render"),
+        (f"{pixel_fakes.MODULE}:Stacked-v0", {"observation": "screen"}, "--observation: all, render"),
+        (f"{pixel_fakes.MODULE}:Board-v0", {}, "--observation: render"),
         (f"{pixel_fakes.MODULE}:Grey-v0", {"crop": "0:49,0:40"}, "0:49,0:40 is not within a picture of 48 rows"),
         (f"{pixel_fakes.MODULE}:Grey-v0", {"crop": "0:1,0:1"}, "with at least 8 of each"),
         (f"{pixel_fakes.MODULE}:Grey-v0", {"environment": {"render_mode": "human"}}, "opens a window.*omit it"),

@@ -19,6 +19,7 @@ from dreamfleet.worker.tasks.pictures import (
     SkipFrames,
     VectorActions,
     box_resize,
+    drawn_pixels,
     is_picture,
     to_pixels,
 )
@@ -85,7 +86,17 @@ def test_grey_and_float_pictures_become_pixels():
         (spaces.Box(0, 255, (8, 9, 1), np.uint8), True),
         (spaces.Box(0, 1, (8, 9), np.float32), True),
         (spaces.Box(0, 255, (7, 7, 3), np.uint8), False),
-        (spaces.Box(0, 255, (8, 9, 4), np.uint8), False),
+        (spaces.Box(0, 255, (8, 9, 4), np.uint8), True),
+        (spaces.Box(0, 255, (3, 8, 9), np.uint8), True),
+        (spaces.Box(0, 1, (4, 8, 9), np.float32), True),
+        (spaces.Box(0, 255, (2, 8, 9, 3), np.uint8), True),
+        (spaces.Box(0, 255, (2, 3, 8, 9), np.uint8), True),
+        (spaces.Box(0, 255, (2, 2, 8, 9), np.uint8), False),
+        (spaces.Box(0, 255, (17, 18, 19), np.uint8), False),
+        (spaces.Box(0, 9, (24, 18), np.uint8), False),
+        (spaces.Box(-np.inf, np.inf, (5, 5), np.float32), False),
+        (spaces.Box(0, 1, (16, 2), np.float32), False),
+        (spaces.Box(0, 255, (8, 9, 3), np.float32), False),
         (spaces.Box(-1, 1, (8, 9, 3), np.float32), False),
         (spaces.Box(0, 255, (8, 9, 3), np.int64), False),
         (spaces.Box(0, 255, (8,), np.uint8), False),
@@ -94,6 +105,31 @@ def test_grey_and_float_pictures_become_pixels():
 )
 def test_a_picture_is_known_by_its_space(space, is_one):
     assert is_picture(space) == is_one
+
+
+@pytest.mark.parametrize(
+    "drawn",
+    [
+        np.full((4, 6, 3), 51, np.uint8),
+        np.full((4, 6, 4), 51, np.uint8),
+        np.full((4, 6, 3), 0.2, np.float32),
+        np.full((4, 6), 0.2),
+        np.full((4, 6, 3), 51.0),
+        np.full((4, 6, 1), 51, np.int64),
+        [np.zeros((4, 6, 3), np.uint8), np.full((4, 6, 3), 51, np.uint8)],
+    ],
+    ids=["plain", "opacity", "floats", "grey floats", "floats up to 255", "whole numbers", "several"],
+)
+def test_what_an_environment_draws_is_taken_in_any_kind_of_number(drawn):
+    found = drawn_pixels(drawn)
+    assert (found.dtype, found.shape, np.unique(found).tolist()) == (np.uint8, (4, 6, 3), [51])
+
+
+@pytest.mark.parametrize(
+    "drawn", [None, "map", [], np.zeros(3), np.zeros((4, 6, 2)), np.zeros((0, 6, 3)), np.array(["a"])]
+)
+def test_what_is_no_picture_is_none(drawn):
+    assert drawn_pixels(drawn) is None
 
 
 class Scripted(gymnasium.Env):

@@ -93,6 +93,17 @@ def test_a_bundle_without_a_dream_is_recorded_with_two_pictures(controller, rand
         assert (stream.width, stream.height) == AWAKE.size
 
 
+def test_floats_with_opacity_are_filmed_in_their_colours(tmp_path, monkeypatch):
+    task = "gym:tests.support.pixel_fakes:Glass-v0"
+    record(
+        make_agent(Controller(ControllerShape(2, 3), np.zeros(9, np.float32), task, "")), SEED, 2, tmp_path / "a.mp4"
+    )
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        frame = next(container.decode(container.streams.video[0])).to_ndarray(format="rgb24")
+    green = (frame[..., 1] > 150) & (frame[..., 0] < 80) & (frame[..., 2] < 80)  # the player
+    assert green.any()
+
+
 def save_controller(monkeypatch, name, path):
     """A controller of an environment of `tests.support.dark_environments`, which is trusted."""
     monkeypatch.setenv("DREAMFLEET_TRUST", "tests")
