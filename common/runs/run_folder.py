@@ -20,6 +20,7 @@ from dreamfleet.common.protocol.host_classes import HostClasses, class_from_fing
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite
+from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.common.runs import schema
 from dreamfleet.common.runs.effort import START_EFFORT, Effort, GenerationEffort, parse_start_effort
 from dreamfleet.common.runs.journal_reader import (
@@ -57,6 +58,7 @@ CONFIRMED = "confirmed"  # the confirmed score
 ENDED_AT = "ended_at"  # the time when the run ended
 EPISODE_LIMIT = "episode_limit"  # steps after which the environment itself ends an episode
 ENDING = "ending"  # the limit that ended the run; set while the last evaluations still run, and kept
+STOP_KIND = "stop_kind"  # of that limit, a `StopKind`; journals of older versions lack it
 
 
 def open_run(runs_dir: Path, name: str) -> RunFolder:
@@ -150,6 +152,11 @@ class RunFolder(Displayed):
     def ended(self) -> str | None:
         """Why the run ended, or `None` if it did not."""
         return self.fact("ended")
+
+    @property
+    def stop_kind(self) -> StopKind | None:
+        """What ended the run; `None` if it did not end, or if its version did not write it."""
+        return StopKind.parse(self.fact(STOP_KIND)) if self.ended else None
 
     @property
     def ended_at(self) -> str | None:

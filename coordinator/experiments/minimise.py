@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +16,7 @@ from dreamfleet.common.artifacts.objective import Objective, takes_seed
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.protocol.failures import error_text
+from dreamfleet.common.protocol.stop_kind import StopKind, StopReason
 from dreamfleet.common.runs.records import StoredGeneration, best_evaluation
 from dreamfleet.common.runs.run_paths import default_runs_dir
 from dreamfleet.common.serialization.display import Displayed
@@ -33,7 +33,7 @@ FULL_DIMENSION = 200  # up to which CMA-ES learns the full matrix by default
 DETERMINISTIC = {"episodes": 1, "evaluate_every": 10, "evaluation_episodes": 1, "confirm_episodes": 0}
 NOISY = {"episodes": 2, "evaluate_every": 10, "evaluation_episodes": 20, "confirm_episodes": 20}
 CALLER = 5  # frames from what a search run warns in to the program that searches
-CONVERGED = ("no candidate beat", "the population of generation")  # how the words of such an end begin
+CONVERGED = (StopKind.STAGNATION, StopKind.ONE_POINT)
 
 
 class Progress(NamedTuple):
@@ -231,13 +231,12 @@ class _Searches:
         first = popsize or 4 + math.floor(3 * math.log(size))
         if settings.get("optimiser", "cma") == "cma" and size <= FULL_DIMENSION:
             settings = {"covariance": "full", **settings}
-        message = ""
         for number, plan in enumerate(self._plans(first, seed, restarts, kind)):
             own = f"{self._runs[0]}-restart-{number}" if number else name
-            message = self._run(own, plan, number, settings)
+            reason = self._run(own, plan, number, settings)
             if self._stopped or self._has_reached or (self._budget and self._spent >= self._budget):
                 break
-        return self._result(message)
+        return self._result(reason)
 
     def _plans(self, popsize: int, seed: int, restarts: int, kind: Restart) -> Iterator[_Plan]:
         """The searches in turn; BIPOP as Hansen 2009, "Benchmarking a BI-population CMA-ES on BBOB-2009"."""
@@ -270,7 +269,7 @@ class _Searches:
         found = self._favorite if self._is_noisy else self._best
         return self._ftarget is not None and found is not None and found[0] >= self._objective.value(self._ftarget)
 
-    def _run(self, name: str | None, plan: _Plan, number: int, settings: dict[str, Any]) -> str:
+    def _run(self, name: str | None, plan: _Plan, number: int, settings: dict[str, Any]) -> StopReason:
         """One search as a run; why it ended."""
         objective = self._objective_of(plan, number)
         target = None if self._ftarget is None else objective.value(self._ftarget)
@@ -290,19 +289,23 @@ class _Searches:
         self._read_means(run, objective)
         self._results += run.result_count()
         run.close()
-        return f"reached ftarget {format_number(self._ftarget)}" if self._has_reached else ended
+        if self._has_reached:
+            return StopReason(ended.kind, f"reached ftarget {format_number(self._ftarget)}")
+        if self._budget and ended.kind is StopKind.STEPS and "steps" not in settings:
+            return StopReason(ended.kind, f"maxfevals={self._budget} is reached")
+        return ended
 
-    def _follow_all(self, run: StartedRun, objective: Objective) -> str:
+    def _follow_all(self, run: StartedRun, objective: Objective) -> StopReason:
         """Follow a run to its end; why it ended. `UsageError` if no candidate of the search has a value."""
         try:
             for generation in run:
                 if not self._follow(run, objective, generation):
                     self._stopped = True
-                    return "stopped by the callback"
+                    return StopReason(None, "stopped by the callback")
         except RunPausedError as pause:
             if self._best is not None and run.failures():
                 self._note_failures(run, run.settings.population)
-                return f"all candidates of generation {len(run.history())} failed"
+                return StopReason(None, f"all candidates of generation {len(run.history())} failed")
             errors = [*(each.error for each in run.failures()), *pause.errors]
             if self._best is not None or not errors:
                 raise
@@ -310,7 +313,7 @@ class _Searches:
                 f"no candidate has a value, first: {error_text(errors[0])}. Begin where the function has one (x0, a "
                 "smaller sigma0, bounds), or give a penalty in place of NaN and infinity"
             ) from None
-        return run.ended or run.state
+        return StopReason(run.stop_kind, run.ended or run.state)
 
     def _objective_of(self, plan: _Plan, number: int) -> Objective:
         """Where a search begins: the first at x0, a restart at random within bounds, or at x0 if there are none."""
@@ -367,15 +370,12 @@ class _Searches:
         if self._favorite is None or fitness > self._favorite[0]:
             self._favorite = fitness, objective.decode(run.evaluated_mean(best.generation))
 
-    def _result(self, message: str) -> SearchResult:
+    def _result(self, reason: StopReason) -> SearchResult:
         if self._best is None:
-            raise UsageError(f"the search ended before its first generation closed: {message}")
+            raise UsageError(f"the search ended before its first generation closed: {reason.text}")
         best, favorite = self._best, self._favorite or self._best
         fitness, x = favorite if self._is_noisy else max(best, favorite, key=lambda each: each[0])
-        converged = self._ftarget is None and message.startswith(CONVERGED)
-        if self._budget and re.fullmatch(r"[\d,]+ evaluations?", message):
-            message = f"maxfevals={self._budget} is reached"
-        message = message.partition("; start another")[0]  # a command line's advice
+        converged, message = self._ftarget is None and reason.kind in CONVERGED, reason.text
         if self._failed:
             message += f"; {plural(self._failed, 'candidate')} failed, first: {self._first_failure}"
         return SearchResult(

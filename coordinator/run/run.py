@@ -17,8 +17,9 @@ from dreamfleet.common.errors import NotWritableNowError
 from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.messages import Job, Result
 from dreamfleet.common.protocol.result_bounds import MAX_SECONDS
+from dreamfleet.common.protocol.stop_kind import StopKind, StopReason
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
-from dreamfleet.common.runs.run_folder import ENDING, EPISODE_LIMIT
+from dreamfleet.common.runs.run_folder import ENDING, EPISODE_LIMIT, STOP_KIND
 from dreamfleet.common.runs.scoring_params import ScheduleState
 from dreamfleet.common.runs.stages import longest_horizon
 from dreamfleet.common.serialization.times import elapsed_seconds
@@ -110,6 +111,11 @@ class Run:
     def ending(self) -> bool:
         """Whether a limit is reached, so that only evaluations, kept rollouts and the confirmation remain."""
         return self._ending is not None
+
+    @property
+    def stop_kind(self) -> StopKind | None:
+        """What ended the run; `None` while it has not ended, or if an older version did not write it."""
+        return None if self.ended is None or self._ending is None else self._ending.kind
 
     @property
     def elapsed(self) -> float | None:
@@ -447,7 +453,7 @@ class Run:
         stage = self.generations.scoring_params.stage
         return f"stage {stage.number} of {len(self._agenda.stages)} ({stage.description})"
 
-    def _stop_reason(self, generation: Generation) -> str | None:
+    def _stop_reason(self, generation: Generation) -> StopReason | None:
         if self.settings.is_external:
             return None
         return find_stop_reason(self.limits, self.history, self.background_jobs, generation, self.settings.task)
@@ -468,19 +474,23 @@ class Run:
                 self.fleet.notes.append("no confirmed score: every episode of the confirmation failed")
             self._end()
 
-    def _begin_ending(self, reason: str) -> None:
+    def _begin_ending(self, reason: StopReason) -> None:
         """Journal the reached limit with all limits: the last evaluations may make it look unreached again."""
         self._ending = reason
-        self._journal.set_fact(ENDING, json.dumps([reason, asdict(self.limits)]))
+        self._journal.set_fact(ENDING, json.dumps([reason.text, asdict(self.limits)]))
+        self._journal.set_fact(STOP_KIND, reason.kind or "")
 
-    def _stored_end_reason(self) -> str | None:
+    def _stored_end_reason(self) -> StopReason | None:
         """The limit that an earlier incarnation reached; `None` if this one has other limits."""
         reason, limits = json.loads(self._journal.fact(ENDING) or "[null, null]")
         known = None if limits is None else {**asdict(LimitsConfig()), **limits}  # an older version knew fewer
-        return reason if known == asdict(self.limits) else None
+        if known != asdict(self.limits):
+            return None
+        return StopReason(StopKind.parse(self._journal.fact(STOP_KIND)), reason)
 
     def _end(self) -> None:
-        self.ended = self._ending or "stopped"
+        assert self._ending is not None
+        self.ended = self._ending.text
         self.fleet.withdraw(self.fleet.jobs.digests_of_kind("score"))  # a new host may still have one to show itself
         self._journal.end(self.ended)
         self._journal_notes()

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.runs.effort import Effort
-from dreamfleet.common.runs.run_folder import CONFIRMED, ENDED_AT, ENDING
+from dreamfleet.common.runs.run_folder import CONFIRMED, ENDED_AT, ENDING, STOP_KIND
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
 from dreamfleet.coordinator.storage.batch_records import MOST_VARIABLES
 from dreamfleet.coordinator.storage.verification_records import VerificationRecords
@@ -174,6 +174,6 @@ class RecallRecords(VerificationRecords):
     def _settle_recall(self) -> None:
         """Let checks of results that do not count any more stand no longer, and no end or confirmation follow."""
         self._write("UPDATE verification SET stands = 0 WHERE digest NOT IN (SELECT digest FROM result)")
-        for fact in (ENDING, "ended", ENDED_AT, CONFIRMED):
+        for fact in (ENDING, STOP_KIND, "ended", ENDED_AT, CONFIRMED):
             self.drop_fact(fact)
         self._effort = self._counted = self._has_set_aside = None

@@ -211,6 +211,7 @@ def _report(
     args: argparse.Namespace, run: Run, request: RunRequest, outcome: ExitReport, *, nothing_new: bool
 ) -> None:  # fmt: skip
     from dreamfleet.common.monitoring.eta import format_duration
+    from dreamfleet.common.protocol.stop_kind import StopKind
     from dreamfleet.common.runs.records import describe_score, in_values, with_error
     from dreamfleet.common.runs.run_folder import open_run
     from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER
@@ -238,6 +239,8 @@ def _report(
     else:
         where = f"; controller: {controller}" if controller else "; it has no controller yet"
         more = f"; to continue it, widen its limits: {again} --generations 0 --minutes 30" if nothing_new else ""
+        if run.stop_kind is StopKind.ONE_POINT:
+            more = f"; a run --from {request.name} with a larger --sigma0 searches on"
         failed = _describe_failures(request, run.history.failed)
         lasted = elapsed_seconds(run.created, datetime.now(UTC).isoformat())
         ago = "" if lasted is None else f" (begun {format_duration(lasted)} ago)"

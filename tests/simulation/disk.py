@@ -238,7 +238,7 @@ class MemoryJournal:
         self._put("result", digest, None)
 
     def _settle_recall(self) -> None:
-        for fact in ("ending", "ended", "ended_at", "confirmed"):
+        for fact in ("ending", "stop_kind", "ended", "ended_at", "confirmed"):
             self.drop_fact(fact)
 
     def rewind(self, number: int, state: Any, seeds: Sequence[int]) -> None:

@@ -12,6 +12,10 @@ def sphere(x):
     return float(np.square(x - 1).sum())
 
 
+def flat(_x):
+    return 2.5
+
+
 def noisy(x, seed):
     return float(np.square(x).sum() + 0.1 * np.random.default_rng(seed).normal())
 

@@ -4,12 +4,20 @@ import numpy as np
 import pytest
 
 import dreamfleet
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.errors import StoppedError, UsageError
+from dreamfleet.common.monitoring.client import Client
+from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.coordinator.experiments import minimise as module
 from dreamfleet.coordinator.experiments.search_arguments import read_bounds, read_objective
 from tests.support import objectives
+from tests.support.processes import free_port
 
 FEW = {"workers": 1, "popsize": 8}
+
+
+def stop_kind(found, runs_dir):
+    with dreamfleet.open_run(found.run, runs_dir) as run:
+        return run.stop_kind
 
 
 @pytest.mark.slow
@@ -20,7 +28,6 @@ def test_it_finds_the_minimum_and_the_run_can_be_read(tmp_path):
         run="mine", runs_dir=tmp_path, **FEW,
     )  # fmt: skip
     assert found.success
-    assert found.message.startswith("reached ftarget")
     assert found.fun == objectives.sphere(found.x) <= 1e-6
     assert found.history == tuple(seen)
     assert [each.fun for each in seen] == sorted((each.fun for each in seen), reverse=True)
@@ -28,6 +35,7 @@ def test_it_finds_the_minimum_and_the_run_can_be_read(tmp_path):
         assert found.nfev == run.result_count() >= 8 * found.nit
         assert -run.history()[-1].best == objectives.sphere(found.xbest) >= found.fun
         assert run.spec.horizon == 1
+        assert run.stop_kind is StopKind.CANDIDATE_TARGET
 
 
 @pytest.mark.slow
@@ -38,18 +46,52 @@ def test_a_noisy_function_gives_the_mean_that_was_judged(tmp_path):
     )  # fmt: skip
     assert np.array_equal(found.x, found.xfavorite)
     assert not np.array_equal(found.x, found.xbest)
-    assert found.message == "6 generations"
+    assert not found.success
+    assert stop_kind(found, tmp_path) is StopKind.GENERATIONS
 
 
 @pytest.mark.slow
 def test_a_noisy_search_has_no_more_calls_than_maxfevals(tmp_path):
     found = dreamfleet.minimise(objectives.noisy, [1, 1], 0.3, maxfevals=400, run="mine", runs_dir=tmp_path, **FEW)
-    assert found.message == "maxfevals=400 is reached"
+    assert not found.success
+    assert "maxfevals=400" in found.message
     with dreamfleet.open_run("mine", tmp_path) as run:
+        assert run.stop_kind is StopKind.STEPS
         generation = run.settings.population * run.settings.episodes
         assert len(run.evaluations()) > 1
         assert run.confirmation() is not None
         assert 400 - 2 * generation - run.settings.evaluation_episodes < found.nfev == run.result_count() <= 400
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "success", "function", "given"),
+    [
+        (StopKind.ONE_POINT, True, objectives.sphere, {"stagnation": 0, "popsize": 16}),
+        (StopKind.ONE_POINT, False, objectives.sphere, {"stagnation": 0, "popsize": 16, "ftarget": -1.0}),
+        (StopKind.STAGNATION, True, objectives.flat, {"stagnation": 2}),
+        (StopKind.TARGET, True, objectives.noisy, {"ftarget": 100.0, "evaluate_every": 1, "confirm_episodes": 0}),
+        (StopKind.MINUTES, False, objectives.flat, {"minutes": 0.001}),
+    ],
+)
+def test_a_search_succeeds_where_it_converged_or_reached_its_target(kind, success, function, given, tmp_path):
+    found = dreamfleet.minimise(function, [1.5, 2], 0.1, runs_dir=tmp_path, **{**FEW, **given})
+    assert found.success is success
+    assert stop_kind(found, tmp_path) is kind
+    assert "--" not in found.message, "it is read in a program"
+
+
+@pytest.mark.slow
+def test_a_search_that_somebody_stops_raises(tmp_path):
+    address = f"tcp/127.0.0.1:{free_port()}"
+
+    def stop(progress):
+        if progress.generation == 0:
+            with Client(address) as client:
+                client.control(progress.run, "stop")
+
+    with pytest.raises(StoppedError):
+        dreamfleet.minimise(objectives.flat, [0, 0], 1.0, callback=stop, listen=address, runs_dir=tmp_path, **FEW)
 
 
 @pytest.mark.slow
@@ -105,8 +147,8 @@ def test_a_search_that_loses_all_values_returns_what_it_found(tmp_path, monkeypa
         )
     # On a busy host several generations close before the first call, and a mean that is evaluated may be better.
     assert found.fun <= found.history[-1].fun
-    assert f"all candidates of generation {found.nit} failed; " in found.message
-    assert "failed, first: losing returned nan" in found.message
+    assert not found.success
+    assert stop_kind(found, tmp_path / "runs") is None, "it was left open"
 
 
 @pytest.mark.slow
@@ -116,7 +158,8 @@ def test_a_callback_ends_the_search(tmp_path):
             raise StopIteration
 
     found = dreamfleet.minimise(objectives.sphere, [0, 0], 1.0, callback=stop, restarts=2, runs_dir=tmp_path, **FEW)
-    assert (found.nit, found.message, found.success) == (2, "stopped by the callback", False)
+    assert (found.nit, len(found.runs), found.success) == (2, 1, False)
+    assert stop_kind(found, tmp_path) is None, "it was left open"
 
 
 @pytest.mark.parametrize(

@@ -19,8 +19,9 @@ from dreamfleet.common.protocol.messages import (
     ResultBatch,
     UploadPart,
 )
+from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation
-from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.run_folder import STOP_KIND, RunFolder
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.run.worker_protocol import WorkerProtocol
@@ -330,11 +331,22 @@ def test_a_run_whose_population_is_one_point_ends_with_that_reason(tmp_path, ran
             for send in bench.run.fleet.dispatch(bench.now):
                 for work in send.content.work:
                     bench.deliver(send.identity, Result(work.job.digest, 1.0, 10, 0.1, None, None))
-        assert "are equal; a run --from it" in bench.run.ended
+        assert bench.run.stop_kind is StopKind.ONE_POINT
         closed = len(bench.run.history)
         bench.restart()
         assert len(bench.run.history) == closed
         assert bench.run.ended
+        assert bench.run.stop_kind is StopKind.ONE_POINT
+    with RunFolder(bench.path) as stored:
+        assert stored.stop_kind is StopKind.ONE_POINT
+    bench.journal.drop_fact(STOP_KIND)  # as an older version leaves it
+    bench.journal.commit()
+    bench.restart()
+    assert bench.run.ended
+    assert bench.run.stop_kind is None
+    with RunFolder(bench.path) as stored:
+        assert stored.ended
+        assert stored.stop_kind is None
 
 
 def test_parted_compares_the_same_scores_before_and_after_a_restart(tmp_path, random_bundle):

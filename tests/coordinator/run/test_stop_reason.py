@@ -7,19 +7,54 @@ import pytest
 
 from dreamfleet.common.artifacts.objective import Objective
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.runs.records import StoredGeneration
+from dreamfleet.common.protocol.stop_kind import StopKind
+from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.run.stop_reason import find_stop_reason
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from tests.support.samples import SPEC
 
 NO_JOBS = SimpleNamespace(evaluations=SimpleNamespace(best=None))
+FALLEN = SimpleNamespace(
+    evaluations=SimpleNamespace(best=StoredEvaluation(0, 10, 5.0, 1.0)), have_fallen_behind=lambda limit: limit == 2
+)
 OPEN = SimpleNamespace(is_one_point=False, number=9)
 
 
-def reason(limits, *best, task="gym:CartPole-v1", options="", spread=2.0):
+def find(limits, *best, task="gym:CartPole-v1", options="", spread=2.0, jobs=NO_JOBS, generation=OPEN):
     rows = (StoredGeneration(number, each, 1.0, each, each - spread, 0.1, 10, 1.0) for number, each in enumerate(best))
-    return find_stop_reason(limits, History(rows), NO_JOBS, OPEN, replace(SPEC, task=task, options=options))
+    return find_stop_reason(limits, History(rows), jobs, generation, replace(SPEC, task=task, options=options))
+
+
+def reason(*given, **more):
+    found = find(*given, **more)
+    return found and found.text
+
+
+@pytest.mark.parametrize(
+    ("kind", "limits"),
+    [
+        (StopKind.GENERATIONS, {"generations": 4}),
+        (StopKind.STEPS, {"steps": 40}),
+        (StopKind.MINUTES, {"minutes": 4 / 60}),
+        (StopKind.CANDIDATE_TARGET, {"candidate_target": 2.0}),
+        (StopKind.STAGNATION, {"stagnation": 2}),
+        (StopKind.TARGET, {"target": 5.0}),
+        (StopKind.PARTED, {"parted": 2}),
+        (StopKind.ONE_POINT, {}),
+    ],
+)
+def test_each_end_has_its_kind(kind, limits):
+    generation = SimpleNamespace(is_one_point=kind is StopKind.ONE_POINT, number=9)
+    found = find(LimitsConfig(**limits), 2, 1, 1, 1, jobs=FALLEN, generation=generation)
+    assert found.kind is kind
+    assert StopKind.parse(found.kind.value) is kind
+    assert "--" not in found.text, "a search in Python says it too"
+
+
+def test_a_kind_that_is_not_known_is_none():
+    assert StopKind.parse(None) is None
+    assert StopKind.parse("of a later version") is None
 
 
 def test_a_run_ends_when_a_candidate_reaches_the_target():
