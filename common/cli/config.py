@@ -32,8 +32,8 @@ METAVARS = {
     **dict.fromkeys(("horizon", "patience", "steps"), "STEPS"),
     **dict.fromkeys(("optimiser_options", "variant"), "NAME=VALUE"),
     "bundle": "BUNDLE", "env": "NAME=VALUE", "environment": "KEY=VALUE", "init": "CONTROLLER", "name": "NAME",
-    "preset": "PRESET", "run": "RUN", "subspace": "SUBSPACE", "target": "SCORE", "task": "TASK", "trust": "MODULE",
-    "world": "WORLD",
+    "observation": "KEY", "preset": "PRESET", "run": "RUN", "subspace": "SUBSPACE", "target": "SCORE", "task": "TASK",
+    "trust": "MODULE", "world": "WORLD",
 }  # fmt: skip
 KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", Path: "a path"}
 

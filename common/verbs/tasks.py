@@ -30,6 +30,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--environment", nargs="+", default=(), metavar="KEY=VALUE", help="arguments of gym:ENVIRONMENT, as in JSON"
     )
+    parser.add_argument(
+        "--observation", nargs="+", default=(), metavar="KEY",
+        help="keys of the Dict that gym:ENVIRONMENT observes which the controller sees (default all that are numbers)",
+    )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print them as JSON")
 
 
@@ -42,8 +46,10 @@ def run(args: argparse.Namespace) -> int:
         points = {args.task: points[args.task]}
     elif args.task is not None:
         return _check(args)
-    if args.environment:
-        raise UsageError("--environment needs one gym:ENVIRONMENT: name it, such as gym:LunarLander-v3")
+    if args.environment or args.observation:
+        raise UsageError(
+            "--environment and --observation need one gym:ENVIRONMENT: name it, such as gym:LunarLander-v3"
+        )
     rows = [_row(name, point) for name, point in points.items()]
     if args.json:
         print(json.dumps(rows, indent=2))
@@ -59,7 +65,8 @@ def _check(args: argparse.Namespace) -> int:
 
     check_task(args.task)
     arguments = parse_arguments("--environment", args.environment, ENVIRONMENT_EXAMPLE)
-    found = try_task(args.task, {"environment": arguments} if arguments else {})
+    given = {"environment": arguments, "observation": list(args.observation)}
+    found = try_task(args.task, {key: value for key, value in given.items() if value})
     if args.json:
         print(json.dumps({"task": args.task, **asdict(found)}, indent=2))
     else:

@@ -62,7 +62,7 @@ from dreamfleet.coordinator.settings.run_checks import check_subspace, try_optim
 from dreamfleet.coordinator.settings.schedule import check_schedule, split_first_stage
 from dreamfleet.coordinator.settings.task_options import (
     check_normalisation,
-    parse_environment,
+    parse_described,
 )
 
 DEFAULT_BUNDLE, NO_BUNDLE = "tiny", "none"
@@ -92,11 +92,15 @@ class RunConfig:
     environment: tuple[str, ...] = option(
         (), "KEY=VALUE arguments of gym:ENVIRONMENT or function:MODULE:NAME; values as in JSON"
     )
+    observation: tuple[str, ...] = option(
+        (), "keys of the Dict that gym:ENVIRONMENT observes which the controller sees (default all that are numbers)"
+    )
     normalise: bool = option(
         False, "shift and scale the observations of gym:ENVIRONMENT by their statistics when the run begins"
     )
     task_options: str | None = option(
-        None, "the task's own options as `runs show` prints them, instead of --environment and --normalise"
+        None,
+        "the task's own options as `runs show` prints them, instead of --environment, --observation and --normalise",
     )
     variant: tuple[str, ...] = option(
         (),
@@ -328,8 +332,10 @@ class RunConfig:
 
     def _resolve_with_bundle(self, bundle: Bundle) -> tuple[TaskSpec, ControllerShape, tuple[str, ...]]:
         self._check_world(bundle)
-        if self.environment or self.normalise or self.task_options:
-            raise UsageError("--environment, --normalise and --task-options are of tasks without a world model")
+        if self.environment or self.observation or self.normalise or self.task_options:
+            raise UsageError(
+                "--environment, --observation, --normalise and --task-options are of tasks without a world model"
+            )
         if self.recorded:
             bundle.check_recorded()
         driving, facts = self._driving(bundle), bundle.manifest.world
@@ -406,9 +412,11 @@ class RunConfig:
     def description_options(self) -> dict[str, Any]:
         """The options under which the task describes itself."""
         if self.task_options is not None:
-            return {"environment": parse_environment(self.task_options)}
+            return parse_described(self.task_options)
         arguments = parse_arguments("--environment", self.environment, "continuous=true")
         options: dict[str, Any] = {"environment": arguments} if arguments else {}
+        if self.observation:
+            options["observation"] = list(self.observation)
         return options | ({"normalise": True, "seed": self.seed} if self.normalise else {})
 
 

@@ -62,7 +62,7 @@ class Fork:
                 source,
                 heat,
             )
-        if {"environment", "normalise"} & set(given):
+        if {"environment", "observation", "normalise"} & set(given):
             settings.pop("task_options", None)  # described anew, and refused if that makes another world of it
         if "optimiser" in given and "optimiser_options" not in given:
             settings.pop("optimiser_options", None)  # they are the other one's

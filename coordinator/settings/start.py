@@ -56,7 +56,7 @@ class StartPoint:
             way = own.without_costs if said or config.task == DREAM else own
             kept = (text for text in way.option_texts if _key_of(text) not in said)
             return replace(config, variant=(*kept, *config.variant), preset_variant=costs)
-        given = config.task_options is not None or config.environment or config.normalise
+        given = config.task_options is not None or config.environment or config.observation or config.normalise
         return config if given else replace(config, task_options=self.options)
 
     @property
@@ -87,8 +87,8 @@ class StartPoint:
         """What candidates pay is no part of a controller: a start may be of another time cost."""
         if not spec.bundle and self.options != spec.options:
             raise ControllerError(
-                f"{self.source} was evolved under other options of {spec.task}: omit --environment and --normalise, "
-                "and it brings its own"
+                f"{self.source} was evolved under other options of {spec.task}: omit --environment, --observation and "
+                "--normalise, and it brings its own"
             )
         if spec.bundle and (own := Variant.from_json(self.options).without_costs) != (
             wanted := Variant.from_json(spec.options).without_costs

@@ -9,10 +9,12 @@ from typing import Any
 from dreamfleet.common.errors import UsageError
 
 
-def parse_environment(text: str) -> dict[str, Any]:
-    """The arguments of the environment in the JSON object of --task-options."""
+def parse_described(text: str) -> dict[str, Any]:
+    """The options by which a task describes itself, of those in the JSON object of --task-options."""
     try:
-        return dict(json.loads(text or "{}").get("environment", {}))
+        plain = json.loads(text or "{}")
+        observation = {"observation": list(plain["observation"])} if plain.get("observation") else {}
+        return {"environment": dict(plain.get("environment", {})), **observation}
     except (ValueError, AttributeError, TypeError, RecursionError) as error:
         raise UsageError(f"--task-options must be a JSON object, not {text!r}") from error
 

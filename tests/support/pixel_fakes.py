@@ -199,9 +199,30 @@ class Gauges(gymnasium.Env):
 
 
 class Telling(Gauges):
-    """Observes a text among others, as MiniGrid does."""
+    """Observes texts among numbers, as MiniGrid does, and deeper ones too."""
 
-    observation_space = spaces.Dict({"hand": spaces.Discrete(3), "mission": spaces.Text(9)})
+    observation_space = spaces.Dict(
+        {
+            "hand": spaces.Discrete(3, start=5),
+            "mission": spaces.Text(9),
+            "notes": spaces.Tuple((spaces.Text(3), spaces.Box(-1, 1, (2,), np.float32))),
+        }
+    )
+
+    def observe(self):
+        return {"hand": np.int64(7), "mission": "go", "notes": ("so", np.float32([0.5, 0.25]))}
+
+
+class Mute(Gauges):
+    """Observes only a text."""
+
+    observation_space = spaces.Dict({"mission": spaces.Text(9)})
+
+
+class Blind(Gauges):
+    """Observes nothing."""
+
+    observation_space = spaces.Box(-1, 1, (0,), np.float32)
 
 
 class Faulty(Dodge):
@@ -267,7 +288,7 @@ class Rude(Dodge):
 
 KINDS = (
     Faulty, Rude, InDict, InTwo, Grey, ChannelsFirst, Stacked, Floats, Buttons, Switches, BothEnds, Unseen, Glass,
-    Board, Gauges, Telling,
+    Board, Gauges, Telling, Mute, Blind,
 )  # fmt: skip
 for each in KINDS:
     gymnasium.register(f"{each.__name__}-v0", each, max_episode_steps=200)

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from enum import IntEnum
 from importlib import import_module
+from importlib.util import find_spec
 from math import isfinite
 from typing import Any
 
@@ -76,7 +77,8 @@ def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
         module, colon, _ = name.rpartition(":")
         remedy = "" if colon else f"; an environment of another package is written {GYM}:its_module:Its-v0"
         if known := next((each for start, each in PACKAGES.items() if name.startswith(start)), None):
-            remedy = f"; install it on this host with `pip install {known[0]}`, and write {GYM}:{known[1]}:{name}"
+            install = "" if find_spec(known[1]) else f"install it on this host with `pip install {known[0]}`, and "
+            remedy = f"; its package must be imported: {install}write {GYM}:{known[1]}:{name}"
         if colon and isinstance(error, ModuleNotFoundError):
             remedy = (
                 f"; install the package of {module} on this host, or name its folder in PYTHONPATH, and trust it by "

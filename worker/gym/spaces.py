@@ -5,7 +5,7 @@ A number of a `Discrete` or `MultiDiscrete` space is one-hot there; entries of a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import product
 from math import prod
@@ -59,20 +59,23 @@ def make_converter(space: Any, actions: Continuous) -> Callable[[Floats], Any]:
     return convert
 
 
-def flatten_environment(environment: gymnasium.Env[Any, Any], name: str) -> tuple[gymnasium.Env[Any, Any], Actions]:
+def flatten_environment(
+    environment: gymnasium.Env[Any, Any], name: str, keys: Sequence[str] = ()
+) -> tuple[gymnasium.Env[Any, Any], Actions]:
     """The environment for a controller without a world model, and the actions that it then takes.
 
     Box observations, Discrete actions and flat Boxes stay as they are. Other observations and actions become vectors,
-    and other numbered actions one number. `UsageError` where that is impossible.
+    and other numbered actions one number. Of a Dict, `keys` are seen; without any, all that are numbers. `UsageError`
+    where that is impossible.
     """
     observed, space = environment.observation_space, environment.action_space
-    if not isinstance(observed, spaces.Box):
-        if not all(isinstance(each, (spaces.Box, *NUMBERED)) for each in _leaves(observed)):
-            raise UsageError(
-                f"{name} observes {observed}: wrap it so that it observes numbers (Box, Discrete, MultiDiscrete, "
-                "MultiBinary, or a Dict or Tuple of these)"
-            )
-        environment = FlattenObservation(environment)
+    if keys or not isinstance(observed, spaces.Box):
+        environment = FlattenObservation(_choose_numbers(environment, name, keys))
+    if 0 in (environment.observation_space.shape or ()):
+        raise UsageError(
+            f"{name} observes no number ({observed}), and a controller acts on what it sees: let it observe one, such "
+            "as a constant 1, or search its actions as a function (function:MODULE:NAME)"
+        )
     if isinstance(space, spaces.Discrete):
         return environment, Discrete(int(space.n), int(space.start))
     actions = vector_actions(space, name)
@@ -86,13 +89,74 @@ def flatten_environment(environment: gymnasium.Env[Any, Any], name: str) -> tupl
     return TransformAction(environment, lambda number: convert(table[number]), numbers), Discrete(len(table))
 
 
+class NumbersAlone(gymnasium.ObservationWrapper[Any, Any, Any]):
+    """Observes the numbers of a Dict or Tuple as a Dict, without text, graphs and sequences."""
+
+    def __init__(self, environment: gymnasium.Env[Any, Any], numbers: spaces.Dict, left_out: Sequence[str]) -> None:
+        """`left_out` names what is no number."""
+        super().__init__(environment)
+        self.observation_space = numbers
+        self.left_out = tuple(left_out)
+
+    def observation(self, observation: Any) -> Any:
+        """The numbers."""
+        return _pick(self.observation_space, observation)
+
+
+def _choose_numbers(environment: gymnasium.Env[Any, Any], name: str, keys: Sequence[str]) -> gymnasium.Env[Any, Any]:
+    """The environment with what a controller sees of it, all if all are numbers; `UsageError` if nothing is left."""
+    observed = environment.observation_space
+    entries = observed.spaces if isinstance(observed, spaces.Dict) else {}
+    if unknown := [key for key in keys if key not in entries]:
+        known = f"it observes {', '.join(map(str, entries))}" if entries else "it does not observe a Dict: omit it"
+        raise UsageError(f"{name} has no {', '.join(unknown)} for --observation: {known}")
+    chosen = spaces.Dict({key: entries[key] for key in keys}) if keys else observed
+    paths = [path for path, each in _paths(chosen) if not is_of_numbers(each)]
+    numbers = _numbers(chosen)
+    if numbers is None or any(_numbers(entries[key]) is None for key in keys):
+        raise UsageError(
+            f"{name} observes {chosen}: wrap it so that it observes numbers (Box, Discrete, MultiDiscrete, "
+            "MultiBinary, or a Dict or Tuple of these)"
+        )
+    return NumbersAlone(environment, numbers, paths) if keys or paths else environment
+
+
+def is_of_numbers(space: Any) -> bool:
+    """Whether all of a space, however deep, are numbers that a controller can see."""
+    return all(isinstance(each, (spaces.Box, *NUMBERED)) for each in _leaves(space))
+
+
+def _numbers(space: Any) -> Any:
+    """The space without what is no number, and Tuples as Dicts; `None` if nothing is left."""
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        kept = {key: found for key, each in _entries(space) if (found := _numbers(each)) is not None}
+        return spaces.Dict(kept) if kept else None
+    return space if is_of_numbers(space) else None
+
+
+def _pick(numbers: Any, observation: Any) -> Any:
+    """What a space of `_numbers` holds of an observation."""
+    if isinstance(numbers, spaces.Dict):
+        return {key: _pick(each, observation[key]) for key, each in numbers.spaces.items()}
+    return observation
+
+
+def _paths(space: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """The spaces in a Dict or Tuple, however deep, each with its keys from the outermost on."""
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        for key, each in _entries(space):
+            yield from _paths(each, f"{path}.{key}" if path else str(key))
+    else:
+        yield path, space
+
+
+def _entries(space: Any) -> list[tuple[Any, Any]]:
+    return list(space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces))
+
+
 def _leaves(space: Any) -> Iterator[Any]:
     """The spaces in a Dict or Tuple, however deep, in the order in which they are flattened."""
-    if isinstance(space, (spaces.Dict, spaces.Tuple)):
-        for each in space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces:
-            yield from _leaves(each)
-    else:
-        yield space
+    return (each for _, each in _paths(space))
 
 
 def _check_box(space: spaces.Box, name: str) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +29,13 @@ from dreamfleet.worker.gym.environments import (
     make_environment,
 )
 from dreamfleet.worker.gym.pixels import GymPixelTask, PixelOptions
-from dreamfleet.worker.gym.spaces import flatten_environment
+from dreamfleet.worker.gym.spaces import flatten_environment, is_of_numbers
 from dreamfleet.worker.tasks.api import Assignment, Description, Policy, Task, World
 from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tasks.policy import FlatPolicy
 from dreamfleet.worker.tasks.reset import reset_folded
 
-OPTIONS = ("environment", "normalise", "seed")
+OPTIONS = ("environment", "observation", "normalise", "seed")
 NORMALISING_EPISODES = 20
 
 
@@ -68,7 +68,7 @@ class GymTask(Task):
 
     def world_of(self, assignment: Assignment) -> World:
         """The world of the environment's spaces and registration; `UsageError` if they cannot be used."""
-        environment, world = self._open(assignment.spec.option("environment", {}))
+        environment, world = self._open(*_frozen(assignment))
         close_environment(environment)
         return world
 
@@ -80,7 +80,7 @@ class GymTask(Task):
         self, assignment: Assignment, render_mode: str | None = None
     ) -> gymnasium.Env[Any, Any]:
         """The same environment; `UsageError` if it has no render modes and pictures are wanted."""
-        return self._open(assignment.spec.option("environment", {}), render_mode)[0]
+        return self._open(*_frozen(assignment), render_mode)[0]
 
     def make_watched_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any] | None:
         """The environment with pictures; `None` outside of gymnasium, where `render` might change scores."""
@@ -95,26 +95,35 @@ class GymTask(Task):
         return FlatPolicy(assignment.controller, self.world_of(assignment).actions, normal["mean"], normal["deviation"])
 
     def find_standalone_script(self, assignment: Assignment) -> Path | None:
-        """The script for Discrete and flat Box actions; `None` for other actions, which it would have to convert."""
-        made = make_environment(self._id, assignment.spec.option("environment", {}))
-        space = made.action_space
+        """The script for Discrete and flat Box actions; `None` for other actions, which it would have to convert.
+
+        So it is where a part of the observation is left out.
+        """
+        arguments, keys = _frozen(assignment)
+        made = make_environment(self._id, arguments)
+        space, seen = made.action_space, made.observation_space
         close_environment(made)
         is_plain = isinstance(space, spaces.Discrete) or (isinstance(space, spaces.Box) and len(space.shape) == 1)
+        is_plain = is_plain and not keys and is_of_numbers(seen)
         return Path(__file__).with_name("standalone_play.py") if is_plain else None
 
     def describe(self, options: Mapping[str, Any]) -> Description:
         """Sizes, packages, and the options that a run freezes.
 
-        Option `environment`: arguments of `gymnasium.make`. Option `normalise`: shift and scale observations by their
-        mean and standard deviation in 20 episodes of random actions, with seeds from `seed` on.
+        Option `environment`: arguments of `gymnasium.make`. Option `observation`: keys of a Dict that are seen. Option
+        `normalise`: shift and scale observations by their mean and standard deviation in 20 episodes of random actions,
+        with seeds from `seed` on.
         """
         if unknown := set(options) - set(OPTIONS):
             raise UsageError(f"task {self.name} knows no option {', '.join(sorted(unknown))}: {', '.join(OPTIONS)}")
         arguments = dict(options.get("environment") or {})
-        environment, world = self._open(arguments)
+        keys = list(dict.fromkeys(options.get("observation") or ()))
+        environment, world = self._open(arguments, keys)
         try:
             self._check_version(environment)
             frozen: dict[str, Any] = {"environment": arguments} if arguments else {}
+            if keys:
+                frozen["observation"] = keys
             if options.get("normalise"):
                 mean, deviation = _measure_normalisation(environment, int(options.get("seed", 0)))
                 frozen["normal"] = {"mean": mean.tolist(), "deviation": deviation.tolist()}
@@ -133,18 +142,23 @@ class GymTask(Task):
             raise UsageError(f"task {self.name} names no version: write {GYM}:{module}{colon}{found}")
 
     def _open(
-        self, arguments: Mapping[str, Any], render_mode: str | None = None
+        self, arguments: Mapping[str, Any], keys: Sequence[str] = (), render_mode: str | None = None
     ) -> tuple[gymnasium.Env[Any, Any], World]:
         """The environment for a controller without a world model, and its world."""
         made = make_environment(self._id, arguments, render_mode)
         try:
-            environment, actions = flatten_environment(made, self._id)
+            environment, actions = flatten_environment(made, self._id, keys)
         except UsageError:
             close_environment(made)
             raise
         meanings = action_meanings(made)
         names = meanings if len(meanings) == actions.outputs and isinstance(actions, Discrete) else ()
         return environment, World(actions, action_names=names, **describe_environment(made))
+
+
+def _frozen(assignment: Assignment) -> tuple[dict[str, Any], list[str]]:
+    """The environment's arguments and the observation's keys that a run froze."""
+    return assignment.spec.option("environment", {}), assignment.spec.option("observation", [])
 
 
 class _RenderOnDemand(gymnasium.Wrapper[Any, Any, Any, Any]):

@@ -141,6 +141,7 @@ def dry_run(
         report.description = describe_task(name, options)
     if thorough:
         checked.warnings += _describe_pictures(name, checked.environment)
+        checked.warnings += _describe_left_out(checked.environment)
         if checked.reset_seconds >= SLOW_RESET:
             checked.warnings.append(f"a reset took {checked.reset_seconds:.0f} s, so gymnasium's checker was left out")
     report.warnings = tuple(checked.warnings)
@@ -222,6 +223,13 @@ def _describe_pictures(name: str, environment: Any) -> list[str]:
         f"it observes pictures of shape {tuple(space.shape)}, and the controller has a weight for each value: a world "
         f"model makes few numbers of them (`dreamfleet pipeline --task {name}`)"
     ]
+
+
+def _describe_left_out(environment: Any) -> list[str]:
+    found = getattr(environment, "has_wrapper_attr", None)
+    if found is None or not found("left_out") or not (names := environment.get_wrapper_attr("left_out")):
+        return []
+    return [f"no numbers, and left out of what the controller sees: {', '.join(names)}"]
 
 
 def _load_and_wait(go: int) -> None:

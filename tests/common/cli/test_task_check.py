@@ -86,6 +86,13 @@ def test_gymnasiums_checker_only_warns(fault, code):
     assert found.warnings == (f"gymnasium's checker ended the process (exit code {code})",)
 
 
+def test_what_is_left_out_is_named_unless_the_user_chose():
+    task = "gym:tests.support.pixel_fakes:Telling-v0"
+    assert [each for each in try_task(task, {}).warnings if "mission, notes.0" in each]
+    found = try_task(task, {"observation": ["hand"]})
+    assert (found.description.observations, found.warnings) == (3, ())
+
+
 def test_a_table_of_codes_is_no_picture():
     assert not any("picture" in each for each in try_task("gym:tests.support.pixel_fakes:Board-v0", {}).warnings)
 

@@ -337,6 +337,15 @@ def test_a_task_that_describes_itself_needs_no_bundle(random_bundle):
         RunConfig(task="gym:CartPole-v1", bundle="tiny").settings(random_bundle)
 
 
+def test_the_chosen_keys_of_an_observation_are_frozen_and_described_again(tmp_path):
+    task = "gym:tests.support.pixel_fakes:Telling-v0"
+    settings = RunConfig(task=task, observation=("hand",)).settings(None)
+    assert settings.task.option("observation") == ["hand"]
+    again = RunConfig(task=task, task_options=settings.task.options)
+    assert again.settings(None).controller == settings.controller
+    assert settings.controller.features == 3
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [

@@ -10,6 +10,7 @@ from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import describe_task, family_of, load_task
+from dreamfleet.worker.gym import environments
 from dreamfleet.worker.gym.task import DEFAULT_MAX_STEPS
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tasks.api import Assignment
@@ -64,6 +65,33 @@ def test_observations_and_actions_of_any_numbers_are_flattened(name, observation
     scores = [scorer.score("evaluate", parameters, seed).fitness for seed in (5, 6, 5)]
     assert scores[0] == scores[2]
     scorer.close()
+
+
+@pytest.mark.parametrize(
+    ("keys", "observed"), [((), [0, 0, 1, 0.5, 0.25]), (("hand",), [0, 0, 1]), (("notes",), [0.5, 0.25])]
+)
+def test_what_is_no_number_is_left_out_and_keys_are_chosen(keys, observed):
+    task = find_task("gym:tests.support.pixel_fakes:Telling-v0")
+    frozen = spec(task.name, observation=keys)
+    assert frozen.controller.features == len(observed)
+    assert frozen.option("observation", []) == list(keys)
+    with task.make_environment(Assignment(frozen)) as environment:
+        assert environment.reset(seed=1)[0].tolist() == observed
+        assert environment.step(0)[0].tolist() == observed
+    assert task.find_standalone_script(Assignment(frozen)) is None
+
+
+@pytest.mark.parametrize(
+    ("environment", "keys", "named"),
+    [
+        ("Telling", ["hand", "mission"], "mission"),
+        ("Gauges", ["radar"], "hand, speeds"),
+        ("Grey", ["screen"], "screen"),
+    ],
+)
+def test_a_key_that_is_no_number_or_not_there_is_refused(environment, keys, named):
+    with pytest.raises(UsageError, match=named):
+        describe_task(f"gym:tests.support.pixel_fakes:{environment}-v0", {"observation": keys})
 
 
 @pytest.mark.parametrize(("number", "taken"), [(0, (0, [0])), (1, (0, [1])), (2, (1, [0])), (3, (1, [1]))])
@@ -122,7 +150,8 @@ def test_observations_are_normalised_by_what_the_run_froze():
         ("gym:tests.support.no_such:X-v0", r"No module named 'tests\.support\.no_such'"),
         ("gym:", "makes no environment ''"),
         ("gym", "cannot be loaded"),
-        ("gym:tests.support.pixel_fakes:Telling-v0", "wrap it so that it observes numbers"),
+        ("gym:tests.support.pixel_fakes:Mute-v0", "wrap it so that it observes numbers"),
+        ("gym:tests.support.pixel_fakes:Blind-v0", "function:MODULE:NAME"),
         ("car-racing:x", "cannot be loaded"),
     ],
 )
@@ -141,6 +170,13 @@ def test_an_unusable_environment_is_refused_with_the_reason(name, says):
 def test_an_environment_of_a_known_package_says_how_to_install_and_write_it(name, says):
     with pytest.raises(UsageError, match=re.escape(says)):
         describe_task(f"gym:{name}", {})
+
+
+def test_a_known_package_that_is_here_is_only_to_be_imported(monkeypatch):
+    monkeypatch.setitem(environments.PACKAGES, "Here-", ("here", "tests"))
+    with pytest.raises(UsageError, match="gym:tests:Here-v0") as caught:
+        describe_task("gym:Here-v0", {})
+    assert "pip install" not in str(caught.value)
 
 
 def test_a_class_that_its_module_does_not_register_is_made_as_it_is():
@@ -219,7 +255,7 @@ def test_a_name_with_a_version_is_taken_although_the_environment_shows_that_of_a
 
 
 def test_unknown_options_and_arguments_are_refused():
-    with pytest.raises(UsageError, match="knows no option wings: environment, normalise"):
+    with pytest.raises(UsageError, match="knows no option wings: environment, observation, normalise"):
         describe_task(CARTPOLE, {"wings": 2})
     with pytest.raises(UsageError, match="takes no such arguments"):
         describe_task(CARTPOLE, {"environment": {"wings": 2}})
