@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from math import nan
@@ -17,6 +18,7 @@ from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError
 from dreamfleet.common.monitoring.batch_client import BatchClient, is_final
 from dreamfleet.common.monitoring.client import Client
 from dreamfleet.common.protocol.batches import BatchError, BatchEvent, BatchReply, pack_batch
+from dreamfleet.common.runs.seeds import remark_on_seeds
 from dreamfleet.common.serialization.display import Displayed
 from dreamfleet.common.transport.session import Network
 
@@ -97,6 +99,8 @@ class RemoteScorer(Displayed):
         taken by another content, or the vectors are not what they must be.
         """
         header, body = pack_batch(batch_id or secrets.token_hex(8), vectors, seeds, episodes)
+        if remark := remark_on_seeds(seeds or ()):
+            warnings.warn(remark, stacklevel=2)
         return RemoteBatch(self, self.persist(lambda: self._batches.submit(self.run, header, body)))
 
     def find(self, batch_id: str) -> RemoteBatch:

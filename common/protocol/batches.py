@@ -26,7 +26,8 @@ MAX_EPISODES = 100_000  # of a batch: each is a job
 LAST_SEED = 2**53 - 1  # the largest integer that every JSON parser reads exactly
 PAGE_CANDIDATES = 1000  # of a reply
 ID_RULE = "1 to 63 of A-Z, a-z, 0-9, '.', '_' and '-', and a letter or a digit first"
-_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
+ID_PATTERN = "[A-Za-z0-9][A-Za-z0-9._-]{0,62}"
+_ID = re.compile(ID_PATTERN)
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 BatchState = Literal["", "uploading", "waiting", "running", "complete", "cancelled"]
@@ -153,7 +154,10 @@ def pack_batch(
 def _as_float32(vectors: object) -> NDArray[np.float32]:
     try:
         with np.errstate(over="ignore"):
-            rows = np.ascontiguousarray(vectors, dtype="<f4")
+            given = np.asarray(vectors)
+            if given.dtype.kind not in "iufO":  # numpy would read texts and truth values as numbers
+                raise TypeError(f"{given.dtype} is no type of numbers")
+            rows = np.ascontiguousarray(given, dtype="<f4")
     except (ValueError, TypeError, OverflowError) as error:
         raise BatchError("malformed", "vectors must be rows of numbers, all of one length") from error
     if rows.ndim != 2 or not len(rows):

@@ -11,7 +11,8 @@ from dreamfleet.common.errors import UsageError
 PROTOCOL_VERSION = 2
 ROOT = "dreamfleet"
 _PREFIX = f"{ROOT}/v{PROTOCOL_VERSION}"
-_RUN = re.compile(r"[a-z0-9][a-z0-9-]{0,62}")
+RUN_PATTERN = "[a-z0-9][a-z0-9-]{0,62}"
+_RUN = re.compile(RUN_PATTERN)
 _WORKER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 _LIFE = re.compile(r"[0-9a-f]{8}")
 

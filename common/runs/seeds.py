@@ -8,6 +8,8 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 
+from dreamfleet.common.printable import plural
+
 TEST = range(10_000, 20_000)
 VALIDATION = range(20_000, 1_000_000)
 # Offsets of the first validation seeds for choosing and for confirming the report; evaluations use those before.
@@ -66,6 +68,18 @@ def validation_seeds(episodes: int, first: int = 0) -> tuple[int, ...]:
     `CHOOSING_OFFSET` on, the reported score those from `CONFIRMING_OFFSET` on, which influence no choice.
     """
     return tuple(VALIDATION[first : first + episodes])
+
+
+def remark_on_seeds(seeds: Sequence[int]) -> str:
+    """What to say of `seeds` that a search scores candidates on; empty if none is a test seed."""
+    count = sum(each in TEST for each in seeds)
+    if not count:
+        return ""
+    return (
+        f"{count:,} of the {plural(len(seeds), 'seed')} {'is a test seed' if count == 1 else 'are test seeds'} "
+        f"({TEST[0]} to {TEST[-1]}): a controller that was selected on them cannot be tested on them; search on seeds "
+        f"from {TRAINING_FIRST} on"
+    )
 
 
 def _derive_seed(text: str) -> int:

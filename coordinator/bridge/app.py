@@ -20,7 +20,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
-from starlette.types import ASGIApp
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
 from dreamfleet.common.host.packages import package_version
@@ -30,6 +30,7 @@ from dreamfleet.common.monitoring.remote_scorer import scored_candidates
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol.batches import MAX_CANDIDATES, BatchError, BatchReply, pack_batch
 from dreamfleet.common.protocol.keys import check_run_name
+from dreamfleet.common.runs.seeds import remark_on_seeds
 from dreamfleet.coordinator.bridge.changes import Changes
 from dreamfleet.coordinator.bridge.guard import BridgeGuard
 from dreamfleet.coordinator.bridge.openapi import document
@@ -52,13 +53,16 @@ def make_app(client: Client, changes: Changes, tokens: Sequence[str], *, is_loop
     """The routes behind their guard."""
     handlers = _Handlers(client, changes)
     batch = "/v1/runs/{run}/batches/{id}"
+    description = document(needs_token=bool(tokens))
+
+    async def openapi(_request: Request) -> Response:
+        return JSONResponse(description)
+
     routes = [
-        Route("/v1/health", handlers.health), Route("/openapi.json", handlers.openapi),
-        Route("/v1/runs", _answering(handlers.runs)),
-        Route("/v1/runs/{run}/batches", _answering(handlers.submit), methods=["POST"]),
-        Route("/v1/runs/{run}/batches", _answering(handlers.list_batches)),
-        Route(batch, _answering(handlers.read)), Route(batch, _answering(handlers.cancel), methods=["DELETE"]),
-        Route(f"{batch}/events", _answering(handlers.events)),
+        _route("/v1/health", GET=handlers.health), _route("/openapi.json", GET=openapi),
+        _route("/v1/runs", GET=handlers.runs),
+        _route("/v1/runs/{run}/batches", GET=handlers.list_batches, POST=handlers.submit),
+        _route(batch, GET=handlers.read, DELETE=handlers.cancel), _route(f"{batch}/events", GET=handlers.events),
     ]  # fmt: skip
     app = Starlette(routes=routes, exception_handlers={HTTPException: _http_error, Exception: _bug})
     return BridgeGuard(app, tokens, is_loopback=is_loopback)
@@ -78,9 +82,6 @@ class _Handlers:
     async def health(self, _request: Request) -> Response:
         return JSONResponse({"status": "ok", "version": package_version("dreamfleet")})
 
-    async def openapi(self, _request: Request) -> Response:
-        return JSONResponse(document())
-
     async def runs(self, _request: Request) -> Response:
         return _json({"runs": await run_in_threadpool(self._list_runs)})
 
@@ -89,9 +90,9 @@ class _Handlers:
         if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
             return _error(415, "malformed", "send JSON: Content-Type: application/json")
         async with self._body(request) as body:
-            reply = await self._ask(run, lambda: self._submit(run, body))
+            reply, remark = await self._ask(run, lambda: self._submit(run, body))
         headers = {"location": f"/v1/runs/{run}/batches/{reply.id}"}
-        return _json(_describe(reply), 201 if reply.is_new else 200, headers)
+        return _json(_describe(reply) | {"remark": remark}, 201 if reply.is_new else 200, headers)
 
     async def list_batches(self, request: Request) -> Response:
         run = _run_name(request)
@@ -111,8 +112,12 @@ class _Handlers:
         run, batch = _run_name(request), request.path_params["id"]
         first = await self._ask(run, lambda: self._batches.read(run, batch))
         if self._streams >= MOST_STREAMS:
-            return _error(503, "busy", "too many streams are open: close some, or ask for the batch itself")
-        return StreamingResponse(self._stream(run, first), media_type="text/event-stream")
+            raise BatchError("busy", "too many streams are open: close some, or ask for the batch itself")
+        self._streams += 1  # here, as no request comes between: the stream itself begins later
+        return _Stream(self._stream(run, first), self._stream_closed)
+
+    def _stream_closed(self) -> None:
+        self._streams -= 1
 
     def _list_runs(self) -> list[dict[str, Any]]:
         rows = []
@@ -127,18 +132,20 @@ class _Handlers:
                          "episodes": settings.episodes, "slots": status.slots})  # fmt: skip
         return rows
 
-    def _submit(self, run: str, body: bytes) -> BatchReply:
+    def _submit(self, run: str, body: bytes) -> tuple[BatchReply, str]:
         given = _parse(body)
-        batch_id, seeds, episodes = given.get("id"), given.get("seeds"), given.get("episodes", 0)
-        if batch_id is not None and not isinstance(batch_id, str):
+        batch_id = given["id"] if "id" in given else secrets.token_hex(8)
+        seeds, episodes = given.get("seeds", []), _whole(given.get("episodes", 0))
+        if not isinstance(batch_id, str):
             raise BatchError("malformed", "id must be a text")
-        if not (seeds is None or isinstance(seeds, list)):
+        if not isinstance(seeds, list):
             raise BatchError("malformed", "seeds must be a list of whole numbers")
+        seeds = list(map(_whole, seeds))
         if not isinstance(episodes, int) or isinstance(episodes, bool):
             raise BatchError("malformed", "episodes must be a whole number")
         vectors = _read_vectors(given.get("vectors"))
-        header, packed = pack_batch(batch_id or secrets.token_hex(8), vectors, seeds, episodes)
-        return self._batches.submit(run, header, packed)
+        header, packed = pack_batch(batch_id, vectors, seeds if "seeds" in given else None, episodes)
+        return self._batches.submit(run, header, packed), remark_on_seeds(seeds)
 
     def _read_all(self, run: str, batch: str) -> list[BatchReply]:
         pages = [self._batches.read(run, batch)]
@@ -189,40 +196,61 @@ class _Handlers:
 
     async def _stream(self, run: str, first: BatchReply) -> AsyncIterator[bytes]:
         """An event for each candidate that is done, once; then one that says how the batch ended."""
-        self._streams += 1
         sent: set[int] = set()
         lost_since, spoke_at = None, monotonic()
-        try:
-            with self._changes.following(run, first.id) as changed:
-                while not self._changes.closed:
-                    try:
-                        pages = await self._ask(run, lambda: self._read_all(run, first.id))
-                    except BatchError as error:
-                        lost_since = monotonic() if lost_since is None else lost_since
-                        if error.refusal != "busy" or monotonic() - lost_since > RUN_WAIT:
-                            yield event("error", {"error": error.refusal, "text": str(error)})
-                            return
-                        pages = []
-                    else:
-                        lost_since = None
-                    new = [each for page in pages for each in scored_candidates(page) if each.index not in sent]
-                    for each in new:
-                        sent.add(each.index)
-                        yield event("candidate", vars(each))
-                    if pages and is_final(pages[0]):
-                        yield event("end", _describe(pages[0]))
+        with self._changes.following(run, first.id) as changed:
+            while not self._changes.closed:
+                try:
+                    pages = await self._ask(run, lambda: self._read_all(run, first.id))
+                except BatchError as error:
+                    lost_since = monotonic() if lost_since is None else lost_since
+                    if error.refusal != "busy" or monotonic() - lost_since > RUN_WAIT:
+                        yield event("error", {"error": error.refusal, "text": str(error)})
                         return
-                    if monotonic() - spoke_at > KEEP_ALIVE:
-                        spoke_at = monotonic()
-                        yield b": the batch is being scored\n\n"
-                    await changed(POLL)
+                    pages = []
+                else:
+                    lost_since = None
+                new = [each for page in pages for each in scored_candidates(page) if each.index not in sent]
+                for each in new:
+                    sent.add(each.index)
+                    yield event("candidate", vars(each))
+                if pages and is_final(pages[0]):
+                    yield event("end", _describe(pages[0]))
+                    return
+                if monotonic() - spoke_at > KEEP_ALIVE:
+                    spoke_at = monotonic()
+                    yield b": the batch is being scored\n\n"
+                await changed(POLL)
+
+
+class _Stream(StreamingResponse):
+    """Server-sent events; `closed` is called once they have ended, even if none was sent."""
+
+    media_type = "text/event-stream"
+
+    def __init__(self, events: AsyncIterator[bytes], closed: Callable[[], None]) -> None:
+        super().__init__(events)
+        self._closed = closed
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the events until they end or the client leaves."""
+        try:
+            await super().__call__(scope, receive, send)
         finally:
-            self._streams -= 1
+            self._closed()
 
 
 def _parse(body: bytes) -> dict[str, Any]:
     def refuse(name: str) -> Any:
         raise BatchError("malformed", f"{name} is not a number in JSON")
+
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found = dict(pairs)
+        if len(found) < len(pairs):  # which one counts depends on the reader
+            names = [name for name, _ in pairs]
+            twice = next(name for name in names if names.count(name) > 1)
+            raise BatchError("malformed", f"{truncate(twice, 60)!r} is given twice")
+        return found
 
     is_text = b'"float32"' not in body
     if body.count(b"[") > MAX_CANDIDATES + 2 or (is_text and len(body) > MAX_TEXT):
@@ -232,19 +260,23 @@ def _parse(body: bytes) -> dict[str, Any]:
             "split it into smaller batches, or send float32",
         )
     try:
-        found = json.loads(body, parse_constant=refuse)
+        found = json.loads(str(body, "utf-8"), parse_constant=refuse, object_pairs_hook=once)
     except (ValueError, RecursionError) as error:
         raise BatchError("malformed", f"the body is not JSON: {truncate(str(error), 200)}") from error
     if not isinstance(found, dict):
         raise BatchError("malformed", "the body must be a JSON object with vectors")
     if unknown := found.keys() - {"id", "vectors", "seeds", "episodes"}:
         raise BatchError("malformed", f"unknown field {truncate(min(unknown), 60)!r}: id, vectors, seeds, episodes")
+    if found.keys() >= {"seeds", "episodes"}:
+        raise BatchError("malformed", "give seeds, or a number of episodes, not both")
     return found
 
 
 def _read_vectors(given: object) -> object:
     """Rows of numbers as they are; of `{"float32": BASE64, "size": N}` an array `(n, N)`."""
     if isinstance(given, list):
+        if not all(isinstance(row, list) and {int, float}.issuperset(map(type, row)) for row in given):
+            raise BatchError("malformed", "vectors must be rows of numbers: no texts, true, false or null")
         return given
     if not (isinstance(given, dict) and given.keys() == {"float32", "size"}):
         raise BatchError(
@@ -252,12 +284,19 @@ def _read_vectors(given: object) -> object:
             'vectors must be a list of rows of numbers, all of one length, or {"float32": BASE64, "size": N}',
         )
     try:
+        if type(size := _whole(given["size"])) is not int:
+            raise TypeError("size is no whole number")
         numbers = np.frombuffer(base64.b64decode(given["float32"], validate=True), dtype="<f4")
-        return numbers.reshape(-1, given["size"])
+        return numbers.reshape(-1, size)
     except (ValueError, TypeError) as error:
         raise BatchError(
             "malformed", "vectors: float32 must be base64 of little-endian numbers, `size` of them a vector"
         ) from error
+
+
+def _whole(value: Any) -> Any:
+    """A number such as 3.0 as 3: JSON has one kind of number. Others as they are."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _run_name(request: Request) -> str:
@@ -272,6 +311,15 @@ def _describe(reply: BatchReply) -> dict[str, Any]:
 def _scores(pages: Sequence[BatchReply]) -> dict[str, Any]:
     fitness = [each for page in pages for each in page.fitness]
     return {"fitness": fitness, "errors": {str(each.candidate): each.error for page in pages for each in page.errors}}
+
+
+def _route(path: str, **handlers: Handler) -> Route:
+    """One route with a handler for each method: another one's answer is 405, with all these in `Allow`."""
+
+    async def handle(request: Request) -> Response:
+        return await handlers["GET" if request.method == "HEAD" else request.method](request)
+
+    return Route(path, _answering(handle), methods=[*handlers])
 
 
 def _answering(handler: Handler) -> Handler:
@@ -296,7 +344,8 @@ def _answering(handler: Handler) -> Handler:
 
 async def _http_error(_request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    return _error(error.status_code, "malformed", error.detail)
+    kind = "unknown" if error.status_code == 404 else "malformed"
+    return _error(error.status_code, kind, error.detail, dict(error.headers or {}))
 
 
 async def _bug(_request: Request, _cause: Exception) -> Response:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import logging
 import socket
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import uvicorn
@@ -52,6 +54,7 @@ def run_server(server: uvicorn.Server, listening: socket.socket, on_ready: Calla
 
 def server_config(app: ASGIApp, connection: type[HttpConnection], **more: Any) -> uvicorn.Config:
     """How a web server of ours runs `app`: few headers, bounded connections, no log of its own."""
+    logging.getLogger("uvicorn.error").addFilter(_OneAMinute())
     return uvicorn.Config(
         app,
         log_config=None,
@@ -65,6 +68,23 @@ def server_config(app: ASGIApp, connection: type[HttpConnection], **more: Any) -
         timeout_graceful_shutdown=SHUTDOWN_TIMEOUT,
         **more,
     )
+
+
+class _OneAMinute(logging.Filter):
+    """Passes each warning once a minute: anyone who reaches the port causes them, such as by malformed requests."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._next: dict[str, float] = {}  # text -> when it may be said again; uvicorn's warnings are few texts
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether the record is logged."""
+        if record.levelno != logging.WARNING:
+            return True
+        now = monotonic()
+        if is_due := now >= self._next.get(record.msg, 0.0):
+            self._next[record.msg] = now + 60.0
+        return is_due
 
 
 class HttpConnection(H11Protocol):

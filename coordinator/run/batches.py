@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -29,7 +30,7 @@ from dreamfleet.common.protocol.batches import (
     unpack_seeds,
 )
 from dreamfleet.common.protocol.messages import MAX_PART, UploadPart
-from dreamfleet.common.runs.seeds import training_seed
+from dreamfleet.common.runs.seeds import remark_on_seeds, training_seed
 from dreamfleet.coordinator.jobs.upload_assembler import UploadAssembler
 from dreamfleet.coordinator.run.external_generations import CANCELLED, ExternalGenerations
 from dreamfleet.coordinator.run.run import Run
@@ -40,6 +41,7 @@ MAX_WAITING = 256  # batches
 MAX_WAITING_SIZE = 8 * MAX_BATCH  # bytes of their vectors
 PAGE_BYTES = 30_000  # of a reply's scores and errors
 LONGEST_ERROR = 300  # characters
+log = logging.getLogger(__name__)
 Parameters = Callable[[str], str | None]
 
 
@@ -51,6 +53,7 @@ class Batches:
         self._journal = journal
         self._name = name
         self._uploads = UploadAssembler()
+        self._remarked = False  # on test seeds: once in a coordinator's life
         self._announced: tuple[str, int] | None = None  # the open batch's id and its candidates that were done
 
     def answer(self, verb: str, get: Parameters, payload: bytes, now: float) -> BatchReply:
@@ -168,6 +171,9 @@ class Batches:
         if not seeds:
             first, number = self._run.settings.seed, self._journal.batch_count()
             seeds = [training_seed(first, number, each) for each in range(self._episodes(header))]
+        if (remark := remark_on_seeds(seeds)) and not self._remarked:
+            self._remarked = True
+            log.warning("batch %s: %s", header.id, remark)
         self._journal.add_batch(header.id, header.content, seeds, header.population, vectors)
         batch = self._journal.batch(header.id)
         assert batch is not None

@@ -1,16 +1,22 @@
 """Batches over HTTP: the bridge's answers to good and bad requests, and to connections that stop."""
 
 import base64
+import http.client
 import json
 import math
 import re
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import urllib.error
 import urllib.request
+from contextlib import ExitStack
 
 import pytest
 
+from dreamfleet.coordinator.bridge.app import MOST_STREAMS
 from tests.support import tasks
 from tests.support.access import begin as begin_secured
 from tests.support.batches import begin, count_results, resume, vectors
@@ -214,6 +220,107 @@ def test_the_description_fits_the_answers(bridge):
     bridge.submit({"id": "a", "vectors": rows(1), "seeds": [1]})
     assert bridge.batch("a")[1].keys() == schemas["Scores"]["properties"].keys()
     assert bridge.ask("GET", "/v1/runs")[1]["runs"][0].keys() == schemas["Run"]["properties"].keys()
+
+
+def described_for_the_run(described):
+    """The description with what only the run knows: its name, and the size of its vectors."""
+    for way in (way for path in described["paths"].values() for way in path.values()):
+        for each in way.get("parameters", ()):
+            if each["name"] == "run":
+                each["schema"] = {"anyOf": [{"const": "test"}, each["schema"]]}
+    numbers, packed = described["components"]["schemas"]["Submission"]["properties"]["vectors"]["oneOf"]
+    numbers["items"] |= {"minItems": 10, "maxItems": 10}
+    packed["properties"]["float32"]["enum"] = [base64.b64encode(bytes(40)).decode()]
+    packed["properties"]["size"]["const"] = 10
+    return described
+
+
+@pytest.mark.slow
+def test_schemathesis_finds_no_broken_promise_in_the_description(processes, tmp_path):
+    processes.coordinator("--task", "gym:CartPole-v1", "--optimiser", "external")
+    processes.worker()
+    bridge = Bridge(processes)
+    described = described_for_the_run(bridge.ask("GET", "/openapi.json")[1])
+    path = tmp_path / "openapi.json"
+    path.write_text(json.dumps(described))
+    done = subprocess.run(
+        [sys.executable, "-m", "schemathesis.cli", "run", path, "--url", bridge.address, "--phases", "coverage,fuzzing",
+         "--checks", "all", "--max-examples", "15", "--seed", "1", "--no-color"],
+        cwd=tmp_path, capture_output=True, text=True, check=False, timeout=DEADLINE,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
+
+
+def test_numbers_are_numbers_and_nothing_is_said_twice(processes, random_bundle):
+    begin(processes, random_bundle)
+    bridge = Bridge(processes)
+    good = {"id": "a", "vectors": rows(1), "seeds": [1]}
+    first = rows(1)[0][1:]
+    packed = {"float32": base64.b64encode(vectors(1).tobytes()).decode(), "size": 867}
+    for wrong in (
+        {"vectors": [["1.5", *first]]}, {"vectors": [[True, *first]]}, {"vectors": [[None, *first]]}, {"vectors": [[]]},
+        {"vectors": {**packed, "size": True}}, {"vectors": {**packed, "size": "867"}}, {"seeds": ["1"]},
+        {"seeds": [True]}, {"seeds": None}, {"seeds": []}, {"seeds": [1.5]}, {"episodes": 0}, {"episodes": True},
+        {"id": ""}, {"id": None},
+    ):  # fmt: skip
+        status, answer = bridge.submit(good | wrong)
+        assert (status, answer["error"]) == (400, "malformed"), wrong
+    text = json.dumps(good)
+    for body in (text[:-1] + ', "id": "b"}', text.replace("{", '{"seeds": [2], ', 1)):
+        assert bridge.submit(body.encode())[0] == 400
+    assert bridge.submit(text.encode("utf-16"))[0] == 400
+    status, first = bridge.submit({"id": "b", "vectors": rows(1), "seeds": [2**20, 10_000, 19_999]})
+    assert (status, "2 of the 3" in first["remark"]) == (201, True)
+    assert (
+        bridge.submit({"id": "c", "vectors": {**packed, "size": 867.0}, "seeds": [9_999.0, 20_000]})[1]["remark"] == ""
+    )
+    assert bridge.submit({"id": "d", "vectors": rows(1), "seeds": [*range(2**20, 2**20 + 10_000)]})[0] == 201
+    assert bridge.submit({"id": "e", "vectors": rows(1), "episodes": 10_001})[0] == 400
+
+
+def test_another_method_is_answered_with_those_that_there_are(processes):
+    processes.start("router", "--listen", processes.endpoint).wait_for(processes.endpoint)
+    bridge = Bridge(processes)
+    described = bridge.ask("GET", "/openapi.json")[1]["paths"]
+    for path, methods in described.items():
+        connection = http.client.HTTPConnection("127.0.0.1", bridge.port, timeout=DEADLINE)
+        connection.request("PATCH", path.format(run="test", id="a"))
+        answer = connection.getresponse()
+        allowed = {each.strip().lower() for each in answer.headers["allow"].split(",")}
+        connection.close()
+        assert (answer.status, allowed - {"head"}) == (405, methods.keys())
+
+
+def test_malformed_requests_fill_no_log(processes):
+    processes.start("router", "--listen", processes.endpoint).wait_for(processes.endpoint)
+    bridge = Bridge(processes)
+    for _ in range(5):
+        with socket.create_connection(("127.0.0.1", bridge.port), timeout=DEADLINE) as made:
+            made.sendall(b"\x16\x03\x01\xff\r\n\r\n")
+            assert b"400" in made.recv(4096)
+    bridge.process.popen.send_signal(signal.SIGTERM)
+    bridge.process.finish()
+    assert sum("WARNING" in line for line in bridge.process.lines) == 1
+
+
+@pytest.mark.slow
+def test_streams_are_counted_where_they_are_opened(processes, random_bundle):
+    begin(processes, random_bundle)
+    bridge = Bridge(processes)
+    assert bridge.submit({"id": "a", "vectors": rows(1), "seeds": [1]})[0] == 201  # nobody scores it
+    request = f"GET /v1/runs/test/batches/a/events HTTP/1.1\r\nHost: 127.0.0.1:{bridge.port}\r\n\r\n".encode()
+    with ExitStack() as stack:
+        opened = [
+            stack.enter_context(socket.create_connection(("127.0.0.1", bridge.port), timeout=DEADLINE))
+            for _ in range(MOST_STREAMS + 8)
+        ]
+        for each in opened:
+            each.sendall(request)
+        answers = [each.recv(12) for each in opened]
+        assert answers.count(b"HTTP/1.1 200") == MOST_STREAMS
+        assert answers.count(b"HTTP/1.1 503") == 8
+    assert bridge.ask("DELETE", "/v1/runs/test/batches/a")[0] == 200
+    assert [kind for kind, _ in bridge.events("a")][-1] == "end"  # those that left are not counted
 
 
 @pytest.mark.slow

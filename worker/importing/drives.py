@@ -1,8 +1,8 @@
 """Recorded drives of other programs, as episodes of a data set of the first world.
 
-WME's `record/*.npz` hold `obs` and `action`, the article's also `reward` and `done`. ctallec's hold `observations`,
-`actions`, `rewards` and `terminals`. The last two show the bar below the scene too, and their steps are shifted: the
-article's `reward` is that of the action before, and ctallec's picture is the one after its action.
+WME's `record/*.npz` hold `obs` as uint8 and `action` as float16, the article's also `reward` and `done`. ctallec's hold
+`observations`, `actions`, `rewards` and `terminals`. The last two show the bar below the scene too, and their steps are
+shifted: the article's `reward` is that of the action before, and ctallec's picture is the one after its action.
 """
 
 from __future__ import annotations
@@ -110,12 +110,16 @@ def read_drive(path: Path, *, layout: Layout | None = None) -> Drive:
 
 
 def _layout_of(path: Path, found: Mapping[str, NDArray[Any]]) -> Layout:
-    """Whose drive it is: without rewards WME's, and by the article's first reward and ctallec's file name theirs."""
-    if "reward" not in found:
-        return "wme"
+    """Whose drive it is: WME's by its two arrays' types, the article's by its first reward, ctallec's by the name."""
+    picture = found["picture"]
+    if found.keys() == {"picture", "action"}:
+        is_wme = picture.dtype == np.uint8 and picture.shape[1:] == SMALL and found["action"].dtype == np.float16
+        return "wme" if is_wme else "dreamfleet"
     if CTALLEC_NAME.fullmatch(path.name) and len(found) == len(NAMES):
         return "ctallec"
-    picture, rewards = found["picture"], found["reward"]
+    if "reward" not in found:
+        return "dreamfleet"
+    rewards = found["reward"]
     begins_before = rewards.ndim == 1 and rewards[:1].tolist() == [FIRST_REWARD]
     return "article" if begins_before and picture.dtype.kind == "f" and picture.shape[1:] == SMALL else "dreamfleet"
 
@@ -165,8 +169,10 @@ def _pictures(
         raise DatasetError(f"{path}: pictures hold NaN or infinity, or are of type {pictures.dtype}, not numbers")
     if pictures.min() < 0 or pictures.max() > 255:
         raise DatasetError(f"{path}: pictures have values from 0 to 255, not {pictures.min()} to {pictures.max()}")
+    if minus_one and pictures.dtype != np.uint8:
+        raise DatasetError(f"{path}: pictures of the layout wme are of type uint8, not {pictures.dtype}")
     scale = 255 if kind == "f" and pictures.max() <= 1 else 1
     whole = np.stack([np.round(each * scale) if kind == "f" else each for each in pictures]).astype(np.uint8)
     if whole.shape[1:] == WHOLE:
         return np.stack([preprocessing.picture(each) for each in whole])
-    return whole + np.uint8(1) if minus_one else whole
+    return whole + np.uint8(1) if minus_one else whole  # wraps as WME's own sum does: its 254 is white, its 255 black

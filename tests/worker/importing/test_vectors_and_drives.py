@@ -121,6 +121,56 @@ def test_drives_of_wme(tmp_path):
     assert load_steps(first)["reward"].tolist() == [0] * 6
 
 
+PROGRAMS = {
+    # hardmaru/WorldModelsExperiments, carracing/extract.py: white is 254 there, and black 255
+    "wme": ("1466665.npz", 254, {"obs": np.uint8, "action": np.float16}),
+    # zacwellmer/WorldModels, WorldModels/extract.py
+    "dreamfleet": ("1001466665.npz", 255, {"obs": np.uint8, "action": np.float16, "reward": np.float16, "done": bool,
+                                           "N": np.uint16}),
+    # ctallec/world-models, data/carracing.py
+    "ctallec": ("rollout_0.npz", 255, {"observations": np.uint8, "actions": np.float32, "rewards": float,
+                                       "terminals": bool}),
+    # AppliedDataSciencePartners/WorldModels, 01_generate_data.py
+    "article": ("735.npz", 1.0, {"obs": np.float32, "action": np.float32, "reward": float, "done": bool}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("layout", PROGRAMS)
+def test_white_stays_white_in_the_drives_of_each_public_program(layout, tmp_path):
+    name, white, types = PROGRAMS[layout]
+    shapes = {"obs": (4, 64, 64, 3), "observations": (4, 96, 96, 3), "action": (4, 3), "actions": (4, 3)}
+    arrays = {each: np.zeros(shapes.get(each, 4), kind) for each, kind in types.items()}
+    arrays["obs" if "obs" in types else "observations"][:] = white
+    if layout == "article":
+        arrays["reward"][0] = -0.1
+    np.savez_compressed(tmp_path / name, **arrays)
+    drive = read_drive(tmp_path / name)
+    assert drive.layout == layout
+    assert (drive.arrays["picture"] == 255).all()
+
+
+@pytest.mark.parametrize(
+    ("white", "pictures", "actions"),
+    [(1.0, np.float32, np.float16), (255, np.float32, np.float16), (255, np.int64, np.float16),
+     (255, np.uint8, np.float32), (1.0, float, float)],
+)  # fmt: skip
+def test_drives_without_rewards_are_not_wmes_by_that_alone(white, pictures, actions, tmp_path):
+    arrays = {"obs": np.full((3, 64, 64, 3), white, pictures), "action": np.zeros((3, 3), actions)}
+    np.savez(tmp_path / "x.npz", **arrays)
+    drive = read_drive(tmp_path / "x.npz")
+    assert (drive.layout, drive.has_rewards) == ("dreamfleet", False)
+    assert (drive.arrays["picture"] == 255).all()
+
+
+def test_named_as_wmes_pictures_must_be_what_that_program_writes(tmp_path):
+    arrays = {"obs": np.ones((3, 64, 64, 3)), "action": np.zeros((3, 3))}
+    np.savez(tmp_path / "x.npz", **arrays)
+    with pytest.raises(DatasetError):
+        read_drive(tmp_path / "x.npz", layout="wme")
+    np.savez(tmp_path / "x.npz", **arrays | {"obs": np.full((3, 64, 64, 3), 254, np.uint8)})
+    assert (read_drive(tmp_path / "x.npz", layout="wme").arrays["picture"] == 255).all()
+
+
 @pytest.mark.parametrize(
     "names", [("obs", "action", "reward", "done"), ("observations", "actions", "rewards", "terminals")]
 )
