@@ -19,6 +19,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.foreign_code import contained
 from dreamfleet.common.host.packages import find_distributions
 from dreamfleet.common.host.trusted_modules import check_trusted
+from dreamfleet.common.host.unseen_drawing import draw_offscreen
 from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, World
 from dreamfleet.worker.tasks.closing import close_environment
@@ -68,6 +69,7 @@ def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
     _check_arguments(f"{GYM}:{name}", arguments)
     if arguments.get("render_mode") == "human":
         raise UsageError(f"render_mode=human opens a window in every process that plays {name}: omit it")
+    draw_offscreen()
     try:
         with contained(f"making {name}"):
             return gymnasium.make(_unregistered_class(name) or name, disable_env_checker=True, **arguments)

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from dreamfleet.common.cli.task_check import LAST_STEP, DryRunReport
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host.resource_limits import pin_thread_pools
+from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.protocol.tasks import Description, describe_task
 
@@ -247,7 +248,7 @@ def main() -> None:
     sys.path[:] = request["path"]
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
-    os.environ["SDL_VIDEODRIVER"] = "dummy"
+    draw_unseen()
     pin_thread_pools()
     _load_and_wait(int(sys.argv[1]))
     step = "loading it"

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking, make_stdout_nonblocking
 from dreamfleet.common.host.parent_death import exit_with_parent
 from dreamfleet.common.host.stop_signals import outlive_stop_signals
+from dreamfleet.common.host.unseen_drawing import draw_unseen
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -60,7 +61,7 @@ def serve_jobs(
         faulthandler.enable()
     make_stderr_nonblocking()  # inherited from the worker, whose reader may be suspended
     make_stdout_nonblocking()
-    os.environ["SDL_VIDEODRIVER"] = "dummy"
+    draw_unseen()
     scorer = _make_scorer(pipe, arguments)
     _score_groups(pipe, scorer, steps, abandoned, is_watched)
 

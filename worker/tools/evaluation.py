@@ -16,6 +16,7 @@ from dreamfleet.common.host.process_pool import count_step, map_in_processes
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.stall_watch import STALL_SECONDS
 from dreamfleet.common.host.stop_signals import outlive_stop_signals
+from dreamfleet.common.host.unseen_drawing import draw_offscreen, draw_unseen
 from dreamfleet.common.protocol.result_bounds import rejection_reason
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.common.runs.evaluation_report import EvaluationReport
@@ -38,6 +39,7 @@ def evaluate(agent: Agent, seeds: tuple[int, ...], jobs: int) -> Iterator[Episod
         return
     pin_thread_pools()
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    draw_offscreen()
     # In this process, so that a script needs no `if __name__ == "__main__"`; Ctrl-C interrupts it.
     driver = _Driver(agent, (Exception, SystemExit))
     try:
@@ -139,7 +141,7 @@ class _ProcessEvaluator:
     def start(cls, agent: Agent, parent: int) -> None:
         """Initialise the process, which ends with its parent."""
         exit_with_parent(parent)
-        os.environ["SDL_VIDEODRIVER"] = "dummy"
+        draw_unseen()
         outlive_stop_signals()  # Ctrl-C reaches the whole process group; the parent ends this process
         # The first episode loads the agent, so that errors are reported as that episode's. No Ctrl-C raises here.
         cls.driver = _Driver(agent, (BaseException,))

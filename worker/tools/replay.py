@@ -18,6 +18,7 @@ from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.stall_watch import STALL_SECONDS
 from dreamfleet.common.host.stop_signals import outlive_stop_signals
 from dreamfleet.common.host.trusted_modules import check_trusted
+from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.protocol.failures import failure_cause
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, class_from_fingerprint
 from dreamfleet.common.protocol.tasks import module_of
@@ -171,7 +172,7 @@ class _Replayer:
     def start(cls, parent: int, spec: TaskSpec, bundle: Path | None, torch_device: str) -> None:
         """Initialise the process, which ends with its parent."""
         exit_with_parent(parent)
-        os.environ["SDL_VIDEODRIVER"] = "dummy"
+        draw_unseen()
         outlive_stop_signals()  # Ctrl-C reaches the whole process group; the parent ends this process
         cls.spec, cls.bundle, cls.torch_device = spec, bundle, torch_device
 

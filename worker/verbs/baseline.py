@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +12,7 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path
+from dreamfleet.common.host.unseen_drawing import draw_unseen
 
 if TYPE_CHECKING:
     from dreamfleet.worker.baselines.progress import TrainingReport
@@ -53,7 +53,7 @@ def train_baseline(args: argparse.Namespace) -> int:
     _check_learns(args.agent, f"`dreamfleet evaluate --controller {args.agent}` judges it")
     preset = find_preset(args.preset)
     config, layers = apply_settings((preset.learning, preset.agent), TABLE, args)
-    os.environ["SDL_VIDEODRIVER"] = "dummy"
+    draw_unseen()
     from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.common.host.stop_signals import stop_on_signals
     from dreamfleet.worker.baselines.presets import CHECKPOINT

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.stop_signals import stop_on_signals
+from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.worker.tools.video_cli import MOST_STEPS
 
 SUMMARY = "write a controller as a folder to publish: a model card, scores, a video, ONNX, a script without dreamfleet"
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     if args.steps < 0:
         raise UsageError("--steps must be 0 or more")
     pin_thread_pools()
-    os.environ["SDL_VIDEODRIVER"] = "dummy"
+    draw_unseen()
     from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.common.runs.evaluation_report import read_evaluation_report
     from dreamfleet.common.runs.lookup import find_bundle_of, find_controller

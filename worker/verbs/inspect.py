@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.resource_limits import pin_thread_pools
+from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.runs.seeds import VALIDATION
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the page and print its path, or measure and print figures."""
-    os.environ["SDL_VIDEODRIVER"] = "dummy"
+    draw_unseen()
     if args.end and not args.survival:
         raise UsageError("--end needs the dreams of --survival: give that too")
     if args.probe or args.losses or args.likeness or args.survival:

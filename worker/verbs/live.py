@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING
 from dreamfleet.common.cli.global_config import add_global_flags, add_run_argument, resolve_network
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.runs.seeds import TEST
 from dreamfleet.worker.verbs.evaluate import add_random_flags, named_agent
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     """Show until it is over, closed, or stopped."""
     _check(args)
     if args.out is not None:
-        os.environ["SDL_VIDEODRIVER"] = "dummy"
+        draw_unseen()
     from dreamfleet.common.host.stop_signals import stop_on_signals
 
     with ExitStack() as stack:

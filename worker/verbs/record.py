@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import os
+import sys
 from functools import partial
 
 from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.host.unseen_drawing import describe_choice, draw_unseen
 from dreamfleet.worker.tools.video_cli import add_video_flags, check_video_flags, record_videos
 from dreamfleet.worker.verbs.evaluate import CONTROLLER, add_random_flags, named_agent
 
@@ -27,10 +28,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Record, and print the scores."""
     check_video_flags(args)
-    os.environ["SDL_VIDEODRIVER"] = "dummy"
+    draw_unseen()
     from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
     from dreamfleet.worker.tools.recording import record
 
     agent = named_agent(args)
     film = partial(record, agent, steps=args.steps, dreaming=ParallelDreamConfig(args.temperature))
-    return record_videos(args, agent, film)
+    code = record_videos(args, agent, film)
+    if note := describe_choice():
+        print(note, file=sys.stderr)
+    return code

@@ -21,6 +21,7 @@ from dreamfleet.common.host.parent_death import exit_with_parent
 from dreamfleet.common.host.process_pool import count_step, map_in_processes
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.stop_signals import outlive_stop_signals
+from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.worker.scoring.episode import EpisodeConfig, ResetHook, run_episode
 from dreamfleet.worker.scoring.failure_cause import describe_exception, describe_loss
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld, Rollout, write_episode
@@ -94,7 +95,7 @@ def _lose(task: tuple[Path, CollectConfig, int, tuple[Pilot, ...], DataWorld], r
 def _start_process(parent: int) -> None:
     exit_with_parent(parent)
     outlive_stop_signals()  # Ctrl-C reaches the whole process group; the parent lets this episode finish
-    os.environ["SDL_VIDEODRIVER"] = "dummy"
+    draw_unseen()
 
 
 def _collect_one(task: tuple[Path, CollectConfig, int, tuple[Pilot, ...], DataWorld]) -> int:

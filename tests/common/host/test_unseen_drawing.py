@@ -1,0 +1,90 @@
+"""Simulators draw where there is no display."""
+
+import os
+import sys
+
+import gymnasium
+import pytest
+
+from dreamfleet.common.host import unseen_drawing
+from dreamfleet.common.host.unseen_drawing import describe_choice, draw_offscreen
+from dreamfleet.worker.gym.environments import make_environment
+
+VARIABLES = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "PYGLET_HEADLESS")
+
+
+@pytest.fixture
+def host(monkeypatch, tmp_path):
+    """A host with MuJoCo, PyOpenGL and pyglet, and without a display; it returns which libraries are there."""
+    for name in (*VARIABLES, unseen_drawing.CHOSEN, "DISPLAY"):
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+    for module in ("mujoco", "OpenGL", "pyglet"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+        (tmp_path / f"{module}.py").touch()
+    monkeypatch.syspath_prepend(str(tmp_path))
+    here = {"libEGL.so.1", "libOSMesa.so.8"}
+    monkeypatch.setattr(unseen_drawing, "_is_here", lambda library: library in here)
+    monkeypatch.setattr(sys, "platform", "linux")
+    draw_offscreen.cache_clear()
+    yield here
+    draw_offscreen.cache_clear()
+
+
+def chosen():
+    draw_offscreen()
+    return tuple(os.environ.get(name) for name in VARIABLES)
+
+
+def test_egl_draws_and_without_it_osmesa(host):
+    assert chosen() == ("egl", "egl", "1")
+
+
+def test_osmesa_draws_where_egl_is_not(host):
+    host.remove("libEGL.so.1")
+    assert chosen() == ("osmesa", "osmesa", None)
+
+
+def test_nothing_is_chosen_where_no_library_is(host):
+    host.clear()
+    assert chosen() == (None, None, None)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "found"),
+    [
+        ("DISPLAY", ":0", (None, None, None)),
+        ("MUJOCO_GL", "osmesa", ("osmesa", "osmesa", None)),
+        ("MUJOCO_GL", "glfw", ("glfw", None, None)),
+        ("PYOPENGL_PLATFORM", "osmesa", ("osmesa", "osmesa", None)),
+    ],
+)
+def test_what_the_user_chose_counts(host, monkeypatch, name, value, found):
+    monkeypatch.setenv(name, value)
+    assert chosen() == found
+
+
+def test_a_host_without_these_packages_keeps_its_variables(host, monkeypatch):
+    monkeypatch.setattr(unseen_drawing, "find_spec", lambda _name: None)
+    assert chosen() == (None, None, None)
+
+
+def test_the_choice_is_said_where_mujoco_draws(host, monkeypatch):
+    draw_offscreen()
+    assert not describe_choice()
+    monkeypatch.setitem(sys.modules, "mujoco", os)
+    assert "MUJOCO_GL=egl" in describe_choice()
+
+
+class Arm(gymnasium.Env):
+    """Reports by what it would draw."""
+
+    observation_space = action_space = gymnasium.spaces.Box(-1, 1, (1,))
+
+    def __init__(self):
+        self.drawn_by = os.environ.get("MUJOCO_GL")
+
+
+def test_an_environment_is_made_where_it_can_draw(host):
+    with make_environment(f"{__name__}:Arm", {}) as made:
+        assert made.unwrapped.drawn_by == "egl"
