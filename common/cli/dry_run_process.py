@@ -35,7 +35,8 @@ class DryRunProcess:
     Its arguments are a file descriptor, which is closed by `begin`: until then it only loads what it needs.
     """
 
-    def __init__(self, module: str, request: str) -> None:
+    def __init__(self, module: str, request: str, hash_seed: int) -> None:
+        """`hash_seed` is Python's own, by which texts are hashed: the order of a set depends on it."""
         waits, self._go = os.pipe()
         self._descendants = Descendants()
         self._lines: list[bytes] = []  # unread, the next one last
@@ -47,7 +48,8 @@ class DryRunProcess:
             stdin.seek(0)
             self._child = subprocess.Popen(  # noqa: S603 - our own interpreter and module
                 [*parent_death_command(), sys.executable, "-P", "-m", module, str(waits)], pass_fds=(waits,),
-                stdin=stdin, stdout=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=0, start_new_session=True,
+                env={**os.environ, "PYTHONHASHSEED": str(hash_seed)}, stdin=stdin,
+                stdout=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=0, start_new_session=True,
             )  # fmt: skip
         os.close(waits)
         self._selector = selectors.DefaultSelector()

@@ -111,7 +111,11 @@ class Odd(gymnasium.Env):
     def step(self, action):
         self._steps += 1
         self._at = 0.9 * self._at + (0.1 if action else -0.1)
-        self._at += {"noise": random.random(), "carry": 0.01 * self._steps, "hash": hash("a") % 997}.get(self._fault, 0)
+        self._at += {
+            "noise": random.random(),
+            "carry": 0.01 * self._steps,
+            "hash": "lr".index(min({"left", "right"}, key=lambda _: 0)[0]),
+        }.get(self._fault, 0)
         if self._fault == "raise":
             raise RuntimeError("the engine\nstalled")
         reward = float(-np.abs(self._at).sum())

@@ -10,9 +10,11 @@ from enum import IntEnum
 from importlib import import_module
 from importlib.util import find_spec
 from math import isfinite
+from traceback import walk_tb
 from typing import Any
 
 import gymnasium
+from gymnasium.envs import registration
 from gymnasium.envs.registration import EnvSpec
 
 from dreamfleet.common.errors import UsageError
@@ -47,6 +49,10 @@ PACKAGES = {
 Environment = gymnasium.Env[Any, Any]
 
 
+class ArgumentsError(UsageError):
+    """The environment does not take the arguments that are given."""
+
+
 def make_environment(name: str, arguments: Mapping[str, Any], render_mode: str | None = None) -> Environment:
     """The environment of gymnasium with this id; `UsageError` if it cannot be made, or draws no wanted pictures."""
     if render_mode is None:
@@ -56,7 +62,7 @@ def make_environment(name: str, arguments: Mapping[str, Any], render_mode: str |
             warnings.filterwarnings("ignore", ".*render_mode")  # gymnasium's: the error says it
             return _make(name, {**arguments, "render_mode": render_mode})
     except UsageError as error:
-        if not isinstance(error.__cause__, TypeError):
+        if not isinstance(error, ArgumentsError):
             raise
         close_environment(_make(name, arguments))  # without pictures it is sound
         raise UsageError(
@@ -77,6 +83,11 @@ def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
         raise UsageError(f"{name} lacks a package on this host: {error}") from error
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
         module, colon, _ = name.rpartition(":")
+        if isinstance(error, ModuleNotFoundError) and not f"{module}.".startswith(f"{error.name}."):
+            raise UsageError(
+                f"{name} needs the module {error.name!r}, which is not installed on this host: install the package "
+                "that has it"
+            ) from error
         remedy = "" if colon else f"; an environment of another package is written {GYM}:its_module:Its-v0"
         if known := next((each for start, each in PACKAGES.items() if name.startswith(start)), None):
             install = "" if find_spec(known[1]) else f"install it on this host with `pip install {known[0]}`, and "
@@ -88,9 +99,26 @@ def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
             )
         raise UsageError(f"gymnasium makes no environment {name!r} here ({error}){remedy}") from error
     except TypeError as error:
-        raise UsageError(f"{name} takes no such arguments: {error}") from error
+        if _is_of_call(error, arguments):
+            raise ArgumentsError(f"{name} takes no such arguments: {error.__cause__}") from error
+        raise UsageError(f"{name} cannot be made: TypeError: {error.__cause__ or error}") from error
     except (Exception, SystemExit) as error:  # environments may raise anything
         raise UsageError(f"{name} cannot be made: {type(error).__name__}: {error}") from error
+
+
+def _is_of_call(error: TypeError, arguments: Mapping[str, Any]) -> bool:
+    """Whether the call with these arguments raised it, and not what the constructor does with them.
+
+    Gymnasium raises it again from that of its call. A function or subclass may hand arguments on: then the text names
+    one of them.
+    """
+    cause = error.__cause__
+    if not isinstance(cause, TypeError):
+        return False
+    places = [frame.f_code.co_filename for frame, _ in walk_tb(cause.__traceback__)]
+    return places[-1] == registration.__file__ or any(
+        f"unexpected keyword argument {name!r}" in str(cause) for name in arguments
+    )
 
 
 def _unregistered_class(name: str) -> EnvSpec | None:

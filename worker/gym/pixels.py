@@ -133,22 +133,27 @@ class GymPixelTask(Task):
         self.name = f"{GYM}:{environment}"
         self.options = options.text
         self._id, self._options = environment, options
+        self._world: World | None = None  # until an environment was made
 
     @classmethod
     def of(cls, environment: str, options: str) -> GymPixelTask:
         """The task of an environment's id and options as `PixelOptions.parse` takes them; made once for each."""
         return _find(environment, PixelOptions.parse(options).text)
 
-    @cached_property
+    @property
     def world(self) -> World:  # type: ignore[override]
-        """The world of the environment's actions and registration."""
-        made = self._make()
-        try:
-            actions = self._wrap(made).actions
-            facts = describe_environment(made, self._options.skip)
-            meanings = action_meanings(made)
-        finally:
-            close_environment(made)
+        """The world of the environment's actions and registration.
+
+        An environment is made for it only if none was before: many simulators allow one a process.
+        """
+        if self._world is None:
+            close_environment(self._open())
+        assert self._world is not None
+        return self._world
+
+    def _describe(self, made: gymnasium.Env[Any, Any], actions: Continuous) -> World:
+        facts = describe_environment(made, self._options.skip)
+        meanings = action_meanings(made)
         drawing = distributions_of("pygame") if self._options.observation == RENDERED else ()
         packages = tuple(dict.fromkeys((*facts.pop("packages"), "onnxruntime", *drawing)))
         names = meanings if len(meanings) == actions.actions else ()
@@ -201,7 +206,9 @@ class GymPixelTask(Task):
     def _open(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         made = self._make(render_mode)
         try:
-            return self._wrap(made)
+            wrapped = self._wrap(made)
+            self._world = self._world or self._describe(made, wrapped.actions)
+            return wrapped
         except BaseException:
             close_environment(made)
             raise

@@ -22,6 +22,8 @@ from dreamfleet.common.errors import UsageError
 
 Floats = NDArray[np.float32]
 MAX_CHOICES = 64  # a controller has an output for each
+LARGEST_WHOLE = 2**53  # of a whole number as an action; beyond it, double precision skips some
+ENDS = ("low", "high")
 NUMBERED = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 
@@ -37,7 +39,7 @@ def vector_actions(space: Any, name: str) -> Continuous:
     if leaves and all(isinstance(each, spaces.Box) for each in leaves):
         for each in leaves:
             _check_box(each, name)
-        low, high = ([getattr(each, end).ravel() for each in leaves] for end in ("low", "high"))
+        low, high = ([getattr(each, end).ravel() for each in leaves] for end in ENDS)
         return Continuous.between(np.concatenate(low), np.concatenate(high))
     if not leaves or not all(isinstance(each, NUMBERED) for each in leaves):
         raise UsageError(f"{name} takes actions {space}: wrap it so that they are a flat Box of floats, or Discrete")
@@ -49,12 +51,21 @@ def vector_actions(space: Any, name: str) -> Continuous:
 
 
 def make_converter(space: Any, actions: Continuous) -> Callable[[Floats], Any]:
-    """What turns a vector of `vector_actions` into an action of the space: the nearest choice, if there are choices."""
+    """What turns a vector of `vector_actions` into an action of the space: the nearest choice, if there are choices.
+
+    Numbers get the type of their Box. They are rounded if that is whole, and clipped to the Box' own bounds: the single
+    precision of a vector may lie beyond these, as float32(0.1) > 0.1 does.
+    """
     table = np.array(actions.choices, dtype=np.float32)
+    if len(table):
+        return lambda action: spaces.unflatten(space, table[np.argmin(((table - action) ** 2).sum(axis=1))])
+    leaves = list(_leaves(space))
+    low, high = (np.concatenate([getattr(each, end).ravel() for each in leaves], dtype=np.float64) for end in ENDS)
+    whole = np.concatenate([np.full(each.low.size, _is_whole(each)) for each in leaves])
 
     def convert(action: Floats) -> Any:
-        exact = table[np.argmin(((table - action) ** 2).sum(axis=1))] if len(table) else action
-        return spaces.unflatten(space, exact)
+        exact = np.where(whole, np.rint(action), action).astype(np.float64)
+        return spaces.unflatten(space, np.clip(exact, low, high))
 
     return convert
 
@@ -64,9 +75,9 @@ def flatten_environment(
 ) -> tuple[gymnasium.Env[Any, Any], Actions]:
     """The environment for a controller without a world model, and the actions that it then takes.
 
-    Box observations, Discrete actions and flat Boxes stay as they are. Other observations and actions become vectors,
-    and other numbered actions one number. Of a Dict, `keys` are seen; without any, all that are numbers. `UsageError`
-    where that is impossible.
+    Box observations, Discrete actions and flat Boxes of float32 stay as they are. Other observations and actions become
+    vectors, and other numbered actions one number. Of a Dict, `keys` are seen; without any, all that are numbers.
+    `UsageError` where that is impossible.
     """
     observed, space = environment.observation_space, environment.action_space
     if keys or not isinstance(observed, spaces.Box):
@@ -79,7 +90,7 @@ def flatten_environment(
     if isinstance(space, spaces.Discrete):
         return environment, Discrete(int(space.n), int(space.start))
     actions = vector_actions(space, name)
-    if isinstance(space, spaces.Box) and len(space.shape) == 1:
+    if isinstance(space, spaces.Box) and len(space.shape) == 1 and space.dtype == np.float32:
         return environment, actions
     convert = make_converter(space, actions)
     if not actions.choices:
@@ -162,13 +173,16 @@ def _leaves(space: Any) -> Iterator[Any]:
 def _check_box(space: spaces.Box, name: str) -> None:
     if 0 in space.shape:
         raise UsageError(f"{name} takes actions {space}: a controller gives at least one number")
-    if not np.issubdtype(space.dtype, np.floating):
-        raise UsageError(f"{name} takes whole numbers as actions: wrap it so that they are Discrete, or of a float Box")
     low, high = (np.asarray(each, np.float64) for each in (space.low, space.high))
+    is_endless = _is_whole(space) and bool((np.abs([low, high]) > LARGEST_WHOLE).any())
     with np.errstate(over="ignore"):  # actions are float32, and so are drawn ones of their whole range
         reach = np.stack([low, high, high - low]).astype(np.float32)
-    if not np.isfinite(reach).all():
+    if is_endless or not np.isfinite(reach).all():
         raise UsageError(f"{name} takes actions without bounds: wrap it so that its actions have a range")
+
+
+def _is_whole(space: spaces.Box) -> bool:
+    return not np.issubdtype(space.dtype, np.floating)
 
 
 def _sizes(space: Any) -> list[int]:

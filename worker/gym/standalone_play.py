@@ -43,7 +43,8 @@ def play(seed: int) -> float:
         else:
             low, high = np.float64(space.low), np.float64(space.high)
             action = np.tanh(found) * np.float32((high - low) / 2) + np.float32((high + low) / 2)
-            action = np.clip(action, space.low, space.high)
+            action = np.clip(np.clip(action, np.float32(low), np.float32(high)), low, high)
+            action = (np.rint(action) if np.issubdtype(space.dtype, np.integer) else action).astype(space.dtype)
         observation, reward, terminated, truncated, _ = environment.step(action)
         score, over, steps = score + float(reward), terminated or truncated, steps + 1
     environment.close()

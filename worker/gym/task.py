@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.actions import Discrete
+from dreamfleet.common.artifacts.actions import Actions, Discrete
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.worker.gym.environments import (
@@ -68,9 +69,7 @@ class GymTask(Task):
 
     def world_of(self, assignment: Assignment) -> World:
         """The world of the environment's spaces and registration; `UsageError` if they cannot be used."""
-        environment, world = self._open(*_frozen(assignment))
-        close_environment(environment)
-        return world
+        return self._facts(*_frozen(assignment)).world
 
     def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
         """The environment, with the arguments that the run froze."""
@@ -80,14 +79,13 @@ class GymTask(Task):
         self, assignment: Assignment, render_mode: str | None = None
     ) -> gymnasium.Env[Any, Any]:
         """The same environment; `UsageError` if it has no render modes and pictures are wanted."""
-        return self._open(*_frozen(assignment), render_mode)[0]
+        return self._open(*_frozen(assignment), render_mode)
 
     def make_watched_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any] | None:
         """The environment with pictures; `None` outside of gymnasium, where `render` might change scores."""
-        plain = self.make_environment(assignment)
-        close_environment(plain)
-        drawn = is_gymnasiums(plain) and RGB in plain.metadata.get("render_modes", ())
-        return _RenderOnDemand(self.make_evaluation_environment(assignment, RGB)) if drawn else None
+        if not self._facts(*_frozen(assignment)).is_drawn:
+            return None
+        return _RenderOnDemand(self.make_evaluation_environment(assignment, RGB))
 
     def make_policy(self, assignment: Assignment) -> Policy:
         """A controller on the flat observation, normalised with the statistics that the run froze."""
@@ -99,12 +97,7 @@ class GymTask(Task):
 
         So it is where a part of the observation is left out.
         """
-        arguments, keys = _frozen(assignment)
-        made = make_environment(self._id, arguments)
-        space, seen = made.action_space, made.observation_space
-        close_environment(made)
-        is_plain = isinstance(space, spaces.Discrete) or (isinstance(space, spaces.Box) and len(space.shape) == 1)
-        is_plain = is_plain and not keys and is_of_numbers(seen)
+        is_plain = self._facts(*_frozen(assignment)).is_plain
         return Path(__file__).with_name("standalone_play.py") if is_plain else None
 
     def describe(self, options: Mapping[str, Any]) -> Description:
@@ -118,8 +111,9 @@ class GymTask(Task):
             raise UsageError(f"task {self.name} knows no option {', '.join(sorted(unknown))}: {', '.join(OPTIONS)}")
         arguments = dict(options.get("environment") or {})
         keys = list(dict.fromkeys(options.get("observation") or ()))
-        environment, world = self._open(arguments, keys)
+        environment = self._open(arguments, keys)
         try:
+            world = self._facts(arguments, keys).world
             self._check_version(environment)
             frozen: dict[str, Any] = {"environment": arguments} if arguments else {}
             if keys:
@@ -141,19 +135,52 @@ class GymTask(Task):
         if re.fullmatch(rf"{re.escape(name)}-v\d+", found, re.ASCII):
             raise UsageError(f"task {self.name} names no version: write {GYM}:{module}{colon}{found}")
 
+    def _facts(self, arguments: Mapping[str, Any], keys: Sequence[str]) -> _Facts:
+        """What is known of the environment; it is made only if this process never made it with these arguments."""
+        key = self._key(arguments, keys)
+        if key not in _known:
+            close_environment(self._open(arguments, keys))
+        return _known[key]
+
     def _open(
         self, arguments: Mapping[str, Any], keys: Sequence[str] = (), render_mode: str | None = None
-    ) -> tuple[gymnasium.Env[Any, Any], World]:
-        """The environment for a controller without a world model, and its world."""
+    ) -> gymnasium.Env[Any, Any]:
+        """The environment for a controller without a world model; its facts are known from then on."""
         made = make_environment(self._id, arguments, render_mode)
         try:
             environment, actions = flatten_environment(made, self._id, keys)
-        except UsageError:
+            _known[self._key(arguments, keys)] = _Facts.of(made, actions, keys)
+        except BaseException:
             close_environment(made)
             raise
-        meanings = action_meanings(made)
+        return environment
+
+    def _key(self, arguments: Mapping[str, Any], keys: Sequence[str]) -> str:
+        return f"{self._id} {json.dumps([arguments, list(keys)], sort_keys=True, default=repr)}"
+
+
+@dataclass(frozen=True)
+class _Facts:
+    """What an environment says of itself: asked of one that is open, as many simulators allow one a process."""
+
+    world: World
+    is_drawn: bool  # its `render` is gymnasium's own, and gives pictures
+    is_plain: bool  # it takes Discrete or a flat Box, and all that it observes is seen
+
+    @classmethod
+    def of(cls, made: gymnasium.Env[Any, Any], actions: Actions, keys: Sequence[str]) -> _Facts:
+        """The facts of an environment before it was wrapped, and of its actions after that."""
+        meanings, space = action_meanings(made), made.action_space
         names = meanings if len(meanings) == actions.outputs and isinstance(actions, Discrete) else ()
-        return environment, World(actions, action_names=names, **describe_environment(made))
+        takes_plain = isinstance(space, spaces.Discrete) or (isinstance(space, spaces.Box) and len(space.shape) == 1)
+        return cls(
+            World(actions, action_names=names, **describe_environment(made)),
+            is_gymnasiums(made) and RGB in made.metadata.get("render_modes", ()),
+            takes_plain and not keys and is_of_numbers(made.observation_space),
+        )
+
+
+_known: dict[str, _Facts] = {}  # of each environment and its arguments that this process made
 
 
 def _frozen(assignment: Assignment) -> tuple[dict[str, Any], list[str]]:

@@ -65,21 +65,32 @@ class Scorer(Displayed):
         task = find_scored_task(spec.task, bundle)
         fitting = None if bundle is None else bundle.with_options(spec.controller, spec.options)
         assignment = Assignment(spec, fitting, torch_device)
-        self.world = find_checked_world(assignment)
         self.spec = spec
+        self._task, self._assignment = task, assignment
+        # First of all, so that nothing else makes one to ask for the world: many simulators allow one a process.
+        self._environment = task.make_environment(assignment)
+        self._more_environments: list[gymnasium.Env[Any, Any]] = []  # for episodes that are driven side by side
+        try:
+            self._prepare()
+        except BaseException:
+            self.close()
+            raise
+
+    def _prepare(self) -> None:
+        """Check the world, and make what scores in it."""
+        spec, task, assignment = self.spec, self._task, self._assignment
+        self.world = find_checked_world(assignment)
         self._batch_for: Callable[[TaskSpec], Batch] | None = None
         if isinstance(task, BatchedTask):
             make = task.make_batch
             # The last batch is kept: specifications change rarely, and making a batch takes milliseconds.
             self._batch_for = lru_cache(maxsize=1)(lambda each: make(replace(assignment, spec=each)))
             self._batch_for(spec)  # raises its errors now, not with the first job
-        self._task, self._assignment = task, assignment
-        self._environment = task.make_environment(assignment)
-        self._more_environments: list[gymnasium.Env[Any, Any]] = []  # for episodes that are driven side by side
         self._policy = task.make_policy(assignment)
         self._policies: Policies | None = None
         truth = getattr(task.reality(assignment), "truth", None)
         self._measurer = Measurer(spec.measures, self.world.actions, self.world.action_names, truth)
+        bundle = assignment.bundle
         self._preprocessing = "" if bundle is None else bundle.manifest.preprocessing
         self._data_world = OF_FIRST_WORLD if bundle is None else DataWorld.of(bundle)
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from time import monotonic
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from dreamfleet.common.cli.task_check import LAST_STEP, DryRunReport
 from dreamfleet.common.errors import DreamfleetError, UsageError
@@ -25,10 +25,13 @@ from dreamfleet.common.printable import one_line
 from dreamfleet.common.protocol.tasks import Description, describe_task
 
 if TYPE_CHECKING:
-    from dreamfleet.worker.tasks.api import Task
+    from dreamfleet.worker.tasks.api import Actions, Policy, Task
 
 MEND = "fix the environment, or wrap it"
 SLOW_RESET = 2.0  # seconds; gymnasium's checker resets a dozen times, so it is left out where resets are slower
+CORNERS = 4  # random corners of the actions that are tried
+SATURATED = 1000.0  # an output so large that its action is a bound
+MAX_ACTION = 100  # characters of an action in a message
 ADVICE = re.compile(r"infinity|we recommend")  # warnings of gymnasium's checker that are about style
 COLOURS = re.compile(r"\x1b\[\d+m|WARN: ")
 
@@ -84,9 +87,16 @@ class CheckedEnvironment:
                 f"its observation is {_describe(observation)}, but its observation space has {self.observations} "
                 f"numbers; {MEND}"
             )
-        finite = bool(np.isfinite(np.asarray(observation, dtype=np.float64)).all())
+        numbers = np.asarray(observation, dtype=np.float64)
+        finite = bool(np.isfinite(numbers).all())
         text = "an observation holds NaN or infinity, from which no controller can act"
-        if not finite and text not in self.warnings:
+        if finite and (np.abs(numbers) > np.finfo(np.float32).max).any():
+            text = (
+                "an observation holds a number beyond 3.4e38, which is infinity in the single precision of controllers"
+            )
+        elif finite:
+            return True
+        if text not in self.warnings:
             self.warnings.append(text)
         return finite
 
@@ -130,21 +140,27 @@ def dry_run(
     announce("making it")
     description = describe_task(name, {key: value for key, value in options.items() if key != "normalise"})
     from dreamfleet.worker.scoring.host_class_probe import REPEAT_LIMIT  # needs gymnasium, as the task may not
+    from dreamfleet.worker.tasks.closing import close_environment
 
-    checked, drive = _prepare(name, description, announce, measures)
+    trial = _prepare(name, description, announce, measures)
+    checked = trial.checked
     began = monotonic()
-    report = DryRunReport(description, episode=drive(), first=_digest(checked.first))
+    report = DryRunReport(description, episode=trial.drive(), first=_digest(checked.first))
     report.seconds = monotonic() - began
     if thorough and report.episode and report.seconds < REPEAT_LIMIT:
-        report.repeated = drive()
-    if thorough and options.get("normalise"):
-        announce("")
-        report.description = describe_task(name, options)
+        report.repeated = trial.drive()
     if thorough:
+        trial.drive_extremes()
         checked.warnings += _describe_pictures(name, checked.environment)
         checked.warnings += _describe_left_out(checked.environment)
         if checked.reset_seconds >= SLOW_RESET:
             checked.warnings.append(f"a reset took {checked.reset_seconds:.0f} s, so gymnasium's checker was left out")
+    if thorough and options.get("normalise"):
+        close_environment(checked.environment)  # the description makes its own, and many simulators allow one a process
+        announce("")
+        report.description = describe_task(name, options)
+        announce("making it")
+        checked.environment = trial.make()
     report.warnings = tuple(checked.warnings)
     yield report
     if thorough and checked.reset_seconds < SLOW_RESET:
@@ -152,17 +168,56 @@ def dry_run(
         report.warnings = (*checked.warnings, *_check_by_gymnasium(checked.environment))
         yield report
     announce(LAST_STEP)
-    with suppress(Exception):
-        checked.environment.close()
+    if fault := close_environment(checked.environment):
+        report.warnings = (*report.warnings, fault)
+        yield report
 
 
-def _prepare(
-    name: str, description: Description, announce: Callable[[str], None], measures: Sequence[str]
-) -> tuple[CheckedEnvironment, Callable[[], str]]:
-    """The task's environment, and what drives its probe episode and returns the digest; empty: there is no probe."""
+@dataclass(frozen=True)
+class _Trial:
+    """A task's environment under its policy."""
+
+    checked: CheckedEnvironment
+    make: Callable[[], Any]  # its environment anew
+    policy: Policy
+    actions: Actions
+    parameters: int
+    probe_steps: int
+
+    def drive(self) -> str:
+        """Drive the probe episode and return its digest; empty: there is none."""
+        from dreamfleet.worker.scoring.host_class_probe import HostClassProbe
+
+        if self.probe_steps <= 0:
+            return ""
+        probe, environment = HostClassProbe(), cast("Any", self.checked)
+        probe.add_episode(environment, self.policy, self.parameters, self.probe_steps)
+        return probe.host_class
+
+    def drive_extremes(self) -> None:
+        """Step with both bounds and random corners of the actions, as controllers with large outputs do."""
+        import numpy as np
+
+        from dreamfleet.worker.tasks.policy import FlatPolicy
+
+        if not isinstance(self.policy, FlatPolicy):  # others may take other outputs
+            return
+        size, is_over = self.actions.outputs, True
+        corners = np.random.default_rng(0).choice([-1.0, 1.0], (CORNERS, size))
+        last = np.arange(size) == size - 1  # of numbered actions
+        for signs in (np.full(size, -1.0), np.full(size, 1.0), np.where(last, 1.0, -1.0), *corners):
+            if is_over:
+                self.checked.reset(seed=0)
+            action = self.actions.to_action((SATURATED * signs).astype(np.float32))
+            self.checked.announce(f"a step with the action {one_line(str(action))[:MAX_ACTION]}")
+            _, _, terminated, truncated, _ = self.checked.step(action)
+            is_over = bool(terminated or truncated)
+
+
+def _prepare(name: str, description: Description, announce: Callable[[str], None], measures: Sequence[str]) -> _Trial:
+    """The task's environment and policy."""
     from dreamfleet.common.artifacts.controller import ControllerShape
     from dreamfleet.common.protocol.messages import TaskSpec
-    from dreamfleet.worker.scoring.host_class_probe import HostClassProbe
     from dreamfleet.worker.tasks.api import Assignment
     from dreamfleet.worker.tasks.measures import Measurer
     from dreamfleet.worker.tasks.registry import find_task
@@ -174,17 +229,15 @@ def _prepare(
     )
     world = task.world_of(assignment)
     Measurer(measures, world.actions, world.action_names, getattr(task, "truth", None))
-    environment: Any = CheckedEnvironment(task.make_environment(assignment), description.observations, announce)
-    policy = task.make_policy(assignment)
-
-    def drive() -> str:
-        if task.probe_steps <= 0:
-            return ""
-        probe = HostClassProbe()
-        probe.add_episode(environment, policy, shape.size, task.probe_steps)
-        return probe.host_class
-
-    return environment, drive
+    checked = CheckedEnvironment(task.make_environment(assignment), description.observations, announce)
+    return _Trial(
+        checked,
+        lambda: task.make_environment(assignment),
+        task.make_policy(assignment),
+        world.actions,
+        shape.size,
+        task.probe_steps,
+    )
 
 
 def _digest(value: Any) -> str:

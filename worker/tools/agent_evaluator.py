@@ -18,9 +18,14 @@ class AgentEvaluator:
     """Drives an agent in its evaluation environment, one episode after another."""
 
     def __init__(self, agent: Agent) -> None:
-        self._world, self._parameters = agent.world, agent.parameters
-        self._environment, self._policies = agent.make_evaluation_environment(), agent.make_policies()
-        self._truth = agent.truth
+        # First of all, so that nothing else makes one to ask for the world: many simulators allow one a process.
+        self._environment = agent.make_evaluation_environment()
+        try:
+            self._world, self._parameters, self._truth = agent.world, agent.parameters, agent.truth
+            self._policies = agent.make_policies()
+        except BaseException:
+            self.close()
+            raise
 
     def drive(self, seed: int, on_step: Callable[[int], None] = lambda _steps: None) -> EpisodeResult:
         """Drive one whole episode; `on_step` gets the number of each step. The statistics do not change its score."""

@@ -35,13 +35,13 @@ def record(
     With a world model, the video also shows what the model sees, decodes and, if it can, dreams. An episode's end is
     held for a second. If `stop()` turns true, the video ends early, after at least one step.
     """
-    policy: Any = agent.make_policies()(seed)
-    policy.begin(agent.parameters)
     config, bundle = replace(dreaming or ParallelDreamConfig(), seed=seed), agent.bundle
-    model_view = None if bundle is None else WorldModelView(bundle, policy, agent.parameters, config)
     score = 0.0
-    environment = agent.make_evaluation_environment("rgb_array")
+    environment = agent.make_evaluation_environment("rgb_array")  # first of all: what follows asks the open one
     try:
+        policy: Any = agent.make_policies()(seed)
+        policy.begin(agent.parameters)
+        model_view = None if bundle is None else WorldModelView(bundle, policy, agent.parameters, config)
         with episode_errors(seed), Video(out, agent.world.frames_per_second) as video:
             filmed = FilmedPolicy(policy, FramePainter(environment, agent, seed, video.add), model_view)
             for moment in run_episode(environment, filmed, EpisodeConfig(seed, steps)):

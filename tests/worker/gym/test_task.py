@@ -11,10 +11,12 @@ from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import describe_task, family_of, load_task
 from dreamfleet.worker.gym import environments
+from dreamfleet.worker.gym.environments import ArgumentsError, make_environment
 from dreamfleet.worker.gym.task import DEFAULT_MAX_STEPS
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task, known_tasks
+from tests.support.stuck_environments import MODULE as STUCK
 
 CARTPOLE = "gym:CartPole-v1"
 
@@ -198,7 +200,6 @@ class Strange(gymnasium.Env):
             raise RuntimeError(fails)
         self.action_space = {
             "float": gymnasium.spaces.Box(-1, 1, (1,)),
-            "whole": gymnasium.spaces.Box(0, 3, (1,), np.int64),
             "none": gymnasium.spaces.Box(-1, 1, (0,)),
         }[actions]
 
@@ -220,7 +221,6 @@ def strange():
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        ({"actions": "whole"}, "takes whole numbers as actions"),
         ({"actions": "none"}, "takes actions Box"),
         ({"actions": "?"}, "cannot be made: KeyError"),
         ({"fails": "boom"}, "cannot be made: RuntimeError: boom"),
@@ -230,6 +230,24 @@ def strange():
 def test_any_error_while_an_environment_is_made_is_one_line(strange, arguments, says):
     with pytest.raises(UsageError, match=says):
         describe_task(strange, {"environment": arguments})
+
+
+@pytest.mark.parametrize("place", ["tests.support.needy_environments:Needy-v0", f"{STUCK}:Lazy-v0"])
+def test_a_missing_dependency_is_named_and_not_the_environments_own_module(place):
+    with pytest.raises(UsageError) as raised:
+        describe_task(f"gym:{place}", {})
+    assert "'a_package_that_is_missing'" in str(raised.value)
+    assert "--trust" not in str(raised.value)
+
+
+def test_a_type_error_inside_a_constructor_is_not_one_of_its_arguments():
+    for kind, arguments in (("Mistaken", {"size": 3}), ("HandsOn", {"size": 3})):
+        with pytest.raises(UsageError) as raised:
+            make_environment(f"{STUCK}:{kind}-v0", arguments)
+        assert not isinstance(raised.value, ArgumentsError)
+    for kind in ("Mistaken", "HandsOn"):
+        with pytest.raises(ArgumentsError):
+            make_environment(f"{STUCK}:{kind}-v0", {"wings": 3})
 
 
 @pytest.mark.slow
