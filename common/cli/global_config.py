@@ -114,7 +114,9 @@ def _named_modules(args: argparse.Namespace, environment: Mapping[str, str], fil
 
 
 def load_credentials(args: argparse.Namespace, roles: Collection[str] = ()) -> Credentials | None:
-    """Read the join file, if one is set; `AccessError` if its role is not among `roles` (empty: any role)."""
+    """Read and check the join file, if one is set; `AccessError` if its role is not among `roles` (empty: any role)."""
+    from dreamfleet.common.security.certificate_check import check_certificate
+
     path: Path | None = args.global_config.join
     if path is None:
         return None
@@ -124,11 +126,20 @@ def load_credentials(args: argparse.Namespace, roles: Collection[str] = ()) -> C
             f"{path} is for the role {credentials.role}, and this needs {' or '.join(roles)}: have it issued "
             f"with `dreamfleet access issue {next(iter(roles))} NAME --out FILE`"
         )
+    check_certificate(credentials)
     left = credentials.time_left(datetime.now(UTC))
     if left < EXPIRY_WARNING:
         log.warning("%s expires soon (%s): have %s %s issued again", path, describe_time_left(left), credentials.role,
                     credentials.name)  # fmt: skip
     return credentials
+
+
+def security_flags(args: argparse.Namespace) -> tuple[str, ...]:
+    """The flags by which another coordinator has the same join file and list of revoked files; none without one."""
+    join, access_dir = args.global_config.join, args.global_config.access_dir
+    if join is None:
+        return ()
+    return ("--join", str(join), *(("--access-dir", str(access_dir)) if access_dir != GlobalConfig.access_dir else ()))
 
 
 def resolve_network(args: argparse.Namespace, *roles: str) -> Network:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import asdict, dataclass, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from dreamfleet.common.errors import AccessError
@@ -83,29 +83,60 @@ class CertificateLedger:
 
 
 class RevocationWatcher:
-    """The revoked seats by a ledger file, reloaded when it changes; none without credentials."""
+    """The revoked seats by a ledger file, reloaded when it changes; none without credentials.
 
-    def __init__(self, folder: Path, credentials: Credentials | None) -> None:
-        """`AccessError` if the folder's ledger is damaged or another authority's: revoked seats would stay valid."""
+    A revocation is final: a seat stays revoked if the file is removed, damaged, or replaced by an older copy.
+    """
+
+    def __init__(
+        self, folder: Path, credentials: Credentials | None, kept: Collection[str] = (), *, named: bool = False
+    ) -> None:
+        """`kept` are seats that are known to be revoked; `named` says that the user chose the folder.
+
+        `AccessError` if the own seat is revoked, if the folder's ledger is damaged or another authority's, or if there
+        is none although the folder was named or seats are known to be revoked: others may be revoked too.
+        """
         self._path = folder / LEDGER_FILE
-        self._authority = credentials.authority if credentials else None
+        self._credentials = credentials
         self._next = float("-inf")
         self._seen: tuple[int, int, int] | None = None
-        self.revoked_seats: frozenset[str] = frozenset()
+        self._is_gone = False
+        self.revoked_seats = frozenset(kept)
         if credentials is None:
             return
-        try:
-            exists = self._path.exists()
-        except OSError as error:
-            raise AccessError(f"{self._path} cannot be read: {error.strerror}") from error
-        if not exists:
-            log.warning("there is no %s: nothing is revoked (--access-dir)", self._path)
-        else:
+        if exists_in(folder):
             self._reload(time.monotonic())
+        elif kept:
+            raise AccessError(
+                f"there is no {self._path}, and this run's fleet has revoked {len(kept)} of its files: name its "
+                "folder with --access-dir, or copy issued.json of the authority into one (it holds no secret)"
+            )
+        elif named:
+            raise AccessError(f"there is no {self._path}: name the authority's folder, or one with a copy of that file")
+        else:
+            log.warning("there is no %s: nothing is revoked (--access-dir)", self._path)
+        self.check_own_file()
+
+    @property
+    def authority(self) -> str:
+        """Hash of the authority's certificate; empty without credentials."""
+        return "" if self._credentials is None else self._credentials.authority
+
+    def check_own_file(self) -> None:
+        """`AccessError` if the join file of this program is revoked or has expired: nobody should follow it then."""
+        own = self._credentials
+        if own is None:
+            return
+        is_revoked = own.identity in self.revoked_seats
+        if is_revoked or own.time_left(datetime.now(UTC)) <= timedelta():
+            raise AccessError(
+                f"the join file of {own.identity} ({own.name}) {'is revoked' if is_revoked else 'has expired'}: have "
+                f"another issued with `dreamfleet access issue {own.role} {own.name} --out FILE`"
+            )
 
     def reload_if_changed(self, now: float) -> None:
-        """Reload the ledger if it changed; a damaged one only logs a warning."""
-        if self._authority is None or now < self._next:
+        """Reload the ledger if it changed; a damaged or missing one only logs a warning."""
+        if self._credentials is None or now < self._next:
             return
         try:
             self._reload(now)
@@ -116,15 +147,27 @@ class RevocationWatcher:
         self._next = now + CHECK_INTERVAL
         try:
             found = self._path.stat()
-        except OSError:  # gone
+        except OSError:
+            if self._seen is not None and not self._is_gone:
+                self._is_gone = True
+                log.warning("%s is gone: what is revoked from now on is not seen; put it back", self._path)
             return
+        self._is_gone = False
         seen = found.st_ino, found.st_mtime_ns, found.st_size
         if seen == self._seen:
             return
         self._seen = seen
         ledger = CertificateLedger.load(self._path)
-        if ledger.authority != self._authority:
+        if ledger.authority != self.authority:
             raise AccessError(f"{self._path} belongs to another authority than the join file: name its --access-dir")
         for each in sorted(ledger.revoked_seats() - self.revoked_seats):
             log.warning("%s is revoked: its messages are ignored", each)
-        self.revoked_seats = ledger.revoked_seats()
+        self.revoked_seats |= ledger.revoked_seats()
+
+
+def exists_in(folder: Path) -> bool:
+    """Whether a folder holds a ledger; `AccessError` if it cannot be read."""
+    try:
+        return (folder / LEDGER_FILE).exists()
+    except OSError as error:
+        raise AccessError(f"{folder / LEDGER_FILE} cannot be read: {error.strerror}") from error

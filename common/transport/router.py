@@ -6,10 +6,12 @@ import logging
 from collections import Counter
 from contextlib import closing
 from threading import Event
+from time import monotonic
 
 import zenoh
 
 from dreamfleet.common.printable import plural
+from dreamfleet.common.security.certificate_ledger import CHECK_INTERVAL, RevocationWatcher
 from dreamfleet.common.transport.network import Network
 from dreamfleet.common.transport.session import open_session
 
@@ -17,17 +19,23 @@ log = logging.getLogger("dreamfleet.router")
 SUMMARY_INTERVAL = 60.0  # seconds between two log lines about the sessions
 
 
-def run_router(network: Network, stopped: Event) -> None:
+def run_router(network: Network, stopped: Event, revocations: RevocationWatcher) -> None:
     """Route messages between all connected sessions until `stopped`; `ConnectionFailedError` if it cannot listen.
 
-    Other routers in `network.connect` may start later, stop and return.
+    Other routers in `network.connect` may start later, stop and return. `AccessError` once its own file is revoked or
+    expired.
     """
     with closing(open_session(network, timeout=None)) as session:
         others = f"; linked to {', '.join(network.connect)} while it is reachable" if network.connect else ""
         log.info("listening on %s%s", ", ".join(network.listen), others,
                  extra={"facts": {"event": "begin", "listen": network.listen, "connect": network.connect}})  # fmt: skip
-        while not stopped.wait(SUMMARY_INTERVAL):
-            _log_sessions(session)
+        summary_at = monotonic() + SUMMARY_INTERVAL
+        while not stopped.wait(CHECK_INTERVAL):
+            revocations.reload_if_changed(monotonic())
+            revocations.check_own_file()
+            if monotonic() >= summary_at:
+                summary_at += SUMMARY_INTERVAL
+                _log_sessions(session)
         _log_sessions(session)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from threading import Event
 
 from dreamfleet.common.cli.config import add_flags, load, option
-from dreamfleet.common.cli.global_config import add_global_flags, load_credentials
+from dreamfleet.common.cli.global_config import GlobalConfig, add_global_flags, load_credentials
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.files.atomic_write import open_new
 from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking
@@ -58,10 +58,14 @@ def run(args: argparse.Namespace) -> int:
     raise_open_file_limit()
     config = load(RouterConfig, "router", **args.sources)
     credentials = load_credentials(args, ("router",))
-    revoked_seats = RevocationWatcher(args.global_config.access_dir, credentials).revoked_seats
+    access_dir = args.global_config.access_dir
+    revocations = RevocationWatcher(access_dir, credentials, named=access_dir != GlobalConfig.access_dir)
     default = DEFAULT_ENDPOINT if credentials is None else SECURED_ENDPOINT
     network = Network(
-        config.listen or args.global_config.listen or (default,), config.connect, credentials, revoked_seats
+        config.listen or args.global_config.listen or (default,),
+        config.connect,
+        credentials,
+        revocations.revoked_seats,
     )
     network.check_open(insecure=config.insecure)
     if args.print_config:
@@ -75,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     stopped = Event()
     for number in SIGNALS:
         signal.signal(number, lambda *_: stopped.set())
-    run_router(network, stopped)
+    run_router(network, stopped, revocations)
     return 0
 
 

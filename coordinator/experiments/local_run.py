@@ -53,11 +53,14 @@ class LocalFleet:
     @classmethod
     def of(
         cls, listen: tuple[str, ...], local: int | None, coordinator: tuple[str, ...], worker: tuple[str, ...],
-        join: Path | None = None, *, insecure: bool = False,
+        join: Path | None = None, security: tuple[str, ...] = (), *, insecure: bool = False,
     ) -> LocalFleet:  # fmt: skip
-        """Without `listen`: a free port of this host. Without `local`: a slot per core, or none where `listen` is."""
+        """Without `listen`: a free port of this host. Without `local`: a slot per core, or none where `listen` is.
+
+        `security` are a coordinator's flags for the fleet of the join file.
+        """
         joined = () if join is None else ("--join", str(join))
-        security = (*joined, *(("--insecure",) if insecure else ()))
+        security = (*security, *(("--insecure",) if insecure else ()))
         here = f"{'tcp' if join is None else 'tls'}/127.0.0.1:{free_port()}"
         slots = local if local is not None else 0 if listen else usable_cores()
         return cls(listen or (here,), slots, coordinator, (*worker, *joined), security)

@@ -25,7 +25,7 @@ from dreamfleet.common.runs.run_folder import EPISODE_LIMIT, open_run
 from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.common.runs.run_paths import ARCHIVE, BUNDLE, JOURNAL, resume_command
 from dreamfleet.common.security.anchor_key import make_anchor_key
-from dreamfleet.common.security.certificate_ledger import RevocationWatcher
+from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, RevocationWatcher
 from dreamfleet.common.security.credentials import Credentials
 from dreamfleet.common.transport.session import Network
 from dreamfleet.common.worlds.score_words import score_word
@@ -41,6 +41,7 @@ from dreamfleet.coordinator.settings.resume_settings import serving_facts
 from dreamfleet.coordinator.settings.start import SUBSPACE_FACT, StartPoint
 from dreamfleet.coordinator.storage.file_watch import FileWatch
 from dreamfleet.coordinator.storage.journal import Journal
+from dreamfleet.coordinator.storage.kept_revocations import REVOKED, revoked_seats_in
 from dreamfleet.coordinator.storage.served_bundle import ServedBundle
 
 log = logging.getLogger(__name__)
@@ -69,14 +70,24 @@ class RunRequest:
     @property
     def with_absolute_paths(self) -> RunRequest:
         """The same request with absolute paths, which hold in any working directory."""
-        access = self.access_dir if self.access_dir == GlobalConfig.access_dir else self.access_dir.absolute()
         join = None if self.join is None else self.join.absolute()
+        access = self.access_dir.absolute() if self._has_access_dir else self.access_dir
         return replace(self, runs_dir=self.runs_dir.absolute(), join=join, access_dir=access)
+
+    @property
+    def is_access_dir_named(self) -> bool:
+        """Whether the user chose the folder of the list of revoked certificates."""
+        return self.access_dir != GlobalConfig.access_dir
+
+    @property
+    def _has_access_dir(self) -> bool:
+        """Whether a command elsewhere must name that folder: it was chosen, or the default one holds the list."""
+        return self.is_access_dir_named or (self.access_dir / LEDGER_FILE).exists()
 
     def resume_command(self, folder: Path | None = None) -> str:
         """The command that continues the run, also in a `folder` that it was moved to."""
-        own_access_dir = None if self.access_dir == GlobalConfig.access_dir else self.access_dir
-        return resume_command(folder or self.folder, self.join, own_access_dir, self.trust)
+        access_dir = self.access_dir if self._has_access_dir else None
+        return resume_command(folder or self.folder, self.join, access_dir, self.trust)
 
 
 class Stop:
@@ -125,6 +136,7 @@ def _serve_life(request: RunRequest, stop: Stop) -> Run:
         else:
             journal = None
             Journal.check_absent(folder)
+        revocations = _watch_revocations(request, journal)
 
         def open_run() -> OpenRun:
             """The run; a new one is created here, once its addresses and its name are its own."""
@@ -139,7 +151,7 @@ def _serve_life(request: RunRequest, stop: Stop) -> Run:
             run = Run(journal, settings, request.limits, request.network, monotonic(), anchor_key)
             return OpenRun(run, file_watch, served)
 
-        service = _service(request, _score_word(settings, bundle))
+        service = _service(request, revocations, _score_word(settings, bundle))
         stop.stop_service = service.stop
         if stop.is_requested:
             service.stop()
@@ -167,10 +179,17 @@ def _score_word(settings: RunSettings, bundle: Bundle | None) -> str:
     return score_word(task) if bundle is None else score_word(bundle.manifest.task, bundle.manifest.world)
 
 
-def _service(request: RunRequest, word: str) -> Service:
+def _watch_revocations(request: RunRequest, journal: Journal | None) -> RevocationWatcher:
+    """What is revoked now, or was when the run was last served; `AccessError` where that cannot be known."""
+    credentials, start = request.credentials, request.start
+    fact = journal.fact(REVOKED) if journal is not None else start.revoked if start is not None else None
+    kept = () if credentials is None else revoked_seats_in(fact, credentials.authority)
+    return RevocationWatcher(request.access_dir, credentials, kept, named=request.is_access_dir_named)
+
+
+def _service(request: RunRequest, revocations: RevocationWatcher, word: str) -> Service:
     network = request.network
     intervals = Intervals(network.beat, network.beat)
-    revocations = RevocationWatcher(request.access_dir, request.credentials)
     reached = Network(network.listen, network.connect, request.credentials, revocations.revoked_seats)
     return Service(request.name, reached, intervals, network.metrics_port, revocations, word)
 

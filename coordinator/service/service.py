@@ -16,7 +16,7 @@ from typing import Any
 
 import zenoh
 
-from dreamfleet.common.errors import DreamfleetError, JournalError, NotWritableNowError, RefusedError
+from dreamfleet.common.errors import AccessError, DreamfleetError, JournalError, NotWritableNowError, RefusedError
 from dreamfleet.common.host.error_counter import ErrorCounter
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import CountingDecoder, encode, encode_json, encoding
@@ -48,6 +48,7 @@ from dreamfleet.coordinator.service.run_log import RunLog
 from dreamfleet.coordinator.service.snapshot import Snapshot, take_snapshot
 from dreamfleet.coordinator.service.status import encode_status
 from dreamfleet.coordinator.storage.file_watch import FileWatch
+from dreamfleet.coordinator.storage.kept_revocations import KeptRevocations
 from dreamfleet.coordinator.storage.served_bundle import ServedBundle
 
 log = logging.getLogger(__name__)
@@ -113,6 +114,9 @@ class Service:
             except RefusedError:  # another coordinator of this name continues; nothing of the run is lost
                 self._run.leave()
                 raise
+            except AccessError as error:
+                self._run.leave()
+                raise AccessError(f"{error}, and continue the run with it: {self._file_watch.command}") from error
         return self._run
 
     def _start(self, session: zenoh.Session, opened: OpenRun) -> list[Any]:
@@ -123,6 +127,8 @@ class Service:
         self._protocol = WorkerProtocol(run, name, self._nonce, self._intervals)
         self._control = Control(run, name, self._intervals.beat, self.stop)
         self._batch_queries = BatchQueries(Batches(run, run.journal, name), name)
+        self._kept_revocations = KeptRevocations(run.journal, self._revocations.authority)
+        self._kept_revocations.keep(self._revocations.revoked_seats)
         self._started = monotonic()
         self._run_log = RunLog(run, name, self._network, self._started)
         self._snapshot = self._take_snapshot()
@@ -316,10 +322,12 @@ class Service:
         return worker_seat_identity(worker) in self._revocations.revoked_seats
 
     def _check_revocations(self, now: float) -> None:
-        """Remove workers whose certificates were revoked since the last look."""
+        """Remove workers whose certificates were revoked since the last look; `AccessError` if the own file ended."""
         before = self._revocations.revoked_seats
         self._revocations.reload_if_changed(now)
+        self._revocations.check_own_file()
         if self._revocations.revoked_seats != before:
+            self._kept_revocations.keep(self._revocations.revoked_seats)
             for worker in list(self._run.fleet.members):
                 if self._is_revoked(worker):
                     self._run.fleet.remove_worker(worker)

@@ -29,6 +29,7 @@ from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.storage.journal import Journal
+from dreamfleet.coordinator.storage.kept_revocations import REVOKED
 
 START_SOURCE, START_MEAN = "start", "start_mean"  # the facts' names
 SUBSPACE_FACT = "subspace"
@@ -43,6 +44,7 @@ class StartPoint:
     source: str
     options: str = ""  # of the task, as its specification has them
     effort: Effort | None = None  # what was spent on it, where that is known
+    revoked: str | None = None  # the fact of its run's revoked seats
 
     def apply_to(self, config: RunConfig) -> RunConfig:
         """The configuration with the options that this start was evolved under, where it does not name them.
@@ -64,7 +66,8 @@ class StartPoint:
         """What the journal keeps of it, whole: the file that it came from may be gone when the run is continued."""
         mean = base64.b64encode(self.mean.astype("<f8").tobytes()).decode()
         spent = {} if self.effort is None else {START_EFFORT: json.dumps(to_dict(self.effort))}
-        return {START_SOURCE: self.source, START_MEAN: mean, **spent}
+        revoked = {} if self.revoked is None else {REVOKED: self.revoked}
+        return {START_SOURCE: self.source, START_MEAN: mean, **spent, **revoked}
 
     def check(self, settings: RunSettings, bundle: Bundle | None) -> None:
         """Refuse parameters that mean nothing to this world model, these options and this controller."""
@@ -125,7 +128,10 @@ def find_start(name: str, runs_dir: Path) -> StartPoint:
 def start_from_run(stored: RunFolder) -> StartPoint:
     """The mean of a run's latest generation."""
     mean, _ = latest_mean_and_sigma(stored)
-    return StartPoint(mean, stored.spec.bundle, f"run {stored.name}", stored.spec.options, stored.total_effort())
+    return StartPoint(
+        mean, stored.spec.bundle, f"run {stored.name}", stored.spec.options, stored.total_effort(),
+        stored.fact(REVOKED),
+    )  # fmt: skip
 
 
 def latest_mean_and_sigma(stored: RunFolder) -> tuple[NDArray[np.float64], float]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.config import add_flags, configured_values, load
-from dreamfleet.common.cli.global_config import add_global_flags, load_credentials
+from dreamfleet.common.cli.global_config import add_global_flags, load_credentials, security_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.cli.presets import default_run_preset
 from dreamfleet.common.errors import UsageError
@@ -48,9 +48,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add_json_flag(parser)
     listen = "workers of any host find the rounds' runs here (default: none do)"
-    add_global_flags(
-        parser, "listen", "join", texts={"listen": listen, "join": "a coordinator's join file, for the rounds' runs"}
-    )
+    texts = {"listen": listen, "join": "a coordinator's join file, for the rounds' runs"}
+    add_global_flags(parser, "listen", "join", "access_dir", texts=texts)
     add_flags(parser, NetworkConfig, only=["insecure"])
     add_flags(parser, IterateConfig)
     parser.add_argument(
@@ -163,14 +162,15 @@ def _local_fleet(args: argparse.Namespace, config: IterateConfig, more: tuple[st
     from dreamfleet.coordinator.experiments.local_run import LocalFleet, task_flags
 
     own = task_flags(task, config.task)
-    return LocalFleet.of(args.listen, config.local, more, own, args.global_config.join, insecure=_insecure(args))
+    return LocalFleet.of(
+        args.listen, config.local, more, own, args.global_config.join, security_flags(args), insecure=_insecure(args)
+    )
 
 
 def _network_flags(args: argparse.Namespace) -> tuple[str, ...]:
     """The flags of where workers of other hosts connect, as a person repeats them."""
     listen = ("--listen", *args.listen) if args.listen else ()
-    join = () if args.global_config.join is None else ("--join", str(args.global_config.join))
-    return (*listen, *join, *(("--insecure",) if _insecure(args) else ()))
+    return (*listen, *security_flags(args), *(("--insecure",) if _insecure(args) else ()))
 
 
 def _insecure(args: argparse.Namespace) -> bool:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.cli.config import add_flags, read_toml
-from dreamfleet.common.cli.global_config import add_global_flags, load_credentials
+from dreamfleet.common.cli.global_config import add_global_flags, load_credentials, security_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_signals
@@ -168,8 +168,7 @@ def _fleet(args: argparse.Namespace, options: SweepOptions) -> SweepFleet:
     if options.connect:
         credentials = load_credentials(args, ("coordinator",))
         network = Network(connect=options.connect, credentials=credentials)
-        security = () if credentials is None else ("--join", str(args.global_config.join))
-        return SweepFleet(network, options.workers or 0, options.parallel, False, security)
+        return SweepFleet(network, options.workers or 0, options.parallel, False, security_flags(args))
     if args.global_config.join is not None:
         raise UsageError(
             "a sweep's own router knows no join files: give --connect, a fleet with one, or leave --join out"

@@ -187,6 +187,13 @@ def test_a_worker_that_is_revoked_counts_no_more_while_the_run_goes_on(processes
         again = client.control("safe", "stop")
     coordinator.finish()
     assert again.endswith(f"--join {access.path('coordinator')} --access-dir {access.folder}")
+    # Without the list, which the run's journal remembers, nobody is served: neither of the run nor of a copy of it.
+    backup, fork = processes.folder / "backup", ("--run", "fork", "--from", "safe", "--generations", 1)
+    assert processes.call("runs", "backup", "safe", "--runs-dir", processes.runs, "--to", backup)[0] == 0
+    for runs, words in ((processes.runs, ("--resume", "safe")), (backup, ("--resume", "safe")), (processes.runs, fork)):
+        call = ("coordinator", *words, "--runs-dir", runs, "--join", access.path("coordinator"))
+        code, _, err = processes.call(*call)
+        assert (code, "--access-dir" in err) == (1, True)
     # The next start: the router itself lets it do nothing.
     revoked_seats, said = frozenset({f"worker.{seats['fired']}"}), []
     network = Network(
@@ -202,6 +209,20 @@ def test_a_worker_that_is_revoked_counts_no_more_while_the_run_goes_on(processes
         listening.undeclare()
     # The newcomer's worker, which comes back by itself, may be among them.
     assert {str(each.key_expr).split("/")[-2].rpartition(".")[2] for each in said} == {str(seats["newcomer"])}
+
+
+@pytest.mark.slow
+def test_a_coordinator_whose_own_file_is_revoked_leaves_and_does_not_come_back(processes, access, endpoint):
+    coordinator = begin(processes, access, endpoint, None, "--generations", 10_000)
+    assert processes.call("access", "revoke", "home", "--access-dir", access.folder)[0] == 0
+    assert coordinator.finish()[0] == 1
+    assert f"--access-dir {access.folder}" in coordinator.last_line()
+    flags = ("--join", access.path("coordinator"), "--access-dir", access.folder)
+    assert processes.call("coordinator", "--resume", "safe", "--runs-dir", processes.runs, *flags)[0] == 1
+    other = access.path("other")
+    access.authority.issue("coordinator", "home", other)
+    again = ("--join", other, "--access-dir", access.folder)
+    processes.start("coordinator", "--resume", "safe", "--runs-dir", processes.runs, *again).wait_for("incarnation 2")
 
 
 def test_a_router_that_starts_after_it_bars_every_role(access, endpoint):

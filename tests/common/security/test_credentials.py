@@ -8,6 +8,7 @@ import stat
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from threading import Event
 
 import pytest
 
@@ -18,6 +19,9 @@ from dreamfleet.common.security.authority import Authority
 from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, CertificateLedger, RevocationWatcher
 from dreamfleet.common.security.credentials import MAX_BYTES, add_seat_to_name, read_join_file, worker_seat_identity
 from dreamfleet.common.security.handshake import diagnose_connection
+from dreamfleet.common.transport import router
+from dreamfleet.common.transport.network import Network
+from tests.support.processes import free_port
 
 HERE = ["tls/127.0.0.1:7447"]
 
@@ -126,6 +130,51 @@ def test_the_watcher_sees_revocations_and_keeps_them_if_the_ledger_is_damaged(ac
     replace(ledger, authority="0" * 64).save(folder / LEDGER_FILE)
     with pytest.raises(AccessError, match="another authority"):
         RevocationWatcher(folder, read_join_file(join))
+
+
+@pytest.fixture
+def revoked(access, tmp_path):
+    """The folder of a ledger in which the worker `box` is revoked."""
+    folder = tmp_path / "revoked"
+    folder.mkdir()
+    ledger = CertificateLedger.load(access._folder / LEDGER_FILE)
+    ledger.with_revoked([each for each in ledger.issued if each.name == "box"], 1.0).save(folder / LEDGER_FILE)
+    return folder
+
+
+def test_what_is_known_to_be_revoked_stays_so_without_its_ledger_and_with_an_older_one(access, join, tmp_path):
+    credentials, seats = replace(read_join_file(join), seat=2), frozenset({"worker.1"})
+    for folder, kept, named in ((tmp_path, seats, False), (tmp_path, seats, True), (tmp_path, (), True)):
+        with pytest.raises(AccessError):
+            RevocationWatcher(folder, credentials, kept, named=named)
+    older = RevocationWatcher(access._folder, credentials, seats)
+    older.reload_if_changed(float("inf"))
+    assert seats <= older.revoked_seats
+    assert RevocationWatcher(tmp_path, None, seats).authority == ""
+
+
+def test_a_ledger_that_is_replaced_or_removed_takes_no_revocation_back(access, join, revoked):
+    watched = RevocationWatcher(revoked, replace(read_join_file(join), seat=2))
+    (revoked / LEDGER_FILE).write_bytes((access._folder / LEDGER_FILE).read_bytes())
+    watched.reload_if_changed(float("inf"))
+    assert "worker.1" in watched.revoked_seats
+    (revoked / LEDGER_FILE).unlink()
+    watched._next = float("-inf")
+    watched.reload_if_changed(0.0)
+    assert "worker.1" in watched.revoked_seats
+
+
+def test_a_program_whose_own_file_is_revoked_or_over_goes_no_further(access, join, revoked, monkeypatch):
+    own = read_join_file(join)
+    with pytest.raises(AccessError):
+        RevocationWatcher(revoked, own)
+    with pytest.raises(AccessError):
+        RevocationWatcher(access._folder, replace(own, expires=datetime.now(UTC)))
+    monkeypatch.setattr(router, "CHECK_INTERVAL", 0.01)
+    watched = RevocationWatcher(access._folder, own)
+    watched._path, watched._next = revoked / LEDGER_FILE, float("-inf")
+    with pytest.raises(AccessError):
+        router.run_router(Network(listen=(f"tcp/127.0.0.1:{free_port()}",)), Event(), watched)
 
 
 def test_the_verbs_create_list_and_revoke(tmp_path, capsys):

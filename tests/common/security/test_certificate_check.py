@@ -1,0 +1,70 @@
+"""A join file that was edited, or is used while the clock is wrong, is found before it is used."""
+
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+
+import pytest
+
+from dreamfleet.common.cli.command_line import main
+from dreamfleet.common.errors import AccessError
+from dreamfleet.common.security.certificate_check import check_certificate
+from dreamfleet.common.security.credentials import format_join_file, read_join_file
+from tests.support.access import Access
+
+ROLES = ("coordinator", "first", "viewer", "operator")
+
+
+@pytest.fixture(scope="module")
+def access(tmp_path_factory):
+    return Access(tmp_path_factory.mktemp("keys") / "access")
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory):
+    return Access(tmp_path_factory.mktemp("keys") / "access")
+
+
+@pytest.mark.parametrize("passwords", [False, True])
+def test_what_was_issued_is_in_order(tmp_path, passwords):
+    access = Access(tmp_path / "access", passwords=passwords)
+    for each in ROLES:
+        check_certificate(read_join_file(access.path(each)))
+
+
+@pytest.mark.parametrize("who", ROLES)
+def test_each_field_that_the_certificate_has_too_must_agree(access, other, who):
+    whole, foreign = read_join_file(access.path(who)), read_join_file(other.path(who))
+    edits = [
+        {"seat": whole.seat + 1},
+        {"role": "router"},
+        {"expires": whole.expires + timedelta(days=1)},
+        {"ca": foreign.ca},
+        {"key": foreign.key},
+        {"ca": ""},
+        {"key": ""},
+        {"certificate": whole.certificate[:300]},
+        {"ca": "gärbage", "certificate": "x"},
+    ]
+    for edit in edits:
+        with pytest.raises(AccessError):
+            check_certificate(replace(whole, **edit))
+    check_certificate(replace(whole, connect=("tls/elsewhere.example:7447",), name="renamed"))
+
+
+@pytest.mark.parametrize("verb", ["coordinator", "worker", "status", "router"])
+def test_every_verb_refuses_an_edited_file(access, tmp_path, capsys, verb):
+    whole = read_join_file(access.path("first" if verb == "worker" else "coordinator"))
+    path = tmp_path / "edited.join"
+    path.touch(mode=0o600)
+    role = "router" if verb == "router" else whole.role
+    path.write_text(format_join_file(replace(whole, seat=7, role=role)))
+    assert main([verb, "--join", str(path)]) == 1
+    assert f"{whole.role}.{whole.seat}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("days", [-91, 3])
+def test_a_wrong_clock_is_called_that(access, tmp_path, days):
+    now = datetime.now(UTC) + timedelta(days=days)
+    issued = access.authority.issue("viewer", "early", tmp_path / "join", connect=["tls/h.example:1"], now=now)
+    with pytest.raises(AccessError, match=r"clock"):
+        check_certificate(issued)
