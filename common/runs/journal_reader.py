@@ -23,11 +23,6 @@ from dreamfleet.common.runs.stages import BegunStage
 _TYPES: dict[str, tuple[type, ...]] = {
     "i": (int,), "f": (int, float), "F": (int, float, NoneType), "s": (str,), "b": (bytes,),
 }  # fmt: skip
-CANDIDATES_QUERY = (
-    "SELECT candidate.generation, number, candidate.fitness, count(digest), total(steps), total(seconds) "
-    "FROM candidate LEFT JOIN result ON kind = 'score' AND candidate = number "
-    "AND result.generation = candidate.generation GROUP BY 1, 2 ORDER BY 1, 2"
-)
 
 
 class JournalReader:

@@ -195,13 +195,17 @@ class StoredWork:
 
 @dataclass(frozen=True)
 class StoredCandidate:
-    """One candidate: its fitness, and the effort of its accepted results, also of those before a redraw."""
+    """One candidate: its fitness, and the episodes that it is the mean of, with their effort.
+
+    A generation's steps are the sum of its candidates'. Results of a vector that was discarded, of seeds that were
+    replaced and of a candidate that failed are part of the run's effort alone.
+    """
 
     generation: int
     number: int
     fitness: float | None  # `None` while its generation is open, or if it failed
-    episodes: int  # accepted results
-    steps: int
+    episodes: int  # 0 if it failed
+    steps: int  # an episode of several equal candidates is driven once: its effort is the first one's
     seconds: float  # slot time
 
 

@@ -23,8 +23,8 @@ from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite
 from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.common.runs import schema
 from dreamfleet.common.runs.effort import START_EFFORT, Effort, GenerationEffort, parse_start_effort
+from dreamfleet.common.runs.journal.candidate_counts import CandidateCounts
 from dreamfleet.common.runs.journal_reader import (
-    CANDIDATES_QUERY,
     WORK_QUERY,
     JournalReader,
     class_counts_query,
@@ -232,12 +232,14 @@ class RunFolder(Displayed):
 
     def candidates(self) -> list[StoredCandidate]:
         """Every candidate by generation and number."""
-        return [
-            StoredCandidate(
-                generation, number, fitness, episodes, clamp_count(int(to_finite(steps))), to_finite(seconds)
-            )
-            for generation, number, fitness, episodes, steps, seconds in self._journal.rows("iiFiff", CANDIDATES_QUERY)
-        ]
+        with self.read_transaction():
+            counts = CandidateCounts(self._journal, self.settings, self.history(), self.evaluations())
+            generations = self._journal.rows("ii", "SELECT number, closed IS NULL FROM generation ORDER BY number")
+            return [
+                each
+                for number, is_open in generations
+                for each in counts.rows(number, self.training_seeds(number), is_open=bool(is_open))
+            ]
 
     def measured_candidates(self, since: int = 0) -> list[tuple[int, int, float, tuple[float, ...]]]:
         """Generation, number, fitness and measures of the candidates that have measures, in the order of the run.

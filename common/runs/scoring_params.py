@@ -5,14 +5,18 @@ They are a pure function of the run's settings and of the generations and evalua
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from dreamfleet.common.protocol.messages import MAX_TEMPERATURE, TaskSpec
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
-from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import BegunStage, Stage, StageTracker, latest_usable_evaluation
+
+if TYPE_CHECKING:
+    from dreamfleet.common.runs.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,17 @@ class ScoringParams:
     def episode_spec(self, episode: int) -> TaskSpec:
         """The specification of one episode of a candidate."""
         return self.spec.with_overrides(driven=episode < self.stage.driven_episodes or None)
+
+    def job_digests(self, vectors: Iterable[bytes], seeds: Sequence[int]) -> Iterator[list[bytes]]:
+        """The digests of each candidate's jobs, one a seed, from its float32 vector.
+
+        R1: a digest names the vector and the seed, so it tells a result that counts from one of a discarded vector or
+        of a replaced seed, which has the same place.
+        """
+        texts = [self.episode_spec(each).digest_text("score", (seed,)) for each, seed in enumerate(seeds)]
+        for vector in vectors:
+            identity = hashlib.sha256(vector).digest()
+            yield [hashlib.sha256(identity + text).digest() for text in texts]
 
 
 class ScheduleState:
