@@ -15,6 +15,7 @@ from pathlib import Path
 from types import ModuleType
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.swig_types import allow_swig_types
 
 VARIABLE = "DREAMFLEET_TRUST"
 PLACES = "DREAMFLEET_PATH"  # folders of users' modules, for this process and those that it starts
@@ -58,6 +59,7 @@ def check_trusted(module: str, chooser: str) -> None:
 def import_trusted(module: str, chooser: str) -> ModuleType:
     """Import a module by a name from elsewhere; errors as in `check_trusted`, or those of the import."""
     check_trusted(module, chooser)
+    allow_swig_types()
     found = import_module(module)
     trust([module])  # also in processes that this one starts, which may not have it yet
     return found

@@ -10,9 +10,12 @@ from __future__ import annotations
 
 import gymnasium
 
+from dreamfleet.common.host.swig_types import allow_swig_types
+
 ENVIRONMENT = "dreamfleet/CarRacing-v3"
 LATENT = "dreamfleet/CarRacingLatent-v0"
 
+allow_swig_types()  # before Box2D is imported
 gymnasium.register(
     id=ENVIRONMENT,
     entry_point="dreamfleet.worker.car_racing.environment:CarRacing",

@@ -20,6 +20,7 @@ from gymnasium.envs.registration import EnvSpec
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.foreign_code import contained
 from dreamfleet.common.host.packages import find_distributions
+from dreamfleet.common.host.swig_types import allow_swig_types
 from dreamfleet.common.host.trusted_modules import check_trusted
 from dreamfleet.common.host.unseen_drawing import draw_offscreen
 from dreamfleet.common.protocol.tasks import GYM
@@ -76,6 +77,7 @@ def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
     if arguments.get("render_mode") == "human":
         raise UsageError(f"render_mode=human opens a window in every process that plays {name}: omit it")
     draw_offscreen()
+    allow_swig_types()
     try:
         with contained(f"making {name}"):
             return gymnasium.make(_unregistered_class(name) or name, disable_env_checker=True, **arguments)
