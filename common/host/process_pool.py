@@ -18,6 +18,7 @@ from dreamfleet.common.host.descendants import Descendants
 from dreamfleet.common.host.foreign_code import send_stdout_to_stderr
 from dreamfleet.common.host.parent_death import signals_blocked
 from dreamfleet.common.host.stall_watch import START_LIMIT, StallWatch, describe_slow_start, describe_stall
+from dreamfleet.common.host.user_code import keep_user_arguments
 
 LOOK_INTERVAL = 1.0  # seconds between two looks whether all processes run
 EXIT_GRACE = 2.0  # seconds that processes may take to exit once there is no more work
@@ -185,5 +186,6 @@ def _begin(steps: Any, start: Callable[..., None], arguments: tuple[Any, ...]) -
     """Initialise a process of the pool. What it prints goes to stderr: its parent answers on stdout."""
     global _steps  # noqa: PLW0603 - one a process
     send_stdout_to_stderr()
+    keep_user_arguments()
     _steps = steps
     start(*arguments)

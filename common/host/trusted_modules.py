@@ -14,8 +14,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host.swig_types import allow_swig_types
+from dreamfleet.common.host.user_code import describe_error, user_code
 
 VARIABLE = "DREAMFLEET_TRUST"
 PLACES = "DREAMFLEET_PATH"  # folders of users' modules, for this process and those that it starts
@@ -57,10 +58,16 @@ def check_trusted(module: str, chooser: str) -> None:
 
 
 def import_trusted(module: str, chooser: str) -> ModuleType:
-    """Import a module by a name from elsewhere; errors as in `check_trusted`, or those of the import."""
+    """Import a module by a name from elsewhere; errors as in `check_trusted`, `ImportError`s, or `UsageError`."""
     check_trusted(module, chooser)
     allow_swig_types()
-    found = import_module(module)
+    try:
+        with user_code(module, f"{chooser}: importing {module}"):
+            found = import_module(module)
+    except (ImportError, DreamfleetError):
+        raise
+    except Exception as error:  # a module may raise anything
+        raise UsageError(f"{chooser}: importing {module} raised {describe_error(error)}") from error
     trust([module])  # also in processes that this one starts, which may not have it yet
     return found
 

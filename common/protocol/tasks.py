@@ -20,6 +20,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.host.packages import install_command_for
 from dreamfleet.common.host.trusted_modules import check_trusted, import_trusted
+from dreamfleet.common.host.user_code import user_code
 from dreamfleet.common.serialization.display import DisplayedFields
 
 GROUP = "dreamfleet.tasks"
@@ -108,7 +109,9 @@ def load_task(name: str) -> Any:
             make = points[head].load()
             return make(rest) if colon else make()
         if colon:
-            return _task_class(import_trusted(head, f"task {name!r}"), rest)()
+            found = import_trusted(head, f"task {name!r}")
+            with user_code(head, f"making task {name!r}"):
+                return _task_class(found, rest)()
     except ModuleNotFoundError as error:
         remedy = install_command_for(error.name) or (
             "install the package that has it, or name its folder in PYTHONPATH: the current folder is not searched"

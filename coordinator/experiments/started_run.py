@@ -24,6 +24,7 @@ from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
 from dreamfleet.common.files.locks import open_lock, try_lock
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.trusted_modules import check_trusted
+from dreamfleet.common.host.user_code import own_arguments
 from dreamfleet.common.monitoring.client import Client
 from dreamfleet.common.monitoring.status import Status
 from dreamfleet.common.monitoring.status_card import show_live
@@ -213,7 +214,7 @@ def start_run_in(
     fleet = LocalFleet.of((listen,) if isinstance(listen, str) else tuple(listen), slots, flags, ())
     folder = Path(default_runs_dir() if runs_dir is None else runs_dir).absolute()
     name, words = _coordinator_words(settings, folder, fleet)
-    processes = LocalRun(name, words, folder / name, {**os.environ, **ALONE, **environment})
+    processes = LocalRun(name, words, folder / name, {**os.environ, **ALONE, **own_arguments(), **environment})
     with ExitStack() as stack:
         stack.enter_context(_claim(folder / name))
         stack.callback(_discard_unless_begun, folder / name)

@@ -13,6 +13,7 @@ from dreamfleet.common.errors import MissingExtraError, UsageError
 from dreamfleet.common.host.packages import install_command_for
 from dreamfleet.common.host.resource_limits import usable_memory
 from dreamfleet.common.host.trusted_modules import import_trusted
+from dreamfleet.common.host.user_code import user_code
 from dreamfleet.coordinator.optimisers.api import Footprint, Optimiser, Search
 
 GROUP = "dreamfleet.optimisers"
@@ -40,7 +41,8 @@ def build_optimiser(name: str, search: Search) -> Optimiser:
         inspect.signature(kind).bind(search)
     except TypeError as error:
         raise UsageError(f"optimiser {name!r} must be built from one Search: {error}") from error
-    optimiser: Optimiser = kind(search)
+    with user_code(name.partition(":")[0], f"building optimiser {name!r}"):
+        optimiser: Optimiser = kind(search)
     _refuse_incomplete(name, optimiser, _OF_INSTANCE)
     return optimiser
 

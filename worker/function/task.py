@@ -21,6 +21,7 @@ from dreamfleet.common.artifacts.objective import KEY, Objective, takes_seed
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host.packages import find_distributions
 from dreamfleet.common.host.trusted_modules import import_trusted
+from dreamfleet.common.host.user_code import describe_error
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.protocol.tasks import FUNCTION
 from dreamfleet.common.runs.seeds import fold_seed
@@ -120,9 +121,15 @@ class FunctionEnvironment(gymnasium.Env[Any, Any]):
         try:
             returned = self._function(action, seed=self._seed) if self._takes_seed else self._function(action)
         except (Exception, SystemExit) as error:
-            what = one_line(f"{type(error).__name__}: {error}")
-            raise ObjectiveError(f"{self._name} raised {what}{_find_line(self._function, error)}") from error
+            raise ObjectiveError(_describe_raised(self._name, self._function, error)) from error
         return _to_number(self._name, returned)
+
+
+def _describe_raised(name: str, function: Callable[..., Any], error: BaseException) -> str:
+    what = one_line(str(error))
+    if not what:
+        return f"{name} raised {describe_error(error)}"
+    return f"{name} raised {type(error).__name__}: {what}{_find_line(function, error)}"
 
 
 def _find_line(function: Callable[..., Any], error: BaseException) -> str:
@@ -152,13 +159,7 @@ def _find_function(place: str) -> Callable[..., Any]:
     module, colon, name = place.partition(":")
     if not (module and colon and name):
         raise UsageError(f"task {FUNCTION}:{place} names no function: write {FUNCTION}:MODULE:NAME")
-    try:
-        found: Any = import_trusted(module, f"task '{FUNCTION}:{place}'")
-    except (ImportError, DreamfleetError):
-        raise
-    except (Exception, SystemExit) as error:  # a module may raise anything
-        what = one_line(f"{type(error).__name__}: {error}")
-        raise UsageError(f"task {FUNCTION}:{place}: importing {module} raised {what}") from error
+    found: Any = import_trusted(module, f"task '{FUNCTION}:{place}'")
     for part in name.split("."):
         if not hasattr(found, part):
             raise UsageError(f"task {FUNCTION}:{place}: {module} has no function {name}")

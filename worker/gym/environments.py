@@ -23,6 +23,7 @@ from dreamfleet.common.host.packages import find_distributions
 from dreamfleet.common.host.swig_types import allow_swig_types
 from dreamfleet.common.host.trusted_modules import check_trusted
 from dreamfleet.common.host.unseen_drawing import draw_offscreen
+from dreamfleet.common.host.user_code import describe_error, user_code
 from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, World
 from dreamfleet.worker.tasks.closing import close_environment
@@ -79,7 +80,7 @@ def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
     draw_offscreen()
     allow_swig_types()
     try:
-        with contained(f"making {name}"):
+        with contained(f"making {name}"), user_code(name.rpartition(":")[0] or name, f"making {name}"):
             return gymnasium.make(_unregistered_class(name) or name, disable_env_checker=True, **arguments)
     except gymnasium.error.DependencyNotInstalled as error:
         raise UsageError(f"{name} lacks a package on this host: {error}") from error
@@ -104,8 +105,10 @@ def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
         if _is_of_call(error, arguments):
             raise ArgumentsError(f"{name} takes no such arguments: {error.__cause__}") from error
         raise UsageError(f"{name} cannot be made: TypeError: {error.__cause__ or error}") from error
-    except (Exception, SystemExit) as error:  # environments may raise anything
-        raise UsageError(f"{name} cannot be made: {type(error).__name__}: {error}") from error
+    except UsageError:
+        raise
+    except Exception as error:  # environments may raise anything
+        raise UsageError(f"{name} cannot be made: {describe_error(error)}") from error
 
 
 def _is_of_call(error: TypeError, arguments: Mapping[str, Any]) -> bool:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.actions import Continuous
 from dreamfleet.common.artifacts.task_options import write_options
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.user_code import describe_error
 from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
 from dreamfleet.common.serialization.validation import Between, Length, MalformedError, from_plain
@@ -245,7 +246,7 @@ class GymPixelTask(Task):
             try:
                 return LookAtDrawn(environment)
             except Exception as error:  # environments may raise anything
-                raise UsageError(f"{self._id} draws no pictures: {type(error).__name__}: {error}") from error
+                raise UsageError(f"{self._id} draws no pictures: {describe_error(error)}") from error
         draws = RGB in environment.metadata.get("render_modes", ())
         known = [each for each in (*pictures, every) if each] + [RENDERED] * (draws and RENDERED not in pictures)
         remedy = f"choose one with --observation: {', '.join(known)}" if known else "and it draws none"

@@ -9,6 +9,7 @@ import errno
 import signal
 from contextlib import suppress
 
+from dreamfleet.common.host.user_code import find_user_line
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.protocol.failures import HOST_PREFIX, is_host_failure
 
@@ -81,6 +82,6 @@ def _text(error: BaseException) -> str:
     """The first line of an exception's message, printable; a simulator's own exceptions may fail to give it."""
     try:
         lines = str(error)[: 10 * MAX_TEXT].strip().splitlines()
-        return one_line(lines[0]) if lines else ""
+        return one_line(lines[0]) if lines else find_user_line(error)
     except BaseException as another:  # also `SystemExit`
         return f"its message cannot be read ({type(another).__name__})"

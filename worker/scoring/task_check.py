@@ -21,6 +21,7 @@ from dreamfleet.common.cli.task_check import LAST_STEP, DryRunReport
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.unseen_drawing import draw_unseen
+from dreamfleet.common.host.user_code import describe_error, keep_user_arguments
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.protocol.tasks import Description, describe_task
 
@@ -304,6 +305,7 @@ def main() -> None:
     draw_unseen()
     pin_thread_pools()
     _load_and_wait(int(sys.argv[1]))
+    keep_user_arguments()
     step = "loading it"
 
     def announce(name: str) -> None:
@@ -325,8 +327,7 @@ def main() -> None:
     except FaultError as error:
         send(DryRunReport(fault=f"{name} cannot be scored: {error}"))
     except (Exception, SystemExit) as error:  # environments may raise anything
-        what = one_line(f"{type(error).__name__}: {error}")
-        send(DryRunReport(fault=f"{name} cannot be scored: {step} raised {what}; {MEND}"))
+        send(DryRunReport(fault=f"{name} cannot be scored: {step} raised {describe_error(error)}; {MEND}"))
     os._exit(0)  # what the environment left running must not keep it
 
 

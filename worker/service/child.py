@@ -15,6 +15,7 @@ from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking, make_
 from dreamfleet.common.host.parent_death import exit_with_parent
 from dreamfleet.common.host.stop_signals import outlive_stop_signals
 from dreamfleet.common.host.unseen_drawing import draw_unseen
+from dreamfleet.common.host.user_code import keep_user_arguments
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -62,6 +63,7 @@ def serve_jobs(
     make_stderr_nonblocking()  # inherited from the worker, whose reader may be suspended
     make_stdout_nonblocking()
     draw_unseen()
+    keep_user_arguments()
     scorer = _make_scorer(pipe, arguments)
     _score_groups(pipe, scorer, steps, abandoned, is_watched)
 

@@ -224,7 +224,7 @@ def strange():
         ({"actions": "none"}, "takes actions Box"),
         ({"actions": "?"}, "cannot be made: KeyError"),
         ({"fails": "boom"}, "cannot be made: RuntimeError: boom"),
-        ({"fails": "exit"}, "cannot be made: SystemExit"),
+        ({"fails": "exit"}, r"exit\(3\)"),
     ],
 )
 def test_any_error_while_an_environment_is_made_is_one_line(strange, arguments, says):

@@ -1,0 +1,145 @@
+"""What a user's code sees of the command line, and what is said as it fails."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host import user_code as module
+from dreamfleet.common.host.trusted_modules import VARIABLE, import_trusted
+from dreamfleet.common.host.user_code import (
+    ARGUMENTS,
+    describe_error,
+    keep_user_arguments,
+    own_arguments,
+    user_code,
+)
+from dreamfleet.common.protocol.tasks import load_task
+from dreamfleet.coordinator.optimisers.registry import _find
+from tests.support.processes import environment
+
+OURS = ["/somewhere/bin/dreamfleet", "worker", "--run", "night"]
+PARSING = """
+import argparse, sys
+SEEN = sys.argv
+parser = argparse.ArgumentParser()
+parser.add_argument("--target", type=float{more})
+TARGET = parser.parse_args().target
+def cost(x):
+    return float(((x - TARGET) ** 2).sum())
+class Search:
+    options = {{}}
+"""
+SCRIPT = """
+if __name__ == "__main__":
+    import dreamfleet
+    found = dreamfleet.minimise(cost, [0, 0], 1.0, ftarget=0.5, popsize=8, workers=1)
+    print(found.success, found.x.round().tolist())
+    with dreamfleet.start_run(
+        task="gym:tuning:Pole", optimiser="tuning:Own", population=4, generations=1, evaluate_every=0, workers=1
+    ) as run:
+        print(run.wait().ended)
+"""
+OWN = """
+from gymnasium.envs.classic_control import CartPoleEnv
+from dreamfleet.coordinator.optimisers.cmaes_library import Separable
+class Pole(CartPoleEnv):
+    pass
+class Own(Separable):
+    pass
+"""
+
+
+@pytest.fixture
+def ours(monkeypatch, tmp_path):
+    """A process of a command line of ours, which finds modules in a folder."""
+    monkeypatch.setattr(sys, "argv", OURS)
+    monkeypatch.delenv(ARGUMENTS, raising=False)
+    monkeypatch.setattr(module, "_shows_own", False)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv(VARIABLE, "parsing")
+    yield tmp_path
+    sys.modules.pop("parsing", None)
+
+
+@pytest.mark.parametrize(
+    "load",
+    [
+        lambda: import_trusted("parsing", "x"),
+        lambda: load_task("function:parsing:cost"),
+        lambda: _find("parsing:Search"),
+    ],
+)
+@pytest.mark.parametrize(("given", "seen"), [(None, ["parsing"]), (["tuning.py", "--target=3"], None)])
+def test_a_module_sees_the_arguments_of_its_program_else_its_name(ours, monkeypatch, load, given, seen):
+    (ours / "parsing.py").write_text(PARSING.format(more=""))
+    if given:
+        monkeypatch.setenv(ARGUMENTS, json.dumps(given))
+    load()
+    assert (given or seen) == sys.modules["parsing"].SEEN
+    assert sys.argv == OURS
+
+
+def test_a_users_program_keeps_its_arguments_and_passes_them_on(monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "argv", ["tuning.py", "--target=3"])
+    with user_code("tuning", "importing tuning"):
+        assert sys.argv == ["tuning.py", "--target=3"]
+    assert own_arguments() == {ARGUMENTS: '["tuning.py", "--target=3"]'}
+    monkeypatch.setattr(sys, "argv", ["tuning.py", "x" * 200_000])
+    assert own_arguments() == {}, "no process starts with such a variable"
+    monkeypatch.setattr(sys, "argv", OURS)
+    assert own_arguments() == {}, "what a fleet's process starts is shown what it was given itself"
+
+
+def test_a_scoring_process_keeps_what_it_shows(ours, monkeypatch):
+    monkeypatch.setenv(ARGUMENTS, '["tuning.py"]')
+    keep_user_arguments()
+    assert sys.argv == ["tuning.py"]
+    with user_code("tuning", "importing tuning"):
+        pass
+    assert sys.argv == ["tuning.py"]
+    monkeypatch.delenv(ARGUMENTS)
+    with user_code("tuning", "importing tuning"):
+        pass
+    assert sys.argv == ["tuning"]
+
+
+def test_what_a_module_printed_as_it_exits_is_in_the_error(ours):
+    (ours / "parsing.py").write_text(PARSING.format(more=", required=True"))
+    with pytest.raises(UsageError) as caught:
+        load_task("function:parsing:cost")
+    assert "--target" in str(caught.value)
+    assert "exit(2)" in str(caught.value)
+    (ours / "parsing.py").write_text("raise SystemExit('no licence here')")
+    with pytest.raises(UsageError, match="no licence here"):
+        load_task("parsing:Task")
+    assert sys.argv == OURS
+
+
+def test_a_logger_of_a_module_goes_on_printing_to_the_stream(capfd):
+    with user_code("mine", "importing mine"):
+        kept = sys.stderr
+    print("later", file=kept)
+    assert (kept.fileno(), kept.isatty()) == (sys.stderr.fileno(), False)
+    assert capfd.readouterr().err == "later\n"
+
+
+def test_an_error_without_a_text_names_the_users_line(ours):
+    (ours / "parsing.py").write_text("x = 1\nassert x > 1\n")
+    with pytest.raises(UsageError, match=r"parsing\.py:2"):
+        load_task("parsing:Task")
+    (ours / "parsing.py").write_text("def make(): json.loads(text)\n")
+    assert describe_error(LookupError("three")) == "LookupError: three"
+    assert describe_error(AssertionError()) == "AssertionError"
+
+
+@pytest.mark.slow
+def test_a_script_that_parses_its_arguments_at_the_top_searches_and_starts_runs(tmp_path):
+    (tmp_path / "tuning.py").write_text(PARSING.format(more=", required=True") + OWN + SCRIPT)
+    done = subprocess.run(
+        [sys.executable, "tuning.py", "--target", "3"], cwd=tmp_path, env=environment(tmp_path / "cache"),
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.stdout.splitlines() == ["True [3.0, 3.0]", "1 generation"], done.stderr
