@@ -63,8 +63,9 @@ def check_modules(names: Iterable[str]) -> None:
             raise ModuleNotFoundError(name=name)
 
 
+@cache
 def package_version(name: str) -> str | None:
-    """Installed version of a distribution, or `None`."""
+    """Installed version of a distribution, or `None`; as this process found it first, whatever is installed later."""
     try:
         return version(name)
     except PackageNotFoundError:

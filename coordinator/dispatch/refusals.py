@@ -26,7 +26,8 @@ def find_refusal(
     reason and a remedy, because somebody must act on it.
     """
     if not request.protocol_min <= PROTOCOL_VERSION <= request.protocol_max:
-        spoken = f"the worker speaks protocol {request.protocol_min} to {request.protocol_max}"
+        worker = f"the worker (dreamfleet {truncate(request.package, LONGEST)})"
+        spoken = f"{worker} speaks protocol {request.protocol_min} to {request.protocol_max}"
         return f"{spoken}, this run {PROTOCOL_VERSION}", (
             f"install dreamfleet {package_version('dreamfleet')} on the worker's host"
         )

@@ -77,7 +77,11 @@ class Build:
         return [line for line in re.split(r"(?<!\\)\n", kept) if line.strip()]
 
     def _arg(self, rest):
-        assert rest.startswith("PYTHON=python:3.11-")  # the version in Debian
+        name, _, default = rest.partition("=")
+        if name == "PYTHON":
+            assert default.startswith("python:3.11-")  # the version in Debian
+        else:
+            self.now.variables[name] = default
 
     def _from(self, rest):
         origin, _, name = rest.split()

@@ -8,6 +8,7 @@ from dataclasses import asdict
 import zenoh
 
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
+from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import decode, decode_json, encode, encode_json
 from dreamfleet.common.protocol.messages import (
@@ -43,6 +44,7 @@ class Hand:
         self.numbering = 0  # of its batches; each accepted hello begins one
         self.intervals = Intervals(beat=0.1, repeat=0.1)
         self.refusal = None
+        self.package = package_version("dreamfleet") or "unknown"  # its own version
         self.packages = NUMERIC_PACKAGES  # in the run's fingerprint
         self.classes = True  # whether it supports host classes
         self.reasons = True  # whether it reads why a worker leaves
@@ -167,9 +169,9 @@ class Hand:
             why, remedy = self.refusal or (("other packages", "say hello again") if other else ("", ""))
             self.numbering += not why
             reply = HelloReply(
-                accepted=not why, protocol_min=keys.PROTOCOL_VERSION, protocol_max=keys.PROTOCOL_VERSION, package="0",
-                run=self.run, run_uid=self.run_uid, incarnation=self.incarnation, nonce=self.nonce,
-                why=why, remedy=remedy,
+                accepted=not why, protocol_min=keys.PROTOCOL_VERSION, protocol_max=keys.PROTOCOL_VERSION,
+                package=self.package, run=self.run, run_uid=self.run_uid, incarnation=self.incarnation,
+                nonce=self.nonce, why=why, remedy=remedy,
                 spec={} if why else asdict(self.spec), intervals={} if why else asdict(self.intervals),
                 packages=self.packages, numbering=self.numbering, classes=self.classes, reasons=self.reasons,
             )  # fmt: skip

@@ -44,6 +44,7 @@ class Admission:
     share: float = 1.0  # of the worker's slots, relative to its other runs' shares
     taken: bool = False  # whether the coordinator reads what other runs use
     together: bool = False  # whether the coordinator reads how many drives a slot does side by side
+    package: str = ""  # the coordinator's version
 
 
 def request_admission(
@@ -165,7 +166,9 @@ def make_request(
 
 def _read_admission(reply: HelloReply) -> Admission:
     if not reply.accepted:
-        raise RefusedError(one_line(f"run {reply.run} refused this worker: {reply.why}; {reply.remedy}"))
+        own = package_version("dreamfleet")
+        versions = "" if reply.package == own else f" (dreamfleet {reply.package}, here is {own})"
+        raise RefusedError(one_line(f"run {reply.run}{versions} refused this worker: {reply.why}; {reply.remedy}"))
     try:
         spec, intervals = from_plain(TaskSpec, reply.spec), from_plain(Intervals, reply.intervals)
     except MalformedError as error:
@@ -175,5 +178,5 @@ def _read_admission(reply: HelloReply) -> Admission:
         ) from error
     return Admission(
         keys.check_run_name(reply.run), reply.run_uid, reply.incarnation, reply.nonce, spec, intervals, reply.packages,
-        reply.numbering, reply.classes, reply.reasons, reply.share, reply.taken, reply.together,
+        reply.numbering, reply.classes, reply.reasons, reply.share, reply.taken, reply.together, reply.package,
     )  # fmt: skip

@@ -18,6 +18,7 @@ import zenoh
 
 from dreamfleet.common.errors import ConnectionFailedError, RefusedError
 from dreamfleet.common.host.error_counter import ErrorCounter
+from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.printable import one_line, plural
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import CountingDecoder
@@ -74,6 +75,7 @@ class RunSession:
         self._next_heartbeat_at = 0.0
         self._finished = self._steps_finished = 0
         self._said_alone = False
+        self._coordinator_version = package_version("dreamfleet")
 
     @property
     def run(self) -> str:
@@ -115,6 +117,7 @@ class RunSession:
         ]
         device = f", dreams on {self._slots.torch_device}" if self._slots.torch_device else ""
         log.info("joined run %s as %s, %s%s", run, self._link.identity, plural(len(self._slots), "slot"), device)
+        self._note_version()
 
     def _main_loop(self) -> str:
         """Work; return why it ended."""
@@ -324,6 +327,16 @@ class RunSession:
         self._membership.rejoin(admission.nonce, monotonic())
         level = logging.INFO if restarted else logging.DEBUG  # an idle worker of a paused run says hello repeatedly
         log.log(level, "joined run %s again, incarnation %d", admission.run, admission.incarnation)
+        self._note_version()
+
+    def _note_version(self) -> None:
+        """Log once for each version of the coordinator that it is not this worker's."""
+        run, version, own = self._admission.run, self._admission.package, package_version("dreamfleet")
+        if version not in (own, self._coordinator_version):
+            log.warning("run %s is of dreamfleet %s, and this worker of %s: install %s here and start the worker again",
+                        run, version, own, version,
+                        extra={"facts": {"event": "other version", "run": run, "package": version}})  # fmt: skip
+        self._coordinator_version = version
 
     def _follow_run(self) -> None:
         """Join the run under another name, if it is live under one: its folder was moved, renamed or rescued.

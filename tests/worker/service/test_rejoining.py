@@ -75,6 +75,28 @@ def test_the_coordinators_next_life_gets_a_rollout_from_its_beginning(stage, cac
     assert hand.upload(kept) == data
 
 
+def test_a_coordinator_that_comes_back_as_another_version_is_said_once_and_at_once(stage, cached, caplog):
+    hand = stage.hand()
+    stage.worker()
+    hand.ready()
+    notes = [record.facts for record in caplog.records if getattr(record, "facts", {}).get("event") == "other version"]
+    assert not notes, "it is of the worker's own version"
+    hand.vanish()
+    hand.nonce, hand.incarnation, hand.package = SECOND, 2, "9.9.dev1+gabc"
+    hand.appear()
+    back_at = monotonic()
+    hand.hello()
+    hand.beat(lambda beat: beat.nonce == SECOND)
+    assert monotonic() - back_at < 10
+    hand.numbering += 1
+    hand.send(1)  # it says hello again
+    hand.hello()
+    hand.send(1, hand.job(0))
+    assert hand.result(hand.job(0)).fitness is not None
+    notes = [record for record in caplog.records if getattr(record, "facts", {}).get("event") == "other version"]
+    assert [(each.levelname, each.facts["package"]) for each in notes] == [("WARNING", "9.9.dev1+gabc")]
+
+
 @pytest.fixture
 def relay(stage):
     made = Relay(stage.port)
