@@ -19,7 +19,7 @@ test: $(VENV)/.dev  ## every test that ends within two seconds: five and a half 
 	$(BIN)/pytest -m "not slow and not long" --numprocesses 3 --dist worksteal $(ARGS)
 
 slow: $(VENV)/.dev  ## those that take longer, each under two minutes; what lands has passed both
-	$(BIN)/pytest -m "slow and not long" --numprocesses 2 --dist worksteal $(ARGS)
+	$(BIN)/pytest -m "slow and not long" --numprocesses 3 --dist worksteal $(ARGS)
 
 $(VENV)/.doom: $(VENV)/.dev
 	$(PIP) --editable '.[doom]'

@@ -76,7 +76,10 @@ def test_it_can_be_interrupted_between_any_two_generations(optimiser, covariance
 
 @pytest.mark.slow
 @pytest.mark.parametrize("optimiser", ["cmaes-lra", "cmaes-sep"])
-@pytest.mark.parametrize(("dimension", "population"), [(2, 4), (2, 16), (5, 8), (12, 16)])
+@pytest.mark.parametrize(
+    ("dimension", "population"),
+    [(2, 4), *(pytest.param(*each, marks=pytest.mark.long) for each in [(2, 16), (5, 8), (12, 16)])],
+)
 def test_it_continues_up_to_convergence_and_beyond(optimiser, dimension, population):
     """As `test_evolution` shows of pycma; where fitness no longer differs, and the step size is next to nothing."""
     setting, start = EvolutionConfig(dimension, population, 1e-8, "diagonal", 3, optimiser), np.ones(dimension)

@@ -69,7 +69,7 @@ def test_a_checkpoint_continues_at_the_real_size(checkpoint):
 @pytest.mark.parametrize("covariance", ["diagonal", "full"])
 @pytest.mark.parametrize(
     ("dimension", "population"),
-    [(2, 4), (2, 16), (5, 8), (12, 16), (23, 5), pytest.param(50, 24, marks=pytest.mark.slow)],
+    [(2, 4), (5, 8), *(pytest.param(*each, marks=pytest.mark.long) for each in [(2, 16), (12, 16), (23, 5), (50, 24)])],
 )
 def test_a_strategy_continues_from_every_generation_up_to_convergence_and_beyond(dimension, population, covariance):
     """pycma's parts share some arrays; which ones changes as a strategy stands still."""

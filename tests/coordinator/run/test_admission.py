@@ -213,7 +213,7 @@ def test_an_old_journal_with_the_class_of_a_hello_has_no_class_again(bench):
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     order=st.lists(
         st.tuples(st.sampled_from(["give", "hello", "find out", "restart"]), st.sampled_from([A, B])), max_size=30
