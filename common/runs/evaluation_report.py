@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import read_text
-from dreamfleet.common.printable import format_number
+from dreamfleet.common.printable import format_number, one_line
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.common.runs.standard_error import format_with_error, score_digits
@@ -95,7 +95,7 @@ class EvaluationReport:
     def _describe_score(self, word: str) -> str:
         found = self.results
         score = format_with_error(found.mean, found.error)
-        judged = "in gymnasium's environment" if self.judge == GYMNASIUM else f"in {self.judge}"
+        judged = "in gymnasium's environment" if self.judge == GYMNASIUM else f"in {one_line(self.judge)}"
         if found.std is None:
             return f"{score} on one {word}; judged {judged}"
         digits = score_digits(found.mean, found.error)
@@ -116,7 +116,7 @@ class EvaluationReport:
     def _describe_origin(self) -> str:
         model = f", world model {self.bundle[:12]}" if self.bundle else ""
         made = f"{self.results.steps:,} environment steps in {self.seconds:.0f} s"
-        return f"{made}; controller {self.controller[:12]}{model}; dreamfleet {self.version}"
+        return f"{made}; controller {self.controller[:12]}{model}; dreamfleet {one_line(self.version)}"
 
 
 def summary_figures(results: EpisodeResults, marks: tuple[float, ...] = FORMER_MARKS) -> dict[str, Any]:

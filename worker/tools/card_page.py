@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import html
 import json
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -57,14 +57,14 @@ class CardContents:
 def describe_card(contents: CardContents, files: Sequence[str]) -> Iterator[str]:
     """The lines of the page of a folder with these files."""
     yield from _metadata(contents, files)
-    yield from ("", f"# {html.escape(one_line(contents.name), quote=False)}", "", _describe_controller(contents))
+    yield from ("", f"# {_plain(contents.name)}", "", _describe_controller(contents))
     if VIDEO in files:
         yield from ("", f'<video src="{VIDEO}" controls width="100%"></video>', "", _describe_video(contents))
     yield from ("", "## Scores", "")
     if contents.report is None:
         yield "Not evaluated."
     else:
-        yield from (f"- {each}" for each in contents.report.describe(score_word(contents.world)).splitlines())
+        yield from (f"- {_plain(each)}" for each in contents.report.describe(score_word(contents.world)).splitlines())
         yield from ("", f"![The score of each seed]({SCORES})")
     yield from ("", "## Use", "")
     if SCRIPT in files:
@@ -84,7 +84,7 @@ def _metadata(contents: CardContents, files: Sequence[str]) -> Iterator[str]:
     tags = ["reinforcement-learning", "dreamfleet", world, *(["world-models"] if contents.bundle is not None else [])]
     yield from ("---", "license: other  # name yours before you publish, such as mit, apache-2.0 or cc-by-4.0")
     yield from ("library_name: dreamfleet", "pipeline_tag: reinforcement-learning", "tags:")
-    yield from (f"- {json.dumps(each)}" for each in [*tags, *(["onnx"] if DRIVER in files else [])])
+    yield from (f"- {_quoted(each)}" for each in [*tags, *(["onnx"] if DRIVER in files else [])])
     if contents.report is not None:
         yield from _index(contents.report, world, contents.name)
     yield "---"
@@ -94,19 +94,19 @@ def _index(report: EvaluationReport, world: str, name: str) -> Iterator[str]:
     """The result as model hubs index it."""
     found = report.results
     value = f"{found.mean:.2f}" if found.std is None else f"{found.mean:.2f} +/- {found.std:.2f}"
-    yield from ("model-index:", f"- name: {json.dumps(name)}", "  results:", "  - task:")
+    yield from ("model-index:", f"- name: {_quoted(name)}", "  results:", "  - task:")
     yield from ("      type: reinforcement-learning", "      name: reinforcement-learning")
-    yield from ("    dataset:", f"      name: {json.dumps(world)}", f"      type: {json.dumps(world)}", "    metrics:")
+    yield from ("    dataset:", f"      name: {_quoted(world)}", f"      type: {_quoted(world)}", "    metrics:")
     yield from ("    - type: mean_reward", f"      value: {value}", "      name: mean_reward", "      verified: false")
 
 
 def _describe_controller(contents: CardContents) -> str:
     controller, bundle = contents.controller, contents.bundle
-    text = f"A controller of {controller.shape.size} parameters for `{contents.world}`. "
+    text = f"A controller of {controller.shape.size} parameters for {_code(contents.world)}. "
     if (source := controller.provenance.get(IMPORTED)) is None:
-        text += f"The Python package `dreamfleet` evolved it in the task `{controller.task}`."
+        text += f"The Python package `dreamfleet` evolved it in the task {_code(controller.task)}."
     else:
-        text += f"The Python package `dreamfleet` imported it from another program's file, {json.dumps(source)}."
+        text += f"The Python package `dreamfleet` imported it from another program's file, {_code(str(source))}."
     if bundle is not None:
         hidden = f" and memory ({bundle.manifest.hidden})" if controller.shape.features > bundle.manifest.latent else ""
         text += (
@@ -119,7 +119,7 @@ def _describe_controller(contents: CardContents) -> str:
 def _describe_video(contents: CardContents) -> str:
     filmed, world = contents.filmed, contents.world
     assert filmed is not None
-    score = f"{profile_of(world).format_score(filmed.score)} on {score_word(world)} {filmed.seed}"
+    score = _plain(f"{profile_of(world).format_score(filmed.score)} on {score_word(world)} {filmed.seed}")
     if contents.is_cut:
         return f"{score} in its first {plural(filmed.steps, 'step')}."
     if contents.report is None:
@@ -153,6 +153,25 @@ def _origin(controller: Controller, bundle: Bundle | None) -> dict[str, Any]:
         "dreamfleet": package_version("dreamfleet"),
         **known,
     }
+
+
+def _plain(text: str) -> str:
+    """A name as Markdown that shows it as it is: no markup, no HTML, no list, no heading."""
+    escaped = re.sub(r"[\\`*_\[\]<>&|~$]", r"\\\g<0>", one_line(text))
+    return re.sub(r"^(\d*)([#+=.)-])(?!\d)", r"\1\\\2", escaped)
+
+
+def _code(text: str) -> str:
+    """A name as a code span, which no backtick in it ends."""
+    text = one_line(text)
+    fence = "`" * (max(map(len, re.findall("`+", text)), default=0) + 1)
+    pad = " " if "`" in text else ""
+    return f"{fence}{pad}{text}{pad}{fence}"
+
+
+def _quoted(text: str) -> str:
+    """A name as a string of YAML on one line."""
+    return json.dumps(one_line(text), ensure_ascii=False)
 
 
 def read_install_command(script: Path) -> str:

@@ -38,7 +38,7 @@ def draw_scores(report: EvaluationReport, name: str) -> bytes:
     counts.set(xlabel=f"{word}s")
     figure.legend(handles=lines, loc="outside lower right", ncols=2, frameon=False, fontsize=9)
     title = f"{name}: {format_with_error(found.mean, found.error)} (standard error) on {len(found.drives)} {word}s"
-    figure.suptitle(title, fontsize=11, x=0.01, ha="left")
+    figure.suptitle(title, fontsize=11, x=0.01, ha="left", parse_math=False)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
     return buffer.getvalue()

@@ -3,18 +3,24 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
+from xml.etree import ElementTree
 
 import av
 import numpy as np
 import onnx
 import pytest
 import yaml
+from markdown_it import MarkdownIt
 
 from dreamfleet import evaluate
-from dreamfleet.common.artifacts.controller import Controller, ControllerShape
+from dreamfleet.common.artifacts.controller import IMPORTED, Controller, ControllerShape
 from dreamfleet.common.cli.command_line import main
+from dreamfleet.common.printable import one_line
 from dreamfleet.common.runs.evaluation_report import read_evaluation_report
 from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.tools.card_page import CardContents, describe_card
+from dreamfleet.worker.tools.score_chart import draw_scores
 from tests.support.processes import ROOT
 
 REPORT = ROOT / "docs" / "lab" / "results" / "real.json"
@@ -131,7 +137,42 @@ def test_an_imported_controller_has_a_card(tmp_path):
     assert main(["import", str(tmp_path / "v.npy"), "--like", "tiny", "--out", str(tmp_path / "zeros.npz")]) == 0
     assert main(["card", str(tmp_path / "zeros.npz"), "--steps", "0", "--out", str(tmp_path / "card")]) == 0
     assert (tmp_path / "card" / "drive.py").exists()
-    assert 'imported it from another program\'s file, "v.npy"' in (tmp_path / "card" / "README.md").read_text()
+    assert "`v.npy`" in (tmp_path / "card" / "README.md").read_text()
+
+
+NAMES = [
+    "# <b>x</b>",
+    "[x](javascript:1)",
+    "a`b``c",
+    "1. x*y*_z_",
+    "- x\n# y",
+    "<script>&amp;",
+    "$\\frac$ ~~x~~",
+    "\u202eé",
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_card_shows_each_name_as_it_is(name):
+    controller = Controller(ControllerShape(1, 1), np.zeros(2, np.float32), f"gym:{name}", "", {IMPORTED: name})
+    report = replace(read_evaluation_report(REPORT), judge=name, version=name)
+    text = "\n".join(describe_card(CardContents(controller, None, report, name), []))
+    _, head, page = text.split("---\n", 2)
+    found = yaml.safe_load(head)
+    shown = one_line(name)
+    assert found["tags"][2] == found["model-index"][0]["results"][0]["dataset"]["name"] == shown
+    assert found["model-index"][0]["name"] == shown
+    page = page.split("```json")[0]
+    title, *elements = ElementTree.fromstring(f"<page>{MarkdownIt('commonmark').render(page)}</page>")
+    assert (title.tag, title.text, len(title)) == ("h1", shown, 0)
+    assert {each.tag for element in elements for each in element.iter()} <= {
+        "h2", "p", "ul", "li", "img", "pre", "code", "video",
+    }  # fmt: skip
+    assert [each.text for each in elements[0].iter("code")] == [f"gym:{shown}", "dreamfleet", shown]
+    scores = "".join(elements[2].itertext())
+    assert f"judged in {shown}" in scores
+    assert f"dreamfleet {shown}" in scores
+    assert draw_scores(report, name)
 
 
 def test_what_draws_no_pictures_has_a_card_without_a_video_that_says_why(tmp_path, capsys):
