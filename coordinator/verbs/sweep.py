@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_signals
 from dreamfleet.common.printable import plural
+from dreamfleet.coordinator.experiments.sweep.options import PARALLEL, SweepOptions
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
@@ -28,27 +29,8 @@ if TYPE_CHECKING:
 SUMMARY = "evolve with several seeds and settings on one fleet, and compare the settings"
 EXTRAS: tuple[str, ...] = ()
 SETTINGS_OF_RUNS = ("beat", "evaluation_share", "failure_limit", "share", "strict")  # of `NetworkConfig`
-PARALLEL, MOST_PARALLEL, MOST_WORKERS = 4, 64, 1024
 LEFT_OPEN = 130
 MOST_EQUAL = 10  # pairs of settings with equal results that are named
-
-
-@dataclass(frozen=True)
-class SweepOptions:
-    """How a sweep is served: what a file or flags say, and defaults for the rest."""
-
-    parallel: int
-    workers: int | None
-    listen: tuple[str, ...]
-    connect: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.parallel <= MOST_PARALLEL:
-            raise UsageError(f"--parallel must be from 1 to {MOST_PARALLEL}, not {self.parallel}")
-        if self.workers is not None and not 0 <= self.workers <= MOST_WORKERS:
-            raise UsageError(f"--workers must be from 0 to {MOST_WORKERS}, not {self.workers}")
-        if self.listen and self.connect:
-            raise UsageError("--listen starts a router here and --connect uses another one: give one of them")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -90,12 +72,13 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.coordinator.experiments.sweep.folder import SweepFolder
 
     file = read_toml(args.file, ("vary", "flags"), ("run", "parallel", "workers", "listen", "connect"))
-    options = _options(args, file)
     if args.resume:
         _refuse_settings(args, file)
         folder = SweepFolder(args.runs_dir, args.resume)
         sweep, tasks = folder.read()
+        options = _options(args, file, folder.read_options())
     else:
+        options = _options(args, file, SweepOptions())
         sweep = _new_sweep(args, file)
         folder = SweepFolder(args.runs_dir, sweep.name)
         folder.check_new(sweep)
@@ -103,16 +86,18 @@ def run(args: argparse.Namespace) -> int:
     fleet = _fleet(args, options)
     with folder_lock(folder.lock, "sweep of this name", "--runs-dir"), stop_on_signals() as stop:
         if not args.resume:
-            folder.begin(sweep, tasks)
+            folder.check_new(sweep)
+        folder.write(sweep, tasks, options)
         progress = _serve(args, sweep, tasks, folder, fleet, stop)
     return _report(args, sweep, folder, progress)
 
 
-def _options(args: argparse.Namespace, file: Mapping[str, Any]) -> SweepOptions:
-    """How to serve the sweep: flags over the file over defaults."""
+def _options(args: argparse.Namespace, file: Mapping[str, Any], kept: SweepOptions) -> SweepOptions:
+    """How to serve the sweep: flags over the file over what is kept of it. A new endpoint replaces both kept ones."""
+    has_endpoint = any(each in args.given or each in file for each in ("listen", "connect"))
 
-    def number(name: str, default: int | None) -> int | None:
-        value = getattr(args, name) if getattr(args, name) is not None else file.get(name, default)
+    def number(name: str) -> int | None:
+        value = getattr(args, name) if getattr(args, name) is not None else file.get(name, getattr(kept, name))
         if value is not None and (isinstance(value, bool) or not isinstance(value, int)):
             raise UsageError(f"{name} in {args.file} must be a whole number, not {value!r}")
         return value
@@ -120,14 +105,15 @@ def _options(args: argparse.Namespace, file: Mapping[str, Any]) -> SweepOptions:
     def endpoints(name: str) -> tuple[str, ...]:
         if name in args.given:
             return tuple(getattr(args.global_config, name))
-        value = file.get(name, [])
+        value = file.get(name, [] if has_endpoint else list(getattr(kept, name)))
         found = [value] if isinstance(value, str) else value
         if not (isinstance(found, list) and all(isinstance(each, str) for each in found)):
             raise UsageError(f"{name} in {args.file} must be an endpoint, such as tcp/0.0.0.0:7447")
         return tuple(found)
 
     listen, connect = endpoints("listen"), endpoints("connect")
-    return SweepOptions(number("parallel", PARALLEL) or 0, number("workers", None), listen, connect)
+    insecure = bool(getattr(args, "insecure", False)) or (kept.insecure and not has_endpoint)
+    return SweepOptions(number("parallel") or 0, number("workers"), listen, connect, insecure)
 
 
 def _new_sweep(args: argparse.Namespace, file: Mapping[str, Any]) -> Sweep:
@@ -173,11 +159,10 @@ def _fleet(args: argparse.Namespace, options: SweepOptions) -> SweepFleet:
         raise UsageError(
             "a sweep's own router knows no join files: give --connect, a fleet with one, or leave --join out"
         )
-    insecure = bool(getattr(args, "insecure", False))
     network = Network(options.listen or (f"tcp/127.0.0.1:{free_port()}",))
-    network.check_open(insecure=insecure)
+    network.check_open(insecure=options.insecure)
     workers = usable_cores() if options.workers is None else options.workers
-    return SweepFleet(network, workers, options.parallel, True, ("--insecure",) if insecure else ())
+    return SweepFleet(network, workers, options.parallel, True, ("--insecure",) if options.insecure else ())
 
 
 def _serve(
@@ -196,7 +181,8 @@ def _serve(
             runner.serve(stop, update)
             update()
     except StoppedError as error:
-        again = shell_command("sweep", "--resume", sweep.name, "--runs-dir", args.runs_dir)
+        joined = () if args.global_config.join is None else ("--join", args.global_config.join)
+        again = shell_command("sweep", "--resume", sweep.name, "--runs-dir", args.runs_dir, *joined)
         raise StoppedError(f"{error}; finished runs and open ones are kept; continue with: {again}") from error
     return runner.progress
 

@@ -20,7 +20,7 @@ from dreamfleet.coordinator.bridge.app import MOST_STREAMS
 from tests.support import tasks
 from tests.support.access import begin as begin_secured
 from tests.support.batches import begin, count_results, resume, vectors
-from tests.support.processes import DEADLINE
+from tests.support.processes import DEADLINE, free_port
 
 TOKEN = "0123456789abcdef0123456789abcdef"
 
@@ -289,6 +289,18 @@ def test_another_method_is_answered_with_those_that_there_are(processes):
         allowed = {each.strip().lower() for each in answer.headers["allow"].split(",")}
         connection.close()
         assert (answer.status, allowed - {"head"}) == (405, methods.keys())
+
+
+@pytest.mark.slow
+def test_the_bridge_may_start_before_its_coordinator(processes, random_bundle):
+    process = processes.start("serve", "--connect", processes.endpoint, "--port", 0)
+    process.wait_for("WARNING")
+    begin(processes, random_bundle)
+    process.wait_for("http://")
+    stopped = processes.start("serve", "--connect", f"tcp/127.0.0.1:{free_port()}", "--port", 0)
+    stopped.wait_for("WARNING")
+    stopped.popen.send_signal(signal.SIGTERM)
+    assert stopped.finish()[0] == 0
 
 
 def test_malformed_requests_fill_no_log(processes):

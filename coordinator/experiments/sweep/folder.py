@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,10 @@ from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write, reporting_unwritable_folder
 from dreamfleet.common.files.regular_files import path_exists, read_text
 from dreamfleet.common.protocol.keys import check_run_name
+from dreamfleet.common.serialization.optional_fields import OPTIONAL
 from dreamfleet.common.serialization.validation import MalformedError, from_plain, to_plain
 from dreamfleet.coordinator.experiments.local_run import has_begun
+from dreamfleet.coordinator.experiments.sweep.options import SweepOptions
 from dreamfleet.coordinator.experiments.sweep.plan import Sweep
 
 SUFFIX = ".sweep"
@@ -37,6 +39,7 @@ class StoredSweep:
     vary: tuple[VariedSetting, ...]
     flags: tuple[str, ...]
     tasks: tuple[str, ...]  # that its workers announce
+    options: SweepOptions = field(default=SweepOptions(), metadata=OPTIONAL)  # of the last time that it was served
 
 
 class SweepFolder:
@@ -61,26 +64,32 @@ class SweepFolder:
         if taken := next((each.name for each in sweep.runs if has_begun(self.runs_dir, each.name)), None):
             raise UsageError(f"run {taken} exists in {self.runs_dir}: give the sweep another --run")
 
-    def begin(self, sweep: Sweep, tasks: tuple[str, ...]) -> None:
-        """Keep a new sweep."""
-        self.check_new(sweep)
+    def write(self, sweep: Sweep, tasks: tuple[str, ...], options: SweepOptions) -> None:
+        """Keep a sweep, and how it is served."""
         vary = tuple(VariedSetting(key, tuple(values)) for key, values in sweep.vary.items())
-        stored = StoredSweep(sweep.name, vary, sweep.flags, tasks)
+        stored = StoredSweep(sweep.name, vary, sweep.flags, tasks, options)
         path = self.path / SETTINGS
         with reporting_unwritable_folder(self.path, "choose another --runs-dir"), atomic_write(path) as file:
             file.write((json.dumps(to_plain(stored), indent=1) + "\n").encode())
 
     def read(self) -> tuple[Sweep, tuple[str, ...]]:
         """The sweep and its workers' tasks; `UsageError` if there is none of this name."""
+        found = self._read()
+        return Sweep(found.name, {each.setting: each.values for each in found.vary}, found.flags), found.tasks
+
+    def read_options(self) -> SweepOptions:
+        """How the sweep was served the last time; errors as in `read`."""
+        return self._read().options
+
+    def _read(self) -> StoredSweep:
         path = self.path / SETTINGS
         try:
             plain: Any = json.loads(read_text(path, MOST_BYTES))
-            found = from_plain(StoredSweep, plain)
+            return from_plain(StoredSweep, plain)
         except FileNotFoundError:
             raise UsageError(f"no sweep {self._name} in {self.runs_dir}: begin it with --run {self._name}") from None
         except (OSError, ValueError, RecursionError, MalformedError) as error:
             raise DreamfleetError(f"{path} is damaged ({error}); put it back from a copy") from error
-        return Sweep(found.name, {each.setting: each.values for each in found.vary}, found.flags), found.tasks
 
 
 def find_sweep(runs_dir: Path, name: str) -> SweepFolder | None:

@@ -1,15 +1,19 @@
 """A sweep's plan, what it keeps, and its results, without processes."""
 
 import argparse
+import json
+from dataclasses import replace
 
 import pytest
 
 from dreamfleet.common.cli.command_line import build_parser
+from dreamfleet.common.cli.global_config import complete_arguments
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.coordinator.experiments.local_run import task_flags
 from dreamfleet.coordinator.experiments.sweep.check import check_runs
 from dreamfleet.coordinator.experiments.sweep.figure import sweep_figure
 from dreamfleet.coordinator.experiments.sweep.folder import SETTINGS, SweepFolder
+from dreamfleet.coordinator.experiments.sweep.options import SweepOptions
 from dreamfleet.coordinator.experiments.sweep.plan import MOST_RUNS, Sweep, parse_vary, read_vary
 from dreamfleet.coordinator.experiments.sweep.summary import (
     CONFIRMED,
@@ -21,6 +25,7 @@ from dreamfleet.coordinator.experiments.sweep.summary import (
     mean_curve,
     means,
 )
+from dreamfleet.coordinator.verbs import sweep as sweep_verb
 from dreamfleet.worker.verbs import worker
 
 SOURCES = {"flags": argparse.Namespace(), "environment": {}, "file": {}}
@@ -113,10 +118,32 @@ def test_a_worker_announces_all_tasks_that_its_flags_name():
 def test_a_sweep_is_kept_and_read_as_it_was(tmp_path):
     sweep, folder = sweep_of("seed=1..2", "sigma0=0.05,0.1"), SweepFolder(tmp_path, "carts")
     folder.path.mkdir()
-    folder.begin(sweep, ("gym:CartPole-v1",))
+    folder.write(sweep, ("gym:CartPole-v1",), SweepOptions())
     assert folder.read() == (sweep, ("gym:CartPole-v1",))
-    with pytest.raises(UsageError, match=r"sweep carts exists .* continue it with --resume carts"):
-        folder.begin(sweep, ())
+    assert "options" not in json.loads((folder.path / SETTINGS).read_text())
+    with pytest.raises(UsageError, match="--resume carts"):
+        folder.check_new(sweep)
+
+
+def resumed(*words):
+    """How a sweep that was begun with six workers is served when it is resumed with these flags."""
+    parser = build_parser("sweep", sweep_verb)
+    kept = SweepOptions(parallel=2, workers=6, listen=("tcp/0.0.0.0:7447",), insecure=True)
+    args = parser.parse_all(["--resume", "carts", *words])
+    complete_arguments(args, {})
+    return sweep_verb._options(args, {}, kept)
+
+
+def test_a_sweep_is_resumed_as_it_was_served(tmp_path):
+    folder = SweepFolder(tmp_path, "carts")
+    folder.path.mkdir()
+    kept = resumed()
+    assert kept == SweepOptions(2, 6, ("tcp/0.0.0.0:7447",), (), insecure=True)
+    folder.write(sweep_of("seed=1..2"), (), kept)
+    assert folder.read_options() == kept
+    assert resumed("--workers", "0", "--parallel", "1") == replace(kept, workers=0, parallel=1)
+    assert resumed("--connect", "tcp/a:1") == SweepOptions(2, 6, (), ("tcp/a:1",))
+    assert resumed("--listen", "tcp/127.0.0.1:1") == SweepOptions(2, 6, ("tcp/127.0.0.1:1",))
 
 
 def test_a_sweep_that_is_absent_or_damaged_is_named(tmp_path):
