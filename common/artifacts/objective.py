@@ -12,6 +12,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,8 @@ class Objective:
     """A function's arguments and the sign of its value; vectors have a number for each parameter.
 
     A parameter in `log` is searched by its natural logarithm, one in `integer` is rounded. An unbounded side is
-    infinite. `penalty` replaces a value that is NaN or infinite; without one, such a candidate counts as failed.
+    infinite, and equal bounds fix a parameter. `penalty` replaces a value that is NaN or infinite; without one, such a
+    candidate counts as failed.
 
     >>> box = Objective.of({"x0": [0.5, 10], "lower": [0, 1], "upper": [1, 1000], "log": [1], "minimise": True})
     >>> box.decode(np.array([0.0, 0.0])).round(9).tolist(), box.decode(np.array([0.75, 1.0])).round(2).tolist()
@@ -95,12 +97,14 @@ class Objective:
         ):
             if not scale > 0:
                 raise UsageError(f"scale of parameter {index} must be above 0, not {scale:g}")
-            if not lower < upper:
-                raise UsageError(f"the bounds of parameter {index} must be apart, and are {lower:g} and {upper:g}")
+            if not lower <= upper:
+                raise UsageError(f"the bounds of parameter {index} are {lower:g} and {upper:g}: the lower one is above")
             if not lower <= x0 <= upper:
                 raise UsageError(f"x0 of parameter {index} is {x0:g}, outside of its bounds {lower:g} and {upper:g}")
             if index in self.log and not (x0 > 0 and (lower == -math.inf or lower > 0)):
                 raise UsageError(f"parameter {index} is logarithmic: its x0 and lower bound must be above 0")
+        if self.lower == self.upper:
+            raise UsageError("the bounds fix every parameter: leave one of them a range to search")
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -161,11 +165,13 @@ def describe_sign(options: str) -> str:
 
 
 def takes_seed(function: Callable[..., Any]) -> bool:
-    """Whether a function of a vector is noisy: a parameter behind its first one is named `seed`.
+    """Whether a function of a vector is noisy: a parameter behind its first one is named `seed`, and has no value yet.
 
     >>> takes_seed(lambda x, seed: 0.0), takes_seed(lambda x: 0.0)
     (True, False)
     """
+    if isinstance(function, partial) and "seed" in function.keywords:
+        return False
     try:
         names = list(inspect.signature(function).parameters)
     except (ValueError, TypeError):  # some builtin functions have no signature
@@ -178,6 +184,9 @@ def _reflect(values: Floats, low: Floats, high: Floats) -> Floats:
     found = values.copy()
     for index, (value, lower, upper) in enumerate(zip(values.tolist(), low.tolist(), high.tolist(), strict=True)):
         if lower <= value <= upper:
+            continue
+        if lower == upper:
+            found[index] = lower
             continue
         if math.isfinite(lower) and math.isfinite(upper):
             way = (value - lower) % (2 * (upper - lower))

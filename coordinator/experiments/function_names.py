@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.trusted_modules import PLACES, check_module_name, join_places, module_folder
 from dreamfleet.common.protocol.tasks import FUNCTION, module_of
 
-REMEDY = "write it as `def` at the top level of a module, and pass that"
+REMEDY = "write it as `def`, a partial function or an object at the top level of a module, and pass that"
+MAIN = "__main__"
 IMPORTED_FOR = "DREAMFLEET_FUNCTION"  # the task for which a process of a fleet imports modules
 
 
@@ -50,8 +52,9 @@ def _path_with(*folders: Path | None) -> dict[str, str]:
 def name_function(function: Callable[..., Any] | str) -> FunctionName:
     """The name of a function of a module, or of a script's own if its file can be imported as a module.
 
-    `function` may also be the text `MODULE:NAME`. `UsageError` says what to do about lambdas, nested functions, methods
-    of objects, and functions of a notebook; also where a script searches as it is imported.
+    It may also be a partial function or an object that a module names at its top level, or a method of one; or the text
+    `MODULE:NAME`. `UsageError` says what to do about lambdas, nested functions, objects without such a name, and
+    functions of a notebook; also where a script searches as it is imported.
 
     >>> import numpy as np
     >>> name_function(np.linalg.norm).task
@@ -73,22 +76,38 @@ def name_function(function: Callable[..., Any] | str) -> FunctionName:
 
 
 def _name_object(function: Callable[..., Any]) -> FunctionName:
-    module, name = getattr(function, "__module__", None), getattr(function, "__qualname__", None)
-    if not callable(function) or not module or not name:
+    if not callable(function):
         raise UsageError(f"{type(function).__name__} is no function of a module: {REMEDY}")
+    if inspect.ismethod(function) and not inspect.isclass(function.__self__):
+        return _name_instance(function.__self__, f".{function.__name__}")
+    module, name = getattr(function, "__module__", None), getattr(function, "__qualname__", None)
+    if not module or not name:
+        return _name_instance(function)
     if "<lambda>" in name or "<locals>" in name:
         kind = "a lambda" if "<lambda>" in name else "a function inside of another"
         raise UsageError(f"{kind} has no name by which other processes find it: {REMEDY}")
-    if inspect.ismethod(function) and not inspect.isclass(function.__self__):
-        raise UsageError(
-            f"{name} is a method of an object, that other processes lack: {REMEDY}; it may make the object itself"
-        )
-    if module == "__main__":
+    if module == MAIN:
         return _name_of_script(name)
     found = _look_up(sys.modules.get(module), name)
     if found is not function and not (inspect.ismethod(function) and found == function):
         raise UsageError(f"{name} of {module} is another object than this function: {REMEDY}")
     return FunctionName(f"{FUNCTION}:{module}:{name}", module_folder(module))
+
+
+def _name_instance(found: object, more: str = "") -> FunctionName:
+    """The name of an object, such as a partial function, under which a module has it; `more` follows that."""
+    kind = type(found)
+    first = getattr(found.func, "__module__", "") if isinstance(found, partial) else kind.__module__
+    places = dict.fromkeys((first, *sys.modules, MAIN))
+    if first != MAIN:  # last: of a notebook nothing is found elsewhere
+        places[MAIN] = places.pop(MAIN)
+    for module in places:
+        for name, value in list(getattr(sys.modules.get(module), "__dict__", {}).items()):
+            if value is found:
+                return _name_of_script(name + more) if module == MAIN else FunctionName(
+                    f"{FUNCTION}:{module}:{name}{more}", module_folder(module)
+                )  # fmt: skip
+    raise UsageError(f"no module has this object of type {kind.__name__} under a name: {REMEDY}")
 
 
 def _name_of_script(name: str) -> FunctionName:

@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -156,7 +157,7 @@ def _is_noisy(function: Callable[..., Any] | str) -> bool:
 
     module, _, name = function.rpartition("function:")[2].partition(":")
     try:
-        return takes_seed(getattr(import_module(module), name))
+        return takes_seed(attrgetter(name)(import_module(module)))
     except (ImportError, AttributeError) as error:
         raise UsageError(f"no function {name} of module {module} here: {error}") from error
 

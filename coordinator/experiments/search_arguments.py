@@ -45,7 +45,11 @@ ADVICE = {
         ("disp", "verbose", "verb_disp", "display", "progress"),
         "a search prints nothing; `callback=print` prints each generation, and `dreamfleet status` shows the live run",
     ),
-    **dict.fromkeys(("args", "kwargs"), "a function has only `x`, and `seed`: write other values into its module"),
+    **dict.fromkeys(
+        ("args", "kwargs"),
+        "a function has only `x`, and `seed`: at the top level of its module write `mine = functools.partial(cost, "
+        "weight=3)`, and pass `mine`",
+    ),
     **dict.fromkeys(("constraints", "constraint"), "return a worse value, or NaN, where a constraint does not hold"),
     **dict.fromkeys(("jac", "hess", "gradient"), "this search needs no derivative: leave it out"),
     "options": "give each of them as an argument of its own",
@@ -134,7 +138,7 @@ def _default_steps(size: int, lower: Any, upper: Any, log: bool | Sequence[int])
         math.log(high / low) if index in logarithmic and min(low, high) > 0 else high - low
         for index, (low, high) in enumerate(ends)
     ]
-    return [STEP_SHARE * each if each > 0 else 1.0 for each in ranges]  # bounds that are not apart are refused later
+    return [STEP_SHARE * each if each > 0 else 1.0 for each in ranges]  # of a fixed parameter any
 
 
 def _read_numbers(name: str, value: Any) -> list[float]:

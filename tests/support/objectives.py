@@ -1,5 +1,6 @@
 """Functions of a vector that tests search."""
 
+import functools
 import os
 import sys
 import time
@@ -82,6 +83,24 @@ class Shifted:
 
     def method(self, x):
         return self.value(x)
+
+
+class Weighted:
+    """A function as an object, and with another name as a method of one."""
+
+    def __init__(self, weight):
+        self.weight = weight
+
+    def __call__(self, x):
+        assert self.weight > 0
+        return self.weight * sphere(x)
+
+    def noisy(self, x, seed):
+        return self(x) + 0.1 * np.random.default_rng(seed).normal()
+
+
+weighted, wrong = Weighted(3), Weighted(-1)
+steady = functools.partial(noisy, seed=1)
 
 
 def outer():

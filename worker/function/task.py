@@ -10,6 +10,7 @@ import inspect
 import math
 import traceback
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -50,7 +51,8 @@ class FunctionTask(Task):
         self.name = f"{FUNCTION}:{place}"
         self.function = _find_function(place)
         self._takes_seed = takes_seed(self.function)
-        self._packages = tuple(dict.fromkeys(("numpy", *find_distributions(self.function.__module__)[:1])))
+        module = self.function.__module__ if inspect.isroutine(self.function) else place.partition(":")[0]
+        self._packages = tuple(dict.fromkeys(("numpy", *find_distributions(module)[:1])))
 
     def world_of(self, assignment: Assignment) -> World:
         """A world of one step."""
@@ -134,7 +136,9 @@ def _describe_raised(name: str, function: Callable[..., Any], error: BaseExcepti
 
 def _find_line(function: Callable[..., Any], error: BaseException) -> str:
     """The last line of the function's own file that led to the error, as " (FILE:LINE)"; empty if there is none."""
-    code = getattr(inspect.unwrap(function), "__code__", None)
+    while isinstance(function, partial):
+        function = function.func
+    code = getattr(inspect.unwrap(function), "__code__", None) or getattr(type(function).__call__, "__code__", None)
     if code is None:
         return ""
     frames = ((frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(error.__traceback__))
@@ -162,7 +166,10 @@ def _find_function(place: str) -> Callable[..., Any]:
     found: Any = import_trusted(module, f"task '{FUNCTION}:{place}'")
     for part in name.split("."):
         if not hasattr(found, part):
-            raise UsageError(f"task {FUNCTION}:{place}: {module} has no function {name}")
+            raise UsageError(
+                f"task {FUNCTION}:{place}: {module} has no function {name} once it is imported: what stands under "
+                '`if __name__ == "__main__":` is not there'
+            )
         found = getattr(found, part)
     if not callable(found):
         raise UsageError(f"task {FUNCTION}:{place}: {name} of {module} is no function but {type(found).__name__}")

@@ -71,6 +71,15 @@ def test_the_sign_turns_fitness_into_a_value_and_back():
     assert Objective.of({"x0": [0]}).value(3.0) == 3.0
 
 
+def test_equal_bounds_fix_a_parameter():
+    bounds = {"lower": [1, 0, 2, 5], "upper": [1, 9, 2, 5]}
+    objective = Objective.of({"x0": [1, 2, 2, 5], **bounds, "integer": [2], "log": [3]})
+    for coordinates in ([0, 0, 0, 0], [1e-9, 1, -1, 0.1], [-1e9, -1e9, 1e9, 700]):
+        x = objective.decode(coordinates)
+        assert x[[0, 2, 3]].tolist() == [1, 2, 5]
+        assert 0 <= x[1] <= 9
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -82,7 +91,7 @@ def test_the_sign_turns_fitness_into_a_value_and_back():
         ({"x0": [0, 0], "dimension": 3}, "x0 has 2 numbers, and the function 3"),
         ({"x0": [0, 0], "lower": [1]}, "lower has 1 numbers"),
         ({"x0": [0], "lower": 1}, "outside of its bounds"),
-        ({"x0": [0], "lower": 1, "upper": 1}, "must be apart"),
+        ({"x0": [1, 2], "lower": [1, 2], "upper": [1, 2]}, "every parameter"),
         ({"x0": [0], "scale": 0}, "scale of parameter 0 must be above 0"),
         ({"x0": [0], "log": [0]}, "is logarithmic"),
         ({"x0": [1], "log": True, "lower": 0}, "is logarithmic"),

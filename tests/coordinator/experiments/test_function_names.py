@@ -24,6 +24,9 @@ def test_a_function_of_a_module_travels_by_its_name():
     assert found.environment[PLACES].split(os.pathsep)[0] == str(found.folder)
     assert name_function(objectives.Shifted.value).task == f"function:{MODULE}:Shifted.value"
     assert name_function(objectives.Shifted.of_class).task == f"function:{MODULE}:Shifted.of_class"
+    assert name_function(objectives.steady).task == f"function:{MODULE}:steady"
+    assert name_function(objectives.weighted).task == f"function:{MODULE}:weighted"
+    assert name_function(objectives.weighted.noisy).task == f"function:{MODULE}:weighted.noisy"
     assert name_function("mine:cost").task == name_function("function:mine:cost").task == "function:mine:cost"
 
 
@@ -32,9 +35,9 @@ def test_a_function_of_a_module_travels_by_its_name():
     [
         (lambda x: x, "a lambda has no name"),
         (objectives.outer(), "a function inside of another has no name"),
-        (objectives.Shifted().method, "is a method of an object"),
-        (functools.partial(objectives.noisy, seed=1), "is no function of a module"),
-        (objectives.Shifted(), "is no function of a module"),
+        (objectives.Shifted().method, "no module has this object of type Shifted"),
+        (functools.partial(objectives.noisy, seed=1), "no module has this object of type partial"),
+        (objectives.Weighted(2), "no module has this object of type Weighted"),
         (3, "is no function of a module"),
     ],
 )
@@ -52,14 +55,19 @@ def test_a_module_that_searches_as_it_is_imported_is_refused(monkeypatch):
 
 
 SCRIPT = """
+import functools
 from dreamfleet.coordinator.experiments.function_names import name_function
-def cost(x): return 0.0
-print(name_function(cost).task)
+def cost(x, weight=1): return 0.0
+heavy = functools.partial(cost, weight=9)
+print(name_function(cost).task, name_function(heavy).task)
 """
 
 
 def test_a_scripts_own_function_is_found_by_the_name_of_its_file(tmp_path):
-    for file, expected in (("tuning.py", "function:tuning:cost"), ("my-tuning.py", "cannot be imported")):
+    for file, expected in (
+        ("tuning.py", "function:tuning:cost function:tuning:heavy"),
+        ("my-tuning.py", "cannot be imported"),
+    ):
         (tmp_path / file).write_text(SCRIPT)
         done = subprocess.run([sys.executable, file], cwd=tmp_path, capture_output=True, text=True, check=False)
         assert expected in done.stdout + done.stderr

@@ -152,6 +152,14 @@ def test_a_search_that_loses_all_values_returns_what_it_found(tmp_path, monkeypa
 
 
 @pytest.mark.slow
+def test_a_fixed_parameter_stays_and_an_object_is_a_function(tmp_path):
+    bounds = [(0, 4), (2, 2)]
+    found = dreamfleet.minimise(objectives.weighted, [3, 2], bounds=bounds, generations=3, runs_dir=tmp_path, **FEW)
+    assert {float(each.x[1]) for each in found.history} == {2.0}
+    assert found.fun == objectives.weighted(found.x) < objectives.weighted(np.array([3, 2]))
+
+
+@pytest.mark.slow
 def test_a_callback_ends_the_search(tmp_path):
     def stop(progress):
         if progress.generation == 1:
@@ -181,6 +189,8 @@ def test_a_callback_ends_the_search(tmp_path):
         ({"call_back": print}, "did you mean 'callback'?"),
         ({"sigma": 3}, "did you mean 'sigma0'?"),
         ({"n_jobs": 3}, "did you mean 'workers'?"),
+        ({"args": (3,)}, r"functools\.partial"),
+        ({"bounds": [(0, 0), (0, 0)]}, "every parameter"),
         ({"tol": 3}, "'ftarget' ends it by a value"),
         ({"disp": True}, "`callback=print` prints each generation"),
         ({"seed": "x"}, "seed must be a whole number, not 'x'"),

@@ -39,6 +39,9 @@ def test_a_call_is_an_episode_of_one_step_whose_fitness_is_the_negative_value(ki
     assert (found.fitness, found.steps) == (-1.25, 1)
     assert score("sphere", minimise=False).fitness == 1.25
     assert score("Shifted.value").fitness == -1.25
+    assert score("weighted").fitness == -3.75
+    assert score("steady", 7) == score("steady", 8), "its seed is bound"
+    assert score("weighted.noisy", 7) != score("weighted.noisy", 8)
 
 
 def test_the_seed_alone_makes_the_noise():
@@ -58,6 +61,7 @@ def test_a_function_that_writes_into_its_argument_changes_nothing_else():
     [
         ("raising", r"raising raised ZeroDivisionError: .*\(objectives\.py:\d+\)"),
         ("exiting", "exiting raised SystemExit: 3"),
+        ("wrong", r"wrong raised AssertionError: objectives\.py:\d+"),
         ("nothing", "nothing returned NoneType None: it must return one number"),
         ("vector", r"vector returned an array of shape \(2,\)"),
         ("text", "text returned str '12'"),
