@@ -34,8 +34,11 @@ class Generation:
     With `racing` all candidates drive the first half of the episodes; after this barrier only the better half of the
     candidates drives the second half. Ties go to the lower index. `run_spec` is the run's
     specification, if `spec` differs from it: at a raised temperature or in a later stage. In a dream the first `driven`
-    episodes are driven in the real world. R8: a candidate of which an episode failed for good has no fitness, needs no
-    more episodes, and ranks last.
+    episodes are driven in the real world. R8: a candidate of which a wanted episode failed for good has no fitness,
+    needs no more episodes, and ranks last.
+
+    Only wanted places count. A result may be known of a place that is not wanted: of the second half before the
+    barrier, or of a candidate that passed an earlier barrier and stays below this one.
 
     `work` are the jobs that are made so far. With `in_parts` they are those of the first candidates, and `make_more`
     makes the others, so that workers may begin meanwhile; not where vectors are equal.
@@ -56,13 +59,15 @@ class Generation:
         self._made = 0  # candidates whose jobs are made
         # Equal vectors have equal digests: one job then fills the place of each of them.
         self._places: dict[bytes, list[tuple[int, int]]] = {}
+        self._shared: list[list[tuple[int, int]]] = []  # the places of each digest that has several
         self._scores = np.full((len(vectors), len(seeds)), np.nan)
         self._first = -(-len(seeds) // 2) if racing else len(seeds)
         self._wanted = np.zeros(self._scores.shape, dtype=bool)
         self._wanted[:, : self._first] = True
-        self._steps = np.zeros(self._scores.shape, dtype=np.int64)  # a result's steps stand in the first of its places
+        self._steps = np.zeros(self._scores.shape, dtype=np.int64)  # a result's steps stand in each of its places
         self._measures = np.full((*self._scores.shape, len(spec.measures)), np.nan)
-        self._failed = np.zeros(len(vectors), dtype=bool)
+        self._lost = np.zeros(self._scores.shape, dtype=bool)  # places whose episode failed for good
+        self._failed = np.zeros(len(vectors), dtype=bool)  # candidates
         if in_parts and distinct == len(vectors):
             self.make_more()
         else:
@@ -85,16 +90,22 @@ class Generation:
             for spec, seeds, first in self._parts:
                 for work in make_work(spec, "score", self.number, candidate, vector, seeds, self._run_spec, first):
                     self.work.append(work)
-                    self._places.setdefault(work.digest, []).append((candidate, work.episode))
+                    places = self._places.setdefault(work.digest, [])
+                    places.append((candidate, work.episode))
+                    if len(places) == 2:
+                        self._shared.append(places)
         self._made = min(until, len(self._vectors))
 
     @property
     def steps(self) -> int:
-        """Environment steps of its results, without those of failed candidates.
+        """Environment steps of the results that count, each once; not those of failed candidates.
 
         How many episodes of a failed candidate were scored before the failure depends on the fleet.
         """
-        return sum(self._steps[~self._failed].ravel().tolist())
+        counting = self._counting
+        counts = [(places[0], sum(bool(counting[place]) for place in places)) for places in self._shared]
+        repeated = sum(int(self._steps[first]) * (count - 1) for first, count in counts if count)
+        return int(sum(self._steps[counting].tolist())) - repeated
 
     @property
     def population(self) -> int:
@@ -116,6 +127,11 @@ class Generation:
     def failed(self) -> list[int]:
         """The candidates that failed."""
         return [int(each) for each in np.flatnonzero(self._failed)]
+
+    @property
+    def has_failures(self) -> bool:
+        """Whether an episode failed for good, of a place that is wanted or not."""
+        return bool(self._lost.any())
 
     @property
     def all_failed(self) -> bool:
@@ -146,14 +162,28 @@ class Generation:
         return [digest for digest, places in self._places.items() if all(failed[row] for row, _ in places)]
 
     @property
+    def counted(self) -> list[Work]:
+        """Jobs whose results count now."""
+        scored = (self._counting & np.isfinite(self._scores)).tolist()
+        return [each for each in self.work if scored[each.template.candidate][each.episode]]
+
+    @property
+    def surplus(self) -> list[bytes]:
+        """Digests of results of the second half that this race does not want; empty before the barrier."""
+        if not self._is_raced or not self._is_decided:
+            return []
+        surplus = ((np.isfinite(self._scores) | self._lost) & ~self._wanted).tolist()
+        return [digest for digest, ((row, at), *_) in self._places.items() if surplus[row][at]]
+
+    @property
     def done(self) -> int:
         """Episodes scored, without those of failed candidates."""
-        return int(np.isfinite(self._scores[~self._failed]).sum())
+        return int((self._counting & np.isfinite(self._scores)).sum())
 
     @property
     def total(self) -> int:
         """Episodes wanted, as far as that is known."""
-        return int((self._wanted | np.isfinite(self._scores))[~self._failed].sum())
+        return int(self._counting.sum())
 
     @property
     def complete(self) -> bool:
@@ -161,16 +191,16 @@ class Generation:
         return self.population > 0 and self.done == self.total
 
     def record(self, digest: bytes, fitness: float, steps: int, measures: Sequence[float] = ()) -> bool:
-        """Record a result of this generation, NaN for an episode that failed for good; whether others are wanted now.
+        """Record a result of this generation, NaN for an episode that failed for good; whether it decides the barrier.
 
         R27: the digest names the place that a result fills, so the order of arrival does not matter. A candidate that
         was drawn anew since has no place for it.
         """
-        for number, place in enumerate(self._places.get(digest, ())):
-            if isnan(fitness):
-                self._failed[place[0]] = True
+        for place in self._places.get(digest, ()):
+            self._lost[place] = isnan(fitness)
+            self._failed[place[0]] |= self._lost[place] and self._wanted[place]
             self._scores[place] = fitness
-            self._steps[place] = 0 if number else steps
+            self._steps[place] = steps
             if measures and len(measures) == self._measures.shape[2]:
                 self._measures[place] = measures
         return self._open_second_half()
@@ -180,38 +210,37 @@ class Generation:
         self._failed |= self._open_places.any(axis=1)
 
     def recall(self, results: Mapping[bytes, KnownResult]) -> None:
-        """Record results of an earlier life by digest.
-
-        The first half goes first: with racing, what failed in the second half must not count at the barrier.
-        """
-        known = (digest for digest in self._places if digest in results)
-        for digest in sorted(known, key=lambda digest: min(episode for _, episode in self._places[digest])):
-            self.record(digest, *results[digest])
+        """Record results of an earlier life by digest."""
+        for digest in self._places:
+            if digest in results:
+                self.record(digest, *results[digest])
 
     def fitness(self) -> NDArray[np.float64]:
-        """The fitness of each candidate, `(population,)`: the mean of its own episodes, NaN where one failed.
+        """The fitness of each candidate, `(population,)`: the mean of its wanted episodes, NaN where one failed.
 
         R27: a mean is taken over a whole row, so any order of results gives the same bits.
         """
         fitness = np.full(len(self._scores), np.nan)
         if not self.all_failed:
-            fitness[~self._failed] = np.nanmean(self._scores[~self._failed], axis=1)
+            fitness[~self._failed] = np.nanmean(np.where(self._counting, self._scores, np.nan)[~self._failed], axis=1)
         return fitness
 
     def measures(self) -> NDArray[np.float64] | None:
-        """The measures of each candidate, `(population, measures)`: means over its episodes, as the fitness.
+        """The measures of each candidate, `(population, measures)`: means over its wanted episodes, as the fitness.
 
         NaN where an episode failed; `None` if nothing is measured beside fitness.
         """
         if not self._measures.shape[2]:
             return None
         measures = np.full((self.population, self._measures.shape[2]), np.nan)
-        measures[~self._failed] = np.nanmean(self._measures[~self._failed], axis=1)
+        counting = np.where(self._counting[:, :, None], self._measures, np.nan)
+        measures[~self._failed] = np.nanmean(counting[~self._failed], axis=1)
         return measures
 
     def candidate_scores(self) -> CandidateScores:
         """The scores of all candidates so far."""
-        scored = np.isfinite(self._scores) & ~self._failed[:, None]
+        counting = self._counting
+        scored = counting & np.isfinite(self._scores)
         done = scored.sum(axis=1)
         with np.errstate(over="ignore"):  # of a generation that an older version closed
             totals = np.where(scored, self._scores, 0.0).sum(axis=1)
@@ -219,19 +248,35 @@ class Generation:
             to_finite(total / count) if count else None
             for total, count in zip(totals.tolist(), done.tolist(), strict=True)
         ]
-        wanted = (self._wanted & ~self._failed[:, None]) | scored
-        return CandidateScores(self.number, done.tolist(), wanted.sum(axis=1).tolist(), means)
+        return CandidateScores(self.number, done.tolist(), counting.sum(axis=1).tolist(), means)
+
+    @property
+    def _counting(self) -> NDArray[np.bool_]:
+        """The places whose results count, once they are there."""
+        return np.asarray(self._wanted & ~self._failed[:, None])
 
     @property
     def _open_places(self) -> NDArray[np.bool_]:
         """The places whose results are wanted and missing."""
-        return np.asarray(self._wanted & np.isnan(self._scores) & ~self._failed[:, None])
+        return np.asarray(self._counting & np.isnan(self._scores))
+
+    @property
+    def _is_raced(self) -> bool:
+        return self._first < self._scores.shape[1]
+
+    @property
+    def _is_decided(self) -> bool:
+        """Whether the barrier of a race is passed."""
+        return bool(self._wanted[:, self._first :].any())
 
     def _open_second_half(self) -> bool:
-        is_raced = self._first < self._scores.shape[1]
-        if not is_raced or self._wanted[:, self._first :].any() or self._open_places.any():
+        if not self._is_raced or self._is_decided or self._open_places.any():
             return False
         first = np.where(self._failed[:, None], -np.inf, self._scores[:, : self._first])
         better = np.argsort(-first.mean(axis=1), kind="stable")[: -(-len(first) // 2)]
         self._wanted[better, self._first :] = True
-        return bool(self._open_places.any())
+        for places in self._shared:  # equal vectors have equal scores
+            if any(self._wanted[place] for place in places):
+                self._wanted[tuple(zip(*places, strict=True))] = True
+        self._failed |= (self._lost & self._wanted).any(axis=1)
+        return True

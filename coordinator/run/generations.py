@@ -159,6 +159,7 @@ class Generations:
             failed=len(self.redrawn.union(generation.failed)),
         )
         self._strategy.tell(_ranked(fitness, statistics["worst"]), measures)
+        self._journal.set_surplus_aside(generation.number, generation.surplus)
         self._journal.close_generation(closed, fitness, measures)
         self._add_elites(closed.number, fitness, measures)
         self.history.append(closed)

@@ -166,6 +166,7 @@ class Run:
         if job.kind != "score":
             self.background_jobs.count(job, fitness)
         elif self.generation.record(job.digest, fitness, steps, measures):  # it wants other jobs now
+            self.verification.restore(self.generation.counted)
             self.fleet.jobs.offer(self.generation.missing)
 
     def tick(self, now: float) -> None:
@@ -281,7 +282,7 @@ class Run:
         self._journal.drop_fact(PAUSED)
         self.failure_limit.accept(self.generation.number)
         self.fleet.jobs.offer(self.background_jobs.retry_failed())
-        if self.generation.failed:
+        if self.generation.has_failures:
             self._journal.drop_failures(self.generation.number)
             self._replace_generation(self.generations.reload(self.generation.number))
 
@@ -369,15 +370,17 @@ class Run:
 
     def _begin_generation(self, generation: Generation) -> None:
         self.generation = generation
-        self.verification.restore(generation.work)
+        self.verification.restore(generation.counted)
         self.work_clock.restart()
         self.fleet.jobs.begin_generation(generation.number)
 
     def _replace_generation(self, generation: Generation) -> None:
         """Score the open generation as it is now: of a race whose first half is open again, nothing of the second."""
-        self.generation, missing = generation, generation.missing
+        self.generation, missing, counted = generation, generation.missing, generation.counted
         wanted = {each.digest for each in missing}
         self.fleet.withdraw(each for each in self.fleet.jobs.plain_scores() if each not in wanted)
+        self.verification.keep_to(counted)
+        self.verification.restore(counted)  # what failed candidates have was checked no more
         self.fleet.jobs.offer(missing)
 
     def take_notes(self) -> list[str]:
@@ -410,7 +413,7 @@ class Run:
         if len(self._agenda.stages) > 1:
             self.fleet.notes.append(f"generation {generation.number} is in {self._stage_text}")
         self.fleet.jobs.begin_generation(generation.number)
-        self.verification.restore(generation.work)
+        self.verification.restore(generation.counted)
         if self._journal.fact(PAUSED) is not None:
             self.pause(BY_HAND)
         work = self.background_jobs.begin(self.generations.mean, now)

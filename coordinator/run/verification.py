@@ -114,6 +114,12 @@ class Verification:
             self._jobs.offer_check(drawn[digest], Check(known.host_class, {known.answer.host}))
             self._answers[digest], self._workers[digest] = [known.answer], known.worker
 
+    def keep_to(self, counted: Iterable[Work]) -> None:
+        """Check no candidate's result but those of these jobs: others count no more."""
+        digests = {each.digest for each in counted}
+        checked = [(digest, each.work.kind) for digest, each in self._jobs.checks.items()]
+        self._fleet.withdraw(digest for digest, kind in checked if kind == "score" and digest not in digests)
+
     def record(self, work: Work, result: Result, worker: str) -> None:
         """Compare a result of a job whose result was accepted before; a repeated message changes nothing."""
         answers, answer = self._answers[work.digest], Answer.of(host_of(worker), result)

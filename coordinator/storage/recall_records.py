@@ -17,7 +17,8 @@ from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
 from dreamfleet.coordinator.storage.batch_records import MOST_VARIABLES
 from dreamfleet.coordinator.storage.verification_records import VerificationRecords
 
-BARRED, REWOUND = "barred", "rewound"  # why a result does not count: its host is barred, or its generation was dropped
+# Why a result does not count: its host is barred, its generation was dropped, or its closed race did not want it.
+BARRED, REWOUND, SURPLUS = "barred", "rewound", "surplus"
 COLUMNS = (
     "digest, kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, fingerprint, incarnation, "
     "host_class, measures"
@@ -59,17 +60,20 @@ class RecallRecords(VerificationRecords):
         self._write_all("DELETE FROM failure WHERE digest = ?", [(digest,) for digest, *_ in failed])
         (count,) = self._read_row(f"SELECT count(*) FROM result WHERE {HOST} IN ({marks})", *hosts)  # noqa: S608
         self._set_aside(BARRED, f"{HOST} IN ({marks})", *hosts)
-        earlier = f"UPDATE recalled SET because = ? WHERE because = ? AND {HOST} IN ({marks})"  # noqa: S608
-        self._write(earlier, BARRED, REWOUND, *hosts)  # of generations that an earlier recall dropped
-        self._write(f"UPDATE verification SET stands = 0 WHERE checker IN ({marks})", *hosts)  # noqa: S608
+        earlier = f"UPDATE recalled SET because = ? WHERE because != ? AND {HOST} IN ({marks})"  # noqa: S608
+        self._write(earlier, BARRED, BARRED, *hosts)  # such as of generations that an earlier recall dropped
+        self._void_checks(hosts)
         self._settle_recall()
         return int(count)
 
     def rewind(self, number: int, state: Checkpoint | bytes, seeds: Sequence[int]) -> None:
         """Open generation `number` again as it was first asked for, and drop what came after it.
 
-        `state` is the strategy's before that `ask`. Results of the generation itself stay.
+        `state` is the strategy's before that `ask`. Results of the generation itself stay, and those that its race
+        did not want are here again: its barrier may be another.
         """
+        self._count_again("because = ? AND generation = ?", SURPLUS, number)
+        self._write("UPDATE recalled SET because = ? WHERE because = ? AND generation > ?", REWOUND, SURPLUS, number)
         self._set_aside(REWOUND, "generation > ? OR (generation = ? AND kind != 'score')", number, number)
         self._write("DELETE FROM failure WHERE generation > ? OR (generation = ? AND kind != 'score')", number, number)
         for table in ("evaluation", "collection"):
@@ -108,15 +112,20 @@ class RecallRecords(VerificationRecords):
             return
         for start in range(0, len(digests), MOST_VARIABLES):
             some = digests[start : start + MOST_VARIABLES]
-            where = f"because = ? AND digest IN ({', '.join('?' * len(some))})"
-            taken = self._read(f"SELECT DISTINCT digest FROM recalled WHERE {where}", REWOUND, *some)  # noqa: S608
-            self._write(
-                f"INSERT OR IGNORE INTO result ({COLUMNS}) SELECT {COLUMNS} FROM recalled WHERE {where}",  # noqa: S608
-                REWOUND, *some,
-            )  # fmt: skip
-            self._write(f"DELETE FROM recalled WHERE {where}", REWOUND, *some)  # noqa: S608
-            self._write_all("UPDATE verification SET stands = 1 WHERE digest = ? AND outcome = 'equal'", taken)
-        self._effort = self._counted = None
+            self._count_again(f"because = ? AND digest IN ({', '.join('?' * len(some))})", REWOUND, *some)
+
+    def set_surplus_aside(self, generation: int, digests: Sequence[bytes]) -> None:
+        """Count these results and failures of a race no more, which is about to close and does not want them.
+
+        So the results of a closed generation are those of its fitness and steps.
+        """
+        for start in range(0, len(digests), MOST_VARIABLES):
+            some = digests[start : start + MOST_VARIABLES]
+            these = f"digest IN ({', '.join('?' * len(some))})"
+            self._set_aside(SURPLUS, f"kind = 'score' AND generation = ? AND {these}", generation, *some)
+            self._write(f"DELETE FROM failure WHERE {these}", *some)  # noqa: S608
+            self._write(f"UPDATE verification SET stands = 0 WHERE {these}", *some)  # noqa: S608
+            self._effort = self._counted = None
 
     def recalled_rollouts(self) -> list[tuple[int, int]]:
         """Generation and episode of the rollouts that count no more, and that were not collected again."""
@@ -170,6 +179,30 @@ class RecallRecords(VerificationRecords):
             time(), *values,
         )  # fmt: skip
         self._write(f"DELETE FROM result WHERE {where}", *values)  # noqa: S608
+
+    def _count_again(self, where: str, *values: object) -> None:
+        """Move results back from the table of those that do not count, and let their checks stand again.
+
+        A check stands by the word of a host that is still believed.
+        """
+        taken = self._read(f"SELECT DISTINCT digest FROM recalled WHERE {where}", *values)  # noqa: S608
+        self._write(f"INSERT OR IGNORE INTO result ({COLUMNS}) SELECT {COLUMNS} FROM recalled WHERE {where}",  # noqa: S608
+                    *values)  # fmt: skip
+        self._write(f"DELETE FROM recalled WHERE {where}", *values)  # noqa: S608
+        stands = "UPDATE verification SET stands = 1 WHERE digest = ? AND outcome = 'equal' AND checker != ''"
+        self._write_all(stands, taken)
+        self._effort = self._counted = None
+
+    def _void_checks(self, hosts: Collection[str]) -> None:
+        """Take these hosts from those that confirm results; a check that none is left of stands no more.
+
+        `checker` lists hosts with commas between them.
+        """
+        lists = "instr(',' || checker || ',', ',' || ? || ',')"
+        without = "trim(replace(',' || checker || ',', ',' || ? || ',', ','), ',')"
+        for host in hosts:
+            self._write(f"UPDATE verification SET checker = {without} WHERE {lists}", host, host)  # noqa: S608
+        self._write("UPDATE verification SET stands = 0 WHERE checker = '' AND outcome != 'unchecked'")
 
     def _settle_recall(self) -> None:
         """Let checks of results that do not count any more stand no longer, and no end or confirmation follow."""

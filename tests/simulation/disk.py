@@ -227,9 +227,11 @@ class MemoryJournal:
         for key, (_, row) in list(self._tables["recalled"].items()):
             if host_of(row[2]) in hosts:
                 self._put("recalled", key, ("barred", row))
-        for digest, (*_, checker, _outcome) in list(self._tables["verification"].items()):
-            if checker in hosts or digest not in self._tables["result"]:
-                self._put("verification", digest, None)
+        for digest, (job, worker, checker, outcome) in list(self._tables["verification"].items()):
+            left = ",".join(each for each in checker.split(",") if each not in hosts)
+            is_void = outcome != "unchecked" and not left
+            kept = None if is_void or digest not in self._tables["result"] else (job, worker, left, outcome)
+            self._put("verification", digest, kept)
         self._settle_recall()
         return len(mine)
 
@@ -241,7 +243,19 @@ class MemoryJournal:
         for fact in ("ending", "stop_kind", "ended", "ended_at", "confirmed"):
             self.drop_fact(fact)
 
+    def set_surplus_aside(self, generation: int, digests: Sequence[bytes]) -> None:
+        for digest in digests:
+            self._put("failure", digest, None)
+            if digest in self._tables["result"]:
+                self._set_aside("surplus", digest, self._tables["result"][digest])
+
     def rewind(self, number: int, state: Any, seeds: Sequence[int]) -> None:
+        for (digest, worker), (because, row) in list(self._tables["recalled"].items()):
+            if because == "surplus" and row[0].generation == number:
+                self._put("recalled", (digest, worker), None)
+                self._put("result", digest, row)
+            elif because == "surplus" and row[0].generation > number:
+                self._put("recalled", (digest, worker), ("rewound", row))
         for digest, row in list(self._tables["result"].items()):
             job = row[0]
             if job.generation > number or (job.generation == number and job.kind != "score"):

@@ -191,6 +191,25 @@ def _pause(world: World, fault: Fault) -> bool:
     return True
 
 
+def _bar(world: World, fault: Fault) -> bool:
+    """Somebody bars an honest host, so what it brought is recalled, and lets it in again."""
+    life, host = world.coordinator, _host(world, fault)
+    if life is None or world.coordinator_stopped or life.run.bar(f"w{host}"):
+        return False
+    world.wake_coordinator(0.0)
+    world.later(fault.seconds, world.unbar, host)
+    return True
+
+
+def _resume(world: World, _fault: Fault) -> bool:
+    """Somebody says `dreamfleet resume` of a run that is not paused: what failed is tried again."""
+    life = world.coordinator
+    if life is None or life.draining or life.run.paused is not None:
+        return False
+    life.run.resume()
+    return True
+
+
 def _stranger(world: World, fault: Fault) -> bool:
     """A result that nobody asked for: of no job, or another fitness of one that counts already."""
     known = list(world.disk.tables["result"])
@@ -234,6 +253,8 @@ _STRIKES: dict[str, Callable[[World, Fault], bool]] = {
     "stop_coordinator": _stop_coordinator,
     "leave": _leave,
     "pause": _pause,
+    "bar": _bar,
+    "resume": _resume,
     "stranger": _stranger,
     "garble": _garble,
 }

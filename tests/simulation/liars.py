@@ -136,12 +136,13 @@ def play_with(
 
 
 def shape_of(workers: int, share: float, seed: int) -> Shape:
-    """A run of eight generations, of 20 candidates in two episodes each, with two evaluations."""
+    """A run of eight generations, of 20 candidates in two episodes each, with two evaluations; half of them race."""
     return Shape(
         workers=workers,
         generations=8,
         population=20,
         episodes=2,
+        racing=seed % 2 == 1,
         evaluate_every=4,
         turn=0.5,
         run_seed=seed,

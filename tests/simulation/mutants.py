@@ -257,7 +257,7 @@ def packing_leaves_out_a_part_of_a_long_vector(original):
 
 @mutant(Generation, "record")
 def generation_fills_places_in_the_order_in_which_results_come(original):
-    def record(self, digest, fitness, steps):
+    def record(self, digest, fitness, steps, measures=()):
         missing = self.missing
         return original(self, missing[0].job.digest if missing else digest, fitness, steps)
 
@@ -266,7 +266,7 @@ def generation_fills_places_in_the_order_in_which_results_come(original):
 
 @mutant(Generation, "record")
 def generation_adds_to_a_place_what_has_been_counted(original):
-    def record(self, digest, fitness, steps):
+    def record(self, digest, fitness, steps, measures=()):
         (row, column), *_ = self._places[digest]
         return original(self, digest, fitness + (self._scores[row, column - 1] == fitness) + (column > 1) * 1e-9, steps)
 
@@ -282,6 +282,16 @@ def generation_lets_the_worse_half_pass_the_barrier(original):
         return passed
 
     return barrier
+
+
+@mutant(Generation, "fitness", racing=True, episodes=3, **FAILING)
+def generation_counts_what_its_race_does_not_want(_original):
+    def fitness(self):
+        scored = np.isfinite(self._scores)
+        means = np.where(scored, self._scores, 0.0).sum(axis=1) / np.maximum(scored.sum(axis=1), 1)
+        return np.where(self._failed, np.nan, means)
+
+    return fitness
 
 
 @mutant(Generations, "_recall")

@@ -82,6 +82,8 @@ KINDS: dict[str, tuple[int, float, float]] = {
     "pause": (1, 2.0, 0),
     "stranger": (1, 0.0, 3.0),
     "garble": (1, 0.0, 3.0),
+    "bar": (0, 4.0, 0),  # drawn apart, as the next one
+    "resume": (0, 0.0, 0),
 }
 
 
@@ -122,6 +124,7 @@ def draw(seed: int, number: int) -> Schedule:
     count = source.choice((0, 1, 5, 20, 20, 30, 40, 60))  # few faults too: each alone must be harmless
     kinds, weights = list(KINDS), [often for often, _, _ in KINDS.values()]
     faults = [_draw_fault(source, kind, shape.workers) for kind in source.choices(kinds, weights, k=count)]
+    faults += _recalls(shape, random.Random(f"recalls of {seed}/{number}"))
     return Schedule(shape, tuple(sorted(faults, key=lambda fault: fault.at)), f"seed {seed}, schedule {number}")
 
 
@@ -140,6 +143,14 @@ def _failing(shape: Shape, source: random.Random) -> Shape:
     """In one of six, episodes fail for good; what else is drawn does not hang on it."""
     policy, failing = source.choice(("worst", "redraw")), source.choice((0.05, 0.15))
     return shape if source.random() > 1 / 6 else replace(shape, on_failure=policy, failing=failing)
+
+
+def _recalls(shape: Shape, source: random.Random) -> list[Fault]:
+    """In half of the races and a few others, hosts are barred, and failures are tried again."""
+    if source.random() > (0.5 if shape.racing else 0.05):
+        return []
+    kinds = source.choices(("bar", "resume"), k=source.choice((1, 2, 4)))
+    return [_draw_fault(source, kind, shape.workers) for kind in kinds]
 
 
 def _draw_fault(source: random.Random, kind: str, workers: int) -> Fault:

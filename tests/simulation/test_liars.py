@@ -6,15 +6,18 @@ from unittest.mock import patch
 import pytest
 
 from dreamfleet.common.errors import JournalError
+from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.run import recall
 from dreamfleet.coordinator.run.generations import Generations
 from tests.simulation.disk import MemoryJournal
 from tests.simulation.liars import by_chance, campaign, for_a_candidate, one_flip, play_with, shape_of
+from tests.simulation.mutants import MUTANTS
 from tests.simulation.schedule import Fault, Schedule
 from tests.simulation.violation import Violation
 from tests.simulation.world import play
 
-SHAPE = replace(shape_of(3, 1.0, 1), generations=3, population=4, evaluate_every=1)
+SHAPE = replace(shape_of(3, 1.0, 1), racing=False, generations=3, population=4, evaluate_every=1)
+RACE = {"racing": True, "episodes": 3}
 
 
 def fleet(workers, share=1.0, faults=(), **more):
@@ -26,6 +29,15 @@ def fleet(workers, share=1.0, faults=(), **more):
 def test_who_differs_is_barred_and_what_counts_is_true(lie, workers):
     make, *given = lie
     found = play_with(fleet(workers), {1: make(*given)}, frozenset({0}))
+    assert found.barred == {"w1"}
+    assert found.is_honest
+
+
+@pytest.mark.parametrize("lie", [(by_chance, 0.5, 1), (for_a_candidate, 0.25, 4, 1)])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_race_that_lies_decided_is_decided_again(lie, seed):
+    make, *given = lie
+    found = play_with(fleet(3, 0.5, run_seed=seed, **RACE), {1: make(*given)}, frozenset({0}))
     assert found.barred == {"w1"}
     assert found.is_honest
 
@@ -62,10 +74,11 @@ def test_bad_memory_on_the_coordinators_own_host_is_found_by_two_others():
     assert found.is_honest
 
 
+@pytest.mark.parametrize("race", [{}, RACE])
 @pytest.mark.parametrize("at", [0.5, 2.0, 3.5])
-def test_a_host_that_the_operator_bars_is_recalled_though_nothing_is_checked(at):
+def test_a_host_that_the_operator_bars_is_recalled_though_nothing_is_checked(at, race):
     kills = tuple(Fault(moment, "kill_coordinator", 0, 0.3, 7) for moment in (at, at + 0.6))
-    found = play_with(fleet(3, 0.0, faults=kills, generations=6), {1: by_chance(0.5, 1)}, bars={1: at})
+    found = play_with(fleet(3, 0.0, faults=kills, generations=6, **race), {1: by_chance(0.5, 1)}, bars={1: at})
     assert found.barred == {"w1"}
     assert found.is_honest
 
@@ -126,6 +139,19 @@ def test_a_recall_that_forgets_a_part_is_noticed(target, name, forgetful):
             except (Violation, JournalError):
                 is_noticed = True
     assert is_noticed
+
+
+@pytest.mark.parametrize(
+    ("name", "forgetful"),
+    [
+        ("surplus", []),
+        ("fitness", MUTANTS["generation_counts_what_its_race_does_not_want"].replacement),
+    ],
+)
+def test_a_recall_that_forgets_what_a_race_wants_is_noticed(name, forgetful):
+    with patch.object(Generation, name, forgetful):
+        plays = [play_with(fleet(3, 0.5, run_seed=seed, **RACE), {1: by_chance(0.5, 1)}) for seed in range(4)]
+    assert not all(found.is_honest for found in plays)
 
 
 def test_a_lone_host_of_its_class_does_not_hold_up_its_run():

@@ -207,20 +207,19 @@ def _scored(
 
     Bad seeds are replaced, then failed candidates drawn anew, three times each at most.
     """
-    reseeds, rounds, drove = 0, list[tuple[bytes, ...]](), set[int]()  # candidates that drove all episodes before
+    reseeds, rounds = 0, list[tuple[bytes, ...]]()
     truth.redrawn.append(rounds)
     while True:
         seeds = [training_seed(shape.run_seed, number, reseeds * episodes + each) for each in range(episodes)]
         scores = [[_score(shape.failing, vector, seed, named) for seed in seeds] for vector in vectors]
-        fitness, driven, whole = _fitness_and_driven(scores, racing, drove)
+        fitness, driven, whole = _fitness_and_driven(scores, racing)
         failed = [each for each, value in enumerate(fitness) if np.isnan(value)]
         if whole <= set(failed) and reseeds < MAX_RETRIES:
-            reseeds, drove = reseeds + 1, set()
+            reseeds += 1
         elif failed and shape.on_failure == "redraw" and len(rounds) < MAX_RETRIES:
             for each, row in zip(failed, strategy.redraw(failed), strict=True):
                 vectors[each] = row.astype("<f4").tobytes()
             rounds.append(tuple(vectors))
-            drove = (drove | whole) - set(failed)
         elif len(failed) == len(fitness):
             raise HopelessError
         else:
@@ -233,7 +232,7 @@ def _score(failing: float, vector: bytes, seed: int, named: Named) -> float:
 
 
 def _fitness_and_driven(
-    scores: list[list[float]], racing: bool, drove: set[int]
+    scores: list[list[float]], racing: bool
 ) -> tuple[list[float], set[tuple[int, int]], set[int]]:  # fmt: skip
     """The mean of each candidate's own episodes, which those are, and which candidates were to drive all episodes.
 
@@ -244,7 +243,7 @@ def _fitness_and_driven(
     early = [-np.inf if np.isnan(row[:first]).any() else float(np.mean(row[:first])) for row in scores]
     order = sorted(range(len(scores)), key=lambda candidate: (-early[candidate], candidate))
     further = set(order[: (len(scores) + 1) // 2]) if first < episodes else set(order)
-    own = [row if candidate in further | drove else row[:first] for candidate, row in enumerate(scores)]
+    own = [row if candidate in further else row[:first] for candidate, row in enumerate(scores)]
     fitness = [float(np.mean(row)) for row in own]
     driven = {(candidate, episode) for candidate, row in enumerate(own) for episode in range(len(row))
               if not np.isnan(fitness[candidate])}  # fmt: skip

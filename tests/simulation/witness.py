@@ -57,9 +57,12 @@ class Witness:
 
     def promised(self, disk: Disk, batch: JobBatch) -> None:
         """A batch leaves: what it says is counted must be on the disk, or a crash would take it back."""
+        if not batch.verdicts:
+            return
+        surplus = {digest for (digest, _), (because, _) in disk.tables["recalled"].items() if because == "surplus"}
         for verdict in batch.verdicts:
             counts = verdict.verdict in ("accepted", "duplicate")
-            if counts and verdict.digest not in disk.tables["result"]:
+            if counts and verdict.digest not in disk.tables["result"] and verdict.digest not in surplus:
                 raise Violation("durability", f"a result was called {verdict.verdict} before it was on the disk")
 
     def confirmed(self, disk: Disk, calm: Disk) -> None:

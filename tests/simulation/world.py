@@ -225,6 +225,15 @@ class World:
         if name not in self.disk.tables["barred"]:
             self.later(OPERATOR, self.bar, host)
 
+    def unbar(self, host: int) -> None:
+        """Somebody says `dreamfleet bar HOST --no-longer`, again until it is done."""
+        name = f"w{host}"
+        if self.coordinator is not None and not self.coordinator_stopped:
+            self.coordinator.run.bar(name, is_barred=False)
+            self.wake_coordinator(LINGER)
+        if name in self.disk.tables["barred"]:
+            self.later(OPERATOR, self.unbar, host)
+
     def _pause_finally(self) -> None:
         """A run that shall fall silent is paused once its last generation is closed."""
         life = self.coordinator
@@ -399,7 +408,8 @@ class World:
     def _check_waste(self) -> None:
         """What is scored beyond what counts was lost by a fault, one worker's hands at most each."""
         checked = sum(bool(checker) for _, _, checker, _ in self.disk.tables["verification"].values())
-        background_jobs = self.scored.steps / 100 - self.counted_jobs - checked - self.scored.failures
+        recalled = len(self.disk.tables["recalled"])
+        background_jobs = self.scored.steps / 100 - self.counted_jobs - recalled - checked - self.scored.failures
         hands = 3 * self.shape.slots * min(self.shape.width, self.shape.most_jobs)
         if background_jobs > hands * (2 + len(self.schedule.faults)):
             raise Violation(

@@ -1,7 +1,10 @@
 from dataclasses import replace
+from math import nan
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from dreamfleet.coordinator.jobs import generation as generation_module
 from dreamfleet.coordinator.jobs.generation import Generation
@@ -99,6 +102,92 @@ def test_the_second_half_is_driven_by_the_better_half_after_the_barrier(order):
 def test_of_equals_the_first_go_on():
     generation, _, _ = race(range(6), [2.0, 2.0, 2.0])
     assert [work.job.candidate for work in generation.missing] == [0, 1]
+
+
+def known(generation, scores):
+    """Results of a whole table of scores by digest, a row for each candidate; NaN: it failed for good."""
+    return {
+        work.digest: (scores[work.template.candidate][work.episode], 7, (float(work.episode),))
+        for work in generation.work
+    }
+
+
+def test_what_was_scored_of_a_candidate_below_the_barrier_does_not_count():
+    generation = Generation(0, replace(SPEC, measures=("x",)), VECTORS, (1, 2), racing=True)
+    generation.recall(known(generation, [[1.0, 9.0], [2.0, 2.0], [3.0, 3.0]]))
+    assert generation.complete
+    assert generation.fitness().tolist() == [1.0, 2.0, 3.0]
+    assert generation.measures().tolist() == [[0.0], [0.5], [0.5]]
+    assert (generation.done, generation.total, generation.steps) == (5, 5, 35)
+    scores = generation.candidate_scores()
+    assert (scores.done, scores.wanted, scores.fitness) == ([1, 2, 2], [1, 2, 2], [1.0, 2.0, 3.0])
+    assert generation.surplus == [generation.work[1].digest]
+    assert [work.digest for work in generation.counted] == [
+        work.digest for work in generation.work if work.digest not in generation.surplus
+    ]
+
+
+def test_a_failure_in_the_second_half_counts_only_above_the_barrier():
+    generation = Generation(0, SPEC, VECTORS, (1, 2), racing=True)
+    generation.recall(known(generation, [[1.0, nan], [2.0, nan], [3.0, 3.0]]))
+    assert generation.failed == [1]
+    assert generation.fitness()[[0, 2]].tolist() == [1.0, 3.0]
+
+
+def test_a_second_half_that_is_known_before_the_barrier_waits_for_it():
+    generation = Generation(0, SPEC, VECTORS, (1, 2), racing=True)
+    results = known(generation, [[1.0, nan], [2.0, nan], [3.0, 8.0]])
+    first = [work.digest for work in generation.missing]
+    generation.recall({digest: each for digest, each in results.items() if digest not in first})
+    assert (generation.done, generation.total, generation.steps, generation.failed) == (0, 3, 0, [])
+    assert (generation.surplus, generation.counted) == ([], [])
+    assert generation.has_failures
+    for digest in first:
+        assert generation.record(digest, *results[digest]) == (digest == first[-1])
+    assert generation.complete
+    assert generation.failed == [1]
+
+
+def test_equal_candidates_have_equal_scores_on_both_sides_of_the_barrier():
+    generation = Generation(0, SPEC, [VECTORS[0], VECTORS[0], VECTORS[1]], (1, 2), racing=True)
+    results = known(generation, [[3.0, 5.0], [3.0, 5.0], [4.0, 4.0]])
+    while generation.missing:
+        for work in generation.missing:
+            generation.record(work.digest, *results[work.digest])
+    assert generation.fitness().tolist() == [4.0, 4.0, 4.0]
+    assert (generation.done, generation.total, generation.steps) == (6, 6, 28)
+
+
+SCORES = st.one_of(st.sampled_from([1.0, 2.0, 3.0]), st.just(nan))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data())
+def test_a_generation_that_recalls_any_results_in_any_order_is_one_that_was_scored_afresh(data):
+    population, episodes = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 4))
+    vectors = data.draw(st.lists(st.sampled_from(VECTORS), min_size=population, max_size=population))
+    seeds = data.draw(st.lists(st.integers(1, 5), min_size=episodes, max_size=episodes))
+    spec, is_raced = replace(SPEC, measures=("x",)), data.draw(st.booleans())
+    fresh, recalled = (Generation(0, spec, vectors, seeds, racing=is_raced) for _ in range(2))
+    digests = list(dict.fromkeys(work.digest for work in fresh.work))
+    results = {digest: (data.draw(SCORES), number, (float(number),)) for number, digest in enumerate(digests)}
+    while fresh.missing:
+        fresh.record(fresh.missing[0].digest, *results[fresh.missing[0].digest])
+    some = data.draw(st.lists(st.sampled_from(digests), unique=True))
+    for digest in some[::2]:
+        recalled.record(digest, *results[digest])
+    recalled.recall({digest: results[digest] for digest in some})
+    while recalled.missing:
+        digest = data.draw(st.sampled_from(recalled.missing)).digest
+        recalled.record(digest, *results[digest])
+    for one in (fresh, recalled):
+        assert one.complete or one.all_failed
+    for facts in ("steps", "done", "total", "failed", "unwanted", "has_bad_seeds", "all_failed"):
+        assert getattr(recalled, facts) == getattr(fresh, facts)
+    np.testing.assert_array_equal(recalled.fitness(), fresh.fitness())
+    np.testing.assert_array_equal(recalled.measures(), fresh.measures())
+    assert recalled.candidate_scores() == fresh.candidate_scores()
+    assert {work.digest for work in recalled.counted} == {work.digest for work in fresh.counted}
 
 
 @pytest.mark.parametrize(

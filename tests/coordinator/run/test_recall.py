@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.common.runs.scoring_params import ScheduleState
@@ -16,7 +17,7 @@ from dreamfleet.coordinator.run.generations import Generations
 from dreamfleet.coordinator.run.recall import bar_stored, recall
 from dreamfleet.coordinator.storage.journal import Journal
 from tests.coordinator.run.test_failures import GENERATIONS, SETTINGS, Failing
-from tests.coordinator.run.test_run import B, Bench, result_of
+from tests.coordinator.run.test_run import A, B, Bench, result_of
 
 OPTIMISERS = ["cma", "full", "cmaes-lra", "openes", "pepg", "snes", "xnes"]
 
@@ -37,6 +38,82 @@ def outcome(bench):
     with RunFolder(bench.path) as run:
         vectors = [run.candidate(each, 0).tolist() for each in range(GENERATIONS + 1)]
         return [replace(each, seconds=0.0) for each in run.history()], run.evaluations(), vectors
+
+
+class Lying(Failing):
+    """Host a praises the first candidates of each generation, in the first half of their episodes."""
+
+    def answer_one(self, name, job):
+        lie = 100.0 if name == A and job.kind == "score" and job.candidate < 3 and job.episode < 2 else 0.0
+        fitness = int.from_bytes(job.digest[:3]) / 1e6 + lie
+        self.deliver(name, Result(job.digest, fitness, 10, 0.1, None, None))
+
+
+RACE = replace(SETTINGS, episodes=4, racing=True)
+
+
+def sums(bench):
+    """Of each generation and of its candidates: steps, and those of the results."""
+    with RunFolder(bench.path) as run:
+        candidates = run.candidates()
+        return [
+            (each.steps, sum(row.steps for row in candidates if row.generation == each.number),
+             10 * sum(row.episodes for row in candidates if row.generation == each.number))
+            for each in run.history()
+        ]  # fmt: skip
+
+
+def bar(bench, host, others):
+    """Bar a host from a run that is served, and go on with others."""
+    assert not bench.run.bar(host)
+    bench.run.commit()
+    bench.hosts = others
+    bench.restart()
+    for name in others:
+        bench.run.admission.admit(bench.request(name), bench.now)
+    bench.serve()
+    assert bench.run.ended
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_race_from_which_lies_are_recalled_is_one_without_them(tmp_path, random_bundle, seed):
+    settings = replace(RACE, seed=seed)
+    honest = ended(tmp_path / "honest", random_bundle.path, settings)
+    bench = Lying(tmp_path / "run", random_bundle.path, settings, fails=None)
+    bench.serve()
+    bar(bench, "a", [B])
+    assert bench.story() == honest.story()
+    assert sums(bench) == sums(honest)
+    assert all(made == counted == scored for made, counted, scored in sums(bench))
+    bar(bench, "b", ["c/1"])  # what a race did not want may be wanted again
+    assert bench.story() == honest.story()
+    assert sums(bench) == sums(honest)
+
+
+class Broken(Failing):
+    """The first two candidates' first episodes fail, and the last ones take for ever, until it is mended."""
+
+    is_broken = True
+
+    def answer_one(self, name, job):
+        if not (self.is_broken and job.kind == "score" and job.episode == 3):
+            super().answer_one(name, job)
+
+
+def test_a_race_that_is_resumed_after_the_fault_of_a_host_is_one_without_it(tmp_path, random_bundle):
+    honest = ended(tmp_path / "honest", random_bundle.path, RACE)
+    bench = Broken(
+        tmp_path / "run", random_bundle.path, RACE,
+        fails=lambda job: bench.is_broken and job.candidate < 2 and job.episode == 0,
+    )  # fmt: skip
+    bench.serve(stop=lambda run: any(work.episode == 2 for work in run.generation.counted))
+    assert bench.run.generation.failed == [0, 1]
+    bench.is_broken = False
+    bench.run.resume()
+    bench.serve()
+    assert bench.run.ended
+    assert bench.story() == honest.story()
+    assert sums(bench) == sums(honest)
 
 
 def new_generations(bench):

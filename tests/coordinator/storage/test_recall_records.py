@@ -1,0 +1,100 @@
+"""Results and checks that a journal takes back, and which of them count again."""
+
+import pytest
+
+from dreamfleet.common.protocol.messages import Result
+from dreamfleet.coordinator.jobs.generation import Generation
+from dreamfleet.coordinator.storage.journal import Journal
+from tests.coordinator.run.test_run import SETTINGS
+from tests.support.samples import SPEC
+
+VECTORS = [bytes(20), bytes([1]) * 20]
+SEEDS = (1, 2)
+
+
+@pytest.fixture
+def journal(tmp_path, random_bundle):
+    """Two generations whose results are all of host a, and checked by host b."""
+    made = Journal.create(tmp_path / "run", SETTINGS, random_bundle.path)
+    made.begin_incarnation()
+    for number in (0, 1):
+        made.open_generation(number, b"state", 0.1, SEEDS, VECTORS)
+        for work in jobs_of(number):
+            made.add_result(work.job, Result(work.digest, 1.0, 10, 0.1, None, None), "a/1", "f", 1, "class")
+            made.add_verification(work.job, "a/1", "b", "equal")
+    made.commit()
+    yield made
+    made.close()
+
+
+def jobs_of(number):
+    return Generation(number, SPEC, [bytes([number]) + vector[1:] for vector in VECTORS], SEEDS).work
+
+
+def unverified(journal, number):
+    return set(journal.unverified([work.job for work in jobs_of(number)]))
+
+
+def digests_of(number):
+    return {work.digest for work in jobs_of(number)}
+
+
+def test_a_check_does_not_stand_again_by_the_word_of_a_host_that_was_barred(journal):
+    journal.rewind(0, b"state", SEEDS)
+    journal.recall_results({"b"})
+    journal.open_generation(1, b"state", 0.1, SEEDS, VECTORS)
+    journal.take_back([*digests_of(1)])
+    assert set(journal.results_of("score", 1)) == digests_of(1), "what a brought counts again"
+    assert unverified(journal, 0) == digests_of(0)
+    assert unverified(journal, 1) == digests_of(1)
+    journal.unbar("b")
+    journal.rewind(0, b"state", SEEDS)
+    journal.take_back([*digests_of(1)])
+    assert unverified(journal, 1) == digests_of(1), "nor once it may come again"
+
+
+def test_a_check_stands_again_by_the_word_of_a_host_that_was_not_barred(journal):
+    journal.rewind(0, b"state", SEEDS)
+    journal.open_generation(1, b"state", 0.1, SEEDS, VECTORS)
+    journal.take_back([*digests_of(1)])
+    assert not unverified(journal, 0)
+    assert not unverified(journal, 1)
+
+
+@pytest.mark.parametrize(("barred", "stands"), [("b", True), ("c", True), ("bc", True), ("b c", False)])
+def test_a_check_of_several_hosts_stands_while_one_of_them_is_believed(journal, barred, stands):
+    (work, *_) = jobs_of(0)
+    journal._write("UPDATE verification SET checker = 'b,c', outcome = 'differs' WHERE digest = ?", work.digest)
+    for host in barred.split():
+        journal.recall_results({host})
+    assert (work.digest not in unverified(journal, 0)) == stands
+
+
+def test_what_a_closed_race_did_not_want_is_aside_and_counts_again_if_its_generation_opens_again(journal):
+    steps, (surplus, *others) = journal.effort.steps, [work.digest for work in jobs_of(1)]
+    journal.set_surplus_aside(1, [surplus])
+    assert set(journal.results_of("score", 1)) == set(others)
+    assert journal.effort.steps == steps - 10
+    journal.take_back([surplus])
+    assert surplus not in journal.results_of("score", 1), "its generation is closed"
+    journal.rewind(1, b"state", SEEDS)
+    assert set(journal.results_of("score", 1)) == {surplus, *others}
+    assert journal.effort.steps == steps
+    assert not unverified(journal, 1)
+
+
+def test_what_a_race_of_a_dropped_generation_did_not_want_counts_again_when_its_job_is_wanted(journal):
+    surplus, *others = [work.digest for work in jobs_of(1)]
+    journal.set_surplus_aside(1, [surplus])
+    journal.rewind(0, b"state", SEEDS)
+    journal.take_back([surplus, *others])
+    assert set(journal.results_of("score", 1)) == {surplus, *others}
+
+
+def test_what_a_race_did_not_want_of_a_barred_host_never_counts_again(journal):
+    surplus, *_ = [work.digest for work in jobs_of(1)]
+    journal.set_surplus_aside(1, [surplus])
+    journal.recall_results({"a"})
+    journal.rewind(1, b"state", SEEDS)
+    assert not journal.results_of("score", 1)
+    assert journal.verification_counts()["recalled"] == 8
