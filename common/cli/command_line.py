@@ -23,7 +23,7 @@ from dreamfleet.common.cli.parser import Parser
 from dreamfleet.common.cli.removed import OTHER_NAMES, describe_removed
 from dreamfleet.common.errors import DreamfleetError, MissingExtraError, UsageError
 from dreamfleet.common.host.logs import configure_logging, report_failure
-from dreamfleet.common.host.packages import extra_of
+from dreamfleet.common.host.packages import GYMNASIUM, extra_of, wrong_version
 from dreamfleet.common.host.standard_streams import discard_stdout, prepare_streams
 from dreamfleet.common.host.stop_signals import interrupts
 from dreamfleet.common.printable import one_line
@@ -94,7 +94,10 @@ def _report(error: BaseException) -> int:
         discard_stdout()
         return 0
     if not isinstance(error, OSError):
-        raise error
+        if not (remedy := wrong_version(GYMNASIUM)):
+            raise error
+        report_failure(f"{type(error).__name__}: {one_line(str(error))}; {remedy}")
+        return 1
     logging.getLogger("dreamfleet").debug("the error in full", exc_info=error)
     discard_stdout()
     report_failure(_describe_system_error(error))

@@ -15,7 +15,7 @@ from dreamfleet.common.artifacts.bundle_store import CACHE_REMEDY, default_cache
 from dreamfleet.common.cli.task_check import try_task
 from dreamfleet.common.errors import AccessError, CacheError, DreamfleetError
 from dreamfleet.common.files.file_system import file_system_type, is_network, lock_problem
-from dreamfleet.common.host.packages import PACKAGES, install_command, package_version
+from dreamfleet.common.host.packages import PACKAGES, install_command, package_version, wrong_version
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, describe_time_left, read_join_file
 
 GROUP = "dreamfleet.checks"
@@ -85,9 +85,10 @@ def missing_for_role(role: str, findings: list[Finding]) -> list[Finding]:
 def _check_packages() -> Iterator[Finding]:
     for name, (module, extra) in PACKAGES.items():
         found = package_version(name) or (package_version("box2d-py") if name == "box2d" else None)
-        ok = found is not None and find_spec(module) is not None
+        wrong = wrong_version(name)
+        ok = found is not None and find_spec(module) is not None and not wrong
         needed = not extra or extra in ROLES  # other extras are of single tasks
-        yield Finding(name, ok, needed, found or "-", extra or "everything", install_command(extra))
+        yield Finding(name, ok, needed, found or "-", extra or "everything", wrong or install_command(extra))
 
 
 def _check_box2d() -> Finding:

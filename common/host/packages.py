@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib.abc import MetaPathFinder
-from importlib.metadata import PackageNotFoundError, distributions, packages_distributions, version
+from importlib.metadata import PackageNotFoundError, distributions, packages_distributions, requires, version
 from importlib.util import find_spec
 from threading import get_ident
 
+GYMNASIUM = "gymnasium"
 # distribution -> (module, extra); the empty extra is required by every role
 PACKAGES = {
     "eclipse-zenoh": ("zenoh", ""),
     "msgpack": ("msgpack", ""),
     "numpy": ("numpy", ""),
     "cma": ("cma", ""),
-    "gymnasium": ("gymnasium", "worker"),
+    GYMNASIUM: ("gymnasium", "worker"),
     "pygame-ce": ("pygame", "worker"),
     "box2d": ("Box2D", "worker"),
     "onnxruntime": ("onnxruntime", "worker"),
@@ -70,6 +72,35 @@ def package_version(name: str) -> str | None:
         return version(name)
     except PackageNotFoundError:
         return None
+
+
+def wanted_versions(name: str) -> str:
+    """The versions of a distribution that this one requires, such as `gymnasium<1.5,>=1.4`; empty for any."""
+    own = (each.partition(";")[0].strip() for each in requires("dreamfleet") or ())
+    return next((each for each in own if re.fullmatch(rf"{re.escape(name)}[<>=].*", each)), "")
+
+
+def wrong_version(name: str) -> str:
+    """The remedy if a distribution is here in a version that this one does not work with; else empty.
+
+    Packages of environments bring such versions: pip replaces what is installed by what they ask for.
+    """
+    found, wanted = package_version(name), wanted_versions(name)
+    bounds = re.findall(r"(<|>=)([\d.]+)", wanted)
+    if found is None or all((_parts(found) < _parts(bound)) == (sign == "<") for sign, bound in bounds):
+        return ""
+    return (
+        f"{name} {found} is installed, and this needs {wanted}: another package brought it. Run `pip install "
+        f"'{wanted}'`, and install that package by `pip install --no-deps` (docs/reference/tasks.md)"
+    )
+
+
+def _parts(number: str) -> tuple[int, ...]:
+    """A version's numbers, without trailing zeros, so that 2.0 is 2."""
+    parts = [int(each) for each in re.findall(r"\d+", re.match(r"[\d.]*", number)[0])]  # type: ignore[index]
+    while parts and not parts[-1]:
+        parts.pop()
+    return tuple(parts)
 
 
 @cache

@@ -18,7 +18,7 @@ from typing import Any
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
-from dreamfleet.common.host.packages import install_command_for
+from dreamfleet.common.host.packages import GYMNASIUM, install_command_for, wrong_version
 from dreamfleet.common.host.trusted_modules import check_trusted, import_trusted
 from dreamfleet.common.host.user_code import user_code
 from dreamfleet.common.serialization.display import DisplayedFields
@@ -117,8 +117,11 @@ def load_task(name: str) -> Any:
             "install the package that has it, or name its folder in PYTHONPATH: the current folder is not searched"
         )
         raise UsageError(f"task {name!r} cannot be loaded: no module {error.name!r} here; {remedy}") from error
-    except (ImportError, AttributeError, TypeError, ValueError) as error:
-        raise UsageError(f"task {name!r} cannot be loaded: {error}") from error
+    except Exception as error:
+        remedy = wrong_version(GYMNASIUM)
+        if not remedy and not isinstance(error, (ImportError, AttributeError, TypeError, ValueError)):
+            raise
+        raise UsageError(f"task {name!r} cannot be loaded: {error}{remedy and f'; {remedy}'}") from error
     if not colon and _ENVIRONMENT.search(name):
         raise UsageError(f"unknown task {name!r}: gymnasium's environments are written {GYM}:{name}")
     known = ", ".join(map(written_name, points)) or "none"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.output import print_rows
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.host.packages import PACKAGES, install_command
+from dreamfleet.common.host.packages import GYMNASIUM, PACKAGES, install_command, wrong_version
 from dreamfleet.common.printable import plural
 
 if TYPE_CHECKING:
@@ -100,7 +100,8 @@ def _row(name: str, point: EntryPoint) -> dict[str, object]:
         lacks = f"lacks the package {error.name!r}: pip install 'dreamfleet[worker]' if it is one of ours"
         return {"task": shown, "package": distribution, "ready": False, "here": lacks}
     except Exception as error:  # whatever a package raises as it is imported
-        return {"task": shown, "package": distribution, "ready": False, "here": f"cannot be loaded: {error}"}
+        here = f"cannot be loaded: {wrong_version(GYMNASIUM) or error}"
+        return {"task": shown, "package": distribution, "ready": False, "here": here}
     for package in getattr(getattr(made, "world", None), "packages", ()):
         module, extra = PACKAGES.get(package, ("sys", ""))
         if find_spec(module) is None:

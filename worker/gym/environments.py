@@ -19,7 +19,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.foreign_code import contained
-from dreamfleet.common.host.packages import find_distributions
+from dreamfleet.common.host.packages import GYMNASIUM, find_distributions
 from dreamfleet.common.host.swig_types import allow_swig_types
 from dreamfleet.common.host.trusted_modules import check_trusted
 from dreamfleet.common.host.unseen_drawing import draw_offscreen
@@ -84,13 +84,10 @@ def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
             return gymnasium.make(_unregistered_class(name) or name, disable_env_checker=True, **arguments)
     except gymnasium.error.DependencyNotInstalled as error:
         raise UsageError(f"{name} lacks a package on this host: {error}") from error
-    except (gymnasium.error.Error, ModuleNotFoundError) as error:
+    except (gymnasium.error.Error, ImportError) as error:
+        if isinstance(error, ImportError) and (fault := _describe_import(name, error)):
+            raise UsageError(fault) from error
         module, colon, _ = name.rpartition(":")
-        if isinstance(error, ModuleNotFoundError) and not f"{module}.".startswith(f"{error.name}."):
-            raise UsageError(
-                f"{name} needs the module {error.name!r}, which is not installed on this host: install the package "
-                "that has it"
-            ) from error
         remedy = "" if colon else f"; an environment of another package is written {GYM}:its_module:Its-v0"
         if known := next((each for start, each in PACKAGES.items() if name.startswith(start)), None):
             install = "" if find_spec(known[1]) else f"install it on this host with `pip install {known[0]}`, and "
@@ -109,6 +106,22 @@ def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
         raise
     except Exception as error:  # environments may raise anything
         raise UsageError(f"{name} cannot be made: {describe_error(error)}") from error
+
+
+def _describe_import(name: str, error: ImportError) -> str:
+    """Why an environment's package cannot be imported; empty if the package itself is missing."""
+    if (error.name or "").partition(".")[0] == GYMNASIUM:
+        return (
+            f"{name} is of a package for another gymnasium than {gymnasium.__version__}, which is here ({error}): "
+            "install a version of that package for this gymnasium, or mend its import (docs/reference/tasks.md)"
+        )
+    if not isinstance(error, ModuleNotFoundError):
+        return f"{name} cannot be made: ImportError: {error}"
+    if f"{name.rpartition(':')[0]}.".startswith(f"{error.name}."):
+        return ""
+    return (
+        f"{name} needs the module {error.name!r}, which is not installed on this host: install the package that has it"
+    )
 
 
 def _is_of_call(error: TypeError, arguments: Mapping[str, Any]) -> bool:

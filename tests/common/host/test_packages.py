@@ -3,7 +3,8 @@ from importlib.metadata import packages_distributions
 
 import pytest
 
-from dreamfleet.common.host.packages import find_distributions, hidden
+from dreamfleet.common.host import packages
+from dreamfleet.common.host.packages import find_distributions, hidden, wanted_versions, wrong_version
 
 
 @pytest.mark.parametrize("module", ["numpy", "numpy.linalg", "zenoh", "Box2D.b2", "yaml", "six", "absent", "obj"])
@@ -19,3 +20,30 @@ def test_a_hidden_module_cannot_be_imported_inside_and_can_be_afterwards(monkeyp
         with pytest.raises(ModuleNotFoundError):
             import this  # noqa: F401
     assert "this" not in sys.modules
+
+
+@pytest.mark.parametrize(
+    ("found", "is_wrong"),
+    [
+        ("0.28.1", True),
+        ("1.3.9", True),
+        ("1.4", False),
+        ("1.4.0", False),
+        ("1.4.7rc1", False),
+        ("1.5.0", True),
+        (None, False),
+    ],
+)
+def test_a_version_that_another_package_brought_is_found(found, is_wrong, monkeypatch):
+    monkeypatch.setattr(packages, "requires", lambda _name: ["numpy<3,>=2.0", 'gymnasium<1.5,>=1.4; extra == "worker"'])
+    monkeypatch.setattr(packages, "package_version", lambda _name: found)
+    assert wanted_versions("gymnasium") == "gymnasium<1.5,>=1.4"
+    assert ("gymnasium<1.5,>=1.4" in wrong_version("gymnasium"), "--no-deps" in wrong_version("gymnasium")) == (
+        is_wrong, is_wrong,
+    )  # fmt: skip
+    assert not wrong_version("no-such-package")
+
+
+def test_what_is_installed_here_is_what_is_required():
+    assert wanted_versions("gymnasium")
+    assert not any(wrong_version(name) for name in packages.PACKAGES)

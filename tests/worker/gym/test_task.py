@@ -8,6 +8,7 @@ import pytest
 from dreamfleet.common.artifacts.actions import Continuous, Discrete
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.errors import ControllerError, UsageError
+from dreamfleet.common.host import packages
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import describe_task, family_of, load_task
 from dreamfleet.worker.gym import environments
@@ -179,6 +180,21 @@ def test_a_known_package_that_is_here_is_only_to_be_imported(monkeypatch):
     with pytest.raises(UsageError, match="gym:tests:Here-v0") as caught:
         describe_task("gym:Here-v0", {})
     assert "pip install" not in str(caught.value)
+
+
+@pytest.mark.parametrize("line", ["import gymnasium.wrappers.compatibility", "from gymnasium import no_such_name"])
+def test_a_package_for_another_gymnasium_is_called_that(line, tmp_path, monkeypatch):
+    (tmp_path / "for_another.py").write_text(line)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("DREAMFLEET_TRUST", "for_another")
+    with pytest.raises(UsageError, match=re.escape(gymnasium.__version__)):
+        describe_task("gym:for_another:It-v0", {})
+
+
+def test_a_task_that_cannot_be_loaded_under_another_gymnasium_names_the_one_to_install(monkeypatch):
+    monkeypatch.setattr(packages, "package_version", lambda _name: "0.28.1")
+    with pytest.raises(UsageError, match=re.escape(packages.wanted_versions("gymnasium"))):
+        load_task("tests.support.tasks:NoSuchTask")
 
 
 def test_a_class_that_its_module_does_not_register_is_made_as_it_is():
