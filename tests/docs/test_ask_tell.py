@@ -7,6 +7,7 @@ import sys
 
 import pytest
 
+from dreamfleet.common.artifacts.controller import Controller
 from tests.support.processes import DEADLINE, ROOT, environment
 
 PAGE = ROOT / "docs" / "how-to" / "ask-tell.md"
@@ -59,6 +60,17 @@ def test_curl(fleet, bridge, tmp_path):
     assert '"text":' not in out  # an error's answer
     assert out.count("event: candidate") == 2
     assert out.rindex('"batches":') > out.rindex('"fitness":') > 0
+
+
+@pytest.mark.slow
+def test_the_best_vector_is_kept_evaluated_and_recorded(fleet, tmp_path, monkeypatch):
+    echo, *commands = block("sh", 3).splitlines()
+    subprocess.run(["sh", "-c", echo], cwd=tmp_path, check=True)
+    monkeypatch.setenv("DREAMFLEET_RUNS_DIR", str(fleet.runs))
+    done = [run(sys.executable, "-P", "-m", *shlex.split(line), where=tmp_path, cache=fleet.cache) for line in commands]
+    assert Controller.load(tmp_path / "best.npz").parameters.tolist() == [0, 0, -1, -1, 0, 0, 1, 1, 0, 0]
+    assert float(re.search(r"-?\d+\.\d", done[1])[0]) > 100  # steps; a random one falls after twenty
+    assert (tmp_path / "best.mp4").stat().st_size > 1000
 
 
 @pytest.mark.slow

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer
@@ -13,6 +14,8 @@ from dreamfleet.common.files.atomic_write import check_output_path, reporting_wr
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from dreamfleet.common.artifacts.controller import Controller
 
 SUMMARY = "read a controller, a world model or drives of another project; no code in them is executed"
@@ -35,15 +38,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--layout", choices=LAYOUTS,
-        help="how a vector's numbers or a drive's steps lie (docs/reference/import.md); default wme for .json; a drive "
-        "says it by its arrays",
+        help="how a vector's numbers or a drive's steps lie (docs/reference/import.md); default of a vector: wme for "
+        ".json with --bundle, else dreamfleet; a drive says it by its arrays",
     )  # fmt: skip
     like = parser.add_mutually_exclusive_group()
     like.add_argument("--bundle", metavar="BUNDLE", help="the world model that a vector's linear controller sees")
     like.add_argument(
         "--like",
         metavar="CONTROLLER",
-        help="take inputs, outputs, task and world model of this controller for a vector",
+        help="take inputs, outputs, task and world model of this controller, or of this run, for a vector",
     )
     add_global_flags(parser, "runs_dir")
     add_json_flag(parser)
@@ -119,29 +122,27 @@ def _import_controller(args: argparse.Namespace) -> int:
 def _read_controller(args: argparse.Namespace) -> Controller:
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.common.artifacts.controller import IMPORTED, Controller
-    from dreamfleet.common.runs.lookup import find_controller
-    from dreamfleet.worker.importing.checkpoints import read_controller, world_command
     from dreamfleet.worker.importing.sources import checkpoint_of
-    from dreamfleet.worker.importing.vectors import read_vector, to_parameters
+    from dreamfleet.worker.importing.vectors import to_parameters
 
     checkpoint = checkpoint_of(args.source)
     if checkpoint is not None and args.layout not in (None, "ctallec"):
         raise UsageError(f"{checkpoint} is of the layout ctallec: omit --layout")
-    vector = read_vector(args.source) if checkpoint is None else read_controller(checkpoint)
-    layout = args.layout or ("wme" if args.source.suffix.lower() == ".json" else "dreamfleet")
+    vector, world_command = _read_numbers(args.source, checkpoint)
+    is_of_wme = args.source.suffix.lower() == ".json" and args.like is None  # else it lies as that run's vectors do
+    layout = args.layout or ("wme" if is_of_wme else "dreamfleet")
     layout = layout if checkpoint is None else "ctallec"
     provenance = {IMPORTED: args.source.name, "layout": layout}
     if args.like is not None and layout == "ctallec":
         raise UsageError("a checkpoint's controller sees its own world model: give --bundle in place of --like")
     if args.like is not None:
-        like, _ = find_controller(args.like, args.runs_dir)
+        like = _find_like(args.like, args.runs_dir)
         parameters = to_parameters(vector, layout, like.shape)
-        return Controller(like.shape, parameters, like.task, like.bundle, provenance, like.options, like.version)
+        return replace(like, parameters=parameters, provenance=provenance)
     if args.bundle is None:
-        folder = "`dreamfleet import FOLDER --out world.zip`" if checkpoint is None else world_command(checkpoint)
         raise UsageError(
             f"{args.source} holds {len(vector)} numbers: say what they control, by --bundle WORLD_MODEL (which the "
-            f"controller sees; {folder} makes it of another project's) or --like CONTROLLER"
+            f"controller sees; {world_command} makes it of another project's) or --like CONTROLLER_OR_RUN"
         )
     bundle = find_bundle(args.bundle)
     options = OPTIONS.get(layout, "") if bundle.manifest.world is None else ""
@@ -151,3 +152,32 @@ def _read_controller(args: argparse.Namespace) -> Controller:
         shape, to_parameters(vector, layout, shape), bundle.manifest.task, bundle.sha256, provenance, options,
         driving.version,
     )  # fmt: skip
+
+
+def _read_numbers(source: Path, checkpoint: Path | None) -> tuple[NDArray[Any], str]:
+    """A controller's vector, and the command that makes its world model; only a checkpoint needs torch."""
+    if checkpoint is None:
+        from dreamfleet.worker.importing.vectors import read_vector
+
+        return read_vector(source), "`dreamfleet import FOLDER --out world.zip`"
+    from dreamfleet.worker.importing.checkpoints import read_controller, world_command
+
+    return read_controller(checkpoint), world_command(checkpoint)
+
+
+def _find_like(name: str, runs_dir: Path) -> Controller:
+    """A controller with the inputs, outputs, task and world model of `name`, a controller or a run."""
+    import numpy as np
+
+    from dreamfleet.common.artifacts.controller import Controller
+    from dreamfleet.common.runs.lookup import find_controller
+    from dreamfleet.common.runs.run_folder import RunFolder
+    from dreamfleet.common.runs.run_paths import JOURNAL
+
+    folder = next((each for each in (runs_dir / name, Path(name)) if (each / JOURNAL).is_file()), None)
+    if folder is None or Path(name).is_file():
+        return find_controller(name, runs_dir)[0]
+    with RunFolder(folder) as run:  # one of submitted batches has no controller, and another none yet
+        shape, spec = run.settings.controller, run.spec
+    zeros = np.zeros(shape.size, np.float32)
+    return Controller(shape, zeros, spec.task, spec.bundle, {}, spec.options, spec.world_version)

@@ -1,6 +1,8 @@
 """Vectors of parameters, and drives, of other programs."""
 
 import json
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cma
@@ -11,6 +13,8 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import ControllerError, DatasetError
+from dreamfleet.common.runs.records import RunSettings
+from dreamfleet.coordinator.storage.journal import Journal
 from dreamfleet.worker.importing.drives import read_drive
 from dreamfleet.worker.importing.vectors import read_vector, to_parameters
 from dreamfleet.worker.training.data.dataset import (
@@ -20,6 +24,7 @@ from dreamfleet.worker.training.data.dataset import (
     load_steps,
     preprocessing_of,
 )
+from tests.support.samples import SPEC
 
 
 def test_orders():
@@ -90,6 +95,26 @@ def test_a_vector_like_a_controller_that_ships(tmp_path):
     out = tmp_path / "zeros.npz"
     assert main(["import", str(tmp_path / "v.npy"), "--like", "tiny", "--out", str(out)]) == 0
     assert Controller.load(out).bundle == Controller.load(out).bundle != ""
+
+
+@pytest.mark.parametrize("name", ["v.json", "v.npy"])
+@pytest.mark.parametrize("optimiser", ["external", "cma"])
+def test_a_vector_like_a_run_lies_as_the_runs_own_and_needs_no_torch(name, optimiser, tmp_path, monkeypatch):
+    spec = replace(SPEC, task="gym:CartPole-v1", bundle="", options='{"x": 1}', controller=ControllerShape(4, 2))
+    settings = RunSettings(spec, ControllerShape(4, 2), 4, 1, 0.1, "diagonal", 1, 0, 1, optimiser=optimiser)
+    (tmp_path / "mine").mkdir()
+    Journal.create(tmp_path / "mine", settings, None).close()
+    vector = [float(each) for each in range(10)]
+    (tmp_path / "v.json").write_text(json.dumps(vector))
+    np.save(tmp_path / "v.npy", vector)
+    monkeypatch.setitem(sys.modules, "torch", None)  # not installed
+    monkeypatch.delitem(sys.modules, "dreamfleet.worker.importing.checkpoints", raising=False)
+    words = ["--like", "mine", "--runs-dir", str(tmp_path), "--out", str(tmp_path / "best.npz")]
+    assert main(["import", str(tmp_path / name), *words]) == 0
+    found = Controller.load(tmp_path / "best.npz")
+    assert (found.parameters.tolist(), found.task, found.options) == (vector, spec.task, spec.options)
+    assert main(["import", str(tmp_path / name), *words, "--layout", "wme"]) == 0
+    assert Controller.load(tmp_path / "best.npz").parameters.tolist() == [2, 4, 6, 8, 3, 5, 7, 9, 0, 1]
 
 
 def test_a_vector_alone_controls_nothing(tmp_path, capsys):
