@@ -16,6 +16,7 @@ import os
 import platform
 import re
 import select
+import shlex
 import shutil
 import signal
 import stat
@@ -37,6 +38,9 @@ LEAST_FREE = 700_000_000  # bytes needed while an environment is made
 LONGEST_TAIL = 8192  # bytes read from the end of a log for its last line
 JOIN, LOG, STATE, COMPLETE, CREATED = "join", "log", "worker.json", "whole", "made"
 FOLDERS = ("environments", "workers", "cache")  # under the root
+LOCK = "lock"
+# Starts a worker only once a line says that its state is written: one that nobody knows of could not be ended.
+ONCE_KNOWN = ("/bin/sh", "-c", 'read known && exec "$@" </dev/null', "sh")
 JOIN_HERE = "{join}"  # placeholder for the join file's path
 _TIME = r"^(?:\d{4}-\d\d-\d\d )?\d\d:\d\d:\d\d\S* "  # of a log line; its date stands in a day's first one
 _LOG_PREFIX = re.compile(rf"{_TIME}(?:[A-Z]+ )?[^:]*: |^dreamfleet: ")  # before the text of a log line or an error
@@ -96,6 +100,7 @@ class HostFolder:
     def __init__(self, text: str, channel: Channel) -> None:
         self.root = Path(text).expanduser().absolute()
         self.channel = channel
+        self.lock = -1  # the lock's descriptor while it is held
 
     @property
     def caches(self) -> dict[str, str]:
@@ -104,8 +109,20 @@ class HostFolder:
 
     @property
     def is_ours(self) -> bool:
-        """Whether this program created the folder; otherwise its content belongs to somebody else."""
-        return (self.root / CREATED).exists() or any(self.root.glob(f"workers/*/{STATE}"))
+        """Whether this program created the folder; otherwise its content belongs to somebody else.
+
+        One that was killed as it created or removed the folder leaves no more than the lock and a file half written.
+        """
+        if (self.root / CREATED).exists() or any(self.root.glob(f"workers/*/{STATE}")):
+            return True
+        found = list(self.root.iterdir()) if self.root.is_dir() else []
+        mere = (aside(self.root / CREATED), *(each for each in found if each.name == LOCK and not each.stat().st_size))
+        return bool(found) and all(each in mere for each in found)
+
+    @property
+    def removal(self) -> str:
+        """The shell command that removes what is ours."""
+        return f"cd {shlex.quote(str(self.root))} && rm -rf {' '.join((*FOLDERS, CREATED, LOCK))}"
 
     def environment(self, name: str) -> Path:
         """The folder of an environment."""
@@ -135,35 +152,50 @@ class HostFolder:
                 self._acquire(lock.fileno())
                 held = False
                 with suppress(FileNotFoundError):  # the last holder may have removed the folder
-                    held = os.path.samestat(os.fstat(lock.fileno()), (self.root / "lock").stat())
+                    held = os.path.samestat(os.fstat(lock.fileno()), (self.root / LOCK).stat())
                 if held:
+                    self.lock = lock.fileno()
                     yield
                     return
 
     def remove(self) -> None:
-        """Remove everything of ours; folders with other content stay."""
-        made = [self.root]
-        with suppress(FileNotFoundError):
-            made = [Path(each) for each in json.loads((self.root / CREATED).read_text())]
+        """Remove everything of ours; folders with other content stay. `OSError` if something of ours stays."""
+        made = self._made()
         for name in FOLDERS:
-            shutil.rmtree(self.root / name, ignore_errors=True)
-        for name in (CREATED, "lock"):
-            (self.root / name).unlink(missing_ok=True)
-        for folder in made:
-            with suppress(OSError):
-                folder.rmdir()
+            remove_tree(self.root / name)
+        for path in (self.root / CREATED, aside(self.root / CREATED), self.root / LOCK):  # only after the folders
+            path.unlink(missing_ok=True)
+        _remove_empty(made)
+
+    def _made(self) -> list[Path]:
+        """The folders that this program created, the root first; a damaged list says only that it created the root."""
+        with suppress(FileNotFoundError, ValueError, TypeError):
+            listed = {Path(each) for each in json.loads((self.root / CREATED).read_text())}
+            return [each for each in (self.root, *self.root.parents) if each in listed]
+        return [self.root]
 
     def _create(self) -> None:
-        missing = [each for each in (self.root, *self.root.parents) if not each.exists()]
-        if not self.is_ours and (strange := [each for each in FOLDERS if (self.root / each).exists()]):
+        """Create the folder, with the list of folders that it took; if that fails, none of them stays."""
+        missing, ours = [each for each in (self.root, *self.root.parents) if not each.exists()], self.is_ours
+        if not ours and (strange := [each for each in FOLDERS if (self.root / each).exists()]):
             raise FailedError(f"{self.root} holds {strange[0]} of something else: name another --remote-dir")
-        self.root.mkdir(parents=True, exist_ok=True)
-        if missing or not (self.root / CREATED).exists():
-            (self.root / CREATED).write_text(json.dumps([str(each) for each in missing]))
+        if not missing and (self.root / CREATED).exists():
+            return
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+            made = missing or ([self.root] if ours else [])
+            _write_private(self.root / CREATED, json.dumps([str(each) for each in made]).encode())
+            self._open_lock().close()
+        except OSError:
+            if missing:
+                for name in (CREATED, LOCK):
+                    (self.root / name).unlink(missing_ok=True)
+                _remove_empty(missing)
+            raise
 
     def _open_lock(self) -> BinaryIO:
         """Open or create the lock file, whose content stays."""
-        path = self.root / "lock"
+        path = self.root / LOCK
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         try:
             file = open(os.open(path, flags, 0o666), "r+b", buffering=0)  # noqa: SIM115 - the caller closes it
@@ -188,6 +220,35 @@ class HostFolder:
             self.channel.wait_for_request()
 
 
+def aside(path: Path) -> Path:
+    """Where a file is written before it takes its name."""
+    return path.with_name(f".{path.name}")
+
+
+def remove_tree(folder: Path) -> None:
+    """Remove a folder and what is in it, also what its owner made read-only; `OSError` if something stays."""
+    if folder.is_symlink() or not folder.exists():
+        folder.unlink(missing_ok=True)
+        return
+    _make_writable(folder)
+    shutil.rmtree(folder)
+
+
+def _make_writable(folder: Path) -> None:
+    with suppress(PermissionError):  # another user's: removing it says so
+        folder.chmod(stat.S_IRWXU)
+    with os.scandir(folder) as inside:
+        for each in inside:
+            if each.is_dir(follow_symlinks=False):
+                _make_writable(Path(each.path))
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    for folder in folders:
+        with suppress(OSError):
+            folder.rmdir()
+
+
 def process_start(pid: int) -> str:
     """When the process began, to detect a reused process id; empty if it does not run."""
     try:
@@ -210,7 +271,7 @@ class WorkerProcess:
         self.folder = folder
         self.state: dict[str, Any] = {}
         with suppress(FileNotFoundError, ValueError):
-            self.state = json.loads((folder / STATE).read_text())
+            self.state = _checked_state(json.loads((folder / STATE).read_text()))
 
     @property
     def is_elsewhere(self) -> bool:
@@ -251,6 +312,13 @@ class WorkerProcess:
             raise FailedError(f"worker {self.folder.name} does not leave: end it with --now")
 
 
+def _checked_state(state: Any) -> dict[str, Any]:
+    """A worker's state as `_launch` wrote it; empty if that was prevented, or something else wrote the file."""
+    kinds: dict[str, type] = {"pid": int, "birth": str, "node": str, "digest": str, "slots": int, "since": float}
+    whole = isinstance(state, dict) and all(isinstance(state.get(name), kind) for name, kind in kinds.items())
+    return state if whole else {}
+
+
 def last_line(log: Path) -> str:
     """The last log line of a worker, without its time."""
     try:
@@ -277,6 +345,7 @@ def inspect_host(host_folder: HostFolder) -> dict[str, Any]:
         "installed": installed,
         "venv": importlib.util.find_spec("venv") is not None and importlib.util.find_spec("ensurepip") is not None,
         "writable": os.access(there, os.W_OK),
+        "noexec": bool(os.statvfs(there).f_flag & getattr(os, "ST_NOEXEC", 0)),
         "root": str(host_folder.root),
         "free": shutil.disk_usage(there).free,
         "environments": [each for each in host_folder.names("environments") if host_folder.is_complete(each)],
@@ -290,7 +359,7 @@ def install(host_folder: HostFolder, request: dict[str, Any], files: dict[str, b
     with host_folder.locked():
         if host_folder.is_complete(request["environment"]):
             return {"python": str(folder / "bin" / "python")}
-        shutil.rmtree(folder, ignore_errors=True)  # left by an interrupted attempt
+        remove_tree(folder)  # left by an interrupted attempt
         parcel = folder / "parcel"
         parcel.mkdir(parents=True)
         for name, data in files.items():
@@ -318,6 +387,7 @@ def _call(host_folder: HostFolder, *command: str, inside: Path | None = None) ->
         check=False,
         cwd=inside,
         env={**os.environ, **host_folder.caches},
+        pass_fds=(host_folder.lock,),  # it outlives an agent that is killed, and until then others must wait
     )
     if done.returncode == 0:
         return
@@ -360,11 +430,15 @@ def start(host_folder: HostFolder, request: dict[str, Any], files: dict[str, byt
 
 def _write_private(path: Path, data: bytes) -> None:
     """Write a file atomically, readable by this user only whatever the umask."""
-    aside = path.with_name(f".{path.name}")
-    with open(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
-        file.write(data)
-    aside.chmod(0o600)
-    aside.replace(path)
+    new = aside(path)
+    try:
+        with open(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
+            file.write(data)
+        new.chmod(0o600)
+        new.replace(path)
+    except OSError:
+        new.unlink(missing_ok=True)
+        raise
 
 
 def _launch(host_folder: HostFolder, folder: Path, request: dict[str, Any]) -> subprocess.Popen[bytes]:
@@ -372,20 +446,20 @@ def _launch(host_folder: HostFolder, folder: Path, request: dict[str, Any]) -> s
     log.unlink(missing_ok=True)
     _write_private(folder / STATE, b"{}")  # a full disk must fail before anything runs
     words = [request["python"], *(str(folder / JOIN) if each == JOIN_HERE else each for each in request["words"])]
+    Path(request["python"]).stat()  # a shell's error would name no errno
     with log.open("xb") as out:
         began = subprocess.Popen(
-            words, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True, cwd=folder,
+            [*ONCE_KNOWN, *words], stdin=subprocess.PIPE, stdout=out, stderr=out, start_new_session=True, cwd=folder,
             env={**os.environ, **host_folder.caches, **request["env"]},
         )  # fmt: skip
+    assert began.stdin is not None
     state = {"digest": request["digest"], "slots": request["slots"], "since": time.time(), "node": platform.node(),
              "pid": began.pid, "birth": process_start(began.pid)}  # fmt: skip
     if request["held"]:
         state["holder"] = [os.getpid(), process_start(os.getpid())]
-    try:
+    with began.stdin:  # closed without a word, it ends the shell
         _write_private(folder / STATE, json.dumps(state).encode())
-    except OSError:
-        began.kill()
-        raise
+        began.stdin.write(b"\n")
     return began
 
 
@@ -427,7 +501,7 @@ def end(host_folder: HostFolder, request: dict[str, Any]) -> dict[str, Any]:
             if found.is_alive:
                 channel.send("say", f"worker {name} leaves")
             found.end(channel, STOP_AT_ONCE if request["now"] else STOP_DRAINED)
-            shutil.rmtree(found.folder)
+            remove_tree(found.folder)
         if not host_folder.names("workers") and not request["keep"]:
             host_folder.remove()
     return {"ended": ended}
@@ -449,7 +523,10 @@ def handle_request(request: dict[str, Any], channel: Channel) -> None:
     except FailedError as error:
         channel.send("failed", str(error))
     except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        if request["do"] == "end":
+            why = f"{error.filename or where}: {error.strerror or error}"
+            channel.send("failed", f"{why}; what is left there is removed by: {host_folder.removal}")
+        elif error.errno in (errno.ENOSPC, errno.EDQUOT):
             channel.send("failed", f"no space left in {where}: make room there, or name another --remote-dir")
         elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
             channel.send("failed", f"{error.filename or where} cannot be written there: name another --remote-dir")

@@ -62,6 +62,7 @@ class HostAnswer:
     installed: Name | None  # the version of dreamfleet there
     venv: bool
     writable: bool
+    noexec: bool  # whether no program may be run from its file system
     root: Name
     free: Count  # bytes
     environments: tuple[Name, ...]

@@ -138,7 +138,14 @@ class RemoteHost:
         if not found.writable:
             raise DreamfleetError(f"{found.root} cannot be written there: name another --remote-dir")
         name = self._environment(found)
-        if name is None or name in found.environments:
+        if name is None:
+            return
+        if found.noexec:
+            raise DreamfleetError(
+                f"{found.root} is on a file system that is mounted noexec, and no environment runs from there: name "
+                "another --remote-dir"
+            )
+        if name in found.environments:
             return
         if not found.venv:
             raise DreamfleetError("its Python has no venv: install it there (Debian: apt install python3-venv)")

@@ -216,7 +216,12 @@ def test_a_full_disk_and_a_folder_that_cannot_be_written_are_said(processes, hos
         full = rows_of(processes, "spawn", "a", *words(hosts, *flags), code=1)["a"]["what"]
         assert "no space left" in full
         assert "--remote-dir" in full
+        assert rows_of(processes, "down", "a", *words(hosts, "--remote-dir", disk.path / "fleet"))
+        assert not (disk.path / "fleet").exists()
         disk.free()
+        subprocess.run(["mount", "-o", "remount,noexec", disk.path], check=True)
+        still = rows_of(processes, "spawn", "a", "--ssh", hosts.ssh, *flags, code=1)["a"]["what"]
+        assert "noexec" in still
     denied = rows_of(processes, "spawn", "a", *words(hosts, "--no-tunnel", "--remote-dir", "/proc/fleet"), code=1)["a"]
     assert "cannot be written" in denied["what"] or "/proc/fleet" in denied["what"]
 

@@ -1,11 +1,16 @@
 """The agent on hosts in unexpected states."""
 
+import json
 import os
+import shutil
+import subprocess
+import sys
 
 import pytest
 
 from dreamfleet.coordinator.spawn import agent
-from dreamfleet.coordinator.spawn.agent import COMPLETE, MARK, Channel, HostFolder
+from dreamfleet.coordinator.spawn.agent import COMPLETE, CREATED, MARK, STATE, Channel, HostFolder
+from tests.support.processes import ROOT
 
 
 def test_a_missing_file_is_reported_and_the_lock_released(tmp_path, capsys):
@@ -61,3 +66,53 @@ def test_an_environment_without_its_python_is_not_listed(tmp_path, there):
     (folder / "bin" / "python").symlink_to(os.devnull if there else tmp_path / "gone")
     found = agent.inspect_host(HostFolder(str(tmp_path), Channel()))
     assert found["environments"] == (["one"] if there else [])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["killed", "full"])
+def test_an_agent_that_ends_at_any_step_leaves_what_the_next_one_removes(tmp_path, mode):
+    script = ROOT / "tests" / "support" / "agent_steps.py"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, script, tmp_path, mode], capture_output=True, check=True, env=environment)
+    found = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(found) > 15
+    assert {each["code"] for each in found[:-1]} == {9 if mode == "killed" else 8}
+    assert [each for each in found if not each["ok"] or each["lives"]] == []
+    # Killed between creating a folder and listing it, an agent leaves it empty: it may have been there before.
+    empty = [["share"], ["share", "share/fleet"]]
+    assert [each["left"] for each in found if each["left"] and (mode == "full" or each["left"] not in empty)] == []
+
+
+@pytest.mark.parametrize("damage", [b"", b"{", b"7", b'"x"', b"[1, [2]]", b'["/"]'])
+def test_damaged_files_of_the_agent_are_read_as_nothing(tmp_path, capsys, damage):
+    root = tmp_path / "place"
+    host_folder = HostFolder(str(root), Channel())
+    with host_folder.locked():
+        host_folder.worker("box").mkdir(parents=True)
+    (root / CREATED).write_bytes(damage)
+    (host_folder.worker("box") / STATE).write_bytes(damage)
+    assert agent.inspect_host(host_folder)["workers"][0]["running"] is False
+    agent.handle_request({"do": "end", "root": str(root), "names": None, "now": True, "keep": False}, Channel())
+    assert '"ok"' in capsys.readouterr().out
+    assert not any(root.glob("*"))
+
+
+def test_what_cannot_be_removed_stays_ours_and_is_named_with_the_command(tmp_path, monkeypatch, capsys):
+    host_folder, remove = HostFolder(str(tmp_path / "place"), Channel()), shutil.rmtree
+    asked = {"do": "end", "root": str(host_folder.root), "names": None, "now": True, "keep": False}
+    with host_folder.locked():
+        (host_folder.environment("one") / "lib").mkdir(parents=True)
+    (host_folder.environment("one") / "lib").chmod(0o500)
+
+    def refused(folder):
+        raise PermissionError(13, os.strerror(13), str(folder))
+
+    monkeypatch.setattr(shutil, "rmtree", refused)
+    agent.handle_request(asked, Channel())
+    said = capsys.readouterr().out
+    assert '"failed"' in said
+    assert f"cd {host_folder.root} && rm -rf environments" in said
+    assert host_folder.is_ours
+    monkeypatch.setattr(shutil, "rmtree", remove)
+    agent.handle_request(asked, Channel())
+    assert not host_folder.root.exists()
