@@ -31,6 +31,7 @@ INTERVAL = 1.0  # seconds between two looks at the journal
 RETRY = 30.0  # seconds after an error until a record is tried again
 GRACE = 60.0  # seconds that the end of a run waits for its records: the import of a library alone may take ten
 LONGEST = 300  # characters of an error
+OURS = ("fitness__", "search__", "effort__", "score__")  # groups of curves, as `scalars_of` names them
 Report = Callable[[str], None]
 
 
@@ -181,6 +182,14 @@ class _Mirror:
             for name, each in numbers.items()
             if (held := sink.known.get(name, {}).get(step)) is not None and not _equal(held, each)
         ]
+        if not self._since:  # all of the journal was read
+            there = {(step, name) for step, numbers in found for name in numbers}
+            differing += [
+                (step, name)
+                for name, points in sink.known.items()
+                for step in points
+                if (step, name) not in there and name.startswith(OURS)
+            ]
         if not differing:
             return False
         sink.rewind(min(step for step, _ in differing))

@@ -121,10 +121,12 @@ class Watcher:
         try:
             status = read_status(document)
             followed = self._followed.get(name)
-            if followed is None or followed.uid != status.run_uid or followed.is_ahead_of(status):
-                self._followed.pop(name, None)  # reinsert it as the newest
+            if followed is None or followed.uid != status.run_uid or followed.is_outdated_by(status):
+                former = self._followed.pop(name, None)  # reinsert it as the newest
                 followed = self._followed[name] = _FollowedRun(status, self._runs_dir)
                 followed.lanes = self._past_lanes.pop(followed.uid, followed.lanes)
+                if former is not None and former.uid == followed.uid:
+                    followed.go_on_from(former)
             followed.update(status, self._client, now)
         except UNREADABLE as error:
             self._problem = f"run {name}: {error}"
@@ -216,9 +218,14 @@ class _FollowedRun:
         """Whether a final status belongs to this run, and not to an earlier incarnation."""
         return final_status.run_uid == self.uid and final_status.incarnation >= self.status.incarnation
 
-    def is_ahead_of(self, status: Status) -> bool:
-        """Whether more generations are known here than the run reports: an older copy of it was resumed."""
-        return len(self.history) > status.generations
+    def is_outdated_by(self, status: Status) -> bool:
+        """Whether generations may be others than those known here: results were recalled, or a copy was resumed."""
+        return status.incarnation != self.status.incarnation or len(self.history) > status.generations
+
+    def go_on_from(self, former: _FollowedRun) -> None:
+        """Keep what happened, and let the curves be others than those that viewers have."""
+        self.lanes = former.lanes
+        self._rendered_curves = (None, b"", former._rendered_curves[2])
 
     def update(self, status: Status, client: Client, now: float) -> None:
         """Take a status, and fetch the rows that it leaves out."""

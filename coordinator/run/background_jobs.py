@@ -104,6 +104,8 @@ class BackgroundJobs:
         """Restore the report of the last incarnation; the jobs that are still missing."""
         if (last := self._history.last) is not None:
             self.report.generation_closed(last.number, mean, self._history.steps, now)
+        else:  # else a file of a copy, or of before a recall, would be the run's
+            self.report.withdraw()
         if (judged := self.confirmed or self.evaluations.best) is not None:
             self.report.set_judged(judged, self._journal.evaluated_vector(judged.generation), self._history.steps)
         self.rollout_collections.remove(self._journal.recalled_rollouts())  # not before the recall was durable

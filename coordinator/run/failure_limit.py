@@ -12,6 +12,13 @@ from dreamfleet.coordinator.storage.journal import Journal
 LIMIT_FROM = "limit_from"  # the fact that names the first generation whose failures count
 
 
+def forget_acceptance(journal: Journal, generation: int) -> None:
+    """Let failures count again from this generation on, which is open again: what was accepted came after it."""
+    with suppress(ValueError):
+        if int(journal.fact(LIMIT_FROM) or 0) > generation + 1:
+            journal.drop_fact(LIMIT_FROM)
+
+
 class FailureLimit:
     """At most the share `share` of the last generations' candidates may fail; `generations` counts them."""
 

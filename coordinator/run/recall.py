@@ -17,7 +17,10 @@ from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL
 from dreamfleet.common.runs.scoring_params import ScheduleState
 from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.jobs.history import History
+from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollections
+from dreamfleet.coordinator.run.failure_limit import forget_acceptance
 from dreamfleet.coordinator.run.generations import Generations
+from dreamfleet.coordinator.run.report import withdraw_controller
 from dreamfleet.coordinator.storage.journal import Journal
 from dreamfleet.coordinator.storage.verification_records import StoredBar
 
@@ -45,6 +48,7 @@ def recall(journal: Journal, settings: RunSettings, hosts: Collection[str]) -> s
     stored = journal.generation(first)  # only of the last two
     state = replayed.replay(first) if stored is None else stored.state
     journal.rewind(first, state, replayed.first_seeds(first))
+    forget_acceptance(journal, first)
     return f"{words}: the run goes on from generation {first}" + (f" (of {last.number})" if last.number > first else "")
 
 
@@ -86,6 +90,7 @@ def bar_stored(folder: Path, host: str, *, is_barred: bool) -> str:
         incarnation = journal.begin_incarnation()
         if is_barred:
             journal.bar(host, BAR_BY_OPERATOR, incarnation)
+            withdraw_controller(folder / CONTROLLER)
             words = recall(journal, RunSettings.from_json(journal.fact("settings") or ""), {host})
             text = f"host {printable(host)} is barred from this run: {BAR_BY_OPERATOR.why}; {words}"
         else:
@@ -94,8 +99,7 @@ def bar_stored(folder: Path, host: str, *, is_barred: bool) -> str:
         journal.add_event(text)
         journal.end_incarnation()
         journal.commit()
-        if is_barred:  # the reported controller follows from what was recalled; a resumed run writes it again
-            (folder / CONTROLLER).unlink(missing_ok=True)
+        RolloutCollections(folder).remove(journal.recalled_rollouts())  # not before the recall was durable
     return text
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import write_error
+from dreamfleet.common.files.atomic_write import fsync_path
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation
 from dreamfleet.common.runs.run_provenance import RECEIPT, RunProvenance
 from dreamfleet.common.serialization.optional_fields import to_dict
@@ -114,7 +115,27 @@ class ControllerWriter:
             raise write_error(self._path, error) from error
         self._saved, self._due = self.current, False
 
+    def withdraw(self) -> None:
+        """Remove the file, durably, before a recall is committed: until the next life writes it, there is none."""
+        withdraw_controller(self._path)
+        self._saved = None
+
     @property
     def path(self) -> Path | None:
         """The file of the reported controller; `None` before it was saved."""
         return self._path if self._saved is not None else None
+
+
+def withdraw_controller(path: Path) -> None:
+    """Remove a run's reported controller, durably; `JournalError` where the disk refuses.
+
+    This comes before what it follows from is taken back in the journal. So a kill in between leaves a run without the
+    file, which its next life writes again, and never a file that claims what counts no more.
+    """
+    try:
+        path.unlink()
+        fsync_path(path.parent)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise write_error(path, error) from error

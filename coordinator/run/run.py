@@ -313,6 +313,7 @@ class Run:
 
     def _rewind(self, hosts: Collection[str]) -> None:
         """Take back what these hosts brought, in the transaction that bars them (R33)."""
+        self.background_jobs.report.withdraw()
         self.fleet.notes.append(recall(self._journal, self.settings, hosts))
         self._journal_notes()
         self.is_rewound = self.fleet.paused = True  # what it holds in memory is true no more

@@ -19,7 +19,7 @@ from dreamfleet.common.files.locks import open_lock, try_lock
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, ROLLOUTS
-from dreamfleet.coordinator.storage.journal_file import copy_database
+from dreamfleet.coordinator.storage.journal_file import copy_database, sqlite_side_files
 
 
 def back_up(source: RunFolder, target: Path) -> None:
@@ -86,13 +86,11 @@ def _check_target(source: RunFolder, target: Path) -> None:
 
 
 def _copy_run(source: RunFolder, folder: Path) -> None:
-    """The controller first: it may lag behind the journal, as after a kill, and must not be ahead of it.
+    """Copy all that the run is made of.
 
     What the journal names lies in the folder before the journal does, so that it is copied behind it.
     """
-    with suppress(FileNotFoundError):  # there is none before the first closed generation
-        shutil.copy2(source.controller_path, folder / CONTROLLER)
-    _copy_journal(source, folder / JOURNAL)
+    _copy_controller_and_journal(source, folder)
     if source.spec.bundle:
         shutil.copy2(source.bundle_path, folder / BUNDLE)
     with RunFolder(folder) as copy:
@@ -103,6 +101,30 @@ def _copy_run(source: RunFolder, folder: Path) -> None:
         shutil.copy2(source.path / ROLLOUTS / drive.name, folder / ROLLOUTS / drive.name)
     for path in (*folder.rglob("*"), folder):
         fsync_path(path)
+
+
+def _copy_controller_and_journal(source: RunFolder, folder: Path) -> None:
+    """The controller first: it may lag behind the journal, as after a kill, and must not be ahead of it.
+
+    A recall in between takes back what the controller follows from: then both are copied again.
+    """
+    while True:
+        before = _recalls(source)
+        (folder / CONTROLLER).unlink(missing_ok=True)
+        with suppress(FileNotFoundError):  # there is none before the first closed generation
+            shutil.copy2(source.controller_path, folder / CONTROLLER)
+        _copy_journal(source, folder / JOURNAL)
+        with RunFolder(folder) as copy:
+            if _recalls(copy) == before:
+                return
+        for left in (folder / JOURNAL, *sqlite_side_files(folder / JOURNAL)):
+            left.unlink(missing_ok=True)
+
+
+def _recalls(run: RunFolder) -> tuple[object, ...]:
+    """What differs once results were recalled: each recall bars hosts, and ends a life of the coordinator."""
+    checks = run.checks
+    return run.fact("incarnation"), checks and (checks.barred, checks.recalled)
 
 
 def _copy_journal(source: RunFolder, path: Path) -> None:

@@ -106,6 +106,17 @@ def test_results_that_were_taken_back_are_replaced(runs):
     assert {name: len(points) for name, points in found.items()} == {name: len(each) for name, each in before.items()}
 
 
+def test_points_of_generations_that_were_dropped_are_taken_back(runs):
+    folder = runs / RUN / "tensorboard"
+    write(runs / RUN)
+    delete_from(runs / RUN, 1)
+    with closing(sqlite3.connect(runs / RUN / "journal.sqlite")) as journal, journal:
+        journal.execute("DELETE FROM evaluation WHERE generation >= 1")
+        journal.execute("DELETE FROM run WHERE key = 'confirmed'")
+    write(runs / RUN)
+    assert {(name, step) for name, points in read_scalars(folder).items() for step in points} == set(wanted(runs / RUN))
+
+
 def test_a_record_that_cannot_be_written_is_reported_once_and_whole_later(runs):
     obstacle = runs / RUN / "tensorboard"
     obstacle.write_text("a file where the folder should be")

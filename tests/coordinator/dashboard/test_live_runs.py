@@ -11,9 +11,11 @@ from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.dashboard import live_runs
 from dreamfleet.coordinator.dashboard.lanes import STRETCH, UNKNOWN
+from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.service.snapshot import take_snapshot
 from tests.coordinator.run.test_run import SETTINGS, Bench
 from tests.support.processes import free_port
+from tests.support.samples import STATUS
 from tests.support.served import serving, snapshot
 
 
@@ -46,6 +48,24 @@ def test_a_run_by_name_is_followed_among_more_runs_than_the_page_holds(tmp_path,
         while watcher.poll().find("night") is None:
             pass  # a busy host may answer late
         assert watcher.poll().find("day") is None
+
+
+def test_generations_that_were_recalled_and_scored_again_are_drawn_again(tmp_path):
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    watcher = live_runs.Watcher(Network(connect=(endpoint,)), "night", tmp_path)
+    first, again = snapshot(4), snapshot(4, incarnation=STATUS.incarnation + 1)
+    again = replace(again, history=History(replace(each, mean=-7.5) for each in again.history.part(0, 4)).view())
+
+    with serving(endpoint, first) as served:
+        while (before := watcher.poll().find("night")) is None:
+            pass  # a busy host may answer late
+        served.snapshot = again
+        while (after := watcher.poll().find("night")).curves == before.curves:
+            pass
+        watcher.suspend()
+    assert b"-7.5" in after.curves
+    assert b"-7.5" not in before.curves
+    assert after.curves_version != before.curves_version
 
 
 def test_a_live_runs_archive_is_drawn_from_its_journal_and_goes_on_after_a_restart(tmp_path, random_bundle):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.run_folder import RunFolder
@@ -13,6 +14,7 @@ from dreamfleet.common.runs.scoring_params import ScheduleState
 from dreamfleet.common.runs.stages import stages_of
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
+from dreamfleet.coordinator.run.failure_limit import LIMIT_FROM
 from dreamfleet.coordinator.run.generations import Generations
 from dreamfleet.coordinator.run.recall import bar_stored, recall
 from dreamfleet.coordinator.storage.journal import Journal
@@ -260,9 +262,82 @@ def test_of_an_external_run_complete_batches_stay_and_what_the_host_brought_is_k
     journal.close()
 
 
-def test_a_barred_run_has_no_reported_controller_until_it_goes_on(tmp_path, random_bundle):
+def test_a_reported_controller_is_withdrawn_before_its_recall_is_durable_and_a_life_writes_it_again(
+    tmp_path, random_bundle
+):
+    bench = ended(tmp_path, random_bundle.path, settings_of("cma"))
+    path = bench.path / CONTROLLER
+    before = Controller.load(path)
+    assert not bench.run.bar("a")
+    assert not path.exists()
+    bench.restart()  # it was killed before the commit
+    assert bench.run.ended
+    assert Controller.load(path).sha256 == before.sha256
+    assert not bench.run.bar("a")
+    bench.run.commit()
+    assert not path.exists()
+    bench.restart()
+    assert not bench.run.history
+    bench.run.commit()
+    assert not path.exists()
+    bench.hosts = [B]
+    bench.serve()
+    assert Controller.load(path).sha256 == before.sha256
+    bench.journal.close()
+
+
+def test_a_life_without_a_closed_generation_has_no_reported_controller(tmp_path, random_bundle):
+    bench = Failing(tmp_path / "run", random_bundle.path, settings_of("cma"), fails=None)
+    (bench.path / CONTROLLER).write_bytes(b"of what was recalled")
+    bench.restart()
+    assert not (bench.path / CONTROLLER).exists()
+    bench.journal.close()
+
+
+def test_a_bar_that_is_killed_leaves_a_run_without_a_controller_or_all_of_the_recall(
+    tmp_path, random_bundle, monkeypatch
+):
     bench = ended(tmp_path, random_bundle.path, settings_of("cma"))
     bench.journal.close()
-    (bench.path / CONTROLLER).write_bytes(b"of what the host brought")
+    commits, commit = [], Journal.commit
+
+    def killed(self):
+        if commits:
+            raise KeyboardInterrupt
+        commits.append(commit(self))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Journal, "commit", killed)
+        with pytest.raises(KeyboardInterrupt):
+            bar_stored(bench.path, "a", is_barred=True)
+    assert not (bench.path / CONTROLLER).exists()
+    with RunFolder(bench.path) as run:
+        assert run.ended
+        assert run.checks is None
     bar_stored(bench.path, "a", is_barred=True)
     assert not (bench.path / CONTROLLER).exists()
+
+
+def test_rollouts_of_a_barred_host_are_removed_though_nobody_serves_the_run(tmp_path, random_bundle):
+    bench = Bench(tmp_path / "run", random_bundle.path)
+    for name, job in bench.reach_collection():
+        for part in bench.parts(job):
+            bench.upload(name, part)
+        bench.deliver(name, result_of(job))
+    bench.journal.close()
+    with RunFolder(bench.path) as run:
+        files = run.rollouts()
+    assert all(path.exists() for path in files)
+    bar_stored(bench.path, "a", is_barred=True)
+    assert not any(path.exists() for path in files)
+
+
+@pytest.mark.parametrize(("since", "kept"), [(1, "1"), (3, None)])
+def test_failures_that_were_accepted_after_the_generation_that_opens_again_count_again(
+    tmp_path, random_bundle, since, kept
+):
+    bench = ended(tmp_path, random_bundle.path, settings_of("cma"))
+    bench.journal.set_fact(LIMIT_FROM, str(since))
+    recall(bench.journal, bench.settings, {"a"})
+    assert bench.journal.fact(LIMIT_FROM) == kept
+    bench.journal.close()
