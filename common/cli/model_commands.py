@@ -111,6 +111,11 @@ def evaluate(controller: Path, episodes: int, *more: object) -> Words:
     return command("evaluate", "--controller", controller, "--episodes", episodes, *more)
 
 
+def use_bundle(path: Path) -> tuple[Words, Words]:
+    """What to do with a world model: look into it, and evolve in it; the coordinator says how a worker joins."""
+    return command("inspect", path), command("coordinator", "--run", "mine", "--bundle", path)
+
+
 def split_flags(flag: str, text: str, owner: str = "", reserved: Sequence[str] = ()) -> Words:
     """Flags of another verb that `flag` was given as one text.
 

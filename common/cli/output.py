@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import sys
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Literal
 
+from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.printable import one_line, printable_lines
 
 if TYPE_CHECKING:
@@ -26,6 +28,19 @@ def add_json_flag(parser: argparse.ArgumentParser) -> None:
 def print_answer(args: argparse.Namespace, text: str, **facts: object) -> None:
     """Print `text`, or with `--json` the facts as one line of JSON."""
     print(json.dumps(facts, default=str) if args.json else printable_lines(text), flush=True)  # noqa: T201 - a verb's output
+
+
+def print_next(args: argparse.Namespace, *commands: Sequence[object]) -> None:
+    """Print on stderr the verbs to type next, each given as its words; nothing beside JSON, if quiet, or within a verb.
+
+    `args.within_verb` is true where another verb runs this one and goes on by itself.
+    """
+    if getattr(args, "json", False) or getattr(args, "within_verb", False):
+        return
+    if logging.getLogger("dreamfleet").level <= logging.INFO:
+        trusted = ("--trust", *args.global_config.trust) if "trust" in getattr(args, "given", ()) else ()
+        for words in commands:
+            print(printable_lines(f"next: {shell_command(*words, *trusted)}"), file=sys.stderr, flush=True)  # noqa: T201
 
 
 def print_rows(

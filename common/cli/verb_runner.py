@@ -39,20 +39,22 @@ class InProcessRunner:
         """`commands` by the names that their answers get; `UsageError` for a wrong one."""
         self._parsed = {name: _parse(words) for name, words in commands.items()}
 
-    def run_all(self) -> None:
-        """Run the verbs, each of which prints its answer."""
-        for verb, args in self._parsed.values():
-            args.json = False
+    def run_all(self, on_end: Callable[[str], None] = lambda _name: None) -> None:
+        """Run the verbs, each of which prints its answer, and call `on_end` with the name of each that has ended."""
+        for name, (verb, args) in self._parsed.items():
+            args.json, args.within_verb = False, True
             verb.run(args)
+            on_end(name)
 
-    def run_all_for_json(self) -> dict[str, Any]:
-        """Run the verbs and return their answers, which are not printed."""
+    def run_all_for_json(self, on_end: Callable[[str], None] = lambda _name: None) -> dict[str, Any]:
+        """As `run_all`, but return the answers, which are not printed."""
         answers = {}
         for name, (verb, args) in self._parsed.items():
             args.json = True
             with redirect_stdout(StringIO()) as printed:
                 verb.run(args)
             answers[name] = json.loads(printed.getvalue())
+            on_end(name)
         return answers
 
 

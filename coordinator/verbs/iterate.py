@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.config import add_flags, configured_values, load
 from dreamfleet.common.cli.global_config import add_global_flags, load_credentials, security_flags
-from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
+from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next, print_rows
 from dreamfleet.common.cli.presets import default_run_preset
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import is_file
@@ -223,3 +223,4 @@ def _print_results(args: argparse.Namespace, layout: IterationFolder, ledger: It
         print(f"it began with {init}, which was not judged on these seeds: `dreamfleet compare` shows which is better")
     if best is not None:
         print(f"best controller: round {best['round']}'s, {summary.format_score(best['score'])}: {best['controller']}")
+        print_next(args, *((verb, "--controller", best["controller"]) for verb in ("evaluate", "record")))

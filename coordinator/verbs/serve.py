@@ -7,6 +7,7 @@ import sys
 
 from dreamfleet.common.cli.config import add_flags, load
 from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
+from dreamfleet.common.cli.output import print_next
 from dreamfleet.coordinator.bridge.config import BridgeConfig
 
 SUMMARY = "let a search in any language score batches over HTTP"
@@ -25,8 +26,9 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.coordinator.bridge.server import serve
 
     serve(config, resolve_network(args, "operator", "coordinator"), _print_address)
+    print_next(args, ("runs", "list"))
     return 0
 
 
 def _print_address(address: str) -> None:
-    print(f"the bridge is at {address}", file=sys.stderr, flush=True)
+    print(f"the bridge is at {address}\nnext: curl {address}/v1/runs", file=sys.stderr, flush=True)

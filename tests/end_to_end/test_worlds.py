@@ -79,7 +79,8 @@ def test_a_gymnasium_world_goes_from_drives_to_a_video(processes, tmp_path):
         return out
 
     data, film = tmp_path / "data", tmp_path / "drive.mp4"
-    made = call("pipeline", "--data", data, "--task", DODGE, "--scale", "0.02", "--jobs", 1, *LAYERS, "--json")
+    made = call("pipeline", "--data", data, "--task", DODGE, "--scale", "0.02", "--jobs", 1, *LAYERS, "--yes",
+                "--json")  # fmt: skip
     bundle = Bundle.open(data / "pixels.zip")
     assert json.loads(made)["stages"]["bundle"]["sha256"] == bundle.sha256
     facts = bundle.manifest.world

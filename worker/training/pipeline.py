@@ -9,8 +9,12 @@ from pathlib import Path
 
 from dreamfleet.common.cli import model_commands
 from dreamfleet.common.cli.model_commands import Words, options, split_flags
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.host.processes import shell_command
+from dreamfleet.worker.training.assemble import load_quality
+from dreamfleet.worker.training.checkpoint import load_progress
 from dreamfleet.worker.training.presets import TrainConfig, TrainingPreset
+from dreamfleet.worker.training.train_vae import CHECKPOINT
 
 COLLECT, VAE, ENCODE, MDNRNN, BUNDLE = STAGES = ("collect", "train.vae", "encode", "train.mdnrnn", "bundle")
 RESERVED_FLAGS = (
@@ -24,6 +28,7 @@ RESERVED_FLAGS = (
     "--out",
 )  # set for each stage
 LEAST_DRIVES = 2  # one for training, one held out
+MORE = 4  # times as many updates as the VAE had are advised where it learnt too little
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,19 @@ class Pipeline:
             MDNRNN: train("mdnrnn", self.data, *self._train_flags(self.preset.mdnrnn, "mdnrnn_flags")),
             BUNDLE: model_commands.bundle(self.data, out or self.bundle, *self._split_flags("bundle_flags")),
         }
+
+    def check_vae(self) -> None:
+        """`DreamfleetError` where the VAE is no better than the mean picture: an MDN-RNN would learn nothing."""
+        figures = load_quality(self.data)
+        error, mean = figures["reconstruction_error"], figures["mean_picture_error"]
+        if error >= mean:
+            updates = load_progress(self.data / CHECKPOINT)["update"]
+            more = shell_command("train", "vae", "--data", self.data, "--updates", MORE * updates)
+            raise DreamfleetError(
+                f"the VAE in {self.data} is no better than the mean picture (squared error {error:g}, not below "
+                f"{mean:g}) after {updates:,} updates: train it longer with `{more}`, then give this command again; "
+                "--yes goes on with it"
+            )
 
     def _train_flags(self, config: TrainConfig, name: str) -> Words:
         """Updates, and those between checks on held-out drives, by scale: so there are as many checks at any scale."""

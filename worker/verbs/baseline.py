@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.command_line import SimpleVerb
-from dreamfleet.common.cli.output import add_json_flag, print_answer
+from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
 from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path
@@ -74,6 +74,7 @@ def train_baseline(args: argparse.Namespace) -> int:
     ):
         figures = train_drqn(args.data, layers, config, report_progress, device, stop, args.new)
     print_answer(args, "  ".join(f"{name} {value}" for name, value in figures.items()), **figures)
+    print_next(args, ("baseline", "export", args.agent, "--data", args.data, "--out", args.data / f"{args.agent}.zip"))
     return 0
 
 
@@ -102,6 +103,7 @@ def export_baseline(args: argparse.Namespace) -> int:
     )
     trained = {name: provenance[name] for name in ("episodes", "steps", "updates")}
     print_answer(args, text, agent=args.out, bytes=size, sha256=agent.sha256, **trained)
+    print_next(args, ("evaluate", "--controller", args.out), ("record", "--controller", args.out))
     return 0
 
 

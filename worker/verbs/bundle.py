@@ -7,7 +7,8 @@ from pathlib import Path
 
 from dreamfleet.common.artifacts.bundle import MAX_RECORDED_STATES, Bundle
 from dreamfleet.common.artifacts.world_facts import EndRule
-from dreamfleet.common.cli.output import add_json_flag, print_answer
+from dreamfleet.common.cli.model_commands import use_bundle
+from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path
 
@@ -107,6 +108,7 @@ def _answer(args: argparse.Namespace, bundle: Bundle) -> int:
     )
     print_answer(args, text, bundle=bundle.path, bytes=bundle.path.stat().st_size, sha256=bundle.sha256,
            controller_parameters=parameters, recorded=states)  # fmt: skip
+    print_next(args, *use_bundle(bundle.path))
     return 0
 
 

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.global_config import add_global_flags
-from dreamfleet.common.cli.output import add_json_flag, print_answer
+from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
 from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.cli.world_flags import add_world_flags, world_arguments
 from dreamfleet.common.errors import StoppedError, UsageError
+from dreamfleet.common.files.regular_files import is_file
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.printable import plural
 
@@ -90,7 +91,14 @@ def run(args: argparse.Namespace) -> int:
         f"{args.data}: {plural(done, 'new episode')} with {plural(frames, 'frame')}; {plural(there, 'episode')} in all"
     )
     print_answer(args, text, data=args.data, new_episodes=done, new_frames=frames, episodes=there)
+    _print_next(args)
     return 0
+
+
+def _print_next(args: argparse.Namespace) -> None:
+    """Train on the drives; those that are added to a trained VAE's are encoded by it."""
+    trained = is_file(args.data / "vae.safetensors")  # `train_vae.CHECKPOINT`, whose module loads torch
+    print_next(args, ("encode", "--data", args.data) if trained else ("train", "vae", "--data", args.data))
 
 
 def _fit_pictures(config: CollectConfig, world: DataWorld) -> CollectConfig:
@@ -135,4 +143,5 @@ def _import_run(args: argparse.Namespace) -> int:
     text = f"{args.data}: {added}, of {len(drives)} that {args.from_run} collected"
     print_answer(args, text, data=args.data, new_episodes=len(new), new_frames=sum(new), collected=len(drives),
            episodes=len(existing_episodes(args.data)))  # fmt: skip
+    _print_next(args)
     return 0

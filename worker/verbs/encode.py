@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from dreamfleet.common.cli.output import add_json_flag, print_answer
+from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
 from dreamfleet.common.printable import plural
 
 SUMMARY = "encode a data set's pictures with its trained VAE"
@@ -36,4 +36,5 @@ def run(args: argparse.Namespace) -> int:
         bar.update(total)  # with those that were encoded before
     also = ", each also mirrored" if encodes_mirrored(args.data) else ""
     print_answer(args, f"{args.data}: {plural(frames, 'frame')} encoded{also}", data=args.data, new_frames=frames)
+    print_next(args, ("train", "mdnrnn", "--data", args.data))
     return 0

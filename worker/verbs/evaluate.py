@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
 from dreamfleet.common.cli.key_values import ENVIRONMENT_EXAMPLE, parse_arguments
+from dreamfleet.common.cli.model_commands import Words, options
+from dreamfleet.common.cli.output import print_next
 from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, open_output
 from dreamfleet.common.host.resource_limits import pin_thread_pools, usable_cores
@@ -78,6 +80,13 @@ def named_agent(args: argparse.Namespace) -> Agent:
     return agent
 
 
+def agent_flags(args: argparse.Namespace) -> Words:
+    """The flags of the same agent for `evaluate` and `record`."""
+    runs_dir = args.runs_dir if "runs_dir" in getattr(args, "given", ()) else None
+    found = options(controller=args.controller, bundle=args.bundle, task=args.task, runs_dir=runs_dir)
+    return (*found, "--environment", *args.environment) if args.environment else found
+
+
 def run(args: argparse.Namespace) -> int:
     """Drive, and print the scores."""
     pin_thread_pools()  # of NumPy, which is not loaded yet: its threads take three times the time of a drive otherwise
@@ -98,6 +107,8 @@ def run(args: argparse.Namespace) -> int:
     if args.out:
         with open_output(args.out) as file:
             file.write(f"{judgement.to_json()}\n".encode())
+    if args.controller and args.cell is None:  # a live run's controller, and a cell's, are no file here
+        print_next(args, ("record", *agent_flags(args)))
     return 0
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from dreamfleet.common.cli.model_commands import world_flags
-from dreamfleet.common.cli.output import add_json_flag, print_answer
+from dreamfleet.common.cli.model_commands import use_bundle, world_flags
+from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
 from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.cli.verb_runner import InProcessRunner
 from dreamfleet.common.cli.world_flags import add_world_flags, world_arguments
@@ -38,6 +38,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     for name, example in EXAMPLES.items():
         text = f'flags of this stage only, as one text: --{name}-flags="{example}"'
         parser.add_argument(f"--{name}-flags", default="", metavar="FLAGS", help=text)
+    parser.add_argument(
+        "--yes", action="store_true",
+        help="go on where the VAE is no better than the mean picture, which ends the command otherwise",
+    )  # fmt: skip
     add_json_flag(parser)
 
 
@@ -46,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the stages, each of which does what is left of it."""
     from dreamfleet.common.files.atomic_write import check_output_path
     from dreamfleet.worker.training.data.data_folder import check_seed, resolve_preset, resolve_world
-    from dreamfleet.worker.training.pipeline import Pipeline
+    from dreamfleet.worker.training.pipeline import VAE, Pipeline
     from dreamfleet.worker.training.presets import find_preset
 
     world = resolve_world(args.data, args.task, world_arguments(args))
@@ -60,9 +64,15 @@ def run(args: argparse.Namespace) -> int:
     stages = source.stages(max(1, args.jobs), args.device, args.out)
     runner = InProcessRunner({name: (*words, *file) for name, words in stages.items()})  # wrong flags end it here
     check_output_path(args.out or source.bundle)
+
+    def check(stage: str) -> None:
+        if stage == VAE and not args.yes:
+            source.check_vae()
+
     if not args.json:
-        runner.run_all()
+        runner.run_all(check)
+        print_next(args, *use_bundle(args.out or source.bundle))
         return 0
-    answers = runner.run_all_for_json()
+    answers = runner.run_all_for_json(check)
     print_answer(args, "", data=args.data, preset=preset.name, scale=args.scale, stages=answers)
     return 0

@@ -7,9 +7,10 @@ import sys
 from functools import partial
 
 from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.cli.output import print_next
 from dreamfleet.common.host.unseen_drawing import describe_choice, draw_unseen
 from dreamfleet.worker.tools.video_cli import add_video_flags, check_video_flags, record_videos
-from dreamfleet.worker.verbs.evaluate import CONTROLLER, add_random_flags, named_agent
+from dreamfleet.worker.verbs.evaluate import CONTROLLER, add_random_flags, agent_flags, named_agent
 
 SUMMARY = "record drives as mp4s: the world, what the model sees, what it decodes, what it dreams"
 EXTRAS = ("worker", "views")
@@ -37,4 +38,5 @@ def run(args: argparse.Namespace) -> int:
     code = record_videos(args, agent, film)
     if note := describe_choice():
         print(note, file=sys.stderr)
+    print_next(args, ("evaluate", *agent_flags(args)))
     return code

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.cli.model_commands import MODELS
-from dreamfleet.common.cli.output import add_json_flag, print_answer
+from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
 from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import plural
@@ -91,7 +91,9 @@ def _train_vae(args: argparse.Namespace) -> int:
         return training.train_vae(args.data, config, report, layers, device, other, args.decoder_only, stop, args.new,
                                   args.tensorboard)  # fmt: skip
 
-    return run_training(args, "VAE", config.updates, args.data / training.CHECKPOINT, train)
+    code = run_training(args, "VAE", config.updates, args.data / training.CHECKPOINT, train)
+    print_next(args, ("encode", "--data", args.data))
+    return code
 
 
 def _train_mdnrnn(args: argparse.Namespace) -> int:
@@ -118,7 +120,9 @@ def _train_mdnrnn(args: argparse.Namespace) -> int:
     if waiting := count_unencoded(args.data):
         note = f"note: not encoded or learnt from: {plural(waiting, 'drive')}; `dreamfleet encode --data {args.data}`"
         print(note, file=sys.stderr)
-    return run_training(args, "MDN-RNN", config.updates, args.data / training.CHECKPOINT, train)
+    code = run_training(args, "MDN-RNN", config.updates, args.data / training.CHECKPOINT, train)
+    print_next(args, ("bundle", "--data", args.data, "--out", args.data / f"{preset.name}.zip"))
+    return code
 
 
 def _print_summary(args: argparse.Namespace, model: nn.Module, addable: frozenset[str] = frozenset()) -> int:

@@ -2,15 +2,17 @@
 
 import fcntl
 import json
+import logging
 import os
 import pty
+import shlex
 import struct
 import subprocess
 import sys
 import termios
 from argparse import Namespace
 
-from dreamfleet.common.cli.output import print_answer, print_rows
+from dreamfleet.common.cli.output import print_answer, print_next, print_rows
 from tests.support.processes import DEADLINE
 
 LONG = "a-run-whose-name-is-longer-than-any-column-of-a-narrow-terminal-would-be"
@@ -68,3 +70,16 @@ def test_untrusted_text_cannot_control_the_terminal():
     for text in (output, piped):
         assert "night\\x1b[2J" in text
         assert "owned\\x07\\u202e" in text
+
+
+def test_the_next_command_is_said_where_a_person_reads(capsys, caplog):
+    words = ("inspect", "a b.zip")
+    print_next(Namespace(json=False), words, ("runs", "list"))
+    first, second = capsys.readouterr().err.splitlines()
+    assert shlex.split(first)[-2:] == ["inspect", "a b.zip"]
+    assert shlex.split(second)[-2:] == ["runs", "list"]
+    print_next(Namespace(json=True), words)
+    print_next(Namespace(json=False, within_verb=True), words)
+    with caplog.at_level(logging.WARNING, "dreamfleet"):
+        print_next(Namespace(), words)
+    assert capsys.readouterr() == ("", "")

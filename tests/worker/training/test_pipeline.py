@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.bundle import WEIGHTS, Bundle
-from dreamfleet.common.errors import DatasetError, StoppedError, UsageError
+from dreamfleet.common.errors import DatasetError, DreamfleetError, StoppedError, UsageError
 from dreamfleet.worker.training import train_mdnrnn, train_vae
-from dreamfleet.worker.training.assemble import assemble
+from dreamfleet.worker.training.assemble import assemble, load_quality, record_quality
 from dreamfleet.worker.training.checkpoint import load_weights
 from dreamfleet.worker.training.data.dataset import load_arrays
 from dreamfleet.worker.training.encode import encode
@@ -153,7 +153,7 @@ def test_the_area_under_the_curve(scores, positive, area):
 # SWIG warns as Box2D is imported, and an error there kills the process.
 pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
 SHARES = {"tiny": 0.004, "notebook": 0.0005, "article": 0.0002, "attentive": 0.001, "paper": 0.00002, "pixels": 0.005}
-FEW = ("--jobs", "1", "--collect-flags", "--steps 24", "--vae-flags", "--batch 4")
+FEW = ("--jobs", "1", "--collect-flags", "--steps 24", "--vae-flags", "--batch 4", "--yes")
 
 
 @pytest.fixture(autouse=True)
@@ -203,6 +203,21 @@ def test_it_goes_on_where_it_stopped_to_the_same_bundle(tmp_path, monkeypatch, c
     for _ in range(2):  # and once more, when all is finished
         assert call("--data", tmp_path / "stopped", *flags) == 0
         assert made(tmp_path / "stopped", "article").sha256 == made(tmp_path / "whole", "article").sha256
+
+
+def test_nothing_is_made_on_a_vae_that_is_no_better_than_the_mean_picture(tmp_path):
+    write_drives(tmp_path, episodes=4, steps=6)
+    for flags in ((), ("--json",)):
+        with pytest.raises(DreamfleetError) as refused:
+            call("--data", tmp_path, "--preset", "tiny", "--scale", "0.001", "--jobs", 1, *flags)
+        assert type(refused.value) is DreamfleetError
+        assert "--yes" in str(refused.value)
+    figures = load_quality(tmp_path)
+    assert figures["reconstruction_error"] >= figures["mean_picture_error"]
+    assert not (tmp_path / "encoded").exists()
+    assert not (tmp_path / train_mdnrnn.CHECKPOINT).exists()
+    record_quality(tmp_path, {"reconstruction_error": figures["mean_picture_error"] - 0.01})
+    Pipeline(PRESETS["tiny"], tmp_path).check_vae()
 
 
 def test_the_world_is_passed_to_collect_alone():
