@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.artifacts.actions import MAX_OUTPUTS
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape, import_hint
 from dreamfleet.common.artifacts.driving import Driving, Variant, parse_driving
 from dreamfleet.common.artifacts.onnx_checks import (
@@ -64,7 +65,7 @@ class BundleManifest:
     picture: tuple[int, ...]  # height, width, channels of the encoder's 8-bit input
     latent: Annotated[int, Between(1, 10_000)]
     hidden: Annotated[int, Between(1, 100_000)]
-    actions: Annotated[int, Between(1, 1000)]
+    actions: Annotated[int, Between(1, MAX_OUTPUTS)]
     parts: dict[str, Any] = field(default_factory=dict)  # name -> SHA-256; `write_bundle` fills it in
     provenance: dict[str, Any] = field(default_factory=dict)
     format: int = FORMAT

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.actions import Continuous
+from dreamfleet.common.artifacts.actions import MAX_OUTPUTS, Continuous
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.serialization.optional_fields import OPTIONAL
 from dreamfleet.common.serialization.validation import Between, Length, MalformedError, Word
@@ -17,7 +17,7 @@ from dreamfleet.common.serialization.validation import Between, Length, Malforme
 DRAWN: Final = "drawn"  # the text of the rule that draws its ends
 ODDS_WEIGHTS: Final = (1e-6, 1e6)  # the least and the most
 MAX_OPTIONS = 20_000  # characters of a task's options
-Components = Annotated[tuple[float, ...], Length(1, 1000)]  # one number for each component of an action
+Components = Annotated[tuple[float, ...], Length(1, MAX_OUTPUTS)]  # one number for each component of an action
 
 
 @dataclass(frozen=True)
@@ -108,12 +108,13 @@ class WorldFacts:
     (True, '0.5')
     """
 
-    scale: Components  # this and the next five as in `Continuous`
+    scale: Components  # this and the next six as in `Continuous`
     shift: Components
     low: Components
     high: Components
     output_indices: tuple[int, ...] = field(default=(), metadata=OPTIONAL)
     choices: tuple[tuple[float, ...], ...] = field(default=(), metadata=OPTIONAL)
+    groups: Annotated[tuple[tuple[int, int], ...], Length(0, MAX_OUTPUTS)] = field(default=(), metadata=OPTIONAL)
     packages: Annotated[tuple[Word, ...], Length(0, 64)]  # distributions on whose versions a fitness may depend
     horizon: Annotated[int, Between(1, 10**6)]  # most steps of an evaluation episode
     frames_per_second: Annotated[int, Between(1, 1000)]  # of videos
@@ -123,7 +124,7 @@ class WorldFacts:
     version: Annotated[int, Between(1, 2**31 - 1)] = field(default=1, metadata=OPTIONAL)  # of the task's world
     score_word: Word = field(default="seed", metadata=OPTIONAL)  # what a scored seed is called
     marks: Annotated[tuple[float, ...], Length(0, 8)] = field(default=(), metadata=OPTIONAL)  # scores to compare with
-    action_names: Annotated[tuple[Word, ...], Length(0, 1000)] = field(default=(), metadata=OPTIONAL)
+    action_names: Annotated[tuple[Word, ...], Length(0, MAX_OUTPUTS)] = field(default=(), metadata=OPTIONAL)
 
     def __post_init__(self) -> None:
         size = len(self.scale)
@@ -135,6 +136,8 @@ class WorldFacts:
             raise MalformedError("output_indices do not name one output for each component of an action")
         if any(len(choice) != size for choice in self.choices):
             raise MalformedError("a choice has another length than the action")
+        if self.groups and not self._are_groups_sound():
+            raise MalformedError("groups do not name outputs for each component of an action")
         if len(self.action_names) not in (0, size):
             raise MalformedError(f"it names {len(self.action_names)} actions of {size}")
         if not all(map(str.isprintable, (*self.packages, *self.action_names, self.score_word))):
@@ -151,12 +154,22 @@ class WorldFacts:
         for name in ("scale", "shift", "low", "high"):
             facts[name] = tuple(map(float, getattr(actions, name)))
         choices = tuple(tuple(map(float, choice)) for choice in actions.choices)
-        return cls(output_indices=actions.output_indices, choices=choices, **facts)
+        return cls(output_indices=actions.output_indices, choices=choices, groups=actions.groups, **facts)
+
+    def _are_groups_sound(self) -> bool:
+        if any(len(each) != 2 for each in self.groups):
+            return False
+        sizes = [outputs for outputs, _ in self.groups]
+        fits = all(columns == outputs or (outputs, columns) == (2, 1) for outputs, columns in self.groups)
+        fits = fits and min(sizes) >= 1 and sum(sizes) <= MAX_OUTPUTS and not (self.choices or self.output_indices)
+        return fits and sum(columns for _, columns in self.groups) == len(self.scale)
 
     @cached_property
     def actions(self) -> Continuous:
         """The conversion of a controller's outputs to actions."""
-        return Continuous(self.scale, self.shift, self.low, self.high, self.output_indices, self.choices)
+        return Continuous(
+            self.scale, self.shift, self.low, self.high, self.output_indices, self.choices, groups=self.groups
+        )
 
 
 def _are_all_used(outputs: tuple[int, ...]) -> bool:

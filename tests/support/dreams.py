@@ -1,11 +1,11 @@
-"""Random world models of three worlds: CarRacing, one of three choices, and one of a single number."""
+"""Random world models of worlds: CarRacing, one of three choices, one of a single number, and one of three numbers."""
 
 import dataclasses
 
 import numpy as np
 import torch
 
-from dreamfleet.common.artifacts.actions import Continuous, one_hot
+from dreamfleet.common.artifacts.actions import Continuous, grouped, one_hot
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, write_bundle
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts, WorldFacts
 from dreamfleet.worker.worldmodel.export import export_dream
@@ -20,21 +20,24 @@ WORLDS = {
     "car-racing": None,
     "choices": WorldFacts.of(one_hot(3), reward=RewardFacts("survival", gain=4.0), end=DRAWN, **ABOUT),
     "one number": WorldFacts.of(Continuous.between([-1], [1]), reward=RewardFacts("value"), end=DRAWN, **ABOUT),
+    "groups": WorldFacts.of(grouped([3, 2, 5], bits=[1]), reward=RewardFacts("survival"), end=DRAWN, **ABOUT),
 }
 MODELS = {
     "car-racing": MDNRNNConfig(latent=3, hidden=4),
     "choices": MDNRNNConfig(latent=3, hidden=4, done=True, reward="none"),
     "one number": MDNRNNConfig(latent=3, hidden=4, done=True, reward="value"),
+    "groups": MDNRNNConfig(latent=3, hidden=4, done=True, reward="none"),
 }
 ACTIONS = {
     "car-racing": np.array([0.1, 0.5, 0.0], np.float32),
     "choices": np.int64(2),
     "one number": np.array([-0.3], np.float32),
+    "groups": np.array([2, 0, 4]),
 }
 
 
 def write_bundle_of(world, path, recorded=None, **options):
-    """A random bundle of one of the three worlds."""
+    """A random bundle of one of the worlds."""
     if WORLDS[world] is None:
         return write_random_bundle(path, vae=VAE, rnn=MODELS[world], recorded=recorded)
     return write_world_bundle(path, WORLDS[world], vae=VAE, rnn=MODELS[world], recorded=recorded, **options)

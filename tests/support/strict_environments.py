@@ -14,6 +14,8 @@ ACTIONS = {
     "signed": spaces.Box(np.array([-3, 0]), np.array([3, 10**9]), dtype=np.int64),
     "mixed": spaces.Dict({"turn": spaces.Box(-0.3, 0.3, (1,), np.float64), "gear": spaces.Box(1, 6, (1,), np.int8)}),
     "start": spaces.Discrete(3, start=-7),
+    "many": spaces.MultiDiscrete([11, 11, 11]),
+    "large": spaces.Discrete(4096, start=1),
     "endless": spaces.Box(np.iinfo(np.int64).min, np.iinfo(np.int64).max, (1,), np.int64),
 }
 

@@ -26,9 +26,9 @@ DEFAULT_HORIZON = 1000  # steps, as gymnasium's CarRacing has them
 
 
 def action_space(actions: Continuous) -> Any:
-    """The gymnasium space of a world's actions: a box, or the numbers of its choices."""
-    if actions.choices:
-        return spaces.Discrete(len(actions.choices))
+    """The gymnasium space of a world's actions: a box, or the number of its choice or of each of them."""
+    if sizes := actions.sizes:
+        return spaces.Discrete(sizes[0]) if len(sizes) == 1 else spaces.MultiDiscrete(list(sizes))
     return spaces.Box(np.array(actions.low, np.float32), np.array(actions.high, np.float32))
 
 
@@ -38,7 +38,7 @@ def horizon_of(bundle: Bundle) -> int:
 
 
 def to_rows(actions: Continuous, given: Any, count: int) -> Floats:
-    """The actions `(count, A)` of that many dreams, each given as such a row, or as the number of a choice.
+    """The actions `(count, A)` of that many dreams, each given as such a row, or as the numbers of its choices.
 
     `ValueError` for anything else.
 
@@ -47,11 +47,13 @@ def to_rows(actions: Continuous, given: Any, count: int) -> Floats:
     array([[0., 0., 1.],
            [1., 0., 0.]], dtype=float32)
     """
-    found, choices = np.asarray(given), len(actions.choices)
-    if choices and found.size == count and np.issubdtype(found.dtype, np.integer):
-        if not ((found >= 0) & (found < choices)).all():
-            raise ValueError(f"the number of an action must be from 0 to {choices - 1}")
-        found = np.array(actions.choices, np.float32)[found.reshape(-1)]
+    found, sizes = np.asarray(given), actions.sizes
+    if sizes and found.size == count * len(sizes) and np.issubdtype(found.dtype, np.integer):
+        numbers = found.reshape(count, len(sizes))
+        if not ((numbers >= 0) & (numbers < sizes)).all():
+            most = " ".join(str(size - 1) for size in sizes)
+            raise ValueError(f"the numbers of an action must be from 0 to {most}")
+        found = actions.from_numbers(numbers)
     rows = found.astype(np.float32)
     if rows.size != count * actions.actions or not np.isfinite(rows).all():
         raise ValueError(f"an action must be {actions.actions} finite numbers")

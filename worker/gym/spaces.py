@@ -6,9 +6,7 @@ A number of a `Discrete` or `MultiDiscrete` space is one-hot there; entries of a
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from itertools import product
-from math import prod
+from itertools import islice
 from typing import Any
 
 import gymnasium
@@ -17,48 +15,55 @@ from gymnasium import spaces
 from gymnasium.wrappers import FlattenObservation, TransformAction
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.actions import Actions, Continuous, Discrete
+from dreamfleet.common.artifacts.actions import (
+    MAX_OUTPUTS,
+    Actions,
+    Continuous,
+    Discrete,
+    grouped,
+    one_hot,
+)
 from dreamfleet.common.errors import UsageError
 
 Floats = NDArray[np.float32]
-MAX_CHOICES = 64  # a controller has an output for each
 LARGEST_WHOLE = 2**53  # of a whole number as an action; beyond it, double precision skips some
 ENDS = ("low", "high")
 NUMBERED = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 
 def vector_actions(space: Any, name: str) -> Continuous:
-    """The actions of a space as vectors `(A,)`: of float Boxes between their bounds, of numbered spaces as choices.
+    """The actions of a space as vectors `(A,)`: of Boxes between their bounds, of numbered spaces by groups of outputs.
 
-    `UsageError` with the environment's `name` for a space of both kinds or neither, or with too many choices.
+    `UsageError` with the environment's `name` for a space of both kinds or neither, or with too many outputs.
 
-    >>> vector_actions(spaces.MultiDiscrete([2, 3]), "it").choices[1]
-    (1.0, 0.0, 0.0, 1.0, 0.0)
+    >>> vector_actions(spaces.MultiDiscrete([11, 11, 11]), "it").outputs
+    33
     """
     leaves = list(_leaves(space))
     if leaves and all(isinstance(each, spaces.Box) for each in leaves):
         for each in leaves:
             _check_box(each, name)
         low, high = ([getattr(each, end).ravel() for each in leaves] for end in ENDS)
+        _check_outputs(sum(each.low.size for each in leaves), name)
         return Continuous.between(np.concatenate(low), np.concatenate(high))
-    if not leaves or not all(isinstance(each, NUMBERED) for each in leaves):
+    numbered = leaves if all(isinstance(each, NUMBERED) for each in leaves) else []
+    sizes = [(size, isinstance(each, spaces.MultiBinary)) for each in numbered for size in _sizes(each)]
+    if not sizes:
         raise UsageError(f"{name} takes actions {space}: wrap it so that they are a flat Box of floats, or Discrete")
-    if (count := prod(prod(_sizes(each)) for each in leaves)) > MAX_CHOICES:
-        raise UsageError(f"{name} takes {count} different actions: wrap it so that they are {MAX_CHOICES} at most")
-    rows = tuple(tuple(map(float, sum(parts, ()))) for parts in product(*map(_rows, leaves)))
-    width = len(rows[0])
-    return replace(Continuous.between([0.0] * width, [1.0] * width), choices=rows)
+    _check_outputs(sum(size for size, _ in sizes), name)
+    if isinstance(space, spaces.Discrete):
+        return one_hot(int(space.n))
+    return grouped([size for size, _ in sizes], [index for index, (_, is_bit) in enumerate(sizes) if is_bit])
 
 
 def make_converter(space: Any, actions: Continuous) -> Callable[[Floats], Any]:
-    """What turns a vector of `vector_actions` into an action of the space: the nearest choice, if there are choices.
+    """What turns a vector of `vector_actions` into an action of the space: the nearest one, if it has numbered ones.
 
     Numbers get the type of their Box. They are rounded if that is whole, and clipped to the Box' own bounds: the single
     precision of a vector may lie beyond these, as float32(0.1) > 0.1 does.
     """
-    table = np.array(actions.choices, dtype=np.float32)
-    if len(table):
-        return lambda action: spaces.unflatten(space, table[np.argmin(((table - action) ** 2).sum(axis=1))])
+    if actions.sizes:
+        return lambda action: _element(space, iter(actions.to_numbers(action)))
     leaves = list(_leaves(space))
     low, high = (np.concatenate([getattr(each, end).ravel() for each in leaves], dtype=np.float64) for end in ENDS)
     whole = np.concatenate([np.full(each.low.size, _is_whole(each)) for each in leaves])
@@ -76,7 +81,7 @@ def flatten_environment(
     """The environment for a controller without a world model, and the actions that it then takes.
 
     Box observations, Discrete actions and flat Boxes of float32 stay as they are. Other observations and actions become
-    vectors, and other numbered actions one number. Of a Dict, `keys` are seen; without any, all that are numbers.
+    vectors. Of a Dict, `keys` are seen; without any, all that are numbers.
     `UsageError` where that is impossible.
     """
     observed, space = environment.observation_space, environment.action_space
@@ -88,16 +93,14 @@ def flatten_environment(
             "as a constant 1, or search its actions as a function (function:MODULE:NAME)"
         )
     if isinstance(space, spaces.Discrete):
+        _check_outputs(int(space.n), name)
         return environment, Discrete(int(space.n), int(space.start))
     actions = vector_actions(space, name)
     if isinstance(space, spaces.Box) and len(space.shape) == 1 and space.dtype == np.float32:
         return environment, actions
-    convert = make_converter(space, actions)
-    if not actions.choices:
-        return TransformAction(environment, convert, spaces.flatten_space(space)), actions
-    table = np.array(actions.choices, dtype=np.float32)
-    numbers = spaces.Discrete(len(table))
-    return TransformAction(environment, lambda number: convert(table[number]), numbers), Discrete(len(table))
+    # Drawn numbers from 0 to 1 choose evenly in each group.
+    drawn = spaces.Box(0, 1, (actions.actions,), np.float32) if actions.sizes else spaces.flatten_space(space)
+    return TransformAction(environment, make_converter(space, actions), drawn), actions
 
 
 class NumbersAlone(gymnasium.ObservationWrapper[Any, Any, Any]):
@@ -185,18 +188,28 @@ def _is_whole(space: spaces.Box) -> bool:
     return not np.issubdtype(space.dtype, np.floating)
 
 
+def _check_outputs(count: int, name: str) -> None:
+    if count > MAX_OUTPUTS:
+        raise UsageError(
+            f"{name} takes actions by {count} outputs of a controller: wrap it so that they are {MAX_OUTPUTS} at most"
+        )
+
+
+def _element(space: Any, numbers: Iterator[Any]) -> Any:
+    """The element of a numbered space whose leaves take the next of these numbers, each from 0."""
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        parts = {key: _element(each, numbers) for key, each in _entries(space)}
+        return parts if isinstance(space, spaces.Dict) else tuple(parts.values())
+    if isinstance(space, spaces.Discrete):
+        return space.start + np.int64(next(numbers))
+    taken = np.array(list(islice(numbers, len(_sizes(space)))))
+    if isinstance(space, spaces.MultiBinary):
+        return taken.astype(space.dtype).reshape(space.shape)
+    return (taken.reshape(space.shape) + space.start).astype(space.dtype)
+
+
 def _sizes(space: Any) -> list[int]:
     """How many values each number of a numbered space has."""
     if isinstance(space, spaces.MultiBinary):
         return [2] * int(np.prod(space.shape))
     return [int(space.n)] if isinstance(space, spaces.Discrete) else space.nvec.ravel().tolist()
-
-
-def _rows(space: Any) -> Iterator[tuple[int, ...]]:
-    """Every element of a numbered space, flattened; the last number varies fastest."""
-    sizes = _sizes(space)
-    for numbers in product(*map(range, sizes)):
-        if isinstance(space, spaces.MultiBinary):
-            yield numbers
-        else:
-            yield tuple(int(k == number) for number, size in zip(numbers, sizes, strict=True) for k in range(size))

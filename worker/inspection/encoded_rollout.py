@@ -79,13 +79,13 @@ class EncodedRollout:
 class ConstantDriver:
     """A driver that repeats one action; `UsageError` if the world has no such action.
 
-    One of numbered choices is given by its number, from 0.
+    One of numbered choices is given by its number, from 0, and several at once by the number of each.
     """
 
     def __init__(self, action: Sequence[float], world: World) -> None:
         actions, names = world.actions, world.action_names
-        if isinstance(actions, Continuous) and len(choices := numbered_choices(actions)):
-            action = _choice_of(action, choices, names).tolist()
+        if isinstance(actions, Continuous) and len(numbered_choices(actions)):
+            action = _choice_of(action, actions, names).tolist()
         done = np.array(action, np.float64)
         if not isinstance(actions, Continuous) or done.shape != (actions.actions,):
             wanted = f"{', '.join(names)}: {len(names)} numbers" if names else "numbers, of a world with such actions"
@@ -103,15 +103,15 @@ class ConstantDriver:
         return self._done
 
 
-def _choice_of(action: Sequence[float], choices: Floats, names: Sequence[str]) -> Floats:
-    if len(action) != 1 or action[0] not in range(len(choices)):
-        numbered = (
-            ", ".join(f"{number} {name}" for number, name in enumerate(names)) if len(names) == len(choices) else ""
-        )
-        wanted = numbered or f"0 to {len(choices) - 1}"
-        raise UsageError(f"--action takes one number of a choice, {wanted}, not {_format_action(action)}")
-    choice: Floats = choices[int(action[0])]
-    return choice
+def _choice_of(action: Sequence[float], actions: Continuous, names: Sequence[str]) -> Floats:
+    sizes = actions.sizes
+    if len(action) != len(sizes) or any(each not in range(size) for each, size in zip(action, sizes, strict=True)):
+        named = len(sizes) == 1 and len(names) == sizes[0]
+        numbered = ", ".join(f"{number} {name}" for number, name in enumerate(names)) if named else ""
+        ranges = numbered or ", then ".join(f"0 to {size - 1}" for size in sizes)
+        wanted = f"one number of a choice, {ranges}" if len(sizes) == 1 else f"{len(sizes)} numbers, {ranges}"
+        raise UsageError(f"--action takes {wanted}, not {_format_action(action)}")
+    return actions.from_numbers(np.array(action, np.int64))
 
 
 def _format_action(action: Sequence[float]) -> str:

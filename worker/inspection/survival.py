@@ -151,7 +151,7 @@ def fixed_drivers(task: Task, world: World) -> dict[str, DriverMaker]:
         raise UsageError(f"the actions of {task.name} are numbers: a dream needs vectors")
     found: dict[str, tuple[float, ...]] = {}
     if len(choices := numbered_choices(actions)[:MOST_CHOICES]):
-        found = {f"always {choice_name(row, names, actions)}": (number,) for number, row in enumerate(choices)}
+        found = {f"always {choice_name(row, names, actions)}": tuple(actions.to_numbers(row)) for row in choices}
     else:
         middle = [(low + high) / 2 for low, high in zip(actions.low, actions.high, strict=True)]
         found["always the middle"] = tuple(middle)

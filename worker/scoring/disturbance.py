@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.actions import Continuous
+from dreamfleet.common.artifacts.actions import MOST_CHOICES, Continuous
 from dreamfleet.worker.scoring.actors import Actor
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 
@@ -80,7 +80,14 @@ class _OtherChoices:
 
 @lru_cache
 def numbered_choices(actions: Continuous) -> Floats:
-    """The choices `(n, actions)` of numbered actions, which are rows of ones and zeros; none of other actions."""
+    """Choices `(n, actions)` of numbered actions, which are rows of ones and zeros; none of other actions.
+
+    Of groups they are at most `MOST_CHOICES`, spread over the numbers of each.
+    """
+    if actions.groups:
+        most = max(actions.sizes)
+        spread = np.linspace(0, most - 1, min(most, MOST_CHOICES)).astype(np.int64)
+        return actions.from_numbers(spread[:, None] % np.array(actions.sizes))
     rows = np.array(actions.choices, np.float32).reshape(-1, actions.actions)
     return rows if np.isin(rows, (0, 1)).all() else rows[:0]
 

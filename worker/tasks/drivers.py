@@ -1,6 +1,6 @@
 """Random drivers for worlds of any actions, which collect the data of a first world model.
 
-They draw each action evenly: one of its choices, or a number between the bounds of each component.
+They draw each action evenly: the number of each of its choices, or a number between the bounds of each component.
 """
 
 from __future__ import annotations
@@ -23,15 +23,13 @@ class UniformActions:
     def __init__(self, random: np.random.Generator, actions: Continuous) -> None:
         self._random = random
         self._low, self._high = (np.array(each, dtype=np.float32) for each in (actions.low, actions.high))
-        self._choices = np.array(actions.choices, dtype=np.float32)
+        self._actions = actions
 
     def act(self) -> Floats:
         """The next action `(A,)`."""
-        if len(self._choices):
-            drawn = self._choices[self._random.integers(len(self._choices))]
-        else:
-            drawn = self._random.uniform(self._low, self._high)
-        return np.array(drawn, dtype=np.float32)
+        if sizes := self._actions.sizes:
+            return self._actions.from_numbers([self._random.integers(size) for size in sizes])
+        return np.array(self._random.uniform(self._low, self._high), dtype=np.float32)
 
 
 class HeldActions:

@@ -40,7 +40,8 @@ class ActionTally:
         """Add a step: the actions `(rows, actions)` of these rows, or their numbers `(rows,)`."""
         values = np.asarray(actions, dtype=np.float64)
         if isinstance(self._actions, Discrete):
-            values = np.eye(self._actions.outputs)[values.astype(np.int64) - self._actions.first]
+            numbers = values.astype(np.int64) - self._actions.first
+            values = (numbers[..., None] == np.arange(self._actions.outputs)).astype(np.float64)
         self._sums[rows] += np.stack([values, np.abs(values), values > 0], axis=1)
 
     def mean(self, row: int, column: tuple[int, int], steps: int) -> float:

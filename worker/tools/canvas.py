@@ -205,6 +205,8 @@ def choice_name(action: NDArray[Any], names: tuple[str, ...], actions: Actions |
         return None
     if len(names) == len(action):
         return " ".join(name for name, value in zip(names, action, strict=True) if value) or "none"
+    if actions.groups:
+        return " ".join(map(str, actions.to_numbers(action)))
     found = np.flatnonzero((choices == action).all(axis=1))
     return f"{found[0]} of {len(choices)}" if len(found) else "none"
 

@@ -103,7 +103,7 @@ def output_bounds(controller: Controller, own: Bundle) -> tuple[Doubles, Doubles
     outputs = controller.shape.layers[0][0]
     lowest, highest = np.full(outputs, -TANH_BOUND), np.full(outputs, TANH_BOUND)
     actions = own.driving_of(controller.options).controls
-    if (actions.choices or not actions.squashed) and not controller.shape.hidden:
+    if (actions.sizes or not actions.squashed) and not controller.shape.hidden:
         return lowest * np.inf, highest * np.inf
     if controller.shape.hidden or actions.output_indices:
         return lowest, highest

@@ -112,12 +112,27 @@ class _Chooser:
         if actions.choices:
             index = graph.node("ArgMax", logits, axis=1, keepdims=0)
             return str(graph.node("Gather", graph.constant(np.array(actions.choices, np.float32)), index))
+        if actions.groups:
+            return self._choose_in_groups(logits)
         if not actions.squashed:
             return logits
         outputs = graph.node("Tanh", logits)
         if actions.output_indices:
             outputs = graph.node("Gather", outputs, graph.shape(*actions.output_indices), axis=1)
         return squash(graph, outputs, actions)
+
+    def _choose_in_groups(self, logits: str) -> str:
+        """`Continuous.to_action` with groups."""
+        graph, layout, outputs = self._graph, self._actions.group_layout, self._actions.outputs
+        groups, longest = layout.real.shape
+        places = graph.node("Gather", logits, graph.shape(*layout.places.reshape(-1)), axis=1)
+        table = graph.node("Reshape", places, graph.shape(-1, groups, longest))
+        lowest = graph.constant(np.array(-np.inf, np.float32))
+        found = graph.node("Where", graph.constant(layout.real[None]), table, lowest)
+        chosen = graph.node("Add", graph.node("ArgMax", found, axis=2, keepdims=0), graph.shape(*layout.starts))
+        depth, ends = graph.shape(outputs), graph.constant(np.array([0, 1], np.float32))
+        one_hot = graph.node("ReduceSum", graph.node("OneHot", chosen, depth, ends), graph.shape(1), keepdims=0)
+        return str(graph.node("Gather", one_hot, graph.shape(*layout.kept), axis=1))
 
     def _as_outputs(self, action: str) -> str:
         """`Continuous.to_outputs`."""
@@ -126,6 +141,11 @@ class _Chooser:
             table = graph.constant(np.array([actions.choices], np.float32))
             equal = graph.node("Equal", graph.node("Unsqueeze", action, graph.shape(1)), table)
             return str(graph.node("ReduceMin", graph.node("Cast", equal, to=TensorProto.FLOAT), axes=[2], keepdims=0))
+        if actions.groups:
+            other = graph.node("Sub", graph.constant(np.array(1, np.float32)), action)
+            return str(
+                graph.node("Gather", graph.join(action, other), graph.shape(*actions.group_layout.order), axis=1)
+            )
         if actions.output_indices:
             return str(
                 graph.node(

@@ -107,8 +107,14 @@ class _Controllers:
         self._scale, self._shift, self._low, self._high = (torch.tensor(each, device=device) for each in scales)
         self._choices = torch.tensor(self._actions.choices, device=device)
         self._columns_of_outputs = torch.tensor(self._actions.output_indices, dtype=torch.int64, device=device)
-        each_action = np.eye(self._actions.actions, dtype=np.float32)
-        self._signs = torch.from_numpy(self._actions.to_outputs(each_action)).to(device)
+        layout = self._actions.group_layout
+        self._starts, self._places, self._kept, self._order, self._real = (
+            torch.from_numpy(each).to(device)
+            for each in (layout.starts, layout.places, layout.kept, layout.order, layout.real)
+        )
+        if self._actions.output_indices:
+            each_action = np.eye(self._actions.actions, dtype=np.float32)
+            self._signs = torch.from_numpy(self._actions.to_outputs(each_action)).to(device)
 
     def set_parameters(self, parameters: NDArray[np.float32]) -> None:
         """Copy the layers of `parameters` `(N, size)` to the device: a captured graph reads the first call's memory."""
@@ -149,6 +155,8 @@ class _Controllers:
         actions = self._actions
         if actions.choices:
             return self._choices[value.argmax(dim=1)]
+        if actions.groups:
+            return self._choose_in_groups(value)
         if not actions.squashed:
             return value
         outputs = torch.tanh(value)
@@ -160,4 +168,12 @@ class _Controllers:
         """`Continuous.to_outputs`."""
         if self._actions.choices:
             return (action[:, None] == self._choices).all(dim=2).float()
+        if self._actions.groups:
+            return torch.cat([action, 1 - action], dim=1)[:, self._order]
         return action @ self._signs if self._actions.output_indices else action
+
+    def _choose_in_groups(self, value: Tensor) -> Tensor:
+        """`Continuous.to_action` with groups."""
+        table = value[:, self._places].masked_fill(~self._real, -torch.inf)
+        chosen = table.argmax(dim=2) + self._starts
+        return torch.zeros_like(value).scatter_(1, chosen, 1.0)[:, self._kept]

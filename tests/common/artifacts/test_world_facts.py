@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from dreamfleet.common.artifacts.actions import Continuous, one_hot
+from dreamfleet.common.artifacts.actions import Continuous, grouped, one_hot
 from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts, WorldFacts
 from dreamfleet.common.errors import UsageError
@@ -15,6 +15,7 @@ ACTIONS = {
     "one-hot": one_hot(3),
     "thirds": Continuous.between([-1], [1]),
     "shared outputs": Variant(pedals="one", pedal_shift=0.25).controls,
+    "groups": grouped([3, 2, 1], bits=[1]),
     "choices": Variant(actions="discrete").controls,
 }
 
@@ -49,6 +50,11 @@ def test_what_is_as_usual_is_not_written():
         {"output_indices": [0, 1, 2**62]},
         {"output_indices": [0, 1]},
         {"choices": [[1.0, 0.0]]},
+        {"groups": [[2, 2]]},
+        {"groups": [[4, 3]]},
+        {"groups": [[3, 3]], "choices": [[1.0, 0.0, 0.0]]},
+        {"groups": [[3, 3], [0, 0]]},
+        {"groups": [[3]]},
         {"horizon": 0},
         {"end": {"kind": "thresholds", "at": 0.5}},
         {"end": {"kind": "threshold", "at": 1.5}},

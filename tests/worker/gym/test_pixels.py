@@ -93,7 +93,7 @@ def test_the_pixel_world_is_one_without_a_line_of_code():
 
 @pytest.mark.parametrize(
     ("kind", "outputs", "action", "taken"),
-    [("Buttons", 6, [0, 1, 0, 0, 1], [2, 1]), ("Switches", 4, [1, 0], [1, 0]), ("Floats", 1, [0.5], [0.5])],
+    [("Buttons", 5, [0, 1, 0, 0, 1], [2, 1]), ("Switches", 4, [1, 0], [1, 0]), ("Floats", 1, [0.5], [0.5])],
 )
 def test_an_action_is_a_vector_that_the_simulator_gets_as_its_own(kind, outputs, action, taken):
     task = fake(kind)

@@ -1,5 +1,8 @@
 """Observations and actions of any space as vectors."""
 
+from itertools import product
+from math import prod
+
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -16,18 +19,20 @@ from dreamfleet.worker.tasks.registry import find_task
 from tests.support.strict_environments import ACTIONS, STRICT
 
 
-def test_a_space_has_as_many_choices_as_elements():
+def test_a_space_has_a_group_of_outputs_for_each_number():
     for space in (
         spaces.MultiDiscrete([2, 3], start=[5, 0]),
         spaces.Dict({"b": spaces.Discrete(3, start=2), "a": spaces.Tuple((spaces.MultiBinary(2), spaces.Discrete(2)))}),
     ):
         actions = vector_actions(space, "it")
         convert = make_converter(space, actions)
-        elements = [convert(np.float32(choice)) for choice in actions.choices]
+        rows = actions.from_numbers(list(product(*map(range, actions.sizes))))
+        elements = [convert(row) for row in rows]
         assert all(each in space for each in elements)
         flat = [tuple(spaces.flatten(space, each)) for each in elements]
-        assert flat == list(actions.choices)
-        assert len(set(flat)) == len(flat) == actions.outputs
+        assert flat == [tuple(row) for row in rows]
+        assert len(set(flat)) == len(flat) == prod(actions.sizes)
+        assert actions.outputs == sum(actions.sizes)
 
 
 def test_an_action_near_a_choice_is_that_choice():
@@ -48,7 +53,10 @@ def test_bounded_numbers_anywhere_are_one_vector():
 @pytest.mark.parametrize(
     ("space", "says"),
     [
-        (spaces.MultiDiscrete([9, 9]), "takes 81 different actions: wrap it so that they are 64 at most"),
+        (spaces.MultiDiscrete([4096, 1]), "4096 at most"),
+        (spaces.Discrete(4097), "4096 at most"),
+        (spaces.MultiBinary(2049), "4096 at most"),
+        (spaces.Box(0, 1, (4097,)), "4096 at most"),
         (spaces.Tuple((spaces.Discrete(2), spaces.Box(0, 1, (1,)))), "flat Box of floats, or Discrete"),
         (ACTIONS["endless"], "without bounds"),
         (spaces.Box(-np.inf, 1, (1,)), "without bounds"),
@@ -102,3 +110,41 @@ def test_whole_numbers_are_the_nearest():
     convert = make_converter(ACTIONS["mixed"], vector_actions(ACTIONS["mixed"], "it"))
     taken = convert(np.float32([2.6, 0.1]))
     assert (taken["gear"].tolist(), taken["gear"].dtype, taken["turn"].dtype) == ([3], np.int8, np.float64)
+
+
+@pytest.mark.parametrize(
+    ("space", "outputs"),
+    [
+        (spaces.MultiDiscrete([11, 11, 11]), 33),
+        (spaces.MultiDiscrete([[3, 2], [4, 5]], start=[[1, 0], [0, 9]]), 14),
+        (spaces.MultiBinary(12), 24),
+        (spaces.MultiBinary((2, 3)), 12),
+        (spaces.Discrete(4096, start=3), 4096),
+        (spaces.MultiDiscrete([4095, 1]), 4096),
+        (spaces.Tuple((spaces.Discrete(100), spaces.MultiBinary(2))), 104),
+    ],
+)
+def test_each_number_is_chosen_by_its_own_outputs(space, outputs):
+    actions = vector_actions(space, "it")
+    convert = make_converter(space, actions)
+    assert actions.outputs == outputs
+    logits = np.random.default_rng(1).normal(size=(5, outputs)).astype(np.float32)
+    together = actions.to_action(logits)
+    for row, action in zip(logits, together, strict=True):
+        assert np.array_equal(actions.to_action(row), action)
+        element = convert(action)
+        assert element in space
+        assert np.array_equal(spaces.flatten(space, element), action)
+        parts = np.split(row, np.cumsum(actions.sizes)[:-1])
+        assert actions.to_numbers(action).tolist() == [int(part.argmax()) for part in parts]
+        chosen = np.concatenate([np.arange(len(part)) == part.argmax() for part in parts])
+        assert np.array_equal(actions.to_outputs(action), chosen)
+
+
+@pytest.mark.parametrize("kind", ["many", "large"])
+def test_an_environment_of_many_numbered_actions_is_scored(kind):
+    scorer = Scorer(spec(kind))
+    size = scorer.spec.controller.size
+    assert scorer.world.actions.outputs == {"many": 33, "large": 4096}[kind]
+    assert scorer.score("score", np.random.default_rng(1).normal(size=size).astype(np.float32), 1).fitness == 20
+    scorer.close()

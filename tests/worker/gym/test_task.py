@@ -80,7 +80,7 @@ def test_what_is_no_number_is_left_out_and_keys_are_chosen(keys, observed):
     assert frozen.option("observation", []) == list(keys)
     with task.make_environment(Assignment(frozen)) as environment:
         assert environment.reset(seed=1)[0].tolist() == observed
-        assert environment.step(0)[0].tolist() == observed
+        assert environment.step(np.float32([1, 0, 0]))[0].tolist() == observed
     assert task.find_standalone_script(Assignment(frozen)) is None
 
 
@@ -97,13 +97,14 @@ def test_a_key_that_is_no_number_or_not_there_is_refused(environment, keys, name
         describe_task(f"gym:tests.support.pixel_fakes:{environment}-v0", {"observation": keys})
 
 
-@pytest.mark.parametrize(("number", "taken"), [(0, (0, [0])), (1, (0, [1])), (2, (1, [0])), (3, (1, [1]))])
-def test_a_number_stands_for_a_whole_action(number, taken):
+@pytest.mark.parametrize("taken", [(0, [0]), (0, [1]), (1, [0]), (1, [1])])
+def test_each_number_of_an_action_is_chosen(taken):
+    numbers = (taken[0], *taken[1])  # in the order of the keys: gear, lamps
     task = find_task("gym:tests.support.pixel_fakes:Gauges-v0")
     with task.make_environment(Assignment(spec(task.name))) as environment:
         observation, _ = environment.reset(seed=1)
         assert observation.tolist() == [0, 0, 1, 0.5, 0.25, 0, 1, 0, 1]  # keys in their order: hand, speeds, switches
-        info = environment.step(number)[4]
+        info = environment.step(task.world_of(Assignment(spec(task.name))).actions.from_numbers(numbers))[4]
         assert (info["taken"]["gear"] - 1, info["taken"]["lamps"].tolist()) == taken
 
 

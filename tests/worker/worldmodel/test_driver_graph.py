@@ -7,13 +7,15 @@ import pytest
 
 from dreamfleet import find_controller
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, write_bundle
+from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import BundleError, UsageError
 from dreamfleet.common.runs.lookup import find_bundle_of
 from dreamfleet.worker.worldmodel.driver_graph import export_driver, largest_difference
 from dreamfleet.worker.worldmodel.inference import open_graph
 from dreamfleet.worker.worldmodel.mdnrnn_config import REWARDED
 from tests.support.bundles import write_random_bundle
-from tests.support.variants import VARIANTS, controller_of
+from tests.support.dreams import write_bundle_of
+from tests.support.variants import VARIANTS, controller_of, vectors
 
 
 @pytest.mark.parametrize("name", ["tiny", "real", "dream", "takecover", "takecover-real"])
@@ -43,6 +45,16 @@ def test_a_variant_acts_as_numpy_computes_it(random_bundle, name):
 def test_a_world_model_with_attention_acts_to_the_bit(tmp_path):
     bundle = write_random_bundle(tmp_path / "attentive.zip", rnn=replace(REWARDED, window=3, dropout=0.1))
     controller = controller_of(bundle)
+    assert largest_difference(bundle, controller, export_driver(bundle, controller)) == 0
+
+
+@pytest.mark.parametrize("options", ["", '{"decide_every": 3, "feedback": "last"}'])
+def test_several_choices_at_once_are_made_to_the_bit(tmp_path, options):
+    bundle = write_bundle_of("groups", tmp_path / "groups.zip")
+    own = bundle.with_options(None, options)
+    controller = Controller(
+        own.controller_shape, vectors(own, 1)[0], bundle.manifest.task, bundle.sha256, options=options
+    )
     assert largest_difference(bundle, controller, export_driver(bundle, controller)) == 0
 
 
