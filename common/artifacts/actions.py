@@ -35,6 +35,7 @@ class Continuous:
     >>> actions = Continuous.between(low=[-1, 0], high=[1, 1])
     >>> actions.to_action(np.array([0, 100], np.float32))
     array([0., 1.], dtype=float32)
+    >>> from dreamfleet.common.artifacts.actions import grouped
     >>> grouped([3, 2]).to_action(np.array([0, 5, 1, 7, 2], np.float32))
     array([0., 1., 0., 1., 0.], dtype=float32)
     """
