@@ -1,4 +1,4 @@
-"""Write docs/reference/verbs.md and settings.md from the parsers and the settings' dataclasses.
+"""Write docs/reference/verbs.md and settings.md from the parsers and the settings' dataclasses, and types of settings.
 
 `make reference` writes them; `tests/docs/test_reference.py` compares them with what this would write. Help texts are
 the source: to change a row, change the verb.
@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, fields
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from keyword import iskeyword
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -22,6 +23,8 @@ from dreamfleet.coordinator.bridge.config import BridgeConfig
 from dreamfleet.coordinator.dashboard.config import DashboardConfig
 from dreamfleet.coordinator.experiments.demo import DemoConfig
 from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
+from dreamfleet.coordinator.experiments.started_run import setting_names
+from dreamfleet.coordinator.settings import run_setup
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
@@ -80,6 +83,23 @@ UNITS = {
     "worker.drain_timeout": "seconds", "worker.lifetime": "seconds", "worker.slot_memory": "MiB",
     "worker.coordinator_timeout": "seconds",
 }  # fmt: skip
+RUN_ARGUMENTS = Path(__file__).parents[1] / "coordinator" / "experiments" / "run_arguments.py"
+RUN_ARGUMENTS_HEAD = '''"""Settings of `start_run` and `evolve`. Written by `make reference`: change the flags."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, TypedDict
+
+_Keywords = TypedDict("_Keywords", {{{items}}}, total=False)  # words of Python: given by `**`
+
+
+class RunArguments(_Keywords, total=False):
+    """The flags of `dreamfleet coordinator`, with `_` for `-`; docs/reference/verbs.md says what each means."""
+
+{body}
+'''
 SETTINGS_HEAD = f"""{NOTE}
 # Settings
 
@@ -108,14 +128,44 @@ flags of that verb too; they are described there. Each verb also has these:
 
 
 def write() -> None:
-    """Write both pages."""
+    """Write both pages, and the types of a run's settings in Python."""
     for name, text in pages().items():
         (FOLDER / name).write_text(text)
+    RUN_ARGUMENTS.write_text(run_arguments())
 
 
 def pages() -> dict[str, str]:
     """The text of each page, by its file name."""
     return {"verbs.md": verbs_page(), "settings.md": settings_page()}
+
+
+def run_arguments() -> str:
+    """The module with the types of what `start_run` and `evolve` take: the flags of `coordinator`."""
+    parser = build_parser("coordinator", run_setup)
+    flags = {
+        flag.removeprefix("--").replace("-", "_"): each for each in parser._actions for flag in each.option_strings
+    }
+    rows = {name: f"{_python_type(flags[name])} | None" for name in setting_names(parser)}
+    head = {name: rows.pop(name) for name in list(rows) if iskeyword(name)}
+    items = ", ".join(f'"{name}": {hint}' for name, hint in head.items())
+    body = "\n".join(f"    {name}: {hint}" for name, hint in rows.items())
+    return RUN_ARGUMENTS_HEAD.format(items=items, body=body)
+
+
+def _python_type(action: argparse.Action) -> str:
+    """The type of a setting in Python, as `flag_words` takes it."""
+    shown = str(action.metavar)
+    if isinstance(action, argparse.BooleanOptionalAction):
+        return "bool"
+    if action.choices:
+        return "Literal[" + ", ".join(f'"{each}"' for each in action.choices) + "]"
+    if action.nargs == "+":
+        return "Mapping[str, Any] | Sequence[str]" if "=" in shown else "str | Sequence[str]"
+    if action.dest == "metrics_port":  # a port, or ADDRESS:PORT
+        return "int | str"
+    if shown in ("BUNDLE", "CONTROLLER", "FILE", "SUBSPACE"):
+        return "str | Path"
+    return {int: "int", float: "float"}.get(action.type, "str")  # type: ignore[call-overload,no-any-return]
 
 
 def settings_page() -> str:

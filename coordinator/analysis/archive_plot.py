@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.monitoring.elites import EliteArchive
@@ -15,6 +14,7 @@ from dreamfleet.common.printable import format_number
 from dreamfleet.common.protocol.measures import Axis, describe_measure
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.analysis.plot import TITLE, save_figure
+from dreamfleet.coordinator.analysis.shown_figure import ShownFigure
 
 EMPTY = "#f2f2f2"  # of cells without an elite
 MOST_LABELS = 13  # of an axis
@@ -26,7 +26,7 @@ def plot_archive(run: RunFolder, path: Path) -> None:
     save_figure(archive_figure(run), path)
 
 
-def archive_figure(run: RunFolder) -> Any:
+def archive_figure(run: RunFolder) -> ShownFigure:
     """The elites' fitness over the archive's axes, as a matplotlib `Figure`.
 
     Over more than two axes a cell shows its best elite. `UsageError` for a run without an archive, or an empty one.
@@ -36,7 +36,7 @@ def archive_figure(run: RunFolder) -> Any:
         what = "has no archive: begin one with --archive" if archive is None else "has no elite yet: wait for the first"
         raise UsageError(f"run {run.name} {what}")
     first, second = (*archive.axes, Axis("", 0, 1, 1))[:2]
-    figure = Figure(figsize=(8, 6), layout="constrained")
+    figure = ShownFigure(figsize=(8, 6), layout="constrained")
     axes = figure.subplots()
     axes.set_facecolor(EMPTY)
     mesh = axes.pcolormesh(

@@ -35,6 +35,7 @@ from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.profile import PublishedScores
 from dreamfleet.common.worlds.score_words import score_word
 from dreamfleet.common.worlds.shipped import WORLDS
+from dreamfleet.coordinator.analysis.shown_figure import ShownFigure
 
 TITLE = 90  # characters in a line of the title
 LABEL = 52  # characters in a line of the label of the y axis
@@ -51,7 +52,7 @@ def plot_fitness(run: RunFolder, path: Path) -> None:
     save_figure(fitness_figure(run), path)
 
 
-def fitness_figure(run: RunFolder) -> Any:
+def fitness_figure(run: RunFolder) -> Figure:
     """One run's fitness over its generations, with its evaluated and confirmed means, as a matplotlib `Figure`.
 
     `UsageError` before the first generation is closed. It is made without pyplot, so that a notebook keeps its backend.
@@ -61,7 +62,7 @@ def fitness_figure(run: RunFolder) -> Any:
     settings = run.settings
     stages = begun_stages(settings, run.history(), run.evaluations())
     two = has_score_panel(run)
-    figure = Figure(figsize=(8.5, 7.2 if two else 5.2), layout=ConstrainedLayoutEngine(w_pad=PAD, h_pad=PAD))
+    figure = ShownFigure(figsize=(8.5, 7.2 if two else 5.2), layout=ConstrainedLayoutEngine(w_pad=PAD, h_pad=PAD))
     shares = [3, 2] if two else [1]
     panels = figure.subplots(len(shares), 1, sharex=True, squeeze=False, height_ratios=shares)[:, 0]
     handles = draw_fitness(list(panels), run)
@@ -107,7 +108,7 @@ def plot_learning(curves: Sequence[LearningCurve], marks: PublishedScores | None
     save_figure(learning_figure(curves, marks), path)
 
 
-def learning_figure(curves: Sequence[LearningCurve], marks: PublishedScores | None) -> Any:
+def learning_figure(curves: Sequence[LearningCurve], marks: PublishedScores | None) -> Figure:
     """Evaluated scores over environment steps and core-hours, with published scores as `marks`: a matplotlib `Figure`.
 
     Of a function its values, as `LearningCurve.in_values` has them.
@@ -118,7 +119,7 @@ def learning_figure(curves: Sequence[LearningCurve], marks: PublishedScores | No
     began from. The legend shows dreamt steps.
     """
     curves = [each.in_values for each in curves]
-    figure = Figure(figsize=(11, 5.6), layout=ConstrainedLayoutEngine(w_pad=PAD, h_pad=PAD))
+    figure = ShownFigure(figsize=(11, 5.6), layout=ConstrainedLayoutEngine(w_pad=PAD, h_pad=PAD))
     over_steps, over_hours = figure.subplots(1, 2, sharey=True)
     one_world = len({each.world for each in curves}) == 1
     short = marks is None and max(each.total.core_hours for each in curves) < SHORT_HOURS

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
@@ -16,7 +16,13 @@ from dreamfleet.common.runs import run_folder, run_paths
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.analysis.export import ELITES, TABLES, columns_of, rows_of
 
+if TYPE_CHECKING:
+    import pandas
+    import polars
+    from matplotlib.figure import Figure
+
 Plot = Literal["fitness", "learning", "archive"]
+TableName = Literal["generations", "candidates", "evaluations", "confirmation", "elites"]
 PLOTS: tuple[Plot, ...] = get_args(Plot)
 NO_ARCHIVE = "run {} has no archive: begin one with --archive"
 
@@ -60,7 +66,7 @@ class StoredRun(RunFolder):
             raise UsageError(NO_ARCHIVE.format(self.name))
         return controller_of(self, archive.find(cell))
 
-    def to_pandas(self, table: str = "generations") -> Any:
+    def to_pandas(self, table: TableName = "generations") -> pandas.DataFrame:
         """A table as a pandas `DataFrame`: `generations`, `candidates`, `evaluations`, `confirmation` or `elites`.
 
         These are the tables of `dreamfleet runs export`. `MissingExtraError` without pandas.
@@ -71,13 +77,15 @@ class StoredRun(RunFolder):
         >>> list(frame.columns)[:4]
         ['number', 'mean', 'std', 'best']
         """
-        return self._to_frame("pandas", table)
+        frame: pandas.DataFrame = self._to_frame("pandas", table)
+        return frame
 
-    def to_polars(self, table: str = "generations") -> Any:
+    def to_polars(self, table: TableName = "generations") -> polars.DataFrame:
         """The same as a polars `DataFrame`; `MissingExtraError` without polars."""
-        return self._to_frame("polars", table)
+        frame: polars.DataFrame = self._to_frame("polars", table)
+        return frame
 
-    def plot(self, kind: Plot = "fitness") -> Any:
+    def plot(self, kind: Plot = "fitness") -> Figure:
         """The picture of `dreamfleet runs plot`, as a matplotlib `Figure`, which notebooks show.
 
         `fitness` is that of the candidates over generations, with the evaluated means. `learning` is the evaluated

@@ -11,7 +11,7 @@ from datetime import datetime
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, Unpack
 from weakref import finalize
 
 from dreamfleet.common.cli import model_commands
@@ -37,6 +37,7 @@ from dreamfleet.common.runs.run_paths import default_runs_dir
 from dreamfleet.coordinator.analysis.stored_run import StoredRun
 from dreamfleet.coordinator.experiments.function_names import environment_for
 from dreamfleet.coordinator.experiments.local_run import ALONE, LocalFleet, LocalRun, has_begun, task_flags
+from dreamfleet.coordinator.experiments.run_arguments import RunArguments
 from dreamfleet.coordinator.run.run import BY_HAND
 from dreamfleet.coordinator.settings import run_setup
 
@@ -164,7 +165,9 @@ class StartedRun(StoredRun):
         return headline, facts | {"address": self.address if self._is_live else None}
 
 
-def start_run(workers: int | None = None, runs_dir: Path | str | None = None, **settings: Any) -> StartedRun:
+def start_run(
+    workers: int | None = None, runs_dir: Path | str | None = None, **settings: Unpack[RunArguments]
+) -> StartedRun:  # fmt: skip
     """Start a run on this host: its coordinator, and worker processes of one slot each (default: one a core).
 
     Settings are the flags of `dreamfleet coordinator` with `_` for `-`, such as `task`, `population`, `generations`,
@@ -188,7 +191,7 @@ def start_run(workers: int | None = None, runs_dir: Path | str | None = None, **
     ('3 generations', 'gym:CartPole-v1')
     """
     named = settings.get("task"), settings.get("optimiser"), _resumed_task(settings.get("resume"), runs_dir)
-    return start_run_in(environment_for(named), workers, runs_dir, settings)
+    return start_run_in(environment_for(named), workers, runs_dir, {**settings})
 
 
 def _resumed_task(name: object, runs_dir: Path | str | None) -> str | None:
@@ -245,8 +248,9 @@ def _start_workers(processes: LocalRun, name: str, endpoint: str, count: int, fl
 
 
 def evolve(
-    callback: Callback | None = None, workers: int | None = None, runs_dir: Path | str | None = None, **settings: Any
-) -> StartedRun:
+    callback: Callback | None = None, workers: int | None = None, runs_dir: Path | str | None = None,
+    **settings: Unpack[RunArguments],
+) -> StartedRun:  # fmt: skip
     """Run `start_run` to its end and return the run, whose processes have ended.
 
     `callback(generation, run)` is called as each generation closes; if it returns `False`, the run is left open there.
@@ -271,7 +275,7 @@ def evolve(
 def check_settings(settings: Mapping[str, Any]) -> tuple[str, ...]:
     """The flags of these settings, without run, resume and listen; `UsageError` suggests a name for a wrong one."""
     parser = build_parser("coordinator", run_setup)
-    known = _setting_names(parser)
+    known = setting_names(parser)
     for name in settings:
         if name not in known:
             raise UsageError(f"unknown setting {name!r}{suggestion(name, known)}")
@@ -281,7 +285,7 @@ def check_settings(settings: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(word for name, value in apart.items() for word in flag_words(name, value))
 
 
-def _setting_names(parser: Parser) -> list[str]:
+def setting_names(parser: Parser) -> list[str]:
     """The long names of a parser's flags as Python names."""
     flags = [flag for each in parser._actions for flag in each.option_strings[:2] if flag.startswith("--")]
     names = [flag.removeprefix("--").replace("-", "_") for flag in flags if not flag.startswith("--no-")]

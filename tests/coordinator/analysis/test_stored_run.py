@@ -4,13 +4,15 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.errors import BundleError, ControllerError, JournalError, UsageError
+from dreamfleet.coordinator.analysis.export import ELITES, TABLES
 from dreamfleet.coordinator.analysis.plot import KINDS, plot_fitness
-from dreamfleet.coordinator.analysis.stored_run import open_run
+from dreamfleet.coordinator.analysis.stored_run import TableName, open_run
 from tests.support.processes import DEADLINE, environment
 
 RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
@@ -94,6 +96,26 @@ def test_a_run_without_evaluations_has_its_fitness_plotted(tmp_path):
         with pytest.raises(UsageError, match="kind must be fitness or learning or archive, not 'curve'"):
             run.plot("curve")
         plot_fitness(run, tmp_path / f"own{KINDS[1]}")
+
+
+SHOWN = """
+import base64, dreamfleet, sys
+from IPython.core.formatters import DisplayFormatter
+shown, _ = DisplayFormatter().format(dreamfleet.open_run('reality', {runs!r}).plot({kind!r}))
+assert shown['image/png'].startswith(b'\\x89PNG'), shown.keys()
+assert 'matplotlib.pyplot' not in sys.modules
+"""
+
+
+@pytest.mark.parametrize("kind", ["fitness", "learning"])
+def test_a_fresh_notebook_shows_a_plot(kind, tmp_path):
+    pytest.importorskip("IPython")
+    program = SHOWN.format(runs=str(RUNS), kind=kind)
+    subprocess.run([sys.executable, "-c", program], env=environment(tmp_path), check=True, timeout=DEADLINE)
+
+
+def test_the_names_of_tables_are_known_to_type_checkers():
+    assert get_args(TableName) == (*TABLES, ELITES)
 
 
 def test_drawing_leaves_the_backend_of_a_notebook(tmp_path):
