@@ -10,6 +10,7 @@ import json
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
+from dreamfleet.common.monitoring.equal_fitness import describe_equal_fitness
 from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.protocol.check_counts import CheckCounts
 from dreamfleet.common.protocol.failures import describe_job
@@ -319,6 +320,7 @@ class Status(Displayed):
     failed: Count = field(default=0, metadata=OPTIONAL)  # candidates of closed generations that failed
     # Since the run began, by the wall clock: pauses, and time without coordinator or workers, included.
     elapsed: Seconds | None = field(default=None, metadata=OPTIONAL)
+    equal: Count = field(default=0, metadata=OPTIONAL)  # last generations in a row whose candidates have one fitness
     open_batches: Count = field(default=0, metadata=OPTIONAL)  # submitted ones that wait or are scored
     ending: bool = field(default=False, metadata=OPTIONAL)  # a limit is reached: only evaluations are left
     # Episodes of evaluations and of the confirmation until the run's end.
@@ -357,6 +359,11 @@ class Status(Displayed):
     def is_over(self) -> bool:
         """Whether the run ended or its coordinator leaves it open."""
         return self.state in FINAL_STATES
+
+    @property
+    def equal_fitness(self) -> str:
+        """A warning that the candidates of the last generations all have one fitness; empty: they do not."""
+        return describe_equal_fitness(self.equal, self.settings.task)
 
     @property
     def refusals(self) -> list[str]:

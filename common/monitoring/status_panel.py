@@ -126,6 +126,8 @@ def _blocks(status: Status, width: int, worker_flags: str) -> Iterator[Block]:
         yield _text_block(1, Text(printable(_describe_failure(status.failures[0])), style="red"), width, min_lines=1)
     if status.checks is not None and status.checks.waiting and not status.why:
         yield _text_block(1, Text(printable(status.checks.waiting), style="red"), width, min_lines=1)
+    if status.equal_fitness:
+        yield _text_block(1, Text(status.equal_fitness, style="yellow"), width, min_lines=1)
     if status.worker_list:  # else they stand in its place
         for each in status.refusals:
             yield _text_block(1, Text(printable(each), style="yellow"), width, min_lines=1)

@@ -253,7 +253,7 @@ def _redundant_work(status: Status) -> dict[str, Any]:
 
 def _problems(status: Status) -> list[str]:
     """Problems that may need action."""
-    found = status.refusals
+    found = [*filter(None, [status.equal_fitness]), *status.refusals]
     for failure in status.failures:
         for worker, error in failure.errors.items():
             times = failure.attempts.get(worker, 1)

@@ -13,6 +13,7 @@ from itertools import islice
 from time import monotonic, time
 from typing import Any
 
+from dreamfleet.common.monitoring.equal_fitness import ENOUGH, describe_equal_fitness, has_equal_fitness
 from dreamfleet.common.monitoring.eta import estimate_eta, summarise_status
 from dreamfleet.common.monitoring.status import Status
 from dreamfleet.common.printable import format_number, plural
@@ -43,6 +44,7 @@ class RunLog:
         self._no_worker_since = now
         self._expiry_at = 0.0
         self._clock_offset = time() - monotonic()
+        self._equal = run.history.equal
 
     def begin(self) -> None:
         """The run is served from now on."""
@@ -63,6 +65,7 @@ class RunLog:
         """Log these closed generations, and the evaluations that have finished since the last call."""
         task = self._run.settings.task
         for closed in generations:
+            self._warn_of_equal_fitness(closed)
             failed = f", {closed.failed} failed" if closed.failed else ""
             shown = in_values(closed, task)
             log.info("generation %d: mean %s, best %s%s", closed.number, format_number(shown.mean),
@@ -77,6 +80,13 @@ class RunLog:
                          count_episodes(each),
                          extra={"facts": {"event": "evaluation", **with_error(each)}})  # fmt: skip
             self._evaluations_logged = len(evaluations)
+
+    def _warn_of_equal_fitness(self, closed: StoredGeneration) -> None:
+        """Warn once per spell of generations whose candidates all have one fitness."""
+        self._equal = self._equal + 1 if has_equal_fitness(closed) else 0
+        if self._equal == ENOUGH and not self._run.settings.is_external:
+            text = describe_equal_fitness(self._equal, self._run.settings.task)
+            log.warning("%s", text, extra={"facts": {"event": "equal fitness", "generation": closed.number}})
 
     def write_notes(self) -> None:
         """Log the run's notes since the last call."""

@@ -133,6 +133,7 @@ def _status(
         confirming=EpisodeProgress(*run.background_jobs.confirming),
         ending=run.ending,
         failed=run.history.failed,
+        equal=0 if run.settings.is_external else run.history.equal,
         elapsed=run.elapsed,
         closing=0 if run.ended is not None else run.background_jobs.episodes_until_end(ending=run.ending),
         strict=run.admission.strict,

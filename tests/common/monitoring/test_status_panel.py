@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from rich.cells import cell_len
 from rich.console import Console
 
+from dreamfleet.common.monitoring.equal_fitness import ENOUGH
 from dreamfleet.common.monitoring.status import FailureStatus, Population, StageStatus, WorkerCount
 from dreamfleet.common.monitoring.status_panel import Block, RunPanel, allocate_lines, panel_lines
 from dreamfleet.common.monitoring.terminal_charts import bar_chart, candidate_grid
@@ -283,3 +284,9 @@ def test_a_driven_stage_is_described_and_its_curve_dims_earlier_ones():
     mixed = dataclasses.replace(generation.stage, driven=0.5)
     text = drawn(dataclasses.replace(status, generation=dataclasses.replace(generation, stage=mixed)), 100)
     assert "dream, 1,000 steps, 50% driven, temperature 1.5" in text
+
+
+def test_generations_of_one_fitness_have_a_line():
+    few, many = (dataclasses.replace(STATUS, equal=count, failures=()) for count in (ENOUGH - 1, ENOUGH))
+    assert [line.plain for line in panel_lines(few, 300)].count(few.equal_fitness) == 0
+    assert [line.plain for line in panel_lines(many, 300)].count(many.equal_fitness) == 1

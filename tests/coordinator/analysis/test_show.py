@@ -5,8 +5,10 @@ import sqlite3
 from contextlib import closing
 
 from dreamfleet.common.cli import command_line
+from dreamfleet.common.monitoring.equal_fitness import ENOUGH
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.coordinator.analysis.plot import fitness_figure
+from dreamfleet.coordinator.verbs import runs as verb
 from tests.support.tables import cells
 
 
@@ -33,3 +35,9 @@ def test_a_limit_of_the_environment_below_the_horizon_is_said(runs, capsys):
     )
     with open_run(runs, "reality") as run:
         assert "in 3 steps at most" in fitness_figure(run).axes[0].get_ylabel()
+
+
+def test_generations_of_one_fitness_are_warned_of(runs, capsys, monkeypatch):
+    assert "warning" not in show(capsys, runs, "reality")
+    monkeypatch.setattr(verb, "count_equal_fitness", lambda *_: ENOUGH)
+    assert "--sigma0" in show(capsys, runs, "reality")["warning"]

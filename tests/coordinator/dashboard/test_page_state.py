@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from dreamfleet.common.monitoring.equal_fitness import ENOUGH
 from dreamfleet.common.monitoring.status import EpisodeProgress, FailureStatus, WorkerCount
 from dreamfleet.coordinator.dashboard.page_state import RunSnapshot, page_state
 from tests.support.samples import STATUS
@@ -48,6 +49,11 @@ def test_a_lost_run_with_its_journal_here_shows_the_whole_command():
         in (page_state(look(101.0, Path("/data/runs") / STATUS.run))["sentence"])
     )
     assert f"--resume {STATUS.run}, with --runs-dir and --join" in page_state(look(101.0))["sentence"]
+
+
+def test_generations_of_one_fitness_are_a_trouble():
+    assert len(page_state(look(failures=(), equal=ENOUGH))["troubles"]) == 1
+    assert page_state(look(failures=(), equal=ENOUGH - 1))["troubles"] == []
 
 
 def test_a_refused_worker_is_told_as_long_as_the_run_goes_on():

@@ -7,14 +7,17 @@ from dataclasses import replace
 
 import pytest
 
+from dreamfleet.common.monitoring.equal_fitness import ENOUGH
 from dreamfleet.common.monitoring.status import PARTS, Population, WorkerStatus, read_document, read_status
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, MAX_OPTIONS, Result
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
 from dreamfleet.common.serialization.validation import from_plain, from_plain_lenient
+from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.dispatch.event_log import EventLog
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.generation import CandidateScores
 from dreamfleet.coordinator.jobs.history import History
+from dreamfleet.coordinator.service.run_log import RunLog
 from dreamfleet.coordinator.service.snapshot import Snapshot, take_snapshot
 from dreamfleet.coordinator.service.status import encode_part, encode_status
 from tests.coordinator.run.test_run import SETTINGS, A, Bench
@@ -226,3 +229,19 @@ def test_a_workers_status_holds_its_job_seconds_round_trip_and_resent_batches(be
     last = snapshot_of(bench).workers[0]
     assert (last.job_seconds, last.round_trip, last.resent) == (0.1, 0.25, 1)
     assert WorkerStatus(**answered(snapshot_of(bench), "workers")["workers"][0]) == last
+
+
+def test_generations_of_one_fitness_are_counted_and_warned_of_once(tmp_path, random_bundle, caplog):
+    bench = Bench(tmp_path / "equal", random_bundle.path, SCORED, generations=8)
+    log = RunLog(bench.run, "night", Network(), bench.now)
+    for closed in range(7):
+        score(bench, 8, lambda job: 1.0)
+        assert snapshot_of(bench).status.equal == closed + 1
+        log.report_closed([bench.run.history.last])
+    warned = [each.facts for each in caplog.records if getattr(each, "facts", {}).get("event") == "equal fitness"]
+    assert [each["generation"] for each in warned] == [ENOUGH - 1]
+    assert read_status(answered(snapshot_of(bench))).equal_fitness
+    score(bench, 8)
+    assert snapshot_of(bench).status.equal == 0
+    assert not read_status(answered(snapshot_of(bench))).equal_fitness
+    bench.journal.close()
