@@ -54,18 +54,25 @@ def describe_clock_error(error: ssl.SSLCertVerificationError) -> str:
     return f"its certificate has expired, and {now}: set the clock if that is wrong, else have it issued again"
 
 
+def load_own_certificate(context: ssl.SSLContext, credentials: Credentials) -> None:
+    """Have a TLS context show the certificate of a join file, if it has one; `OSError` or `ValueError`."""
+    if not credentials.certificate:
+        return
+    with TemporaryDirectory(prefix="dreamfleet-") as folder:  # mode 700; `ssl` reads files only
+        certificate, key = Path(folder) / "certificate", Path(folder) / "key"
+        certificate.write_text(credentials.certificate)
+        key.write_text(credentials.key)
+        context.load_cert_chain(certificate, key, "")
+
+
 def _read_certificate(credentials: Credentials) -> dict[str, Any]:
     """The certificate's fields, verified against the authority's and this host's clock; `OSError` or `ValueError`."""
     listening, calling = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     listening.verify_mode = ssl.CERT_REQUIRED
     listening.load_verify_locations(cadata=credentials.ca)
     calling.check_hostname, calling.verify_mode = False, ssl.CERT_NONE
-    with TemporaryDirectory(prefix="dreamfleet-") as folder:  # mode 700
-        certificate, key = Path(folder) / "certificate", Path(folder) / "key"
-        certificate.write_text(credentials.certificate)
-        key.write_text(credentials.key)
-        for context in (listening, calling):
-            context.load_cert_chain(certificate, key, "")
+    for context in (listening, calling):
+        load_own_certificate(context, credentials)
     there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
     client, server = calling.wrap_bio(back, there), listening.wrap_bio(there, back, server_side=True)
     open_ends = [client, server]

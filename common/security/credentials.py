@@ -125,7 +125,9 @@ def read_join_file(path: Path, now: datetime | None = None) -> Credentials:
     credentials = _parse_credentials(path, document)
     if credentials.time_left(now or datetime.now(UTC)) <= timedelta():
         raise AccessError(
-            f"{path} expired on {credentials.expires:%Y-%m-%d}: have {credentials.role} {credentials.name} issued again"
+            f"{path} expired on {credentials.expires:%Y-%m-%d}, and this host's clock says "
+            f"{now or datetime.now(UTC):%Y-%m-%d %H:%M} UTC: set the clock if that is wrong, else have "
+            f"{credentials.role} {credentials.name} issued again"
         )
     return credentials
 

@@ -112,10 +112,14 @@ def test_a_stranger_to_the_fleet_is_refused_with_the_reason(access, endpoint, tm
     expired = access.authority.issue(
         "viewer", "late", tmp_path / "late", connect=[endpoint], now=datetime.now(UTC) - timedelta(days=91)
     )
+    early = access.authority.issue(
+        "viewer", "early", tmp_path / "early", connect=[endpoint], now=datetime.now(UTC) + timedelta(days=3)
+    )
     strangers = {
         "of another authority": (read_join_file(other.path("viewer")), endpoint, "it is another fleet's"),
         "without a certificate": (replace(good, certificate="", key=""), endpoint, "refuses this join file"),
-        "expired": (expired, endpoint, "refuses this join file"),
+        "expired": (expired, endpoint, "clock"),
+        "early": (early, endpoint, "clock"),
         "at a wrong name": (good, elsewhere, "issued without --host for this name"),
     }
     with open_session(Network(listen=(endpoint, elsewhere), credentials=read_join_file(access.path("coordinator")))):
@@ -128,6 +132,16 @@ def test_a_stranger_to_the_fleet_is_refused_with_the_reason(access, endpoint, tm
         with pytest.raises(HandshakeRejectedError, match=r"speaks TLS.* give --join FILE"):
             open_session(plain, timeout=1)
         assert b"speaks TLS" in Watcher(plain, None, tmp_path).poll().absent_event
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("days", [-91, 3])
+def test_a_listener_whose_certificate_is_out_of_its_time_is_a_matter_of_clocks(access, endpoint, tmp_path, days):
+    now = datetime.now(UTC) + timedelta(days=days)
+    out_of_time = access.authority.issue("coordinator", "other", tmp_path / "other", now=now)
+    listener = Network(listen=(endpoint,), credentials=out_of_time)
+    with open_session(listener), pytest.raises(HandshakeRejectedError, match="clock"):
+        open_session(access.network("viewer", endpoint), timeout=1)
 
 
 @pytest.mark.slow

@@ -52,6 +52,7 @@ class CoordinatorLink:
     # Says hello: run name, host class (empty if unknown), uid of the joined run; `None` if nobody answers.
     request_admission: Callable[[str, str, str], Admission | None]
     retry_delay: Callable[[], float]  # seconds until the next hello
+    secured: bool = False  # whether the fleet has join files
 
 
 class RunSession:
@@ -74,7 +75,7 @@ class RunSession:
         self._error_counter = ErrorCounter(log)
         self._next_heartbeat_at = 0.0
         self._finished = self._steps_finished = 0
-        self._said_alone = False
+        self._said_alone = self._said_shut_out = False
         self._coordinator_version = package_version("dreamfleet")
 
     @property
@@ -139,6 +140,7 @@ class RunSession:
             elif self._membership.start_search_if_due(now):
                 self._say_alone()
                 self._follow_run()
+                self._say_shut_out()
         return why
 
     def _shutdown(self, why: str) -> None:
@@ -195,7 +197,7 @@ class RunSession:
                 return  # it ended the run and left, as it said
             self._say_alone()
             return
-        self._said_alone = False
+        self._said_alone = self._said_shut_out = False
         if self._membership.add_coordinator(nonce):  # joining another life is logged by `_rejoin`
             log.info("the coordinator of run %s is back; this worker continues", self._admission.run,
                      extra={"facts": {"event": "coordinator back", "run": self._admission.run}})  # fmt: skip
@@ -207,6 +209,14 @@ class RunSession:
             log.info("the coordinator of run %s left or cannot be reached; this worker %s",
                      self._admission.run, self._membership.plan_without_coordinator,
                      extra={"facts": {"event": "coordinator gone", "run": self._admission.run}})  # fmt: skip
+
+    def _say_shut_out(self) -> None:
+        """Log once that a secured router shows this worker no coordinator: to a revoked one it shows nothing."""
+        if self._link.secured and not self._said_shut_out and list(self._link.session.info.routers_zid()):
+            self._said_shut_out = True
+            log.warning("a router answers, and shows this worker no coordinator of run %s: if the run is served, the "
+                        "join file of %s was revoked; have another issued", self._admission.run, self._link.identity,
+                        extra={"facts": {"event": "shut out", "run": self._admission.run}})  # fmt: skip
 
     def _handle_batch(self, payload: bytes) -> None:
         """Handle jobs, cancellations and verdicts.

@@ -144,27 +144,43 @@ class Worker:
 
     def _startup(self) -> zenoh.Session | None:
         """A session, as soon as the router answers; `None` if this worker stops first."""
-        rejections: Counter[str] = Counter()
+        rejections, why = Counter[str](), ""
         waiting = self._waiting_text()
         while not self._is_leaving():
             try:
                 listens = wait_for_listener(self._network.connect, CONNECT_TIMEOUT, self._is_leaving)
                 return open_session(self._network, timeout=CONNECT_TIMEOUT if listens else NO_WAIT)
             except HandshakeRejectedError as error:
-                rejections[str(error)] += 1
+                why = str(error)
+                rejections[why] += 1
                 if rejections[str(error)] == 2:  # a coordinator that just started accepts the next try
                     log.warning("%s; trying again", error)
             except ConnectionFailedError:
                 if text := waiting.next(monotonic(), answered=False):
                     log.warning("%s", text)
+            self._check_patience(why)
             self._pause()
         return None
+
+    def _check_patience(self, why: str = "") -> None:
+        """`ConnectionFailedError` if it leaves with its run, and no coordinator let it in for too long; `why` if known.
+
+        R24: such a worker ends by itself, also where its run ended before it came.
+        """
+        if self._membership.gives_up(monotonic()):
+            run = f"run {self._config.run}" if self._config.run else "a run"
+            raise ConnectionFailedError(
+                f"no coordinator of {run} let this worker in for {self._config.coordinator_timeout:g} s at "
+                f"{', '.join(self._network.connect)}{f' ({why})' if why else ''}; start this worker again once the run "
+                "is served, or give it more --coordinator-timeout"
+            )
 
     def _main_loop(self, session: zenoh.Session) -> None:
         """Serve one run, or several side by side."""
         link = CoordinatorLink(
-            session, self.identity, self.inbox, lambda *of: self._request_admission(session, *of), _jittered_retry
-        )
+            session, self.identity, self.inbox, lambda *of: self._request_admission(session, *of), _jittered_retry,
+            secured=self._network.credentials is not None,
+        )  # fmt: skip
         self._waiting = self._waiting_text()
         if self._config.any:
             self._serve_any(link)
@@ -298,6 +314,7 @@ class Worker:
                 return admission
             if pause > FIRST_RETRY:
                 self._log_waiting(session)
+            self._check_patience()
             self._pause(pause)
             pause = min(2 * pause, RETRY)
         return None

@@ -1,11 +1,18 @@
 """When and how a worker leaves."""
 
+from contextlib import ExitStack
+
 import pytest
 
 from dreamfleet.common.errors import ConnectionFailedError
-from dreamfleet.worker.service import membership
+from dreamfleet.common.transport.session import Network, open_session
+from dreamfleet.worker.service import membership, worker
+from dreamfleet.worker.service.config import WorkerConfig
+from dreamfleet.worker.service.run_session import CoordinatorLink
+from dreamfleet.worker.service.worker import Worker
 from tests.support import tasks
 from tests.support.hand import DEADLINE, SECOND, tag
+from tests.support.processes import free_port
 from tests.support.stage import drained, wait_for
 
 
@@ -57,6 +64,31 @@ def test_with_exit_when_done_it_fails_after_long_without_a_coordinator_and_says_
     assert isinstance(error, ConnectionFailedError)
     assert ("1 finished result" in str(error)) == (when == "afterwards")
     assert "--coordinator-timeout" in str(error)
+
+
+@pytest.mark.parametrize("there", ["nobody", "a router"])
+def test_with_exit_when_done_it_also_ends_where_no_coordinator_ever_let_it_in(there):
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    config = WorkerConfig(slots=1, exit_when_done=True, coordinator_timeout=0.1)
+    with ExitStack() as stack:
+        if there == "a router":
+            stack.enter_context(open_session(Network(listen=(endpoint,))))
+        with pytest.raises(ConnectionFailedError, match=r"--coordinator-timeout"):
+            Worker(config, Network(connect=(endpoint,))).serve()
+
+
+def test_a_worker_that_a_secured_router_shows_nothing_says_so_once(stage, said, cached, monkeypatch):
+    monkeypatch.setattr(membership, "SEARCH_INTERVAL", 0.05)
+    secured = lambda *parts, **more: CoordinatorLink(*parts, **{**more, "secured": True})  # noqa: E731
+    monkeypatch.setattr(worker, "CoordinatorLink", secured)
+    hand = stage.hand()
+    stage.worker()
+    hand.ready()
+    hand.vanish()
+    wait_for(said, "revoked")
+    hand.appear()
+    hand.vanish()
+    wait_for(said, "revoked")
 
 
 def test_it_says_to_its_coordinator_why_it_leaves(stage, cached):
