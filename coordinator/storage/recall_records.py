@@ -38,11 +38,14 @@ class RecallRecords(VerificationRecords):
     _has_set_aside: bool | None = None  # whether `recalled` may hold results that could count again
 
     def first_brought(self, hosts: Collection[str]) -> dict[str, int]:
-        """The first generation to which these hosts brought a result or a lasting failure, by kind."""
+        """The first generation to which these hosts brought a result or a lasting failure, by kind.
+
+        Or in which they alone confirmed a result: of hosts that lie alike, each confirms what the other brings.
+        """
         marks = ", ".join("?" * len(hosts))
         query = f"SELECT kind, min(generation) FROM result WHERE {HOST} IN ({marks}) GROUP BY 1"  # noqa: S608
         first: dict[str, int] = dict(self._read(query, *hosts))
-        for _, kind, generation in self._failures_of(hosts):
+        for _, kind, generation in (*self._failures_of(hosts), *self._confirmed_by(hosts)):
             first[kind] = min(generation, first.get(kind, generation))
         return first
 
@@ -56,7 +59,8 @@ class RecallRecords(VerificationRecords):
         failed = self._failures_of(hosts)
         mine = f"(SELECT generation FROM result WHERE kind = 'evaluate' AND {HOST} IN ({marks}))"  # noqa: S608
         self._write(f"{reopened} {mine})", *hosts)
-        self._write_all(f"{reopened} (?))", [(number,) for _, kind, number in failed if kind == "evaluate"])
+        others = (*failed, *self._confirmed_by(hosts))
+        self._write_all(f"{reopened} (?))", [(number,) for _, kind, number in others if kind == "evaluate"])
         self._write_all("DELETE FROM failure WHERE digest = ?", [(digest,) for digest, *_ in failed])
         (count,) = self._read_row(f"SELECT count(*) FROM result WHERE {HOST} IN ({marks})", *hosts)  # noqa: S608
         self._set_aside(BARRED, f"{HOST} IN ({marks})", *hosts)
@@ -170,6 +174,12 @@ class RecallRecords(VerificationRecords):
             for digest, kind, generation, workers in rows
             if set(hosts) & {each.partition("/")[0] for each in workers.split(",")}
         ]
+
+    def _confirmed_by(self, hosts: Collection[str]) -> list[tuple[bytes, str, int]]:
+        """Digest, kind and generation of the results that were checked, and by nobody else than these hosts."""
+        query = "SELECT digest, kind, generation, checker FROM verification WHERE stands AND outcome != 'unchecked'"
+        rows = self._read(query)
+        return [tuple(checked) for *checked, checkers in rows if set(checkers.split(",")) <= set(hosts)]
 
     def _set_aside(self, because: str, where: str, *values: object) -> None:
         """Move results into the table of those that do not count."""

@@ -206,16 +206,22 @@ class MemoryJournal:
         for job, _, worker, _ in self._tables["result"].values():
             if host_of(worker) in hosts:
                 first[job.kind] = min(job.generation, first.get(job.kind, job.generation))
-        for job, _ in self._failures_of(hosts).values():
+        for job in (*(job for job, _ in self._failures_of(hosts).values()), *self._confirmed_by(hosts)):
             first[job.kind] = min(job.generation, first.get(job.kind, job.generation))
         return first
+
+    def _confirmed_by(self, hosts: Collection[str]) -> list[Job]:
+        rows = self._tables["verification"].values()
+        return [job for job, _, checkers, outcome in rows
+                if outcome != "unchecked" and {*checkers.split(",")} <= {*hosts}]  # fmt: skip
 
     def _failures_of(self, hosts: Collection[str]) -> dict[bytes, Any]:
         return {digest: row for digest, row in self._tables["failure"].items() if set(hosts) & {*map(host_of, row[1])}}
 
     def recall_results(self, hosts: Collection[str]) -> int:
         mine = {digest: row for digest, row in self._tables["result"].items() if host_of(row[2]) in hosts}
-        reopened = {row[0].generation for row in mine.values() if row[0].kind == "evaluate"}
+        jobs = [*(row[0] for row in mine.values()), *self._confirmed_by(hosts)]
+        reopened = {job.generation for job in jobs if job.kind == "evaluate"}
         vectors = {each.vector for number, (each, _) in self._tables["evaluation"].items() if number in reopened}
         for number, (evaluation, _) in list(self._tables["evaluation"].items()):
             if evaluation.vector in vectors:

@@ -3,6 +3,8 @@
 import pytest
 
 from dreamfleet.common.protocol.messages import Result
+from dreamfleet.common.runs.records import StoredEvaluation
+from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.storage.journal import Journal
 from tests.coordinator.run.test_run import SETTINGS
@@ -59,6 +61,28 @@ def test_a_check_stands_again_by_the_word_of_a_host_that_was_not_barred(journal)
     journal.take_back([*digests_of(1)])
     assert not unverified(journal, 0)
     assert not unverified(journal, 1)
+
+
+def test_a_recall_begins_where_a_host_alone_confirmed_what_others_brought(journal):
+    assert journal.first_brought({"a"}) == journal.first_brought({"b"}) == {"score": 0}
+    journal.recall_results({"b"})
+    assert journal.first_brought({"b"}) == {}, "its word is gone"
+    for work in jobs_of(1):
+        journal.add_verification(work.job, "a/1", "c", "equal")
+    assert journal.first_brought({"c"}) == {"score": 1}
+    assert journal.first_brought({"d"}) == {}
+
+
+def test_an_evaluation_of_which_a_barred_host_alone_confirmed_a_part_is_finished_again(journal):
+    for number, checker in enumerate("bc"):
+        evaluation = Evaluation(number, VECTORS[number], 1)
+        journal.schedule_evaluation(evaluation)
+        (work,) = evaluation.work(SPEC)
+        journal.add_result(work.job, Result(work.digest, 1.0, 10, 0.1, None, None), "a/1", "f", 1, "class")
+        journal.add_verification(work.job, "a/1", checker, "equal")
+        journal.finish_evaluation(number, StoredEvaluation(number, 1, 1.0, 0.0), 0)
+    journal.recall_results({"b"})
+    assert [each.generation for each in journal.pending_evaluations()] == [0]
 
 
 @pytest.mark.parametrize(("barred", "stands"), [("b", True), ("c", True), ("bc", True), ("b c", False)])
