@@ -1,8 +1,10 @@
 """Build the sdist and its wheel, install each alone, and check that only `dreamfleet` is installed and starts.
 
+The wheel is installed by the documents' own line, and each link of an installed page must lead to an installed file.
 Whatever lies in the current folder, a `worker.py`, a `common/`, a `coordinator.py`, must not be imported for ours.
 """
 
+import re
 import subprocess
 import sys
 import tarfile
@@ -27,6 +29,8 @@ EXPECTED = (
     "dreamfleet/worker/service/worker.py",
 )
 HOSTILE = ("worker.py", "coordinator.py", "common/__init__.py", "tasks.py")
+LINK = re.compile(r"\]\((?![a-z]+:|#)([^)\s#]+)")  # without its anchor
+FENCED = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 NAMES = (
     "import importlib.metadata as m; print(*sorted({p.parts[0] for p in m.files('dreamfleet') if p.suffix == '.py'}))"
 )
@@ -64,13 +68,30 @@ def try_out(environment: Path, archive: Path, folder: Path) -> str:
     """Install an archive and start verbs beside modules named like ours; return the problem, or an empty text."""
     venv.create(environment, with_pip=True)
     python = str(environment / "bin" / "python")
-    run(python, "-m", "pip", "install", "--quiet", "--constraint", str(ROOT / "constraints.txt"), str(archive))
+    is_wheel = archive.suffix == ".whl"
+    what = ("--find-links", str(archive.parent), "dreamfleet") if is_wheel else (str(archive),)
+    run(python, "-m", "pip", "install", "--quiet", "--constraint", str(ROOT / "constraints.txt"), *what)
+    (pages,) = environment.glob("lib/python*/site-packages/dreamfleet")
+    if dead := dead_links(pages):
+        return f"{len(dead)} links lead nowhere, such as {dead[0]}"
     for command in ((str(environment / "bin" / "dreamfleet"),), (python, "-m", "dreamfleet")):
         run(*command, "--help", cwd=folder)
         run(*command, "doctor", cwd=folder)
         run(*command, "runs", "list", cwd=folder)
     importable = capture(python, "-P", "-c", NAMES, cwd=folder).split()
     return "" if importable == ["dreamfleet"] else f"installs {importable}"
+
+
+def dead_links(folder: Path) -> list[str]:
+    """The relative links of the Markdown pages below a folder that lead to nothing in it: page and target."""
+    found = []
+    for page in sorted(folder.rglob("*.md")):
+        text = FENCED.sub("", page.read_text())
+        for target in LINK.findall(text):
+            path = (page.parent / target).resolve()
+            if not (path.exists() and path.is_relative_to(folder.resolve())):
+                found.append(f"{page.relative_to(folder)}: {target}")
+    return found
 
 
 def files_of(archive: Path) -> list[str]:

@@ -5,7 +5,7 @@ import pytest
 from tests.docs.tutorial import WHOLE, run_tutorial
 
 SHARES = {
-    "--scale 0.5": "--scale 0.005 --jobs 1",
+    "--scale 0.5": "--scale 0.005 --jobs 1 --yes",
     "--episodes 1000": "--episodes 8",
     "--updates 1500": "--updates 8",
     "--survival": "--survival --episodes 4",
