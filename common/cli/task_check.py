@@ -95,7 +95,7 @@ def try_task(
             compared, varies = True, _find_difference(first, second)
             if varies and is_function_task(name):
                 varies = VARYING_FUNCTION
-    return TaskReport(first.description, "", tuple(warnings), compared, varies)
+    return TaskReport(first.description, "", tuple(dict.fromkeys(warnings)), compared, varies)
 
 
 def _find_difference(first: DryRunReport, second: DryRunReport) -> str:

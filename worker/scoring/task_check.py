@@ -271,13 +271,27 @@ def _check_by_gymnasium(environment: Any) -> list[str]:
 def _describe_pictures(name: str, environment: Any) -> list[str]:
     from dreamfleet.worker.tasks.pictures import is_picture
 
-    space = environment.observation_space
-    if not is_picture(space):
-        return []
-    return [
-        f"it observes pictures of shape {tuple(space.shape)}, and the controller has a weight for each value: a world "
-        f"model makes few numbers of them (`dreamfleet pipeline --task {name}`)"
-    ]
+    found = []
+    for key, space in _observed(environment).items():
+        if is_picture(space):
+            where, flag = (f" as {key!r}", f" --observation {key}") if key else ("", "")
+            found.append(
+                f"it observes pictures of shape {tuple(space.shape)}{where}, and the controller has a weight for each "
+                f"value: a world model makes few numbers of them (`dreamfleet pipeline --task {name}{flag}`)"
+            )
+    return found
+
+
+def _observed(environment: Any) -> dict[str, Any]:
+    """The spaces that a controller sees: those of a Dict by their keys, before it is flattened, or the only one."""
+    from gymnasium.spaces import Dict
+
+    each = environment
+    while each is not None:
+        if isinstance(each.observation_space, Dict):
+            return dict(each.observation_space.spaces)
+        each = getattr(each, "env", None)
+    return {"": environment.observation_space}
 
 
 def _describe_left_out(environment: Any) -> list[str]:

@@ -105,6 +105,16 @@ def test_pictures_are_hinted_at():
     )
 
 
+def test_a_picture_in_a_dict_is_hinted_at_by_its_key_and_each_warning_is_given_once():
+    task = "gym:tests.support.pixel_fakes:InTwo-v0"
+    found = try_task(task, {})
+    assert len(set(found.warnings)) == len(found.warnings)
+    assert [f"--task {task} --observation {key}`" in text for key in ("map", "screen") for text in found.warnings
+            if f"--observation {key}`" in text] == [True, True]  # fmt: skip
+    (only,) = (text for text in try_task(task, {"observation": ["map"]}).warnings if "--observation" in text)
+    assert "--observation map`" in only
+
+
 linux = pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="Linux")
 
 
