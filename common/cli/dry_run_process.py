@@ -32,7 +32,7 @@ class DryRunError(Exception):
 class DryRunProcess:
     """A module that reads its request from stdin, writes lines to stdout, and prints to stderr. Use it in a `with`.
 
-    Its arguments are a file descriptor, which is closed by `begin`: until then it only loads what it needs.
+    Its argument is a file descriptor, which is closed by `begin`: until then it only loads what it needs.
     """
 
     def __init__(self, module: str, request: str, hash_seed: int) -> None:
@@ -69,9 +69,11 @@ class DryRunProcess:
         for pipe in self._pipes():
             pipe.close()
 
-    def begin(self) -> None:
-        """Let it begin its dry run."""
+    def begin(self, word: bytes = b"") -> None:
+        """Let it begin its dry run; it reads the `word` of one byte, if there is one, from the descriptor."""
         if self._go >= 0:
+            with suppress(OSError):  # it may have ended
+                os.write(self._go, word)
             os.close(self._go)
             self._go = -1
 

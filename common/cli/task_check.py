@@ -19,6 +19,7 @@ from dreamfleet.common.serialization.validation import from_plain
 
 CHILD = "dreamfleet.worker.scoring.task_check"
 LAST_STEP = "close()"
+LEAVE_OPEN = b"o"  # to a child: close no environment
 STEP_LIMIT = 120.0  # seconds of one step of a dry run, such as a reset; as long as a worker's child may take to start
 SECOND_RUN_LIMIT = 20.0  # seconds of the first dry run's episode from which on there is no second dry run
 DRY_RUN_LIMIT = 3600.0  # seconds of a whole dry run, which may normalise observations in 20 episodes
@@ -43,6 +44,7 @@ class DryRunReport:
     episode: str = ""  # digest of the probe episode; empty: the task has none
     repeated: str = ""  # of the same episode, driven once more; empty: it was not
     seconds: float = 0.0  # that the first episode took
+    close_hangs: bool = False  # its `close` was interrupted
 
 
 @dataclass
@@ -89,7 +91,8 @@ def try_task(
             why = "its first steps take too long" if first.episode else "the task has no probe episode"
             warnings.append(f"whether equal seeds give equal episodes was not checked: {why}")
         else:
-            second = _dry_run(another or stack.enter_context(start(thorough=False)), name, limit)
+            process = another or stack.enter_context(start(thorough=False))
+            second = _dry_run(process, name, limit, LEAVE_OPEN if first.close_hangs else b"")
             if second.fault:
                 warnings.append(f"a second dry run failed: {second.fault}")
             compared, varies = True, _find_difference(first, second)
@@ -108,12 +111,15 @@ def _find_difference(first: DryRunReport, second: DryRunReport) -> str:
     return ""
 
 
-def _dry_run(child: DryRunProcess, name: str, limit: float) -> DryRunReport:
-    """Let a child begin and return its last report; without one the fault says what it did as it hung or crashed."""
+def _dry_run(child: DryRunProcess, name: str, limit: float, word: bytes = b"") -> DryRunReport:
+    """Let a child begin with this word and return its last report.
+
+    Without one the fault says what it did as it hung or crashed.
+    """
     step, failure = "loading it", ""
     report: DryRunReport | None = None
     until = monotonic() + DRY_RUN_LIMIT
-    child.begin()
+    child.begin(word)
     try:
         for _ in range(MAX_ANSWERS):
             left = until - monotonic()

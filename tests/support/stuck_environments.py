@@ -1,6 +1,8 @@
 """Environments whose `close` never ends, or whose constructors raise."""
 
+import os
 import threading
+from pathlib import Path
 from typing import ClassVar
 
 import gymnasium
@@ -10,12 +12,18 @@ MODULE = "tests.support.stuck_environments"
 
 
 class StuckClose(CartPoleEnv):
-    """Counts the calls of `close`, which wait for ever."""
+    """Counts the calls of `close`, which wait for ever, also in a file."""
 
     calls: ClassVar = []
 
+    def __init__(self, file=os.devnull, render_mode=None):
+        super().__init__(render_mode=render_mode)
+        self.file = file
+
     def close(self):
         self.calls.append(self)
+        with Path(self.file).open("a") as file:
+            file.write("closed\n")
         threading.Event().wait()
 
 

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, field
 from time import monotonic
 from typing import TYPE_CHECKING, Any, cast
 
-from dreamfleet.common.cli.task_check import LAST_STEP, DryRunReport
+from dreamfleet.common.cli.task_check import LAST_STEP, LEAVE_OPEN, DryRunReport
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.unseen_drawing import draw_unseen
@@ -141,7 +141,7 @@ def dry_run(
     announce("making it")
     description = describe_task(name, {key: value for key, value in options.items() if key != "normalise"})
     from dreamfleet.worker.scoring.host_class_probe import REPEAT_LIMIT  # needs gymnasium, as the task may not
-    from dreamfleet.worker.tasks.closing import close_environment
+    from dreamfleet.worker.tasks import closing
 
     trial = _prepare(name, description, announce, measures)
     checked = trial.checked
@@ -157,7 +157,9 @@ def dry_run(
         if checked.reset_seconds >= SLOW_RESET:
             checked.warnings.append(f"a reset took {checked.reset_seconds:.0f} s, so gymnasium's checker was left out")
     if thorough and options.get("normalise"):
-        close_environment(checked.environment)  # the description makes its own, and many simulators allow one a process
+        closing.close_environment(
+            checked.environment
+        )  # the description makes its own, and many simulators allow one a process
         announce("")
         report.description = describe_task(name, options)
         announce("making it")
@@ -169,8 +171,8 @@ def dry_run(
         report.warnings = (*checked.warnings, *_check_by_gymnasium(checked.environment))
         yield report
     announce(LAST_STEP)
-    if fault := close_environment(checked.environment):
-        report.warnings = (*report.warnings, fault)
+    if fault := closing.close_environment(checked.environment):
+        report.warnings, report.close_hangs = (*report.warnings, fault), closing.has_hung()
         yield report
 
 
@@ -301,13 +303,14 @@ def _describe_left_out(environment: Any) -> list[str]:
     return [f"no numbers, and left out of what the controller sees: {', '.join(names)}"]
 
 
-def _load_and_wait(go: int) -> None:
-    """Import what any dry run needs, and wait until the descriptor `go` is closed elsewhere."""
+def _load_and_wait(go: int) -> bytes:
+    """Import what any dry run needs, and wait until a word comes or the descriptor `go` is closed elsewhere."""
     with suppress(Exception):  # the dry run reports it
         import dreamfleet.worker.scoring.host_class_probe
         import dreamfleet.worker.tasks.registry  # noqa: F401
-    os.read(go, 1)
+    word = os.read(go, 1)
     os.close(go)
+    return word
 
 
 def main() -> None:
@@ -318,7 +321,10 @@ def main() -> None:
     os.dup2(2, 1)
     draw_unseen()
     pin_thread_pools()
-    _load_and_wait(int(sys.argv[1]))
+    if _load_and_wait(int(sys.argv[1])) == LEAVE_OPEN:
+        from dreamfleet.worker.tasks import closing
+
+        closing.leave_open()
     keep_user_arguments()
     step = "loading it"
 

@@ -22,6 +22,20 @@ CLOSE_LIMIT = 10.0  # seconds
 _hung: dict[type, str] = {}  # classes of environments whose `close` hung in this process, and what was said of it
 
 
+_leaves_open = False
+
+
+def has_hung() -> bool:
+    """Whether a `close` was interrupted in this process."""
+    return bool(_hung)
+
+
+def leave_open() -> None:
+    """Close no environment in this process from now on, as another process has shown that this hangs."""
+    global _leaves_open  # noqa: PLW0603 - of the process
+    _leaves_open = True
+
+
 class _Hung(BaseException):  # not an Exception, which an environment may catch
     """Interrupts a `close` that hangs."""
 
@@ -33,6 +47,8 @@ def close_environment(environment: gymnasium.Env[Any, Any]) -> str:
     environments of that class are not closed any more.
     """
     kind = type(environment.unwrapped)
+    if _leaves_open:
+        return ""
     if kind in _hung:
         return _hung[kind]
     name, fault = kind.__name__, ""

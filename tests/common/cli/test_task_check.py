@@ -15,6 +15,7 @@ from dreamfleet.common.cli import dry_run_process
 from dreamfleet.common.cli.task_check import try_task
 from tests.support.environments import DAEMON_FILE, ODD
 from tests.support.processes import DEADLINE, environment
+from tests.support.stuck_environments import MODULE as STUCK
 
 
 def dry_run(fault, name=ODD, **options):
@@ -95,6 +96,14 @@ def test_what_is_left_out_is_named_unless_the_user_chose():
 
 def test_a_table_of_codes_is_no_picture():
     assert not any("picture" in each for each in try_task("gym:tests.support.pixel_fakes:Board-v0", {}).warnings)
+
+
+@pytest.mark.slow
+def test_a_close_that_hangs_is_waited_for_once(tmp_path):
+    file = tmp_path / "closed"
+    found = try_task(f"gym:{STUCK}:StuckClose-v0", {"environment": {"file": str(file)}})
+    assert (found.fault, found.varies, found.compared, len(found.warnings)) == ("", "", True, 1)
+    assert file.read_text().splitlines() == ["closed"]
 
 
 def test_pictures_are_hinted_at():
