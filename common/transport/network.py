@@ -17,7 +17,7 @@ LOOPBACK = "127.0.0.1"
 SECURED_PREFIX = "tls/"  # prefix of a secured fleet's endpoints
 SECURED_ENDPOINT = "tls/0.0.0.0:7447"  # default of a secured coordinator
 LOOK_INTERVAL = 0.02  # seconds between two looks whether a process of this host listens
-_ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws)/(\[[0-9a-fA-F:]+\]|[^:/\s]+):(\d{1,5})")
+_ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws)/(\[[0-9a-fA-F:]+(?:%[\w.-]+)?\]|[^:/\s%]+):(\d{1,5})")
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,28 @@ def check_endpoint(endpoint: str) -> str:
         hint = "" if "/" in endpoint or ":" in endpoint else "; a run's name goes elsewhere: see --help"
         example = f"tcp/127.0.0.1:{endpoint}" if endpoint.isdecimal() else f"{DEFAULT_ENDPOINT}{hint}"
         raise UsageError(f"{endpoint!r} is not an endpoint: write tcp/HOST:PORT, such as {example}")
+    if found[1] == "quic":  # Zenoh's needs certificates, and join files give theirs to TLS
+        place = endpoint.partition("/")[2]
+        raise UsageError(
+            f"{endpoint}: QUIC is not supported: write tcp/{place}, or {SECURED_PREFIX}{place} with --join"
+        )
     return endpoint
+
+
+def with_interface_index(endpoint: str) -> str:
+    """An endpoint of a link-local address (`fe80::1%eth0`) with its interface's index, the only form Zenoh reads.
+
+    `UsageError` if this host has no such interface.
+    """
+    head, percent, rest = endpoint.partition("%")
+    interface, bracket, port = rest.partition("]")
+    if not percent or interface.isdecimal():
+        return endpoint
+    try:
+        return f"{head}%{socket.if_nametoindex(interface)}{bracket}{port}"
+    except OSError:
+        known = ", ".join(name for _, name in socket.if_nameindex())
+        raise UsageError(f"{endpoint}: this host has no interface {interface}; it has {known}") from None
 
 
 def check_secured(endpoint: str) -> str:

@@ -25,7 +25,7 @@ from dreamfleet.common.security.access_rules import access_control_config
 from dreamfleet.common.security.connection_limiter import limit_connections
 from dreamfleet.common.security.credentials import SEATS, Credentials, derive_password, identity
 from dreamfleet.common.security.handshake import diagnose_connection
-from dreamfleet.common.transport.network import SECURED_PREFIX, Network, check_endpoint
+from dreamfleet.common.transport.network import SECURED_PREFIX, Network, check_endpoint, with_interface_index
 
 CONNECT_TIMEOUT = 3.0  # seconds to open a link; TLS takes four or more round trips
 LEASE_MS = 4000  # after so long without a message the other side drops a session's liveliness tokens
@@ -153,7 +153,7 @@ def zenoh_config(network: Network, timeout: float | None, dictionary: str | None
         "mode": "router" if router else "client",
         "listen": {"endpoints": _listen_endpoints(network), "exit_on_failure": True},
         "connect": {
-            "endpoints": list(network.connect),
+            "endpoints": [with_interface_index(each) for each in network.connect],
             "timeout_ms": -1 if timeout is None else int(timeout * 1000),
             "exit_on_failure": timeout is not None,
             "retry": retry,
@@ -167,7 +167,7 @@ def zenoh_config(network: Network, timeout: float | None, dictionary: str | None
 def _listen_endpoints(network: Network) -> list[str]:
     """A router's endpoints; a secured one closes connections whose handshake takes too long."""
     patience = "" if network.credentials is None else f"#tls_handshake_timeout_ms={int(1000 * CONNECT_TIMEOUT)}"
-    return [each + patience for each in network.listen]
+    return [with_interface_index(each) + patience for each in network.listen]
 
 
 def _tls(credentials: Credentials) -> dict[str, Any]:
@@ -222,7 +222,8 @@ def _connection_error(network: Network, error: zenoh.ZError) -> ConnectionFailed
 
 
 def _first_line(error: BaseException) -> str:
-    return str(error).splitlines()[0][:200]
+    """What Zenoh says, without the places in its source, such as ` at /root/.cargo/...`."""
+    return str(error).splitlines()[0].partition(" at /")[0][:200]
 
 
 def enqueue_into(inbox: queue.SimpleQueue[Any], kind: str, max_waiting: int | None = None) -> Callable[[Any], None]:

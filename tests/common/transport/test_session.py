@@ -4,11 +4,14 @@ import time
 import pytest
 
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
+from dreamfleet.common.transport.network import with_interface_index
 from dreamfleet.common.transport.session import Network, check_clock, check_endpoint, open_session
 from tests.support.processes import DEADLINE, free_port
 
 
-@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:7447", "tls/host.example:1", "tcp/[::1]:7447"])
+@pytest.mark.parametrize(
+    "endpoint", ["tcp/127.0.0.1:7447", "tls/host.example:1", "tcp/[::1]:7447", "tcp/[fe80::1%lo]:7447"]
+)
 def test_good_endpoints(endpoint):
     assert check_endpoint(endpoint) == endpoint
 
@@ -17,6 +20,23 @@ def test_good_endpoints(endpoint):
 def test_bad_endpoints_are_refused(endpoint):
     with pytest.raises(UsageError, match="write tcp/HOST:PORT"):
         Network(listen=(endpoint,))
+
+
+def test_a_link_local_address_has_its_interfaces_index_for_zenoh():
+    index, name = socket.if_nameindex()[0]
+    assert with_interface_index(f"tcp/[fe80::1%{name}]:7447") == f"tcp/[fe80::1%{index}]:7447"
+    for each in ("tcp/[fe80::1%7]:7447", "tcp/[::1]:7447", "tcp/host.example:7447"):
+        assert with_interface_index(each) == each
+    for network in (Network(listen=("tcp/[fe80::1%nowhere0]:7447",)), Network(connect=("tcp/[fe80::1%nowhere0]:1",))):
+        with pytest.raises(UsageError, match=name):
+            open_session(network, timeout=0.2)
+
+
+def test_quic_is_refused_with_the_forms_that_work():
+    with pytest.raises(UsageError) as refused:
+        check_endpoint("quic/host.example:7447")
+    assert "tcp/host.example:7447" in str(refused.value)
+    assert "tls/host.example:7447" in str(refused.value)
 
 
 def test_a_port_in_use_is_an_error():
