@@ -203,14 +203,17 @@ class _Trial:
 
         from dreamfleet.worker.tasks.policy import FlatPolicy
 
-        if not isinstance(self.policy, FlatPolicy):  # others may take other outputs
-            return
-        size, is_over = self.actions.outputs, True
+        if not isinstance(self.policy, FlatPolicy) or not getattr(self.actions, "squashed", True):
+            return  # others may take other outputs, and those without tanh have no bounds
+        size, is_over, slow_resets = self.actions.outputs, True, False
         corners = np.random.default_rng(0).choice([-1.0, 1.0], (CORNERS, size))
         last = np.arange(size) == size - 1  # of numbered actions
         for signs in (np.full(size, -1.0), np.full(size, 1.0), np.where(last, 1.0, -1.0), *corners):
+            if is_over and slow_resets:
+                return
             if is_over:
                 self.checked.reset(seed=0)
+                slow_resets = self.checked.reset_seconds >= SLOW_RESET
             action = self.actions.to_action((SATURATED * signs).astype(np.float32))
             self.checked.announce(f"a step with the action {one_line(str(action))[:MAX_ACTION]}")
             _, _, terminated, truncated, _ = self.checked.step(action)
