@@ -34,7 +34,7 @@ def shorten_words(text: str) -> str:
 
 def plural(count: float, noun: str, nouns: str = "") -> str:
     """Format a number with its noun in singular or plural: 1 seed, 1,000 seeds, 1.5 minutes, 2 batches."""
-    return f"{count:{',' if isinstance(count, int) else 'g'}} {noun if count == 1 else nouns or f'{noun}s'}"
+    return f"{count:{'g' if isinstance(count, float) else ','}} {noun if count == 1 else nouns or f'{noun}s'}"
 
 
 def format_number(value: float | None, sign: str = "") -> str:
@@ -67,7 +67,7 @@ def format_setting(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:g}"
+        return f"{value:zg}"
     return ", ".join(map(format_setting, value)) if isinstance(value, (list, tuple)) else str(value)
 
 

@@ -11,6 +11,14 @@ is first used, so that a coordinator needs no simulator and a reader of journals
 
 from __future__ import annotations
 
+import os
+
+if os.path.isfile(os.path.join(os.path.dirname(__file__), "common")):  # noqa: PTH113, PTH118, PTH120
+    raise ImportError(
+        "dreamfleet/common is a file: git made no symbolic links. Make them: "
+        "git config core.symlinks true && git checkout -- dreamfleet"
+    )
+
 TYPE_CHECKING = False  # `typing` takes milliseconds, in which Ctrl-C would still print a traceback
 if TYPE_CHECKING:
     from typing import Any

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.printable import plural
 
 Floats = NDArray[np.float32]
 Integers = NDArray[np.int64]
@@ -207,13 +208,16 @@ class Mirror:
     def __post_init__(self) -> None:
         if sorted(self.order) != list(range(len(self.signs))):
             raise UsageError(
-                f"a mirror of {len(self.signs)} signs orders the columns 0 to {len(self.signs) - 1}, not {self.order}"
+                f"a mirror of {plural(len(self.signs), 'sign')} orders the columns 0 to {len(self.signs) - 1}, "
+                f"not {self.order}"
             )
 
     def apply(self, action: Floats) -> Floats:
         """The mirrored actions `(..., actions)`; `UsageError` for another number of columns."""
         if action.shape[-1:] != (len(self.order),):
-            raise UsageError(f"a mirror of {len(self.order)} columns does not fit actions of shape {action.shape}")
+            raise UsageError(
+                f"a mirror of {plural(len(self.order), 'column')} does not fit actions of shape {action.shape}"
+            )
         mirrored: Floats = action[..., self.order] * np.array(self.signs, np.float32)
         return mirrored
 

@@ -31,6 +31,7 @@ from dreamfleet.common.errors import BundleError, ControllerError, UsageError
 from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive, write_archive
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import is_folder, open_regular, read_regular
+from dreamfleet.common.printable import plural
 from dreamfleet.common.serialization.display import Displayed
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
 from dreamfleet.common.serialization.validation import Between, MalformedError, Word, from_plain
@@ -109,7 +110,7 @@ class Bundle(Displayed):
             "latent": manifest.latent,
             "hidden": manifest.hidden,
             "actions": manifest.actions,
-            "controllers": f"{self.controller_shape.size} parameters",
+            "controllers": f"{plural(self.controller_shape.size, 'parameter')}",
             "file": str(self.path),
             "SHA-256": digest,
         }
@@ -210,7 +211,7 @@ class Bundle(Displayed):
         if shape not in (self.shape_of(features, shape.hidden, driving) for features in ("z", "zh")):
             fitting = self.shape_of("zh", driving=driving)
             raise ControllerError(
-                f"a controller of {shape.size} parameters does not fit {self.path.name}, which needs "
+                f"a controller of {plural(shape.size, 'parameter')} does not fit {self.path.name}, which needs "
                 f"{fitting.size}, or other inputs: latent {self.manifest.latent}, hidden "
                 f"{self.manifest.hidden}, {fitting.actions} actions"
             )

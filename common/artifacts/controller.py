@@ -23,6 +23,7 @@ from dreamfleet.common.errors import ControllerError, MissingExtraError
 from dreamfleet.common.files.archives import ArchiveLimits, read_arrays
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.host.packages import install_command_for
+from dreamfleet.common.printable import plural
 from dreamfleet.common.serialization.display import Displayed
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
 
@@ -68,7 +69,8 @@ class ControllerShape:
         if parameters.shape[-1:] != (self.size,):
             sizes = " + ".join(f"{outputs} x ({inputs} + 1 bias)" for outputs, inputs in self.layers)
             raise ControllerError(
-                f"a controller of {parameters.shape[-1]} parameters does not fit: this run needs {self.size} ({sizes})"
+                f"a controller of {plural(parameters.shape[-1], 'parameter')} does not fit: this run needs "
+                f"{self.size} ({sizes})"
             )
 
     def unpack(self, parameters: NDArray[np.float32]) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
@@ -147,7 +149,7 @@ class Controller(Displayed):
             "from generation": self.provenance.get("generation"),
             "SHA-256": digest,
         }
-        return f"Controller of {self.task}: {shape.size} parameters, {layers}, SHA-256 {digest}", facts
+        return f"Controller of {self.task}: {plural(shape.size, 'parameter')}, {layers}, SHA-256 {digest}", facts
 
     @property
     def sha256(self) -> str:

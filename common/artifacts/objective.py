@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.printable import plural
 
 Floats = NDArray[np.float64]
 LARGEST_EXPONENT = 700.0  # of e: above it no double is finite
@@ -124,7 +125,9 @@ class Objective:
         """The arguments `(dimension,)` of search coordinates `(dimension,)`."""
         given = np.asarray(coordinates, dtype=np.float64)
         if given.shape != (self.dimension,):
-            raise UsageError(f"a function of {self.dimension} parameters takes no coordinates of shape {given.shape}")
+            raise UsageError(
+                f"a function of {plural(self.dimension, 'parameter')} takes no coordinates of shape {given.shape}"
+            )
         inner, low, high = (np.array(each) for each in zip(*map(self._inner, range(self.dimension)), strict=True))
         found = _reflect(inner + np.array(self.scale) * given, low, high)
         for index in self.log:  # one by one: NumPy's vectors of exponentials have other bits on other processors
@@ -207,7 +210,9 @@ def _numbers(name: str, given: Any, size: int | None, missing: float | None = No
         given = [given] * (1 if size is None else size)
     values = tuple(missing if each is None and missing is not None else _number(name, each) for each in given)
     if not values or (size is not None and len(values) != size):
-        raise UsageError(f"{name} has {len(values)} numbers, and the function {size or 'at least 1'} parameters")
+        raise UsageError(
+            f"{name} has {plural(len(values), 'number')}, and the function {size or 'at least 1'} parameters"
+        )
     return values
 
 

@@ -225,9 +225,9 @@ def _uncounted_limits(status: Status) -> Iterator[str]:
         task = status.settings.task
         found = in_values(status.best, task)
         best = "" if found is None else f" (best {format_number(found.mean)})"
-        yield f"until an evaluation reaches {value_of(target, task):g}{best}"
+        yield f"until an evaluation reaches {value_of(target, task):zg}{best}"
     if isinstance(parted, int) and parted:
-        yield f"until {parted} evaluations in a row fall behind"
+        yield f"until {plural(parted, 'evaluation')} in a row fall behind"
 
 
 def _limit(limits: Mapping[str, Any], name: str) -> float:
@@ -250,7 +250,9 @@ def _summarise_progress(status: Status) -> str:
     opened = status.generation
     if status.settings.is_external and not opened.episodes:
         return status.state
-    episodes = f"{opened.episodes_done}/{opened.episodes} episodes" if opened.episodes else "all candidates failed"
+    episodes = (
+        f"{opened.episodes_done}/{plural(opened.episodes, 'episode')}" if opened.episodes else "all candidates failed"
+    )
     return f"{status.state}, generation {opened.number} ({episodes})"
 
 
@@ -258,7 +260,7 @@ def _describe_running(status: Status) -> str:
     open_one = status.generation
     if not open_one.episodes:
         return f"generation {open_one.number}: all candidates failed"
-    return f"generation {open_one.number}: {open_one.episodes_done:,} of {open_one.episodes:,} episodes"
+    return f"generation {open_one.number}: {open_one.episodes_done:,} of {plural(open_one.episodes, 'episode')}"
 
 
 def _describe_evaluating(status: Status) -> str:
@@ -283,7 +285,7 @@ def _describe_waiting(status: Status) -> str:
 
 
 def _format_episodes(part: EpisodeProgress) -> str:
-    return f"{part.episodes_done:,} of {part.episodes:,} episodes"
+    return f"{part.episodes_done:,} of {plural(part.episodes, 'episode')}"
 
 
 def _describe_paused(status: Status) -> str:

@@ -155,5 +155,5 @@ def _draw_evaluations(axes: Any, run: RunFolder, jumps: Sequence[int]) -> None:
         axes.errorbar(
             confirmed.generation + ASIDE * max(1, len(run.history()) - 1), confirmed.mean, error_bars([confirmed]),
             fmt="*", color="tab:red", **STAR,
-            label=f"reported: {score} on {confirmed.episodes} fresh {word}s",
+            label=f"reported: {score} on {plural(confirmed.episodes, f'fresh {word}')}",
         )  # fmt: skip

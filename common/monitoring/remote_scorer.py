@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError
 from dreamfleet.common.monitoring.batch_client import BatchClient, is_final
 from dreamfleet.common.monitoring.client import Client
+from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.batches import BatchError, BatchEvent, BatchReply, pack_batch
 from dreamfleet.common.runs.seeds import remark_on_seeds
 from dreamfleet.common.serialization.display import Displayed
@@ -214,7 +215,9 @@ class RemoteBatch(Displayed):
         deadline = None if timeout is None else monotonic() + timeout
         while not is_final(self._last):
             if deadline is not None and monotonic() >= deadline:
-                raise TimeoutError(f"batch {self.id} is {self.state}: {self.done} of {len(self)} candidates are done")
+                raise TimeoutError(
+                    f"batch {self.id} is {self.state}: {self.done} of {plural(len(self), 'candidate')} done"
+                )
             self._scorer.wait_for_change(self._last)
             self.refresh()
         fitness = np.full(len(self), nan)

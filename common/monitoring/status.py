@@ -169,7 +169,10 @@ class WorkerStatus(Displayed):
             "last heard": f"{self.heard:.1f} s ago",
         }
         slots = plural(self.slots, "slot")
-        return f"WorkerStatus of {self.worker}: {self.state}, {slots}, {self.finished} jobs finished, {speed}", facts
+        return (
+            f"WorkerStatus of {self.worker}: {self.state}, {slots}, {plural(self.finished, 'job')} finished, {speed}",
+            facts,
+        )
 
 
 EventKind = Literal[
@@ -334,13 +337,13 @@ class Status(Displayed):
     def _display(self) -> tuple[str, dict[str, object]]:
         task, now = self.settings.task, self.generation
         last, best = in_values(self.last, task), in_values(self.confirmed or self.best, task)
-        progress = f"generation {now.number}, {now.episodes_done} of {now.episodes} episodes"
+        progress = f"generation {now.number}, {now.episodes_done} of {plural(now.episodes, 'episode')}"
         workers = plural(self.workers.present, "worker")
         facts: dict[str, object] = {
             "task": task.task,
             "state": f"{self.state}: {self.why}" if self.why else self.state,
             "progress": progress,
-            "last generation's mean": None if last is None else f"{last.mean:.6g}",
+            "last generation's mean": None if last is None else f"{last.mean:z.6g}",
             "archive": None if self.archive is None else self.archive.description,
             "confirmed" if self.confirmed else "best evaluation": None if best is None else format_mean(best),
             "workers": f"{workers}, {plural(self.slots, 'slot')}",

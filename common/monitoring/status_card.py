@@ -60,7 +60,7 @@ def status_card(status: Status) -> str:
     reported = "" if best is None else f"{'confirmed' if status.confirmed else 'best evaluation'} {format_mean(best)}"
     doing = [
         f"generation {now.number:,}",
-        f"{now.episodes_done:,} of {now.episodes:,} episodes",
+        f"{now.episodes_done:,} of {plural(now.episodes, 'episode')}",
         f"{status.throughput.steps_per_second:,.0f} {step_unit(task.task)}/s",
         estimate_eta(status).description,
     ]
@@ -119,7 +119,7 @@ def _workers(status: Status) -> str:
 
 def _worker(worker: WorkerStatus) -> str:
     cells = (
-        worker.name, plural(worker.slots, "slot"), f"{worker.finished:,} jobs finished",
+        worker.name, plural(worker.slots, "slot"), f"{plural(worker.finished, 'job')} finished",
         f"{worker.steps_per_second:,.0f} steps/s", "" if worker.state == "present" else worker.state,
     )  # fmt: skip
     columns = "".join(f'<td style="{CELL}">{_text(cell)}</td>' for cell in cells)

@@ -274,7 +274,7 @@ def _progress_lines(status: Status, width: int) -> Iterator[Text]:
     for label, part in parts.items():
         if part.episodes:
             share = part.episodes_done / part.episodes
-            count = f" {part.episodes_done}/{part.episodes} episodes"
+            count = f" {part.episodes_done}/{plural(part.episodes, 'episode')}"
             drawn = share_bar(share, max(min(MAX_BAR_WIDTH, width - LABEL_WIDTH - len(count)), 0))
             yield Text.assemble((label.ljust(LABEL_WIDTH), "dim"), (drawn, "cyan"), count)
 
@@ -296,7 +296,7 @@ def _candidate_lines(status: Status, population: Population, width: int, lines: 
     if failed == population.total:
         parts = ["all candidates failed"]
     else:
-        parts = [f"{done:,}/{wanted:,} episodes", *([f"{failed} failed (x)"] if failed else [])]
+        parts = [f"{done:,}/{plural(wanted, 'episode')}", *([f"{failed} failed (x)"] if failed else [])]
     if found:
         values = [value_of(each.fitness or 0.0, status.settings.task) for each in found]
         parts.append(f"so far {format_number(min(values))} to {format_number(max(values))}")

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.printable import plural
 from dreamfleet.common.serialization.optional_fields import OPTIONAL
 from dreamfleet.common.serialization.validation import Count, Length, Text
 
@@ -75,7 +76,8 @@ class BatchHeader:
         if self.total > MAX_BATCH:
             raise BatchError(
                 "too large",
-                f"a batch of {self.population:,} vectors of {self.size:,} numbers has {self.total:,} bytes, "
+                f"a batch of {plural(self.population, 'vector')} of {plural(self.size, 'number')} has "
+                f"{self.total:,} bytes, "
                 f"{MAX_BATCH:,} are allowed: split it into smaller batches",
             )
         if not _SHA256.fullmatch(self.sha256):
@@ -87,7 +89,8 @@ class BatchHeader:
         if self.population * episodes > MAX_EPISODES:
             raise BatchError(
                 "too large",
-                f"{self.population:,} vectors of {episodes:,} episodes each are {self.population * episodes:,} "
+                f"{plural(self.population, 'vector')} of {plural(episodes, 'episode')} each are "
+                f"{self.population * episodes:,} "
                 f"episodes, {MAX_EPISODES:,} are allowed: split it into smaller batches",
             )
 

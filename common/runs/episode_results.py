@@ -57,7 +57,7 @@ class EpisodeResults(Displayed):
 
     def _display(self) -> tuple[str, dict[str, object]]:
         score = format_with_error(self.mean, self.error)
-        extremes = f"{self.worst:g} to {self.best:g}"
+        extremes = f"{self.worst:zg} to {self.best:zg}"
         failed = f", {len(self.failed)} failed" if self.failed else ""
         facts = {
             "mean ± standard error": score,

@@ -34,7 +34,8 @@ class PairedDifference:
         shared = sorted(one.keys() & other.keys())
         if len(shared) < 2:
             raise UsageError(
-                f"{len(shared)} seeds are in both, and a difference needs 2: evaluate both with equal --first-seed and "
+                f"a difference needs 2 seeds that are in both, not {len(shared)}: evaluate both with equal "
+                "--first-seed and "
                 "--episodes"
             )
         differences = [other[seed] - one[seed] for seed in shared]

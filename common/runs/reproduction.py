@@ -69,7 +69,8 @@ class Reproduction:
         if self.same_fingerprint:
             seeds = ", ".join(map(str, self.differing_seeds[:5])) + (", ..." if len(self.differing_seeds) > 5 else "")
             return (
-                f"{name}: NOT reproduced: {len(self.differing_seeds)} of {count} drives differ (seeds {seeds}) on a "
+                f"{name}: NOT reproduced: {len(self.differing_seeds)} of {plural(count, 'drive')} differ (seeds "
+                f"{seeds}) on a "
                 f"host of the recorded fingerprint; it was recorded by dreamfleet {self.recorded.version}, here is "
                 f"{self.repeated.version}"
             )

@@ -68,7 +68,7 @@ class Stage:
         driven = ", all driven" if self.driven == 1 else f", {self.driven:.0%} of them driven" if self.driven else ""
         search += "" if self.whole else " in the subspace"
         size = f"{self.population} x {plural(self.episodes, 'episode')}"
-        return f"{self.horizon:,} steps{patience}, {size}{driven}{raced}, {search}"
+        return f"{plural(self.horizon, 'step')}{patience}, {size}{driven}{raced}, {search}"
 
     @property
     def driven_episodes(self) -> int:
@@ -156,8 +156,8 @@ def describe_steps(horizon: int, driven: float, *, dreamt: bool, limit: int | No
     if not dreamt:
         return plural(min(horizon, limit or horizon), word.removesuffix("s"))
     if driven in (0, 1):
-        return f"{horizon:,} {'driven' if driven else 'dreamt'} steps"
-    return f"{horizon:,} steps, {driven:.0%} driven"
+        return plural(horizon, "driven step" if driven else "dreamt step")
+    return f"{plural(horizon, 'step')}, {driven:.0%} driven"
 
 
 def describe_limit(horizon: int, limit: int | None) -> str:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_rows
 from dreamfleet.common.host.resource_limits import usable_cores
+from dreamfleet.common.printable import plural
 
 if TYPE_CHECKING:
     from dreamfleet.common.cli.health import Finding
@@ -45,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
         checks = [vars(each) for each in findings]
         print(json.dumps({**host, "checks": checks, "roles": playable, "ok": playable[args.role]}, indent=2))
     else:
-        print(f"Python {host['python']} at {sys.prefix}, {host['cores']} cores, {host['platform']}")
+        print(f"Python {host['python']} at {sys.prefix}, {plural(usable_cores(), 'core')}, {host['platform']}")
         print(f"fingerprint: {host['fingerprint']}\n")
         print_rows([_row(each) for each in findings])
         print()

@@ -6,15 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from dreamfleet.common.printable import format_number
+from dreamfleet.common.printable import format_number, plural
 
 End = Literal["finished", "terminated", "truncated"]
 """How an episode ended: its course was driven to the end, otherwise, or at the limit."""
 # What a recording says of it; `{score}` and `{steps}` are the episode's.
 ANY_ENDS: Mapping[End, str] = {
     "finished": "the course is finished",
-    "terminated": "ended after {steps} steps",
-    "truncated": "the limit of {steps} steps is reached",
+    "terminated": "ended after {counted_steps}",
+    "truncated": "the limit of {counted_steps} is reached",
 }
 
 
@@ -113,7 +113,7 @@ class WorldProfile:
         """A score's number, and the seconds that it stands for, if its unit is a time."""
         if not self.units_per_second:
             return format_number(score)
-        return f"{score:,.0f} ({score / self.units_per_second:.0f} s)"
+        return f"{score:z,.0f} ({score / self.units_per_second:.0f} s)"
 
     def format_score(self, score: float) -> str:
         """A score with what it counts: 909.4 points, 836 tics survived (24 s), reward 21.0."""
@@ -125,4 +125,4 @@ class WorldProfile:
     def describe_end(self, end: End, score: float, steps: int) -> str:
         """What a recording says of an episode's end."""
         text = self.end_texts.get(end) or ANY_ENDS[end]
-        return text.format(score=score, steps=steps)
+        return text.format(score=score, steps=steps, counted_steps=plural(steps, "step"))

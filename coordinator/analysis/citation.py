@@ -182,7 +182,8 @@ def _bibtex(run: RunFolder, controller: Controller, receipt: RunProvenance) -> l
         f"@misc{{dreamfleet-{run.name},",
         f"  title = {{Run {run.name} of dreamfleet {version}}},",
         *([] if begun is None else [f"  year = {{{begun.year}}},"]),
-        f"  note = {{run {run.uid}, controller SHA-256 {controller.sha256}, {receipt.generations} generations}}",
+        "  note = "
+        f"{{run {run.uid}, controller SHA-256 {controller.sha256}, {plural(receipt.generations, 'generation')}}}",
         "}",
         "@misc{dreamfleet,",
         ",\n".join(f"  {name} = {{{text}}}" for name, text in _software_fields(receipt) if text),

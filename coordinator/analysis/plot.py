@@ -216,7 +216,7 @@ def _draw_marks(axes: Any, marks: Sequence[tuple[float, float]], source: str) ->
     axes.plot(*zip(*marks, strict=True), "s--", color="black", markersize=5, linewidth=1, label=source)
     for number, (spent, score) in enumerate(marks):  # alternate sides, so that labels do not overlap
         place = (0, 7 if number % 2 else -14)
-        axes.annotate(f"{score:g}", (spent, score), place, textcoords="offset points", ha="center", fontsize=9)
+        axes.annotate(f"{score:zg}", (spent, score), place, textcoords="offset points", ha="center", fontsize=9)
 
 
 def _set_titles(axes: Any, title: str, note: str) -> None:

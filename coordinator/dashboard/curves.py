@@ -186,5 +186,5 @@ def _effort_columns(efforts: Sequence[Effort]) -> dict[str, list[float]]:
 
 def _rounded(value: float | None) -> float | None:
     """The number with 5 digits; `None` for NaN and infinity, and for no number."""
-    short = math.nan if value is None else float(f"{value:.5g}")
+    short = math.nan if value is None else float(f"{value:z.5g}")
     return short if math.isfinite(short) else None

@@ -129,7 +129,7 @@ def _tiles(look: RunSnapshot, eta: Eta, link: str) -> list[dict[str, str]]:
     word = step_unit(task.task)
 
     def figure(value: float) -> str:
-        return format_number(value, ",") if is_function_task(task.task) else f"{value:,.1f}"
+        return format_number(value, ",") if is_function_task(task.task) else f"{value:z,.1f}"
 
     spread = "" if last is None else f"mean; std {figure(last.std)}; {figure(last.worst)} to {figure(last.best)}"
     return [
@@ -198,7 +198,9 @@ def _candidates(parts: Sequence[Population], status: Status) -> dict[str, Any]:
         "done": [done for each in parts for done in each.done],
         "wanted": [wanted for each in parts for wanted in each.wanted],
         "fitness": [
-            None if value is None else float(f"{value_of(value, task):.5g}") for each in parts for value in each.fitness
+            None if value is None else float(f"{value_of(value, task):z.5g}")
+            for each in parts
+            for value in each.fitness
         ],
         "word": fitness_word(task),
         "minimised": is_minimised(task),

@@ -214,7 +214,7 @@ class Demo:
                 f"on unseen {word}s": f"{format_with_error(fmean(scores), standard_error(scores))} ({len(scores)})",
             }
             rows.append(row if random is None else {**row, "times random play": f"{fmean(scores) / random:.1f}"})
-        beside = "" if random is None else f"; random play has {random:g}"
+        beside = "" if random is None else f"; random play has {random:zg}"
         self._print(f"means of {self._profile.score_label} ± standard error (number of {word}s){beside}:")
         print_rows(rows, right=tuple(rows[0])[2:])
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from dreamfleet.common.artifacts.objective import Objective
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.printable import plural
 from dreamfleet.coordinator.jobs.confirmation import FINALISTS, total_episodes
 
 STEP_SHARE = 0.3  # of a parameter's range: Hansen 2016, "The CMA Evolution Strategy: A Tutorial", section B
@@ -173,7 +174,9 @@ def read_bounds(bounds: Any, size: int) -> tuple[Any, Any]:
         if len(pairs) == 2 and all(each is None or np.ndim(each) == 0 for each in pairs):
             pairs = [tuple(pairs)] * size
     if len(pairs) != size or not all(np.ndim(each) == 1 and len(each) == 2 for each in pairs):
-        raise UsageError(f"bounds must be a pair (low, high) for each of {size} parameters, or one pair of numbers")
+        raise UsageError(
+            f"bounds must be a pair (low, high) for each of {plural(size, 'parameter')}, or one pair of numbers"
+        )
     ends = [[None if each is None or math.isinf(each) else float(each) for each in side]
             for side in zip(*pairs, strict=True)]  # fmt: skip
     return ends[0], ends[1]

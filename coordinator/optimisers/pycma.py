@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import Any, ClassVar
@@ -13,8 +14,12 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.packages import hidden
+from dreamfleet.common.printable import plural
 from dreamfleet.coordinator.optimisers import pycma_state
 from dreamfleet.coordinator.optimisers.api import Footprint, Search, State
+
+if sys.flags.optimize > 1:  # pycma joins its docstrings as it is imported
+    raise UsageError("the package cma needs its docstrings: start Python without -OO, and PYTHONOPTIMIZE at 1 at most")
 
 # pycma's core needs neither, and a coordinator need not have them: importing them takes most of its start.
 with hidden("matplotlib", "scipy"), catch_warnings():
@@ -152,7 +157,7 @@ class Pycma:
         two_point = self._search.dimension >= cma.evolution_strategy.TPA_dimension
         if two_point and self._search.population < 3:
             raise UsageError(
-                f"cma needs a population of at least 3 for {self._search.dimension} parameters, not "
+                f"cma needs a population of at least 3 for {plural(self._search.dimension, 'parameter')}, not "
                 f"{self._search.population}: give --population"
             )
 

@@ -14,6 +14,7 @@ from dreamfleet.common.host.packages import install_command_for
 from dreamfleet.common.host.resource_limits import usable_memory
 from dreamfleet.common.host.trusted_modules import import_trusted
 from dreamfleet.common.host.user_code import user_code
+from dreamfleet.common.printable import plural
 from dreamfleet.coordinator.optimisers.api import Footprint, Optimiser, Search
 
 GROUP = "dreamfleet.optimisers"
@@ -53,7 +54,7 @@ def check_memory(name: str, dimension: int, population: int, options: Mapping[st
     if count is None:
         return
     needed: Footprint = count(dimension, population, options)
-    own = f"optimiser {name} with {dimension:,} parameters and a population of {population:,}"
+    own = f"optimiser {name} with {plural(dimension, 'parameter')} and a population of {population:,}"
     remedy = "give --covariance diagonal" if options.get("covariance") == "full" else (
         "give fewer --hidden-units, a smaller --population, or an optimiser of the diagonal alone (cma, cmaes-sep)"
     )  # fmt: skip

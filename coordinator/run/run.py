@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from math import nan
 
 from dreamfleet.common.errors import NotWritableNowError
+from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.messages import Job, Result
 from dreamfleet.common.protocol.result_bounds import MAX_SECONDS
@@ -74,9 +75,7 @@ class Run:
         self._journal = journal
         self._unpublished: list[StoredGeneration] = []
         if dropped := journal.drop_excessive(longest_horizon(settings)):
-            self.fleet.notes.append(
-                f"{dropped} results of an older version are too large to count: their jobs are scored again"
-            )
+            self.fleet.notes.append(f"{plural(dropped, 'result')} of an older version too large to count: scored again")
         self.admission = WorkerAdmission(journal, settings, self.fleet, strict=network.strict, anchor_key=anchor_key)
         self.verification = Verification(journal, self.fleet, self.admission, network.verify, self.incarnation)
         self._ending = self._stored_end_reason()  # the limit that is reached; only background jobs remain

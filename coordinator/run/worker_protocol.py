@@ -9,7 +9,7 @@ from dataclasses import asdict, replace
 
 from dreamfleet.common.errors import DreamfleetError, InternalError, NotWritableNowError
 from dreamfleet.common.host.packages import package_version
-from dreamfleet.common.printable import truncate
+from dreamfleet.common.printable import plural, truncate
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.messages import (
     MAX_REASON,
@@ -199,7 +199,10 @@ def fail_if_excessive(result: Result, kind: Kind, horizon: int, measures: int = 
         return replace(result, steps=steps)
     why = rejection_reason(result.fitness, result.steps, result.seconds, horizon)
     if why is None and len(result.measures) != measures:
-        why = f"wrong measures: the episode gave {len(result.measures)} numbers beside its fitness, not {measures}"
+        why = (
+            f"wrong measures: the episode gave {plural(len(result.measures), 'number')} beside its fitness, "
+            f"not {measures}"
+        )
     return result if why is None else replace(result, fitness=None, steps=steps, error=why, upload=None, measures=())
 
 

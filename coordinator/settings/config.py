@@ -24,6 +24,7 @@ from dreamfleet.common.cli.key_values import parse_arguments
 from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
+from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.measures import NO_ARCHIVE, check_dreamt, parse_axes
 from dreamfleet.common.protocol.messages import (
     MAX_OPTIONS,
@@ -250,7 +251,8 @@ class RunConfig:
         """`UsageError` for a mixture of dreams and drives that no candidate can have."""
         if round(self.driven * self.episodes) in (0, self.episodes):
             raise UsageError(
-                f"--driven {self.driven:g} of {self.episodes} episodes is none of them, or all: give another share, or "
+                f"--driven {self.driven:g} of {plural(self.episodes, 'episode')} is none of them, or all: give "
+                "another share, or "
                 "more --episodes"
             )
         if self.racing:

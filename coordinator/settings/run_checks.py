@@ -7,6 +7,7 @@ from dreamfleet.common.artifacts.bundle_store import describe_bundle
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.stages import Stage
@@ -24,7 +25,8 @@ def check_subspace(subspace: Subspace, spec: TaskSpec, shape: ControllerShape, b
         )
     if (inputs := subspace.weights.shape[1]) != shape.features:
         raise UsageError(
-            f"--subspace fits controllers that see {inputs} numbers, latent and hidden state alone, and this run's "
+            f"--subspace fits controllers that see {plural(inputs, 'number')}, latent and hidden state alone, "
+            "and this run's "
             f"see {shape.features}: omit --features and feedback=last, or pass --subspace {NO_SUBSPACE}"
         )
 

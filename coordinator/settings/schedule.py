@@ -9,6 +9,7 @@ from typing import Any
 
 from dreamfleet.common.cli.config import Table, read_table, read_toml
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.records import MAX_STAGES, STAGE_FIELDS, RunSettings, StageSettings
 from dreamfleet.common.runs.stages import Stage, stages_of
 
@@ -105,11 +106,13 @@ def _check_end(stage: Stage, every: int) -> None:
         raise UsageError(f"{name} ends by the score of an evaluated mean: give --evaluate-every too")
     if end.score is not None and 0 < end.generations <= every:
         raise UsageError(
-            f"{name} never ends by its score: an evaluation counts {every} generations later (--evaluate-every), and "
+            f"{name} never ends by its score: an evaluation counts {plural(every, 'generation')} later "
+            "(--evaluate-every), and "
             f"it has {end.generations}: give it more, or omit the score"
         )
     most = end.generations * stage.population * stage.episodes * stage.horizon
     if end.generations and end.steps > most:
         raise UsageError(
-            f"{name} never ends by its steps: {end.generations} generations have {most} at most; omit one of the two"
+            f"{name} never ends by its steps: {plural(end.generations, 'generation')} have {most} at most; omit "
+            "one of the two"
         )

@@ -17,6 +17,7 @@ from dreamfleet.common.artifacts.driving import Variant
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.errors import ControllerError, DreamfleetError, JournalError
 from dreamfleet.common.files.regular_files import is_file, path_exists
+from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.effort import START_EFFORT, Effort
@@ -80,7 +81,8 @@ class StartPoint:
         self._check_options(spec)
         if len(self.mean) != shape.size:
             raise ControllerError(
-                f"{self.source} has {len(self.mean)} parameters, this run's controllers {shape.size}: give its own "
+                f"{self.source} has {plural(len(self.mean), 'parameter')}, this run's controllers {shape.size}: "
+                "give its own "
                 "--controller, --hidden-units and --features"
             )
         if not (np.abs(self.mean) <= np.finfo(np.float32).max).all():

@@ -7,6 +7,7 @@ import math
 from typing import Any
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.printable import plural
 
 
 def parse_described(text: str) -> dict[str, Any]:
@@ -31,4 +32,6 @@ def check_normalisation(options: str, observations: int) -> None:
     except (TypeError, KeyError, ValueError, AttributeError, OverflowError, RecursionError):
         fits = False
     if not fits:
-        raise UsageError(f"--task-options: normal must have a mean and a positive deviation of {observations} numbers")
+        raise UsageError(
+            f"--task-options: normal must have a mean and a positive deviation of {plural(observations, 'number')}"
+        )

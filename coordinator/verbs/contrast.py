@@ -11,6 +11,7 @@ from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_signals
+from dreamfleet.common.printable import plural
 from dreamfleet.coordinator.experiments.contrast.config import KINDS, RUN_FLAGS, SEEDS, Contrast, parse_kinds
 
 if TYPE_CHECKING:
@@ -97,6 +98,6 @@ def _print_results(args: argparse.Namespace, outcomes: list[TrialResult]) -> Non
     print()
     for each in means:
         label = "score in reality" if each.figure == summary.SCORE else each.figure.replace("_", " ")
-        print(f"{each.kind}, {label}: {each.text} over {each.seeds} seeds")
+        print(f"{each.kind}, {label}: {each.text} over {plural(each.seeds, 'seed')}")
     first = outcomes[0].kind
     print("\n".join(("", *(summary.describe_difference(kind, first, figure, each) for kind, figure, each in found))))

@@ -192,7 +192,7 @@ def _function_facts(mean: NDArray[np.float32] | None, options: str) -> dict[str,
 
     objective = Objective.parse(options)
     values = f"the function's own; {'smaller' if objective.minimise else 'larger'} ones are better"
-    found = "-" if mean is None else ", ".join(f"{each:.8g}" for each in objective.decode(mean))
+    found = "-" if mean is None else ", ".join(f"{each:z.8g}" for each in objective.decode(mean))
     return {"reported x": found, "values": values}
 
 

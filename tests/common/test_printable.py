@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 
 from dreamfleet.common.printable import format_setting, plural, printable
@@ -19,8 +20,11 @@ def test_control_characters_are_escaped(text, shown):
 
 def test_plurals():
     texts = plural(1, "seed"), plural(1000, "seed"), plural(1.0, "minute"), plural(1.5, "minute")
+    assert plural(np.int64(1_000_000), "step") == "1,000,000 steps"
     assert (*texts, plural(2, "batch", "batches")) == ("1 seed", "1,000 seeds", "1 minute", "1.5 minutes", "2 batches")
 
 
 def test_settings_are_formatted():
-    assert [format_setting(each) for each in (True, False, ("numpy", "cma"), 0.1)] == ["yes", "no", "numpy, cma", "0.1"]
+    assert [format_setting(each) for each in (True, False, ("numpy", "cma"), 0.1, -0.0)] == [
+        "yes", "no", "numpy, cma", "0.1", "0",
+    ]  # fmt: skip

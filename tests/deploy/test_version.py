@@ -60,6 +60,7 @@ def test_versions_grow_with_the_commits_and_differ_where_the_code_does(checkout,
     changed = version_of(checkout)
     assert changed.public == second.public or changed > second
     assert changed not in (first, second)
+    assert changed == version_of(checkout)  # pip asks twice for one build, and refuses a wheel of another version
     git(checkout, "checkout", "file")
     git(tmp_path, "clone", "--depth", "1", f"file://{checkout}", "shallow")
     shallow = version_of(tmp_path / "shallow")

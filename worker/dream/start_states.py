@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.bundle import EIGHT_BITS, INITIAL_LATENTS_PART, RECORDED_STATES, Bundle
 from dreamfleet.common.artifacts.onnx_checks import read_float_array
 from dreamfleet.common.errors import BundleError, UsageError
+from dreamfleet.common.printable import plural
 
 Floats = NDArray[np.float32]
 START_SPAWN_KEY = (1,)  # gives the choice of a start its own random numbers, apart from those of the dream's steps
@@ -53,7 +54,8 @@ class StartStates:
         recorded = bundle.read_recorded()
         if recorded.shape[1] != width:
             raise BundleError(
-                f"{bundle.path}: a state in {RECORDED_STATES} has {recorded.shape[1]} numbers, its model {width}; "
+                f"{bundle.path}: a state in {RECORDED_STATES} has {plural(recorded.shape[1], 'number')}, its "
+                f"model {width}; "
                 "build the bundle again"
             )
         return cls(initial, recorded, share, empty, doubled)

@@ -99,7 +99,7 @@ class DriveWindow:
         top, rate = self._size[1], self._clock.get_fps()
         pace = "over" if status.over else f"{rate:.0f} frames/s, {rate / FRAMES_PER_SECOND:.1f} x time"
         self._text(
-            f"score {status.score:.1f}   step {status.step} of {status.steps}   {pace}", top + 10, self._large, INK
+            f"score {status.score:z.1f}   step {status.step} of {status.steps}   {pace}", top + 10, self._large, INK
         )
         self._text("arrows or WASD: drive    R: again    Esc or Q: quit", top + 38, self._small, FAINT)
         caption = f"dreamfleet: {self._name}{', over' if status.over else ''}"

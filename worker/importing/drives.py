@@ -19,6 +19,7 @@ from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.archives import NPY, ArchiveLimits, DamagedArchiveError, open_archive, parse_array
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import open_regular
+from dreamfleet.common.printable import plural
 from dreamfleet.worker.importing.sources import drive_paths
 from dreamfleet.worker.scoring.rollout import write_episode
 from dreamfleet.worker.tasks.api import Preprocessing
@@ -149,7 +150,9 @@ def _numbers(path: Path, what: str, found: NDArray[Any], shape: tuple[int, ...],
     if found.dtype.kind not in kinds:
         raise DatasetError(f"{path}: {what} are of type {found.dtype}, not numbers")
     if found.shape not in (shape, (*shape, 1)):
-        raise DatasetError(f"{path}: {what} {found.shape} do not fit {shape[0]} pictures: they must be {shape}")
+        raise DatasetError(
+            f"{path}: {what} {found.shape} do not fit {plural(shape[0], 'picture')}: they must be {shape}"
+        )
     with np.errstate(over="ignore"):
         numbers = found.reshape(shape).astype(np.float32)
     if not np.isfinite(numbers).all():

@@ -13,6 +13,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.foreign_code import answer_kept
+from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.seeds import VALIDATION
 from dreamfleet.worker.scoring.actors import check_same_pictures
 from dreamfleet.worker.scoring.disturbance import numbered_choices
@@ -88,7 +89,11 @@ class ConstantDriver:
             action = _choice_of(action, actions, names).tolist()
         done = np.array(action, np.float64)
         if not isinstance(actions, Continuous) or done.shape != (actions.actions,):
-            wanted = f"{', '.join(names)}: {len(names)} numbers" if names else "numbers, of a world with such actions"
+            wanted = (
+                f"{', '.join(names)}: {plural(len(names), 'number')}"
+                if names
+                else "numbers, of a world with such actions"
+            )
             raise UsageError(f"--action takes {wanted}, not {_format_action(action)}")
         if not ((actions.low <= done) & (done <= actions.high)).all():
             bounds = ", ".join(
@@ -115,7 +120,7 @@ def _choice_of(action: Sequence[float], actions: Continuous, names: Sequence[str
 
 
 def _format_action(action: Sequence[float]) -> str:
-    return " ".join(f"{each:g}" for each in action)
+    return " ".join(f"{each:zg}" for each in action)
 
 
 def record_drive(

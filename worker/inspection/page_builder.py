@@ -14,6 +14,7 @@ from dreamfleet.common.artifacts.world_facts import DRAWN, EndRule, RewardFacts
 from dreamfleet.common.errors import BundleError, JournalError, MissingExtraError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write, reporting_unwritable_folder
 from dreamfleet.common.files.regular_files import is_file
+from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.stages import begun_stages, join_distinct
 from dreamfleet.worker.dream.parallel_dream import can_dream
@@ -113,8 +114,11 @@ def _page(subject: InspectionSubject, trained: Sequence[TrainingCurves], section
     stages = begun_stages(settings, history, subject.run.evaluations())
     rows = [
         ("task", settings.task.task),
-        ("controller", f"{settings.controller.size} parameters, layers {settings.controller.layers}"),
-        ("population", join_distinct(f"{each.stage.population} x {each.stage.episodes} episodes" for each in stages)),
+        ("controller", f"{plural(settings.controller.size, 'parameter')}, layers {settings.controller.layers}"),
+        (
+            "population",
+            join_distinct(f"{each.stage.population} x {plural(each.stage.episodes, 'episode')}" for each in stages),
+        ),
         ("generations", str(len(history))),
     ]
     return Page(f"{subject.run.name}, a run without a world model", f"run {subject.run.uid}", rows + facts, sections)

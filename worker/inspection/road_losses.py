@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.printable import plural
 from dreamfleet.worker.dream.world import check_temperature
 from dreamfleet.worker.inspection.disturbed_rollouts import (
     OFF,
@@ -117,7 +118,8 @@ def collect_losing_drives(
         if losses == config.losses:
             return taken
     raise UsageError(
-        f"{len(taken)} drives lost the road {losses} times, not {config.losses}: raise --noise, or ask for fewer"
+        f"{plural(len(taken), 'drive')} lost the road {plural(losses, 'time')}, not {config.losses}: raise "
+        "--noise, or ask for fewer"
     )
 
 
@@ -173,7 +175,7 @@ def _dream_segments(drives: Sequence[DisturbedDrive], config: RoadLossConfig, dr
         begun = {
             row: DreamSegment(drive, (drive.lost or 0) - before, before + driven.after) for row, drive in lost.items()
         }
-        kinds.append((f"{before} steps before", begun))
+        kinds.append((f"{plural(before, 'step')} before", begun))
     found = {
         row: _find_calm_stretch(drive, max(config.before) + driven.after, driven.opening)
         for row, drive in enumerate(drives)

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import Any
 
+from dreamfleet.common.printable import plural
 from dreamfleet.worker.inspection.knowledge import Knowledge
 from dreamfleet.worker.inspection.likeness import RareFrequency
 from dreamfleet.worker.inspection.probe import Estimate
@@ -35,7 +36,8 @@ def knowledge_rows(knowledge: Knowledge) -> list[dict[str, str]]:
 def knowledge_text(knowledge: Knowledge) -> str:
     """Describe the rows of `knowledge_rows`."""
     return (
-        f"R² ± standard error on held-out drives; {knowledge.drives} drives, {knowledge.steps} steps, none off a road; "
+        f"R² ± standard error on held-out drives; {plural(knowledge.drives, 'drive')}, "
+        f"{plural(knowledge.steps, 'step')}, none off a road; "
         "deviations in the units of the world's true state (docs/reference/tasks.md)"
     )
 
@@ -91,8 +93,9 @@ LIKENESS = (
 def loss_text(drives: int, dreams: int, lasting: int) -> str:
     """Describe the rows of `loss_rows`."""
     return (
-        f"means ± standard errors over n beginnings in {drives} drives, {dreams} dreams of each. The road is lost "
-        f"after {lasting} steps in a row off it, and the end is as long"
+        f"means ± standard errors over n beginnings in {plural(drives, 'drive')}, {plural(dreams, 'dream')} of "
+        "each. The road is lost "
+        f"after {plural(lasting, 'step')} in a row off it, and the end is as long"
     )
 
 

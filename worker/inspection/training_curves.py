@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.files.regular_files import read_text
+from dreamfleet.common.printable import plural
 
 Doubles = NDArray[np.float64]
 Points = list[dict[str, float]]
@@ -67,12 +68,15 @@ class TrainingCurves:
     def summary(self) -> str:
         """The number of updates, and the held-out losses at the best one."""
         if self.best is None:
-            return f"{self.updates:,.0f} updates"
+            return f"{plural(round(self.updates), 'update')}"
         held = {part: each.held_out for part, each in self.curves.items()}
         parts = [
             f"{UNITS[part][0]} {line.at(self.best):.4g}" for part, line in held.items() if self.best in line.updates
         ]
-        return f"{self.updates:,.0f} updates; held-out drives lost least in all at {self.best:,.0f}: {', '.join(parts)}"
+        return (
+            f"{plural(round(self.updates), 'update')}; held-out drives lost least in all at "
+            f"{self.best:,.0f}: {', '.join(parts)}"
+        )
 
 
 def load_trainings(folders: Sequence[Path]) -> list[TrainingCurves]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import open_regular
-from dreamfleet.common.printable import truncate
+from dreamfleet.common.printable import plural, truncate
 from dreamfleet.worker.inspection.charts import FONT, draw_heatmap, new_figure, picture_grid, render_png
 from dreamfleet.worker.inspection.encoded_rollout import EncodedRollout
 from dreamfleet.worker.inspection.page import Section
@@ -37,7 +37,7 @@ def reconstructions(drive: EncodedRollout, vae_view: VAEView) -> Section:
     return Section(
         "reconstructions", "What it sees, and what it keeps",
         f"Pictures of {drive.description}, and the decoder's picture of each one's mean latent. "
-        f"Summed squared error a picture over all {len(drive)} steps: {error:.1f}.",
+        f"Summed squared error a picture over all {plural(len(drive), 'step')}: {error:.1f}.",
         picture_grid(rows, [f"step {step}" for step in steps]),
     )  # fmt: skip
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.fingerprint import fingerprint
+from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, class_from_fingerprint
 from dreamfleet.common.protocol.messages import MOST_TOGETHER, Kind, TaskSpec
 from dreamfleet.common.serialization.display import Displayed
@@ -105,7 +106,10 @@ class Scorer(Displayed):
             "world model": spec.bundle[:12] or "none",
             "options": spec.options or None,
         }
-        return f"Scorer of {spec.task}: {size} parameters, episodes of {spec.horizon} steps at most", facts
+        return (
+            f"Scorer of {spec.task}: {plural(size, 'parameter')}, episodes of {plural(spec.horizon, 'step')} at most",
+            facts,
+        )
 
     @property
     def observer(self) -> StepObserver | None:

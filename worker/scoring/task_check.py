@@ -22,7 +22,7 @@ from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.host.user_code import describe_error, keep_user_arguments
-from dreamfleet.common.printable import one_line
+from dreamfleet.common.printable import one_line, plural
 from dreamfleet.common.protocol.tasks import Description, describe_task
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def _check_step(answer: Any) -> None:
 
 def _describe(value: Any) -> str:
     if isinstance(value, tuple):
-        return f"{len(value)} values"
+        return f"{plural(len(value), 'value')}"
     shape = getattr(value, "shape", None)
     return f"an array of shape {shape}" if shape else f"a value of type {type(value).__name__}"
 

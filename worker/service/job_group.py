@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.failures import describe_job
 from dreamfleet.common.protocol.measures import LARGEST_MEASURE
 from dreamfleet.common.protocol.messages import MAX_UPLOAD, MOST_TOGETHER, Job, Result, TaskSpec
@@ -133,7 +134,7 @@ def _results(
 ) -> tuple[Result, ...]:
     """One result a job; `ValueError` if the task's scores are not one a job."""
     if len(scores) != len(work):
-        raise ValueError(f"the task gave {len(scores)} scores of {len(work)} episodes")
+        raise ValueError(f"the task gave {plural(len(scores), 'score')} of {plural(len(work), 'episode')}")
     if not all(0 <= int(score.steps) < 2**63 for score in scores):
         raise ValueError("the task gave a number of steps that is not from 0 to 2**63 - 1")
     if not all(abs(each) <= LARGEST_MEASURE for score in scores for each in score.measures):
@@ -158,5 +159,7 @@ def _result(job: Job, score: Score, spent: float, sha256: bytes | None, horizon:
 def _to_upload(drive: Rollout) -> bytes:
     data = drive.to_bytes()
     if len(data) > MAX_UPLOAD:
-        raise ValueError(f"a rollout of {len(drive)} steps is larger than {MAX_UPLOAD >> 20} MiB: shorten the horizon")
+        raise ValueError(
+            f"a rollout of {plural(len(drive), 'step')} is larger than {MAX_UPLOAD >> 20} MiB: shorten the horizon"
+        )
     return data

@@ -20,6 +20,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts, WorldFacts
 from dreamfleet.common.errors import BundleError, UsageError
+from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import Description
 from dreamfleet.common.serialization.display import DisplayedFields
@@ -238,7 +239,7 @@ class World(DisplayedFields, metaclass=FormerFields):
     def __post_init__(self) -> None:
         own = self.actions.actions if isinstance(self.actions, Continuous) else 0
         if self.mirror is not None and len(self.mirror.order) != own:
-            raise UsageError(f"a mirror of {len(self.mirror.order)} columns does not fit {own} actions")
+            raise UsageError(f"a mirror of {plural(len(self.mirror.order), 'column')} does not fit {own} actions")
         if own and len(self.action_names) not in (0, own):
             raise UsageError(f"{len(self.action_names)} action_names do not fit {own} actions: give one for each")
 

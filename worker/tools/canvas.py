@@ -133,7 +133,7 @@ class Board:
         left, top = corner
         value, low, high = value_between
         from_left = low >= 0
-        self._text(f"{name} {value:.2f}" if from_left else f"{name} {value:+.2f}", corner, self._small, FAINT)
+        self._text(f"{name} {value:z.2f}" if from_left else f"{name} {value:+z.2f}", corner, self._small, FAINT)
         box = pygame.Rect(left, top + 22, 106, 14)
         pygame.draw.rect(self._surface, (45, 48, 56), box)
         start = box.left if from_left else box.centerx

@@ -93,7 +93,7 @@ def _metadata(contents: CardContents, files: Sequence[str]) -> Iterator[str]:
 def _index(report: EvaluationReport, world: str, name: str) -> Iterator[str]:
     """The result as model hubs index it."""
     found = report.results
-    value = f"{found.mean:.2f}" if found.std is None else f"{found.mean:.2f} +/- {found.std:.2f}"
+    value = f"{found.mean:z.2f}" if found.std is None else f"{found.mean:z.2f} +/- {found.std:.2f}"
     yield from ("model-index:", f"- name: {_quoted(name)}", "  results:", "  - task:")
     yield from ("      type: reinforcement-learning", "      name: reinforcement-learning")
     yield from ("    dataset:", f"      name: {_quoted(world)}", f"      type: {_quoted(world)}", "    metrics:")
@@ -102,7 +102,7 @@ def _index(report: EvaluationReport, world: str, name: str) -> Iterator[str]:
 
 def _describe_controller(contents: CardContents) -> str:
     controller, bundle = contents.controller, contents.bundle
-    text = f"A controller of {controller.shape.size} parameters for {_code(contents.world)}. "
+    text = f"A controller of {plural(controller.shape.size, 'parameter')} for {_code(contents.world)}. "
     if (source := controller.provenance.get(IMPORTED)) is None:
         text += f"The Python package `dreamfleet` evolved it in the task {_code(controller.task)}."
     else:
@@ -110,7 +110,8 @@ def _describe_controller(contents: CardContents) -> str:
     if bundle is not None:
         hidden = f" and memory ({bundle.manifest.hidden})" if controller.shape.features > bundle.manifest.latent else ""
         text += (
-            f" It sees a world model's latent ({bundle.manifest.latent} numbers){hidden}, of the frozen VAE and "
+            f" It sees a world model's latent ({plural(bundle.manifest.latent, 'number')}){hidden}, of the "
+            "frozen VAE and "
             f"MDN-RNN in `{BUNDLE}`."
         )
     return text

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.monitoring.live import LiveFrame
-from dreamfleet.common.printable import truncate
+from dreamfleet.common.printable import plural, truncate
 from dreamfleet.common.worlds.score_words import profile_of
 from dreamfleet.worker.dream.parallel_dream import DreamContinuation, can_dream
 from dreamfleet.worker.tasks.api import Actions
@@ -110,7 +110,7 @@ class LiveCanvas(Board):
         if not dream.dreamt:
             self._text("no dream continues from here", (EDGE, STRIP), self._small, FAINT)
         for column, (ahead, picture) in enumerate(dream.dreamt):
-            words = f"dreamt {ahead} steps on" if column == 0 else f"{ahead} steps on"
+            words = f"dreamt {plural(ahead, 'step')} on" if column == 0 else f"{plural(ahead, 'step')} on"
             self._draw_fitted(words, picture, (EDGE + column * pitch, STRIP), (SMALL, SMALL))
 
     def _draw_words(self, live: LiveFrame) -> None:

@@ -7,6 +7,7 @@ import io
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.evaluation_report import EvaluationReport
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.score_words import score_word
@@ -37,7 +38,9 @@ def draw_scores(report: EvaluationReport, name: str) -> bytes:
     points.set(xlabel=f"seed of the {word}" if word != "seed" else "seed", ylabel="score")
     counts.set(xlabel=f"{word}s")
     figure.legend(handles=lines, loc="outside lower right", ncols=2, frameon=False, fontsize=9)
-    title = f"{name}: {format_with_error(found.mean, found.error)} (standard error) on {len(found.drives)} {word}s"
+    title = (
+        f"{name}: {format_with_error(found.mean, found.error)} (standard error) on {plural(len(found.drives), word)}"
+    )
     figure.suptitle(title, fontsize=11, x=0.01, ha="left", parse_math=False)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})

@@ -71,7 +71,7 @@ def record_videos(args: argparse.Namespace, agent: Agent, film: partial[float]) 
                 bar.end(driven, "" if driven == most else "the episode ended")
             if stop():
                 raise StoppedError(
-                    f"stopped: {video} shows the first {driven} steps on {word} {seed}: "
+                    f"stopped: {video} shows the first {plural(driven, 'step')} on {word} {seed}: "
                     f"{profile.format_score(score)}; the same command records whole episodes"
                 )
             beside = "" if known is None else known.describe_beside(seed, word)

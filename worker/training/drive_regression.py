@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.printable import plural
 from dreamfleet.worker.scoring.rollout import DataWorld
 from dreamfleet.worker.training.data.dataset import (
     check_whole,
@@ -144,7 +145,9 @@ def load_in_batches(paths: Sequence[Path], actions: int) -> Iterator[tuple[int, 
 def _load_drive(path: Path, actions: int) -> DriveArrays:
     steps, pictures = load_steps(path), load_pictures(path)
     if len(pictures) != len(steps["reward"]):
-        raise DatasetError(f"{path} holds {len(pictures)} pictures and another number of actions; delete it")
+        raise DatasetError(f"{path} holds {plural(len(pictures), 'picture')} and another number of actions; delete it")
     if steps["action"].shape[1] != actions or not all(np.isfinite(steps[name]).all() for name in ("action", "reward")):
-        raise DatasetError(f"{path} holds other actions than {actions} numbers a step, or NaN or infinity; delete it")
+        raise DatasetError(
+            f"{path} holds other actions than {plural(actions, 'number')} a step, or NaN or infinity; delete it"
+        )
     return DriveArrays(pictures, steps["action"], steps["reward"])

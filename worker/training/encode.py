@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.printable import plural
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
 from dreamfleet.worker.training.data.data_folder import explain_write_errors
 from dreamfleet.worker.training.data.dataset import (
@@ -60,7 +61,9 @@ def encode(folder: Path) -> Iterator[int]:
         pictures = load_pictures(path)
         drive = load_steps(path)
         if len(drive["action"]) != len(pictures):
-            raise DatasetError(f"{path} holds {len(pictures)} pictures and another number of actions; delete it")
+            raise DatasetError(
+                f"{path} holds {plural(len(pictures), 'picture')} and another number of actions; delete it"
+            )
         mu, logvar = encode_pictures(pictures)
         more: dict[str, Any] = load_arrays(path, optional=COPIED)
         if mirrors:

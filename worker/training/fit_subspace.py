@@ -23,6 +23,7 @@ from dreamfleet.common.artifacts.actions import Continuous
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.printable import plural
 from dreamfleet.worker.tasks.api import World
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.training.data.drive_steps import FIRST_START, on_road_mask
@@ -130,14 +131,15 @@ def find_subspace(
     counted = [0 if each is None else each.steps for each in (fit, held_out)]
     if fit is None or held_out is None or sum(counted) < LEAST_STEPS or not all(counted):
         raise UsageError(
-            f"{len(paths)} drives of {sum(counted)} counted steps are too few: it takes {HELD_OUT_EVERY} drives and "
+            f"{plural(len(paths), 'drive')} of {sum(counted)} counted steps are too few: it takes "
+            f"{HELD_OUT_EVERY} drives and "
             f"{LEAST_STEPS} steps; `dreamfleet collect` drives more. Not counted are the first {FIRST_START} steps of "
             f"a drive, its last {ACTION_WINDOWS[-1][1]} and those off the road"
         )
     r_squared = held_out.r_squared(fit.solve(RIDGE))
     predictable = [index for index, each in enumerate(r_squared) if each >= MIN_R_SQUARED]
     if not predictable:
-        raise UsageError(f"{bundle.manifest.name} predicts nothing of these {len(paths)} drives: give others")
+        raise UsageError(f"{bundle.manifest.name} predicts nothing of these {plural(len(paths), 'drive')}: give others")
     whole = fit + held_out
     solved, names = whole.solve(RIDGE)[:, predictable], [targets[each].name for each in predictable]
     scores = [float(r_squared[each]) for each in predictable]

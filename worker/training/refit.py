@@ -20,6 +20,7 @@ from dreamfleet.common.artifacts.actions import one_hot
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, ENCODER, Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ControllerError, UsageError
+from dreamfleet.common.printable import plural
 from dreamfleet.worker.scoring.rollout import DataWorld
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.training.data.drive_steps import on_road_mask
@@ -83,7 +84,9 @@ def refit(
         on_progress(first + len(drives))
     fit, held_out = split.fit, split.held_out
     if fit is None or not fit.steps:
-        raise UsageError(f"none of the {len(paths)} drives stays on its road: there is nothing to fit a controller to")
+        raise UsageError(
+            f"none of the {plural(len(paths), 'drive')} stays on its road: there is nothing to fit a controller to"
+        )
     r_squared = held_out.r_squared(fit.solve(RIDGE)) if held_out and held_out.steps else np.full(len(biases), np.nan)
     whole = fit + held_out if held_out else fit
     solved = whole.solve(RIDGE)

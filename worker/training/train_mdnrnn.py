@@ -67,7 +67,7 @@ def train_mdnrnn(
             model.train()
             values = backward(model, rollouts, noise, device)
             schedule.step(sum(values.values()))
-            report(update, "  ".join(f"{name} {value:.3f}" for name, value in values.items()))
+            report(update, "  ".join(f"{name} {value:z.3f}" for name, value in values.items()))
             if update % 10 == 0:
                 point(update=update, **values)
             schedule.finish_update(

@@ -13,6 +13,7 @@ from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path
 from dreamfleet.common.host.unseen_drawing import draw_unseen
+from dreamfleet.common.printable import plural
 
 if TYPE_CHECKING:
     from dreamfleet.worker.baselines.progress import TrainingReport
@@ -98,8 +99,8 @@ def export_baseline(args: argparse.Namespace) -> int:
     agent.save(args.out)
     provenance, size = agent.manifest.provenance, args.out.stat().st_size
     text = (
-        f"{args.out}: {size / 1e6:.1f} MB, sha256 {agent.sha256}, after {provenance['episodes']} episodes, "
-        f"{provenance['steps']:,} steps and {provenance['updates']:,} updates"
+        f"{args.out}: {size / 1e6:.1f} MB, sha256 {agent.sha256}, after {plural(provenance['episodes'], 'episode')}, "
+        f"{plural(provenance['steps'], 'step')} and {plural(provenance['updates'], 'update')}"
     )
     trained = {name: provenance[name] for name in ("episodes", "steps", "updates")}
     print_answer(args, text, agent=args.out, bytes=size, sha256=agent.sha256, **trained)

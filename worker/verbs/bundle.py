@@ -11,6 +11,7 @@ from dreamfleet.common.cli.model_commands import use_bundle
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path
+from dreamfleet.common.printable import plural
 
 SUMMARY = (
     "freeze a trained world model into one file that workers fetch by its hash; --extract takes one apart, "
@@ -103,7 +104,7 @@ def _answer(args: argparse.Namespace, bundle: Bundle) -> int:
     parameters = bundle.controller_shape.size
     states = bundle.recorded_count
     text = (
-        f"{bundle.path}: {size:.1f} MB, sha256 {bundle.sha256}, controllers of {parameters} parameters, "
+        f"{bundle.path}: {size:.1f} MB, sha256 {bundle.sha256}, controllers of {plural(parameters, 'parameter')}, "
         f"{states} recorded states"
     )
     print_answer(args, text, bundle=bundle.path, bytes=bundle.path.stat().st_size, sha256=bundle.sha256,

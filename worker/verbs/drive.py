@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--bundle and --temperature need a dream: add --dream")
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.common.artifacts.driving import FIRST_WORLD
-    from dreamfleet.common.printable import format_number
+    from dreamfleet.common.printable import format_number, plural
     from dreamfleet.worker.driving.loop import DrivingConfig, drive, random_seed
     from dreamfleet.worker.driving.scene import DreamScene, Scene, make_scene
 
@@ -43,6 +43,6 @@ def run(args: argparse.Namespace) -> int:
     else:
         scene = make_scene(FIRST_WORLD, config.steps)
     for driven in drive(scene, config):
-        text = f"score {format_number(driven.score)} in {driven.steps} steps, seed {config.seed}"
+        text = f"score {format_number(driven.score)} in {plural(driven.steps, 'step')}, seed {config.seed}"
         print_answer(args, text, score=driven.score, steps=driven.steps, seed=config.seed)
     return 0

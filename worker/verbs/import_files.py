@@ -12,6 +12,7 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, reporting_write_errors
 from dreamfleet.common.host.resource_limits import pin_thread_pools
+from dreamfleet.common.printable import plural
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -95,7 +96,7 @@ def _import_drives(args: argparse.Namespace) -> int:
 
     found = import_drives(args.source, args.out, layout=args.layout)
     layouts = " and ".join(found.layouts)
-    text = f"{args.out}: {found.drives} drives, {found.steps} steps, read as layout {layouts}; "
+    text = f"{args.out}: {plural(found.drives, 'drive')}, {plural(found.steps, 'step')}, read as layout {layouts}; "
     text += f"`dreamfleet train vae --data {args.out} --preset paper` trains on them"
     if found.without_rewards:
         text += (
@@ -141,8 +142,8 @@ def _read_controller(args: argparse.Namespace) -> Controller:
         return replace(like, parameters=parameters, provenance=provenance)
     if args.bundle is None:
         raise UsageError(
-            f"{args.source} holds {len(vector)} numbers: say what they control, by --bundle WORLD_MODEL (which the "
-            f"controller sees; {world_command} makes it of another project's) or --like CONTROLLER_OR_RUN"
+            f"{args.source} holds {plural(len(vector), 'number')}: say what they control, by --bundle WORLD_MODEL "
+            f"(which the controller sees; {world_command} makes it of another project's) or --like CONTROLLER_OR_RUN"
         )
     bundle = find_bundle(args.bundle)
     options = OPTIONS.get(layout, "") if bundle.manifest.world is None else ""

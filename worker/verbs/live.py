@@ -13,7 +13,7 @@ from dreamfleet.common.cli.global_config import add_global_flags, add_run_argume
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.unseen_drawing import draw_unseen
-from dreamfleet.common.printable import one_line
+from dreamfleet.common.printable import one_line, plural
 from dreamfleet.common.runs.seeds import TEST
 from dreamfleet.worker.verbs.evaluate import add_random_flags, named_agent
 
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
             if not wanted or stop() or made == most:
                 break
     if _writes_files(args):
-        print_answer(args, f"{args.out}: {made} pictures", out=args.out, pictures=made)
+        print_answer(args, f"{args.out}: {plural(made, 'picture')}", out=args.out, pictures=made)
     return 0
 
 

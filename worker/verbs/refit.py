@@ -11,6 +11,7 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, reporting_write_errors
 from dreamfleet.common.host.resource_limits import pin_thread_pools
+from dreamfleet.common.printable import plural
 
 SUMMARY = "fit a controller to another world model, so that it acts there as before, by regression on recorded drives"
 EXTRAS = ("worker",)
@@ -54,10 +55,13 @@ def run(args: argparse.Namespace) -> int:
         fitted.controller.save(args.out)
     r_squared = [None if math.isnan(each) else round(each, 4) for each in fitted.r_squared]
     spoken = ", ".join(
-        f"{name} {'unknown' if each is None else f'{each:.2f}'}"
+        f"{name} {'unknown' if each is None else f'{each:z.2f}'}"
         for name, each in zip(output_names(fitted.controller, own), r_squared, strict=False)
     )
-    text = f"{args.out}: fitted on {fitted.steps} steps of {fitted.drives} drives; R² on held-out ones: {spoken}"
+    text = (
+        f"{args.out}: fitted on {plural(fitted.steps, 'step')} of {plural(fitted.drives, 'drive')}; R² on "
+        f"held-out ones: {spoken}"
+    )
     if None in r_squared:
         text += " (too few drives, or it never moves)"
     if not fitted.drives:

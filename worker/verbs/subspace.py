@@ -9,6 +9,7 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, reporting_write_errors
 from dreamfleet.common.host.resource_limits import pin_thread_pools
+from dreamfleet.common.printable import plural
 
 SUMMARY = "find a few features that predict a driver's actions and rewards, for a search among them (--subspace)"
 EXTRAS = ("worker",)
@@ -50,9 +51,12 @@ def run(args: argparse.Namespace) -> int:
     with reporting_write_errors(args.out):
         subspace.save(args.out, {"drives": found.drives, "steps": found.steps, "r_squared": r_squared})
     width = max(map(len, subspace.names))
-    rows = [f"{name:<{width}}  {each:.2f}" for name, each in zip(subspace.names, r_squared, strict=True)]
+    rows = [f"{name:<{width}}  {each:z.2f}" for name, each in zip(subspace.names, r_squared, strict=True)]
     heading = "what is predicted, how many steps ahead, and its R² on held-out drives:"
-    last = f"{args.out}: {len(rows)} features, by {found.steps} steps of {found.drives} drives"
+    last = (
+        f"{args.out}: {plural(len(rows), 'feature')}, by {plural(found.steps, 'step')} of "
+        f"{plural(found.drives, 'drive')}"
+    )
     text = "\n".join([heading, *rows, last])
     print_answer(args, text, subspace=args.out, sha256=subspace.sha256, bundle=bundle.sha256, features=subspace.names,
            r_squared=r_squared, drives=found.drives, steps=found.steps)  # fmt: skip

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.errors import JournalError, UsageError
-from dreamfleet.common.printable import one_line
+from dreamfleet.common.printable import one_line, plural
 
 if TYPE_CHECKING:
     from dreamfleet.worker.tools.replay import ReplayedEpisode
@@ -62,14 +62,16 @@ def run(args: argparse.Namespace) -> int:
     else:
         for each in episodes:
             print(f"episode {each.episode}  seed {each.seed}  {_describe(each, args.tolerance)}")
+    count = plural(len(episodes), "episode")
     if varying := sum(not each.deterministic for each in episodes):
-        print(f"{varying} of {len(episodes)} episodes were driven in an environment that is not deterministic, so "
-              "replays are never bit-identical; --tolerance N compares them", file=sys.stderr)  # fmt: skip
+        print(f"{varying} of {count} {'was' if varying == 1 else 'were'} driven in an environment that is not "
+              "deterministic, so replays are never bit-identical; --tolerance N compares them",
+              file=sys.stderr)  # fmt: skip
     elif blocked := sum(not each.attempted for each in episodes):
-        print(f"{blocked} of {len(episodes)} episodes crashed or hung their process and were not driven again",
+        print(f"{blocked} of {count} crashed or hung the process, without a further drive",
               file=sys.stderr)  # fmt: skip
     elif unchecked:
-        print(f"{unchecked} of {len(episodes)} episodes were scored by hosts of another class, which "
+        print(f"{unchecked} of {count} {'was' if unchecked == 1 else 'were'} scored by hosts of another class, which "
               "this host cannot check bit by bit; --tolerance N compares them", file=sys.stderr)  # fmt: skip
     return 0 if False not in agree and True in agree else 1
 

@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.printable import plural
 from dreamfleet.worker.worldmodel.layer_sizes import check_sizes
 from dreamfleet.worker.worldmodel.loss_factors import MOST, added_option, check_factors, loss_factor
 
@@ -80,7 +81,7 @@ class VAEConfig:
         for name, length in wanted.items():
             given = getattr(self, name)
             if given and (len(given) != length or min(given) < 1):
-                raise UsageError(f"{name} takes {length} numbers above 0, as channels are {count}")
+                raise UsageError(f"{name} takes {plural(length, 'number')} above 0, as channels are {count}")
         if min(self.sides) < 1:
             raise UsageError(f"the encoder's convolutions leave nothing of {self.picture} pixels: choose fewer")
         if min(self.decoder_sides) < 1 or any(layer.before < 0 for layer in self.up):

@@ -163,7 +163,7 @@ const draw = ({ facts: named, jpeg }) => {
 const rows = ({ worker, kind, generation, candidate, seed, step, score }) => {
   const found = [["worker", worker], ["drive of", worker ? (KINDS[kind] ?? kind) : "a mean, here"],
     ["generation", generation], ["candidate", kind === "score" ? candidate : null], [kind === "score" ? "seed" : word, seed], ["step", step],
-    ["score so far", score?.toFixed(1)], ["speed", speed(worker, step)]];
+    ["score so far", score?.toFixed(1).replace(/^-0\.0$/, "0.0")], ["speed", speed(worker, step)]];
   return found.filter(([, value]) => value !== null && value !== undefined).map(([name, value]) => [name, String(value)]);
 };
 

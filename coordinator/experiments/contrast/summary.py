@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
+from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.common.runs.standard_error import format_with_error, standard_error
 
@@ -91,7 +92,7 @@ def describe_difference(kind: str, first: str, figure: str, found: PairedDiffere
     label = "score in reality" if figure == SCORE else figure.replace("_", " ")
     verdict = "" if found.is_significant else f": none, for one under {found.threshold_text} is none"
     size = format_with_error(found.mean, found.error, digits, sign="+")
-    return f"{label}: {kind} less {first} {size} over {found.seeds} seeds{verdict}"
+    return f"{label}: {kind} less {first} {size} over {plural(found.seeds, 'seed')}{verdict}"
 
 
 def _reality(found: TrialResult) -> str:

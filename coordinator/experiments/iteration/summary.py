@@ -27,13 +27,13 @@ def describe_outcome(entry: FinishedPhase) -> str:
     """What came out of a phase, in a few words."""
     figures = entry.figures
     if entry.phase in DATA:
-        return f"{figures['new']} drives, {figures['episodes']} in all"
+        return f"{plural(figures['new'], 'drive')}, {figures['episodes']} in all"
     if entry.phase == INIT:
         return f"{figures['controller']}, of {figures['sha256'][:12]}"
     if entry.phase in SHOWN:
         return ", ".join(f"{name} {figures[name]}" for name in SHOWN[entry.phase] if name in figures)
     if entry.phase == BUNDLE:
-        return f"{figures['sha256'][:12]}, of {figures['frames']} frames"
+        return f"{figures['sha256'][:12]}, of {plural(figures['frames'], 'frame')}"
     if entry.phase == GATE:
         return str(figures["why"])
     if entry.phase == EVOLVE:

@@ -263,6 +263,6 @@ def _describe(status: Mapping[str, Any]) -> str:
         closed, limit = int(status["generations"]), int(status["limits"].get("generations") or 0)
         state = "" if status["state"] == "running" else f"{status['state']}, "
         judged = status.get("confirmed") or status.get("best")
-        score = "" if judged is None else f", evaluated {float(judged['mean']):.4g}"
+        score = "" if judged is None else f", evaluated {float(judged['mean']):z.4g}"
         return f"{state}generation {closed}{f' of {limit}' if limit else ''}{score}"
     return ""

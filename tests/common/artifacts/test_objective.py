@@ -89,7 +89,7 @@ def test_equal_bounds_fix_a_parameter():
         ({"x0": [float("nan")]}, "x0 must hold finite numbers"),
         ({"x0": [True]}, "x0 must hold finite numbers"),
         ({"x0": [0, 0], "dimension": 3}, "x0 has 2 numbers, and the function 3"),
-        ({"x0": [0, 0], "lower": [1]}, "lower has 1 numbers"),
+        ({"x0": [0, 0], "lower": [1]}, "lower has 1 number,"),
         ({"x0": [0], "lower": 1}, "outside of its bounds"),
         ({"x0": [1, 2], "lower": [1, 2], "upper": [1, 2]}, "every parameter"),
         ({"x0": [0], "scale": 0}, "scale of parameter 0 must be above 0"),

@@ -22,6 +22,13 @@ def test_what_ships_is_registered():
     assert set(registry.known_optimisers()) >= {"cma", "cmaes-lra", "cmaes-sep", "openes", "pepg", "snes", "xnes"}
 
 
+def test_without_docstrings_pycma_is_refused_as_a_wrong_command():
+    words = [sys.executable, "-OO", "-m", "dreamfleet", "coordinator", "--run", "x", "--task", "gym:CartPole-v1"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (done.returncode, "-OO" in done.stderr.splitlines()[-1]) == (2, True)
+    assert "Traceback" not in done.stderr
+
+
 def test_an_optimiser_of_ones_own_is_found_by_entry_point(tmp_path):
     """As an installed package offers it: a folder of metadata on the path."""
     info = tmp_path / "others-1.0.dist-info"

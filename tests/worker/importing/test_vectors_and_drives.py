@@ -336,6 +336,12 @@ def test_drives_of_the_article_have_the_reward_of_the_step_before(tmp_path, caps
     assert np.array_equal(steps["action"], action[:-1].astype(np.float32))
 
 
+def test_one_drive_is_no_drives(tmp_path, capsys):
+    np.savez(tmp_path / "x.npz", obs=np.zeros((1, 64, 64, 3)), action=np.zeros((1, 3)))
+    assert main(["import", str(tmp_path / "x.npz"), "--out", str(tmp_path / "data")]) == 0
+    assert "1 drive, 1 step," in capsys.readouterr().out
+
+
 def test_a_layout_may_be_named(tmp_path):
     np.savez(tmp_path / "x.npz", **ctallec_drive(tmp_path / "thread_0", 0))
     with pytest.raises(DatasetError, match="do not fit"):

@@ -22,6 +22,7 @@ from dreamfleet.common.host.process_pool import count_step, map_in_processes
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.stop_signals import outlive_stop_signals
 from dreamfleet.common.host.unseen_drawing import draw_unseen
+from dreamfleet.common.printable import plural
 from dreamfleet.worker.scoring.episode import EpisodeConfig, ResetHook, run_episode
 from dreamfleet.worker.scoring.failure_cause import describe_exception, describe_loss
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld, Rollout, write_episode
@@ -231,5 +232,7 @@ def _check_drive(path: Path) -> int:
     frames = len(load_pictures(path))
     load_arrays(path, "driver")
     if len(load_steps(path)["reward"]) != frames:
-        raise DatasetError(f"{path} holds {frames} pictures and another number of actions or rewards; delete it")
+        raise DatasetError(
+            f"{path} holds {plural(frames, 'picture')} and another number of actions or rewards; delete it"
+        )
     return frames
