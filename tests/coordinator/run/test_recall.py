@@ -1,6 +1,7 @@
 """A run that is taken back to an earlier generation, in a real journal and with real optimisers."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -17,7 +18,9 @@ from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConf
 from dreamfleet.coordinator.run.failure_limit import LIMIT_FROM
 from dreamfleet.coordinator.run.generations import Generations
 from dreamfleet.coordinator.run.recall import bar_stored, recall
+from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
+from tests.coordinator.run import test_run
 from tests.coordinator.run.test_failures import GENERATIONS, SETTINGS, Failing
 from tests.coordinator.run.test_run import A, B, Bench, result_of
 
@@ -93,12 +96,13 @@ def test_a_race_from_which_lies_are_recalled_is_one_without_them(tmp_path, rando
 
 
 class Broken(Failing):
-    """The first two candidates' first episodes fail, and the last ones take for ever, until it is mended."""
+    """What `fails(job)` does so until it is mended; until then the last episodes, and all checks, take for ever."""
 
     is_broken = True
 
     def answer_one(self, name, job):
-        if not (self.is_broken and job.kind == "score" and job.episode == 3):
+        is_check = self.run.fleet.jobs.is_accepted(job.digest)
+        if not (self.is_broken and job.kind == "score" and (job.episode == 3 or is_check)):
             super().answer_one(name, job)
 
 
@@ -116,6 +120,25 @@ def test_a_race_that_is_resumed_after_the_fault_of_a_host_is_one_without_it(tmp_
     assert bench.run.ended
     assert bench.story() == honest.story()
     assert sums(bench) == sums(honest)
+
+
+def test_what_a_candidate_has_that_failed_for_a_while_is_checked_once_it_is_scored(
+    tmp_path, random_bundle, monkeypatch
+):
+    monkeypatch.setattr(test_run, "NetworkConfig", partial(NetworkConfig, verify=1.0))
+    bench = Broken(
+        tmp_path / "run", random_bundle.path, replace(SETTINGS, episodes=4),
+        fails=lambda job: bench.is_broken and job.candidate == 0 and job.episode == 1,
+    )  # fmt: skip
+    bench.serve(stop=lambda run: run.generation.failed)
+    bench.is_broken = False
+    bench.run.resume()
+    bench.serve(stop=lambda run: len(run.history) > 0)
+    scored = "SELECT digest FROM result WHERE kind = 'score' AND generation = 0"
+    checked = "SELECT digest FROM verification WHERE stands AND outcome = 'equal'"
+    assert len(bench.journal._read(scored)) == 24
+    assert not bench.journal._read(f"{scored} EXCEPT {checked}")
+    bench.journal.close()
 
 
 def new_generations(bench):
