@@ -116,7 +116,9 @@ class Service:
                 raise
             except AccessError as error:
                 self._run.leave()
-                raise AccessError(f"{error}, and continue the run with it: {self._file_watch.command}") from error
+                raise AccessError(
+                    f"{error}; put it in the old one's place and run: {self._file_watch.command}"
+                ) from error
         return self._run
 
     def _start(self, session: zenoh.Session, opened: OpenRun) -> list[Any]:

@@ -268,18 +268,20 @@ def back_up_run(args: argparse.Namespace) -> int:
     """Copy a run and read the copy; the run may be served meanwhile."""
     from dreamfleet.coordinator.settings.resume_settings import stored_network
     from dreamfleet.coordinator.storage.backup import back_up
+    from dreamfleet.coordinator.storage.kept_revocations import REVOKED
 
     target = args.to / args.run_name
     with open_run(args.runs_dir, args.run_name) as source:
         back_up(source, target)
     with open_run(args.to, args.run_name) as copy:
         generations, results = len(copy.history()), copy.result_count()
-        network = stored_network(copy)
+        network, has_revoked = stored_network(copy), copy.fact(REVOKED) is not None
     secured = any(each.startswith(SECURED_PREFIX) for each in (*network.get("listen", ()), *network.get("connect", ())))
     join = args.global_config.join or ("FILE" if secured else None)
+    access_dir = Path("FOLDER") if has_revoked else None  # of the list of revoked files, which the copy needs
     text = (
         f"copied to {target}: {plural(generations, 'closed generation')}, {plural(results, 'result')}; should its own "
-        f"folder be lost, continue with: {resume_command(target, join)}"
+        f"folder be lost, continue with: {resume_command(target, join, access_dir)}"
     )
     print_answer(args, text, run=args.run_name, copy=target, generations=generations, results=results)
     return 0

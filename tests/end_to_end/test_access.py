@@ -203,7 +203,8 @@ def test_a_worker_that_is_revoked_counts_no_more_while_the_run_goes_on(processes
     assert again.endswith(f"--join {access.path('coordinator')} --access-dir {access.folder}")
     # Without the list, which the run's journal remembers, nobody is served: neither of the run nor of a copy of it.
     backup, fork = processes.folder / "backup", ("--run", "fork", "--from", "safe", "--generations", 1)
-    assert processes.call("runs", "backup", "safe", "--runs-dir", processes.runs, "--to", backup)[0] == 0
+    code, out, _ = processes.call("runs", "backup", "safe", "--runs-dir", processes.runs, "--to", backup)
+    assert (code, "--join FILE --access-dir FOLDER" in out) == (0, True)
     for runs, words in ((processes.runs, ("--resume", "safe")), (backup, ("--resume", "safe")), (processes.runs, fork)):
         call = ("coordinator", *words, "--runs-dir", runs, "--join", access.path("coordinator"))
         code, _, err = processes.call(*call)

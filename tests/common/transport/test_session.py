@@ -27,6 +27,9 @@ def test_a_link_local_address_has_its_interfaces_index_for_zenoh():
     assert with_interface_index(f"tcp/[fe80::1%{name}]:7447") == f"tcp/[fe80::1%{index}]:7447"
     for each in ("tcp/[fe80::1%7]:7447", "tcp/[::1]:7447", "tcp/host.example:7447"):
         assert with_interface_index(each) == each
+    with pytest.raises(ConnectionFailedError) as refused:  # an interface of this host, and nobody's address there
+        open_session(Network(listen=(f"tcp/[fe80::1%{name}]:{free_port()}",)))
+    assert ".cargo" not in str(refused.value)
     for network in (Network(listen=("tcp/[fe80::1%nowhere0]:7447",)), Network(connect=("tcp/[fe80::1%nowhere0]:1",))):
         with pytest.raises(UsageError, match=name):
             open_session(network, timeout=0.2)
