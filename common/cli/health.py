@@ -28,6 +28,7 @@ ROLES = {
     "dashboard": ("everything", "dashboard"),
     "export": ("everything", "export"),
 }
+ABSENT = "-"  # what is found of a thing that is missing
 MIN_FREE_BYTES = 200_000_000
 
 
@@ -88,7 +89,7 @@ def _check_packages() -> Iterator[Finding]:
         wrong = wrong_version(name)
         ok = found is not None and find_spec(module) is not None and not wrong
         needed = not extra or extra in ROLES  # other extras are of single tasks
-        yield Finding(name, ok, needed, found or "-", extra or "everything", wrong or install_command(extra))
+        yield Finding(name, ok, needed, found or ABSENT, extra or "everything", wrong or install_command(extra))
 
 
 def _check_box2d() -> Finding:
@@ -109,7 +110,7 @@ def _check_bundles() -> Iterator[Finding]:
             found, ok = str(error), False
         yield Finding(f"bundle {name}", ok, True, found, "everything", remedy)
     if not names:
-        yield Finding("bundle", False, True, "none shipped", "everything", "reinstall dreamfleet")
+        yield Finding("bundle", False, True, ABSENT, "everything", "reinstall dreamfleet")
 
 
 def _check_writable(name: str, path: Path, role: str) -> Finding:

@@ -11,7 +11,7 @@ from dreamfleet.common.errors import UsageError
 PROTOCOL_VERSION = 2
 ROOT = "dreamfleet"
 _PREFIX = f"{ROOT}/v{PROTOCOL_VERSION}"
-RUN_PATTERN = "[a-z0-9][a-z0-9-]{0,62}"
+RUN_PATTERN = "[A-Za-z0-9][A-Za-z0-9_-]{0,62}"
 _RUN = re.compile(RUN_PATTERN)
 _WORKER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 _LIFE = re.compile(r"[0-9a-f]{8}")
@@ -21,7 +21,7 @@ def check_run_name(name: str) -> str:
     """Return `name` if it may name a run, else raise `UsageError`."""
     if not _RUN.fullmatch(name):
         raise UsageError(
-            f"{name!r} cannot name a run: use 1 to 63 of a-z, 0-9 and '-', and begin with a letter or a digit"
+            f"{name!r} cannot name a run: use 1 to 63 of A-Z, a-z, 0-9, '_' and '-', and begin with a letter or a digit"
         )
     return name
 

@@ -55,7 +55,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _row(each: Finding) -> dict[str, object]:
-    state = "ok" if each.ok else "missing" if each.needed else "optional"
+    from dreamfleet.common.cli.health import ABSENT
+
+    state = "ok" if each.ok else "missing" if each.found == ABSENT else "failed" if each.needed else "warning"
     return {"state": state, "check": each.name, "found": each.found, "for": each.role,
             "remedy": "" if each.ok else each.remedy}  # fmt: skip
 
@@ -64,4 +66,4 @@ def _verdict(lacks: list[Finding]) -> str:
     if not lacks:
         return "can be played"
     remedies = "; ".join(dict.fromkeys(each.remedy for each in lacks))
-    return f"cannot be played: {', '.join(each.name for each in lacks)} missing; {remedies}"
+    return f"cannot be played: {', '.join(each.name for each in lacks)}; {remedies}"

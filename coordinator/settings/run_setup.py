@@ -25,7 +25,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument(
         "--run", dest="run_name", metavar="NAME",
-        help=f"name of the new run: a-z, 0-9 and '-' (default {DEFAULT_NAME}, or RUN-fork with --from RUN)",
+        help=f"name of the new run: A-Z, a-z, 0-9, '_' and '-' (default {DEFAULT_NAME}, or RUN-fork with --from RUN)",
     )  # fmt: skip
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--resume", metavar="RUN", help="continue this run from its journal; its limits and network "

@@ -74,13 +74,13 @@ def test_the_cluster_takes_what_the_kustomization_lists():
     secrets = {each["name"] for each in whole["secretGenerator"]}
     for document in (each for each in listed if each["kind"] != "ScaledObject"):
         kubernetes_validate.validate(document, KUBERNETES, strict=True)
-    for kind, verb, first in (("StatefulSet", "coordinator", ["--run"]), ("Deployment", "worker", [])):
+    for kind, verb, first in (("Job", "coordinator", ["--run"]), ("Deployment", "worker", [])):
         (pod,) = (each["spec"]["template"]["spec"] for each in listed if each["kind"] == kind)
         (container,) = pod["containers"]
         understood(verb, [*first, *container["args"]])
         assert {each["name"] for each in whole["images"]} >= {container["image"]}
         mounted = {each["name"] for each in container["volumeMounts"]}
-        offered = {each["name"] for each in pod["volumes"]} | ({"runs"} if kind == "StatefulSet" else set())
+        offered = {each["name"] for each in pod["volumes"]}
         assert mounted == offered
         assert {each["secret"]["secretName"] for each in pod["volumes"] if "secret" in each} <= secrets
         ports = {each["name"] for each in container.get("ports", ())}
@@ -88,6 +88,9 @@ def test_the_cluster_takes_what_the_kustomization_lists():
         asked = [each["tcpSocket" if "tcpSocket" in each else "httpGet"]["port"] for each in probes]
         assert set(asked) <= ports
         assert ("metrics" in ports) == ("--metrics-port" in container["args"])
+    # What has ended stays ended: of the kinds that hold pods, a Job alone does not restart after exit code 0.
+    (job,) = (each["spec"] for each in listed if each["kind"] == "Job")
+    assert (job["template"]["spec"]["restartPolicy"], job["podReplacementPolicy"]) == ("OnFailure", "Failed")
     (probe,) = (each["spec"]["template"]["spec"]["containers"][0]["startupProbe"] for each in listed
                 if each["kind"] == "Deployment")  # fmt: skip
     understood("doctor", probe["exec"]["command"][2:])

@@ -168,7 +168,7 @@ def test_a_controller_of_another_shape(processes, tmp_path):
 def test_a_worker_or_viewer_without_a_coordinator(processes):
     complains(processes, "status", "--connect", processes.endpoint, says="no one answers at")
     complains(processes, "worker", "--connect", "nowhere", says="write tcp/HOST:PORT")
-    complains(processes, "worker", "--connect", processes.endpoint, "--run", "No", says="cannot name a run")
+    complains(processes, "worker", "--connect", processes.endpoint, "--run", "No!", says="cannot name a run")
     complains(processes, "worker", "--connect", processes.endpoint, "--slots", "-1", says="--slots must be from 0")
     complains(processes, "worker", "--any", "--exit-when-done", says="--any takes the next run")
 

@@ -73,16 +73,18 @@ class WaitingText:
                 awaited = f"run {self._run} to go on" if self._run else "the next run"
                 return f"{self.ended}; waiting for {awaited} at {address}"
             awaited = (f"run {self._run}" if self._run else "a run") if answered else "a coordinator"
-            revoked = "; if it is served already, this join file was revoked" if self._secured and answered else ""
             names = join_some([each for each in others() if each != self._run], SHOWN_RUNS) if answered else ""
             there = f"; what is served there: {names}" if names else ""
-            return f"waiting for {awaited} at {address}{there}{revoked}"
+            return f"waiting for {awaited} at {address}{there}"
         if self.ended or self._has_named_remedy or now - self._since < WAIT_LIMIT:
             return ""
         self._has_named_remedy = True
         own = f" of run {self._run}" if self._run else ""
+        # Not at once: most workers that are not answered began before their coordinator.
+        revoked = "; if one serves there, this worker's join file was revoked" if self._secured and answered else ""
         return (
             f"no coordinator{own} at {address}; tried for {WAIT_LIMIT:.0f} s; start one by: {self._command(answered)}"
+            f"{revoked}"
         )
 
     def _command(self, answered: bool) -> str:

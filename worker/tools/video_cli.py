@@ -48,6 +48,9 @@ def video_paths(args: argparse.Namespace, default_seed: int) -> dict[int, Path]:
         raise UsageError(f"--out {out}: give a name that ends in .mp4")
     seeds = dict.fromkeys(given)
     videos = {seed: out if len(seeds) == 1 else out.with_stem(f"{out.stem}-{seed}") for seed in seeds}
+    folder = out.parent.resolve()
+    if not folder.exists() and not folder.is_relative_to(Path.cwd().resolve()):  # it may be misspelt
+        raise UsageError(f"--out {out}: make its folder first: mkdir -p {folder}")
     for video in videos.values():
         check_output_path(video)
     return videos

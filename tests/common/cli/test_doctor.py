@@ -50,8 +50,11 @@ def test_each_role_is_listed_with_its_remedy(bare, tmp_path):
     code, out = doctor(bare, tmp_path)
     assert code == 0
     assert "coordinator  can be played" in out
-    assert "worker       cannot be played: gymnasium, pygame-ce, box2d, onnxruntime missing" in out
+    assert "worker       cannot be played: gymnasium, pygame-ce, box2d, onnxruntime;" in out
     assert "pip install 'dreamfleet[worker]'" in out
+    rows = [line.split() for line in out.splitlines()]
+    absent = {row[0] for row in rows if len(row) > 3 and row[2] == "-"}
+    assert absent == {"missing"}, "one word, whether a role needs it or not"
 
 
 @pytest.mark.parametrize(

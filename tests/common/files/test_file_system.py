@@ -71,5 +71,5 @@ def test_where_locks_fail_the_cause_and_the_remedy_are_named(processes, error, s
     code, out = doctor.finish()
     found = {tuple(row[:2]): row[2] for row in map(cells, out.splitlines()) if len(row) > 2}
     assert code == 1
-    assert found["missing", "runs folder"].startswith(f"locks fail on {processes.runs}")
+    assert found["failed", "runs folder"].startswith(f"locks fail on {processes.runs}")
     begun.end()

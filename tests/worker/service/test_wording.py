@@ -45,6 +45,14 @@ def said(texts, times, **how):
     return [text for now in times if (text := texts.next(now, **how))]
 
 
+def test_a_worker_that_is_early_is_not_called_revoked_at_once(monkeypatch):
+    texts = WaitingText(WorkerConfig(run="night"), Network(connect=(ADDRESS,)), 5.0)
+    monkeypatch.setattr(texts, "_secured", True)
+    early, later = said(texts, (5.0, 5.0 + WAIT_LIMIT), answered=True)
+    assert "revoked" not in early
+    assert "revoked" in later
+
+
 @pytest.mark.parametrize(
     ("answered", "awaited", "flag"), [(True, "run night", "--connect"), (False, "a coordinator", "--listen")]
 )

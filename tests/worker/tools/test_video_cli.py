@@ -63,6 +63,7 @@ def test_without_a_seed_a_shipped_controllers_median_game_is_shown_beside_its_me
         (("--seed", "7", "-1"), "--steps must be at least 1 and --seed at least 0"),
         (("--out", "drive.avi"), "--out drive.avi: give a name that ends in .mp4"),
         (("--out", "folder.mp4"), "--out folder.mp4 is a folder: name a file in it"),
+        (("--out", "../elsewhere/drive.mp4"), "mkdir -p"),
     ],
 )
 def test_an_invalid_recording_is_one_line_before_the_first_step(verb, words, says, tmp_path, monkeypatch, capsys):
@@ -70,3 +71,4 @@ def test_an_invalid_recording_is_one_line_before_the_first_step(verb, words, say
     (tmp_path / "folder.mp4").mkdir()
     assert command_line.main([*verb, *words]) == UsageError.exit_code
     assert says in capsys.readouterr().err
+    assert not (tmp_path.parent / "elsewhere").exists()
