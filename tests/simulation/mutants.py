@@ -346,7 +346,7 @@ def confirmation_fills_its_round_in_the_order_in_which_scores_come(original):
 @mutant(StageTracker, "required_evaluation", **SCORED)
 def stages_begin_without_the_evaluation_that_decides(original):
     def required_evaluation(self, generation):
-        return original(self, generation) if generation == self._seen else -1
+        return original(self, generation) if generation == self._generation else -1
 
     return required_evaluation
 
