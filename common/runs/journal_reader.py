@@ -22,6 +22,7 @@ from dreamfleet.common.runs.stages import BegunStage
 
 _TYPES: dict[str, tuple[type, ...]] = {
     "i": (int,), "f": (int, float), "F": (int, float, NoneType), "s": (str,), "b": (bytes,),
+    "n": (bytes, NoneType),
 }  # fmt: skip
 
 
@@ -57,13 +58,18 @@ class JournalReader:
     def rows(self, kinds: str, query: str, *values: Any) -> list[Any]:
         """All rows of a query, checked for their column types.
 
-        `kinds` has a letter for each column: i integer, f number, F number or NULL, s text, b bytes. A damaged page, or
+        `kinds` has a letter for each column: i integer, f number, F number or NULL, s text, b bytes, n bytes or
+        NULL. A damaged page, or
         another program, may have left other types.
         """
         found, types = self._fetch(query, *values), [_TYPES[each] for each in kinds]
         if not all(all(map(isinstance, row, types)) for row in found):
             raise self.damage_error("a row holds values of another type")
         return found
+
+    def read(self, query: str, *values: Any) -> list[Any]:
+        """All rows of a query, unchecked."""
+        return self._fetch(query, *values)
 
     def row(self, query: str, *values: Any) -> Any:
         """The first row of a query, unchecked; `None` if there is none."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from difflib import SequenceMatcher
 from pathlib import Path
 from typing import Any, Self
@@ -24,6 +24,7 @@ from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.common.runs import schema
 from dreamfleet.common.runs.effort import START_EFFORT, Effort, GenerationEffort, parse_start_effort
 from dreamfleet.common.runs.journal.candidate_counts import CandidateCounts
+from dreamfleet.common.runs.journal.journal_check import JournalCheck
 from dreamfleet.common.runs.journal_reader import (
     WORK_QUERY,
     JournalReader,
@@ -80,6 +81,7 @@ class RunFolder(Displayed):
         self.path = path
         self.name = path.name
         self._journal = JournalReader(path / JOURNAL)
+        self._check = JournalCheck(self._journal)
         self._class_column = "host_class" if self._journal.version >= schema.HOST_CLASS_VERSION else "''"
         self._has_failures = self._journal.version >= schema.FAILURE_VERSION
         self._failed_column = "failed" if self._has_failures else "0"
@@ -116,6 +118,24 @@ class RunFolder(Displayed):
     def read_transaction(self) -> AbstractContextManager[None]:
         """A context in which all reads see one state of the journal, whatever a coordinator writes meanwhile."""
         return self._journal.transaction()
+
+    def verify(self) -> None:
+        """Compare the whole journal with its checksums, and its generations with their results' sums.
+
+        `DamagedJournalError` if anything differs. It reads everything, some seconds for a million results.
+        """
+        with self.read_transaction():
+            history = self.history()
+            counts = CandidateCounts(self._journal, self.settings, history, self.evaluations())
+            self._check.check_all(history, counts, self.training_seeds)
+
+    @contextmanager
+    def verified_transaction(self) -> Iterator[None]:
+        """`read_transaction` of a journal that was verified: just now, or by the coordinator that serves it."""
+        with self.read_transaction():
+            if not is_run_locked(self.path):
+                self.verify()
+            yield
 
     @property
     def settings(self) -> RunSettings:
@@ -300,6 +320,7 @@ class RunFolder(Displayed):
             "WHERE closed IS NOT NULL AND number >= ? ORDER BY number"
         )
         found = []
+        self._check.check_generations(since)
         rows = self._journal.rows("iFFFFfiFi", query, since)
         for number, mean, std, best, worst, sigma, steps, seconds, failed in rows:
             fitness = to_finite(mean), to_finite(std), to_finite(best), to_finite(worst)  # not finite in old journals
@@ -329,6 +350,7 @@ class RunFolder(Displayed):
             f"SELECT generation, episodes, mean, std, {self._failed_column} FROM evaluation WHERE mean IS NOT NULL "  # noqa: S608
             "ORDER BY generation"
         )
+        self._check.check_evaluations()
         rows = self._journal.rows("iiFFi", query)
         if any(not 0 <= failed < episodes for _, episodes, _, _, failed in rows):
             raise self._journal.damage_error("an evaluation is of no episodes")
@@ -398,6 +420,7 @@ class RunFolder(Displayed):
 
     def strategy_state(self) -> bytes | None:
         """The optimiser's state before it was asked for the latest generation; `None` before the first."""
+        self._check.check_state()
         rows = self._journal.rows("b", "SELECT state FROM strategy ORDER BY generation DESC LIMIT 1")
         return bytes(rows[0][0]) if rows else None
 
@@ -409,6 +432,7 @@ class RunFolder(Displayed):
 
     def fact(self, key: str) -> str | None:
         """One of the run's facts, such as its most recent limits; `None` if it has no such fact."""
+        self._check.check_record()
         return self._journal.fact(key)
 
     def _vector(self, data: Any, what: str) -> NDArray[np.float32]:

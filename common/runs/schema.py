@@ -98,9 +98,15 @@ MIGRATIONS = (
     ALTER TABLE placed RENAME TO result;
     CREATE INDEX evaluation_digest ON result (digest) WHERE kind = 'evaluate';
     """,
+    """
+    ALTER TABLE generation ADD COLUMN checksum BLOB;
+    ALTER TABLE evaluation ADD COLUMN checksum BLOB;
+    ALTER TABLE strategy ADD COLUMN checksum BLOB;
+    """,
 )
 """Entry i migrates a journal from version i to i + 1. Append only."""
 VERSION = len(MIGRATIONS)
+CHECKSUM_VERSION = 10  # the first version with checksums; what an older one wrote has none, and is not compared
 PLACED_VERSION = 9  # the first version whose results lie in the order in which they come
 OPERATOR_VERSION = 7  # the first version that keeps which hosts the operator barred
 VERIFICATION_VERSION = 6  # the first version with results that were checked, barred hosts and recalled results

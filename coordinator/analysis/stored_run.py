@@ -117,7 +117,7 @@ class StoredRun(RunFolder):
         if table not in (*TABLES, ELITES):
             raise UsageError(f"table must be one of {', '.join((*TABLES, ELITES))}, not {table!r}")
         make: Callable[[dict[str, list[Any]]], Any] = _import(package, f"pip install {package}").DataFrame
-        with self.read_transaction():
+        with self.verified_transaction():
             columns, rows = self._elites() if table == ELITES else (columns_of(table), rows_of(self, table))
         return make({name: [row[name] for row in rows] for name in columns})
 

@@ -231,7 +231,7 @@ def _resolve_settings(request: RunRequest, folder: Path) -> tuple[RunSettings, B
     """The run's settings, its verified bundle if its task needs one, and a new run's `_episode_limit`."""
     if request.config is not None:
         return _resolve_new_settings(request.config, request.start, strict=request.network.strict)
-    with open_run(request.runs_dir, request.name) as stored:
+    with open_run(request.runs_dir, request.name) as stored, stored.verified_transaction():
         settings = stored.settings
     if not settings.task.bundle:
         return settings, None, 0

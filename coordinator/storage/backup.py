@@ -94,6 +94,7 @@ def _copy_run(source: RunFolder, folder: Path) -> None:
     if source.spec.bundle:
         shutil.copy2(source.bundle_path, folder / BUNDLE)
     with RunFolder(folder) as copy:
+        copy.verify()
         drives = copy.rollouts()
     if drives:
         (folder / ROLLOUTS).mkdir()

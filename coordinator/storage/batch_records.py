@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from time import time
 
-from dreamfleet.common.errors import JournalError
+from dreamfleet.common.errors import DamagedJournalError
 from dreamfleet.common.protocol.batches import BatchLine, BatchState
 from dreamfleet.common.protocol.result_bounds import to_finite
-from dreamfleet.coordinator.storage.journal_connection import JournalConnection
+from dreamfleet.coordinator.storage.checksum_records import ChecksumRecords
 
 OPEN = "('running', 'waiting')"  # states, as the index has them
 MOST_VARIABLES = 500  # of one SQL statement
@@ -30,7 +30,7 @@ class StoredBatch:
     errors: Mapping[int, str]  # why a candidate has no fitness, once the batch is complete
 
 
-class BatchRecords(JournalConnection):
+class BatchRecords(ChecksumRecords):
     """Reads and writes a journal's batches."""
 
     def add_batch(self, batch_id: str, content: bytes, seeds: Sequence[int], population: int, vectors: bytes) -> None:
@@ -101,7 +101,9 @@ class BatchRecords(JournalConnection):
         (data,) = self._read_row("SELECT vectors FROM batch WHERE id = ?", batch.id)
         size, rest = divmod(len(data or b""), batch.population)
         if rest or not size:
-            raise JournalError(f"{self.path} is damaged: batch {batch.id} lacks its vectors; restore it from a copy")
+            raise DamagedJournalError(
+                f"{self.path} is damaged: batch {batch.id} lacks its vectors; restore it from a copy"
+            )
         return [bytes(data[start : start + size]) for start in range(0, len(data), size)]
 
     def is_closed(self, generation: int) -> bool:
@@ -135,4 +137,4 @@ class BatchRecords(JournalConnection):
                 number, batch_id, content, tuple(json.loads(seeds)), population, generation, state, named
             )
         except (ValueError, TypeError, AttributeError) as error:
-            raise JournalError(f"{self.path} is damaged: {error}; restore it from a copy") from error
+            raise DamagedJournalError(f"{self.path} is damaged: {error}; restore it from a copy") from error

@@ -17,13 +17,14 @@ from time import time
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.errors import JournalError
+from dreamfleet.common.errors import DamagedJournalError, JournalError
 from dreamfleet.common.files.atomic_write import atomic_write, fsync_path, reporting_unwritable_folder
 from dreamfleet.common.protocol.host_classes import HostClasses, class_from_fingerprint, count_results
 from dreamfleet.common.protocol.messages import Job, Kind, Result
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS, LONGEST_EPISODE, max_steps, to_finite
 from dreamfleet.common.runs import schema
 from dreamfleet.common.runs.effort import Effort
+from dreamfleet.common.runs.journal.checksums import RECORD, REST, record_checksum, state_checksum
 from dreamfleet.common.runs.journal_reader import class_counts_query, efforts_query
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_folder import ENDED_AT, RunFolder
@@ -84,7 +85,8 @@ class Journal(RecallRecords):
         cls.check_absent(folder)
         path = folder / JOURNAL
         aside = path.with_suffix(".new")
-        own = {"uid": secrets.token_hex(16), "settings": settings.to_json(), "created": _now()}
+        own = {"uid": secrets.token_hex(16), "settings": settings.to_json(), "created": _now(), **(facts or {})}
+        own[RECORD] = record_checksum(own.items())
         with reporting_unwritable_folder(folder, "choose another --runs-dir", JournalError):
             # What a journal that was removed left beside it would be taken for this one's, and damage it.
             for left in (aside, *sqlite_side_files(aside), *sqlite_side_files(path)):
@@ -95,7 +97,7 @@ class Journal(RecallRecords):
             aside.touch(mode=0o600)  # its log has the same mode
             with journal_errors(path), closing(sqlite3.connect(aside)) as connection:
                 schema.migrate(connection, 0)
-                connection.executemany("INSERT INTO run (key, value) VALUES (?, ?)", {**own, **(facts or {})}.items())
+                connection.executemany("INSERT INTO run (key, value) VALUES (?, ?)", own.items())
                 connection.commit()
             aside.replace(path)
             fsync_path(folder)
@@ -156,6 +158,7 @@ class Journal(RecallRecords):
         killed = "; the last one was killed, crashed or could not write" if last not in (None, (LEAVES,)) else ""
         self._incarnation = number
         self.set_fact("incarnation", str(number))
+        self.drop_fact(REST)
         self.add_event(f"incarnation {number} begins{killed}")
         self.commit()
         self.set_patience(SERVING_PATIENCE)
@@ -166,6 +169,8 @@ class Journal(RecallRecords):
         """Write that the coordinator leaves by itself."""
         self.set_patience(LEAVING_PATIENCE)
         self.add_event(LEAVES)
+        if self.fact("ended") is not None:
+            self.set_rest_checksum()
 
     def open_generation(
         self, number: int, state: Checkpoint, sigma: float, seeds: Sequence[int], vectors: Sequence[bytes]
@@ -177,7 +182,7 @@ class Journal(RecallRecords):
         )  # fmt: skip
         rows = [(number, index, vector) for index, vector in enumerate(vectors)]
         self._write_all("INSERT INTO candidate (generation, number, vector) VALUES (?, ?, ?)", rows)
-        self._write("INSERT INTO strategy (generation, state) VALUES (?, ?)", number, state)
+        self._write_state(number, state)
         self._write("DELETE FROM strategy WHERE generation < ?", number - 1)
         self._opened = number
 
@@ -205,6 +210,7 @@ class Journal(RecallRecords):
             "failed = ? WHERE number = ?",
             time(), *statistics, closed.steps, closed.seconds, closed.failed, closed.number,
         )  # fmt: skip
+        self._closed_now.append(closed.number)
 
     def set_seconds(self, generation: int, seconds: float) -> None:
         """Write for how long the open generation could be scored so far."""
@@ -308,6 +314,7 @@ class Journal(RecallRecords):
         mean, std = (None, None) if found is None else (found.mean, found.std)
         query = "UPDATE evaluation SET mean = ?, std = ?, failed = ? WHERE generation = ?"
         self._write(query, mean, std, failed, generation)
+        self._finished_now.append(generation)
 
     def schedule_collection(self, collection: RolloutCollection) -> None:
         """Write that drives of a generation's mean are to be kept."""
@@ -329,10 +336,15 @@ class Journal(RecallRecords):
     def generation(self, number: int) -> StoredOpenGeneration | None:
         """One of the last two generations, with the population that was sampled; `None` if its state is deleted."""
         row = self._read_row(
-            "SELECT state, seeds, seconds FROM generation JOIN strategy ON number = generation WHERE number = ?", number
-        )
+            "SELECT state, seeds, generation.seconds, strategy.checksum FROM generation JOIN strategy "
+            "ON number = strategy.generation WHERE number = ?", number
+        )  # fmt: skip
         if row is None:
             return None
+        if row[-1] not in (None, state_checksum(row[0])):
+            raise DamagedJournalError(
+                f"{self.path} is damaged: the optimiser's state differs from its checksum; restore it from a copy"
+            )
         vectors = self._read("SELECT vector FROM candidate WHERE generation = ? ORDER BY number", number)
         rounds: dict[int, list[int]] = {}
         query = "SELECT round, candidate FROM redraw WHERE generation = ? ORDER BY round, candidate"
@@ -346,7 +358,7 @@ class Journal(RecallRecords):
                 tuple(map(tuple, rounds.values())), to_finite(row[2] or 0.0),
             )  # fmt: skip
         except (ValueError, TypeError) as error:
-            raise JournalError(f"{self.path} is damaged: {error}; restore it from a copy") from error
+            raise DamagedJournalError(f"{self.path} is damaged: {error}; restore it from a copy") from error
 
     def read_closed(self) -> tuple[list[StoredGeneration], list[StoredEvaluation]]:
         """Every closed generation and finished evaluation, oldest first."""

@@ -40,6 +40,7 @@ class JournalConnection:
         with journal_errors(path):
             self._connection = sqlite3.connect(path, timeout=5)
             try:
+                self._prepare(self._connection)
                 version = schema.check_schema(self._connection, path)
                 if version < schema.PLACED_VERSION:
                     check_room(path)
@@ -51,6 +52,9 @@ class JournalConnection:
             except BaseException:
                 self._connection.close()
                 raise
+
+    def _prepare(self, connection: sqlite3.Connection) -> None:
+        """Add the functions that statements of a subclass call."""
 
     def close(self) -> None:
         """Fold the write-ahead log into the journal and release it."""

@@ -53,8 +53,8 @@ class RecallRecords(VerificationRecords):
         """Take back all that these hosts brought, and reopen the evaluations that it was part of; returns how much."""
         marks = ", ".join("?" * len(hosts))
         reopened = (
-            "UPDATE evaluation SET mean = NULL, std = NULL, failed = 0 WHERE vector IN (SELECT vector FROM evaluation "
-            "WHERE generation IN "
+            "UPDATE evaluation SET mean = NULL, std = NULL, failed = 0, checksum = NULL WHERE vector IN "
+            "(SELECT vector FROM evaluation WHERE generation IN "
         )
         failed = self._failures_of(hosts)
         mine = f"(SELECT generation FROM result WHERE kind = 'evaluate' AND {HOST} IN ({marks}))"  # noqa: S608
@@ -63,6 +63,8 @@ class RecallRecords(VerificationRecords):
         self._write_all(f"{reopened} (?))", [(number,) for _, kind, number in others if kind == "evaluate"])
         self._write_all("DELETE FROM failure WHERE digest = ?", [(digest,) for digest, *_ in failed])
         (count,) = self._read_row(f"SELECT count(*) FROM result WHERE {HOST} IN ({marks})", *hosts)  # noqa: S608
+        scored = f"SELECT DISTINCT generation FROM result WHERE kind = 'score' AND {HOST} IN ({marks})"  # noqa: S608
+        self._closed_now += [number for (number,) in self._read(scored, *hosts)]  # a closed batch keeps its fitness
         self._set_aside(BARRED, f"{HOST} IN ({marks})", *hosts)
         earlier = f"UPDATE recalled SET because = ? WHERE because != ? AND {HOST} IN ({marks})"  # noqa: S608
         self._write(earlier, BARRED, BARRED, *hosts)  # such as of generations that an earlier recall dropped
@@ -95,10 +97,10 @@ class RecallRecords(VerificationRecords):
         self._write("DELETE FROM generation WHERE number > ?", number)
         self._write(
             "UPDATE generation SET closed = NULL, mean = NULL, std = NULL, best = NULL, worst = NULL, steps = NULL, "
-            "failed = 0, seeds = ? WHERE number = ?",
+            "failed = 0, checksum = NULL, seeds = ? WHERE number = ?",
             json.dumps(list(seeds)), number,
         )  # fmt: skip
-        self._write("INSERT INTO strategy (generation, state) VALUES (?, ?)", number, state)
+        self._write_state(number, state)
         self._opened = number
         self._settle_recall()
 
@@ -196,6 +198,8 @@ class RecallRecords(VerificationRecords):
         A check stands by the word of a host that is still believed.
         """
         taken = self._read(f"SELECT DISTINCT digest FROM recalled WHERE {where}", *values)  # noqa: S608
+        changed = f"generation IN (SELECT generation FROM recalled WHERE {where})"  # noqa: S608
+        self._write(f"UPDATE evaluation SET checksum = NULL WHERE {changed}", *values)  # noqa: S608
         self._write(f"INSERT OR IGNORE INTO result ({COLUMNS}) SELECT {COLUMNS} FROM recalled WHERE {where}",  # noqa: S608
                     *values)  # fmt: skip
         self._write(f"DELETE FROM recalled WHERE {where}", *values)  # noqa: S608

@@ -120,7 +120,7 @@ def _run_row(path: Path, *, in_text: bool) -> dict[str, Any]:
 
 def show_run(args: argparse.Namespace) -> int:
     """Print a run's settings and generations; with `--json` also the settings that do not apply to it."""
-    with open_run(args.runs_dir, args.run_name) as stored, stored.read_transaction():
+    with open_run(args.runs_dir, args.run_name) as stored, stored.verified_transaction():
         settings, history, evaluations = stored.settings, stored.history(), stored.evaluations()
         confirmed, duration_seconds = stored.confirmation(), stored.duration_seconds
         facts = {
@@ -334,7 +334,7 @@ def export_run(args: argparse.Namespace) -> int:
     folder = args.out or Path(f"{args.run_name}-{args.kind}")
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"--out {folder} is not a folder: name one")
-    with open_run(args.runs_dir, args.run_name) as stored, stored.read_transaction():
+    with open_run(args.runs_dir, args.run_name) as stored, stored.verified_transaction():
         written = kinds[args.kind](stored, folder)
     text = "\n".join(map(str, written)) if written else f"run {args.run_name} has no row yet: nothing was written"
     print_answer(args, text, run=args.run_name, files=written)

@@ -102,7 +102,7 @@ def write_receipt(args: argparse.Namespace) -> int:
 
     if args.out is not None:
         check_output_path(args.out)
-    with open_run(args.runs_dir, args.run_name) as stored, stored.read_transaction():
+    with open_run(args.runs_dir, args.run_name) as stored, stored.verified_transaction():
         text = (
             json.dumps(citation_facts(stored), default=str) if args.json else printable_lines(format_markdown(stored))
         )

@@ -187,6 +187,8 @@ def test_a_journal_without_classes_continues_with_fingerprints(bench):
     before.executescript(
         "DROP TABLE verification; DROP TABLE barred; DROP TABLE recalled; "
         "DROP TABLE batch; DROP TABLE failure; DROP TABLE redraw; DROP TABLE event; "
+        "ALTER TABLE generation DROP COLUMN checksum; ALTER TABLE evaluation DROP COLUMN checksum; "
+        "ALTER TABLE strategy DROP COLUMN checksum; DELETE FROM run WHERE key = 'checksum'; "
         "ALTER TABLE generation DROP COLUMN failed; "
         "ALTER TABLE evaluation DROP COLUMN failed; "
         "ALTER TABLE result DROP COLUMN measures; ALTER TABLE candidate DROP COLUMN measures; "

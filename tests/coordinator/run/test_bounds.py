@@ -97,6 +97,8 @@ def test_excessive_generations_and_evaluations_of_an_older_coordinator_can_be_en
         deliver_all(bench, (1.0, 10, 0.1))
     bench.run.commit()
     with closing(sqlite3.connect(bench.path / "journal.sqlite")) as connection, connection:
+        for table in ("generation", "evaluation"):
+            connection.execute(f"UPDATE {table} SET checksum = NULL")
         connection.execute("UPDATE generation SET mean = 9e999, std = NULL, best = 9e999, worst = -9e999, steps = ?",
                            (MAX_COUNT,))  # fmt: skip
         connection.execute("UPDATE evaluation SET mean = 9e999, std = NULL WHERE mean IS NOT NULL")

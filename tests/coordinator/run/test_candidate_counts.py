@@ -42,6 +42,7 @@ def check(path):
         counts = Counter(each.episodes for each in scored)
         if racing:
             assert counts.keys() <= {episodes[number], -(-episodes[number] // 2)}
+            assert episodes[number] == 1 or counts[episodes[number]] <= -(-len(own) // 2)
         else:
             assert counts.keys() <= {episodes[number]}
         assert {(each.episodes, each.steps, each.seconds) for each in own if each.fitness is None} <= {(0, 0, 0.0)}
