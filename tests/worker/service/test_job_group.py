@@ -44,7 +44,7 @@ def test_each_job_has_its_own_result_and_an_equal_share_of_the_time():
 @pytest.mark.parametrize(
     ("scores", "said"),
     [
-        ([Score(1.0, 1)], "1 scores of 3 episodes"),
+        ([Score(1.0, 1)], "1 score of 3 episodes"),
         ([Score(1.0, 1)] * 2 + [None], "AttributeError"),
     ],
 )
