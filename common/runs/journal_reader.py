@@ -38,6 +38,7 @@ class JournalReader:
     def close(self) -> None:
         """Release the journal, for all threads."""
         self._connections.close()
+        _remove_empty_log(self._path)
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
@@ -167,6 +168,20 @@ def _has_log(path: Path) -> bool:
         return Path(f"{path}-wal").stat().st_size > 0
     except OSError:
         return False
+
+
+def _remove_empty_log(path: Path) -> None:
+    """Let SQLite remove an empty log and its index, which a read-only connection makes and cannot remove.
+
+    It does so as the last connection closes, which a coordinator's is where one serves the run.
+    """
+    if _has_log(path) or not Path(f"{path}-shm").exists() or not os.access(path.parent, os.W_OK):
+        return
+    with (
+        suppress(sqlite3.Error),
+        closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True, timeout=0)) as last,
+    ):
+        last.execute("SELECT count(*) FROM sqlite_master").fetchone()
 
 
 def _roll_back(path: Path) -> None:

@@ -57,7 +57,14 @@ class JournalConnection:
         """Add the functions that statements of a subclass call."""
 
     def close(self) -> None:
-        """Fold the write-ahead log into the journal and release it."""
+        """Fold the write-ahead log into the journal and release it.
+
+        Where readers have it open, the log stays beside it, empty; the last of them removes it.
+        """
+        with suppress(sqlite3.Error):
+            self._connection.rollback()
+            self._connection.execute("PRAGMA busy_timeout = 0")  # readers do not wait for each other
+            self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         self._connection.close()
 
     @property

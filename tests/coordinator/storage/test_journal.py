@@ -16,6 +16,7 @@ from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.jobs.work import vector_bytes
 from dreamfleet.coordinator.storage.journal import Journal
+from dreamfleet.coordinator.storage.journal_file import sqlite_side_files
 from dreamfleet.coordinator.storage.recall_records import REWOUND
 from dreamfleet.coordinator.storage.verification_records import UNCHECKED
 from tests.support.disks import read_only_view
@@ -316,3 +317,51 @@ def test_a_read_only_view_of_a_live_run_shows_what_is_in_its_write_ahead_log(fol
         shutil.move(tmp_path / "log", folder / "journal.sqlite-wal")
         with pytest.raises(JournalError, match="copy the folder first"):
             RunFolder(view / "night").history()
+
+
+def side_files(folder):
+    return [each.name for each in sqlite_side_files(folder / "journal.sqlite") if each.exists()]
+
+
+def read(folder):
+    with RunFolder(folder) as run:
+        return run.history()
+
+
+def test_a_reader_leaves_nothing_beside_a_run_that_is_not_served(folder, journal):
+    fill(journal)
+    journal.close()
+    assert side_files(folder) == []
+    assert read(folder)
+    assert side_files(folder) == []
+
+
+@pytest.mark.parametrize("readers", [1, 3])
+def test_the_last_reader_of_a_run_that_ended_meanwhile_leaves_nothing(folder, journal, readers):
+    fill(journal)
+    opened = [RunFolder(folder) for _ in range(readers)]
+    before = [each.history() for each in opened]
+    journal.close()
+    assert read(folder) == before[0]
+    for each in opened:
+        assert each.history() == before[0]
+        each.close()
+    assert side_files(folder) == []
+
+
+def test_a_reader_takes_nothing_from_a_coordinator(folder, journal):
+    fill(journal)
+    assert read(folder)
+    assert side_files(folder) == ["journal.sqlite-wal", "journal.sqlite-shm"]
+    journal.set_fact("name", "later")
+    journal.commit()
+    journal.close()
+    again = Journal(folder / "journal.sqlite")
+    assert read(folder)
+    assert again.fact("name") == "later"
+    again.set_fact("name", "last")
+    again.commit()
+    again.close()
+    with RunFolder(folder) as run:
+        assert run.fact("name") == "last"
+    assert side_files(folder) == []
