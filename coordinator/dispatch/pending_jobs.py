@@ -34,7 +34,7 @@ class PendingJob:
 
     work: Work
     order: int
-    in_queue: bool = False  # whether a queue has an entry for it; the entry may outlive the state `QUEUED`
+    queued: int | None = None  # the order of its entry in a queue; the entry may outlive the state `QUEUED`
     holders: frozenset[str] = frozenset()  # workers that have a lease
     given_to: frozenset[str] = frozenset()  # workers that hold it or held it
     overrun_by: frozenset[str] = frozenset()  # workers that reported more steps than it can have
@@ -144,7 +144,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
 
     @property
     def queue_length(self) -> int:
-        """Candidates' jobs that wait, those included that are not made yet; an entry may outlive the state `QUEUED`."""
+        """Candidates' jobs that wait, those included that are not made yet; an entry may outlive its job."""
         return len(self._queue) + self.unmade
 
     def offer(self, work: Iterable[Work]) -> None:
@@ -170,9 +170,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         digest = work.digest
         if digest in self._pending:
             return False
-        pending = PendingJob(work, self._next_order, is_proof=True)
-        pending.in_queue = any(each == digest for _, each in self._queue)  # from before it was scored
-        self._add(pending)
+        self._add(PendingJob(work, self._next_order, is_proof=True))
         return True
 
     def offer_check(self, work: Work, check: Check, holders: Iterable[str] = ()) -> None:
@@ -210,8 +208,8 @@ class PendingJobs(Mapping[bytes, PendingJob]):
             return  # it waits in `checks`
         if pending.retry_at:
             self._waiting.add(digest)
-        elif not pending.in_queue:
-            pending.in_queue = True
+        elif pending.queued is None:
+            pending.queued = pending.order
             heapq.heappush(self._background_queue if pending.is_background else self._queue, (pending.order, digest))
 
     def next(self, slots: int, *, idle: bool, drain_background: bool) -> NextJob | None:
@@ -222,10 +220,10 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         """
         while (next_job := self._next_queue(slots, idle=idle, drain_background=drain_background)) is not None:
             queue, by_share = next_job
-            _, digest = heapq.heappop(queue)
-            if (pending := self._pending.get(digest)) is None or pending.check is not None:
-                continue  # answered meanwhile
-            pending.in_queue = False
+            order, digest = heapq.heappop(queue)
+            if (pending := self._pending.get(digest)) is None or pending.queued != order:
+                continue  # answered or withdrawn meanwhile, and perhaps wanted again since, with an entry of its own
+            pending.queued = None
             if pending.state is JobState.QUEUED:  # else a former holder has its lease again
                 return NextJob(digest, by_share)
         return None

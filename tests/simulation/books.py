@@ -31,7 +31,7 @@ def check_coordinator(fleet: Fleet) -> None:
     is_background = 0
     for digest, each in jobs.items():
         holders = each.holders
-        _require(each.in_queue == (digest in named), "a job and the queue disagree on whether it is queued")
+        _require((each.queued is not None) == (digest in named), "a job and the queue disagree on whether it is queued")
         waits = each.retry_at > 0 or jobs.checks.get(digest) is each
         _require(bool(holders) or digest in named or waits, "a wanted job is neither held nor queued")
         _require(len(holders) <= MAX_HOLDERS, "a job has more copies than two")
@@ -155,8 +155,8 @@ def at_rest(fleet: Fleet, run: Run) -> bool:
 
 
 def _queued(jobs: PendingJobs) -> list[bytes]:
-    return [digest for *_, digest in (*jobs._queue, *jobs._background_queue)
-            if digest in jobs and jobs[digest].check is None]  # fmt: skip
+    queues = (*jobs._queue, *jobs._background_queue)
+    return [digest for order, digest in queues if digest in jobs and jobs[digest].queued == order]
 
 
 def _require(holds: bool, otherwise: str, rule: str = "books") -> None:
