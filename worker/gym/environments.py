@@ -41,7 +41,8 @@ ENGINES = {
     "gymnasium.envs.toy_text": (),
 }
 
-# Packages of environments that gymnasium knows by name alone: how a name begins, the distribution, and its module.
+# Packages whose environments gymnasium knows once they are imported: how a name begins, the distribution, its module.
+# A name so begun imports that module where it is installed: this list chooses what is imported, and never the network.
 PACKAGES = {
     "ALE/": ("ale-py", "ale_py"),
     "MiniGrid-": ("minigrid", "minigrid"),
@@ -81,6 +82,8 @@ def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
     allow_swig_types()
     try:
         with contained(f"making {name}"), user_code(name.rpartition(":")[0] or name, f"making {name}"):
+            if (known := _known_package(name)) and find_spec(known[1]):
+                import_module(known[1])
             return gymnasium.make(_unregistered_class(name) or name, disable_env_checker=True, **arguments)
     except gymnasium.error.DependencyNotInstalled as error:
         raise UsageError(f"{name} lacks a package on this host: {error}") from error
@@ -89,9 +92,8 @@ def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
             raise UsageError(fault) from error
         module, colon, _ = name.rpartition(":")
         remedy = "" if colon else f"; an environment of another package is written {GYM}:its_module:Its-v0"
-        if known := next((each for start, each in PACKAGES.items() if name.startswith(start)), None):
-            install = "" if find_spec(known[1]) else f"install it on this host with `pip install {known[0]}`, and "
-            remedy = f"; its package must be imported: {install}write {GYM}:{known[1]}:{name}"
+        if known := _known_package(name):
+            remedy = "" if find_spec(known[1]) else f"; install its package on this host: `pip install {known[0]}`"
         if colon and isinstance(error, ModuleNotFoundError):
             remedy = (
                 f"; install the package of {module} on this host, or name its folder in PYTHONPATH, and trust it by "
@@ -106,6 +108,11 @@ def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
         raise
     except Exception as error:  # environments may raise anything
         raise UsageError(f"{name} cannot be made: {describe_error(error)}") from error
+
+
+def _known_package(name: str) -> tuple[str, str] | None:
+    """The distribution and module of `PACKAGES` that have an environment of this name; `None` if none has."""
+    return next((each for start, each in PACKAGES.items() if name.startswith(start)), None)
 
 
 def _describe_import(name: str, error: ImportError) -> str:
