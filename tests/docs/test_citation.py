@@ -7,6 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from packaging.version import Version
 
 from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.common.cli.verb_runner import find_verb
@@ -24,7 +25,7 @@ def test_the_citation_is_valid():
 
 def test_the_citation_is_of_this_version_and_of_the_same_authors_as_receipts_say():
     text = CITATION.read_text()
-    assert f"version: {version('dreamfleet')}\n" in text
+    assert f"version: {Version(version('dreamfleet')).base_version}\n" in text
     assert f"- name: {AUTHORS}\n" in text
     assert "dreamfleet runs receipt" in text
 

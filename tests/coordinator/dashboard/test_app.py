@@ -211,7 +211,7 @@ def test_head_of_an_endless_stream_gets_headers_only(runs, path):
 
 
 @pytest.mark.parametrize(
-    "asked", ["", "run=", "run=No", "run=a&worker=--out", "run=a&worker=a/../b", "run=a&worker=a/0a1b2c3d%0a",
+    "asked", ["", "run=", "run=a/b", "run=a&worker=--out", "run=a&worker=a/../b", "run=a&worker=a/0a1b2c3d%0a",
               "run=a&generation=-1", "run=a&generation=1;2", "run=a&generation=%D9%A1x", "run=--help"],
 )  # fmt: skip
 def test_what_cannot_be_watched_is_refused_in_words(runs, asked):
