@@ -99,7 +99,8 @@ class RevocationWatcher:
         self._path = folder / LEDGER_FILE
         self._credentials = credentials
         self._next = float("-inf")
-        self._seen: tuple[int, int, int] | None = None
+        self._seen: tuple[int, ...] | None = None  # of the ledger that was last loaded
+        self._complaint = ""  # why the last attempt failed, logged once
         self._is_gone = False
         self.revoked_seats = frozenset(kept)
         if credentials is None:
@@ -138,10 +139,14 @@ class RevocationWatcher:
         """Reload the ledger if it changed; a damaged or missing one only logs a warning."""
         if self._credentials is None or now < self._next:
             return
+        complaint = ""
         try:
             self._reload(now)
         except AccessError as error:
-            log.warning("%s; earlier revocations stay in force", error)
+            complaint = str(error)
+            if complaint != self._complaint:
+                log.warning("%s; earlier revocations stay in force", error)
+        self._complaint = complaint
 
     def _reload(self, now: float) -> None:
         self._next = now + CHECK_INTERVAL
@@ -153,16 +158,16 @@ class RevocationWatcher:
                 log.warning("%s is gone: what is revoked from now on is not seen; put it back", self._path)
             return
         self._is_gone = False
-        seen = found.st_ino, found.st_mtime_ns, found.st_size
+        seen = found.st_ino, found.st_mtime_ns, found.st_ctime_ns, found.st_size
         if seen == self._seen:
             return
-        self._seen = seen
         ledger = CertificateLedger.load(self._path)
         if ledger.authority != self.authority:
             raise AccessError(f"{self._path} belongs to another authority than the join file: name its --access-dir")
         for each in sorted(ledger.revoked_seats() - self.revoked_seats):
             log.warning("%s is revoked: its messages are ignored", each)
         self.revoked_seats |= ledger.revoked_seats()
+        self._seen = seen  # only now: a ledger that could not be read is tried again
 
 
 def exists_in(folder: Path) -> bool:

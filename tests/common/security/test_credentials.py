@@ -14,7 +14,7 @@ import pytest
 
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import AccessError, UsageError
-from dreamfleet.common.security import authority
+from dreamfleet.common.security import authority, certificate_ledger
 from dreamfleet.common.security.authority import Authority
 from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, CertificateLedger, RevocationWatcher
 from dreamfleet.common.security.credentials import MAX_BYTES, add_seat_to_name, read_join_file, worker_seat_identity
@@ -161,6 +161,23 @@ def test_a_ledger_that_is_replaced_or_removed_takes_no_revocation_back(access, j
     (revoked / LEDGER_FILE).unlink()
     watched._next = float("-inf")
     watched.reload_if_changed(0.0)
+    assert "worker.1" in watched.revoked_seats
+
+
+def test_a_ledger_that_could_not_be_read_is_read_later_and_warned_of_once(access, join, revoked, monkeypatch, caplog):
+    watched = RevocationWatcher(access._folder, replace(read_join_file(join), seat=2))
+    watched._path = revoked / LEDGER_FILE
+
+    def refused(path, most):
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(certificate_ledger, "read_regular", refused)
+        for now in (10.0, 20.0, 30.0):
+            watched.reload_if_changed(now)
+    assert not watched.revoked_seats
+    assert len(caplog.records) == 1
+    watched.reload_if_changed(40.0)
     assert "worker.1" in watched.revoked_seats
 
 
