@@ -166,7 +166,7 @@ def test_a_ledger_that_is_replaced_or_removed_takes_no_revocation_back(access, j
 
 def test_a_ledger_that_could_not_be_read_is_read_later_and_warned_of_once(access, join, revoked, monkeypatch, caplog):
     watched = RevocationWatcher(access._folder, replace(read_join_file(join), seat=2))
-    watched._path = revoked / LEDGER_FILE
+    watched._path, watched._next = revoked / LEDGER_FILE, float("-inf")
 
     def refused(path, most):
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
