@@ -64,7 +64,7 @@ class SearchResult(Displayed):
 
     x: Floats  # (dimension,)
     fun: float  # its value; of a noisy function an estimate
-    nfev: int  # calls whose values counted, of candidates and means
+    nfev: int  # calls whose values counted, of candidates and means, an open generation's included
     nit: int  # generations
     message: str  # why it ended
     success: bool
@@ -107,13 +107,13 @@ def minimise(
     infinity, which otherwise count as failed candidates. The first one of a search is a `RuntimeWarning`.
 
     The search ends by `ftarget`, before it has more than `maxfevals` calls, as it converges, when `callback(progress)`
-    returns `False` or raises `StopIteration`, or by a limit in `settings`, as a generation closes. `maxfevals` counts
-    the calls for means too, and those by which a noisy search confirms its best ones at the end. Only a first
-    generation may exceed it. The search begins anew up to `restarts` times from a random point within bounds, else from
-    `x0`: with twice the population (`ipop`), or with large and small ones in turn (`bipop`). `settings` are those of
-    `start_run`, such as `generations`, `optimiser`, `episodes`, `seed` or `listen`;
-    with `workers=0` only other hosts score. `UsageError` for a wrong setting, for a function that fails at `x0`, or if
-    all candidates fail before one has a value.
+    returns `False` or raises `StopIteration`, or by a limit in `settings`, as a generation closes. Generations that
+    close while the callback runs count too. `maxfevals` counts the calls for means too, and those by which a noisy
+    search confirms its best ones at the end. Only a first generation may exceed it. The search begins anew up to
+    `restarts` times from a random point within bounds, else from `x0`: with twice the population (`ipop`), or with
+    large and small ones in turn (`bipop`). `settings` are those of `start_run`, such as `generations`, `optimiser`,
+    `episodes`, `seed` or `listen`; with `workers=0` only other hosts score. `UsageError` for a wrong setting, for a
+    function that fails at `x0`, or if all candidates fail before one has a value.
 
     >>> import dreamfleet, numpy as np
     >>> found = dreamfleet.minimise(np.linalg.norm, x0=[3, 4], sigma0=1, ftarget=0.01, workers=1)
@@ -287,6 +287,7 @@ class _Searches:
             if not number:
                 _pass_on_warnings(run)
             ended = self._follow_all(run, objective)
+        self._follow_rest(run, objective)
         self._read_means(run, objective)
         self._results += run.result_count()
         run.close()
@@ -300,10 +301,11 @@ class _Searches:
         """Follow a run to its end; why it ended. `UsageError` if no candidate of the search has a value."""
         try:
             for generation in run:
-                if not self._follow(run, objective, generation):
+                if not self._report(self._follow(run, objective, generation)):
                     self._stopped = True
                     return StopReason(None, "stopped by the callback")
         except RunPausedError as pause:
+            self._follow_rest(run, objective)
             if self._best is not None and run.failures():
                 self._note_failures(run, run.settings.population)
                 return StopReason(None, f"all candidates of generation {len(run.history())} failed")
@@ -315,6 +317,11 @@ class _Searches:
                 "smaller sigma0, bounds), or give a penalty in place of NaN and infinity"
             ) from None
         return StopReason(run.stop_kind, run.ended or run.state)
+
+    def _follow_rest(self, run: StartedRun, objective: Objective) -> None:
+        """Note what closed since the last report, so that all numbers are of one moment; the callback is not called."""
+        for generation in run.history(sum(each.run == run.name for each in self._history)):
+            self._follow(run, objective, generation)
 
     def _objective_of(self, plan: _Plan, number: int) -> Objective:
         """Where a search begins: the first at x0, a restart at random within bounds, or at x0 if there are none."""
@@ -330,8 +337,8 @@ class _Searches:
                 start[index] = min(max(math.exp(drawn) if index in found.log else drawn, lower), upper)
         return replace(found, x0=tuple(start))
 
-    def _follow(self, run: StartedRun, objective: Objective, generation: StoredGeneration) -> bool:
-        """Note a closed generation and report it; whether the search goes on."""
+    def _follow(self, run: StartedRun, objective: Objective, generation: StoredGeneration) -> Progress:
+        """Note a closed generation."""
         self._calls += generation.steps
         self._note_failures(run, generation.failed)
         if self._best is None or generation.best > self._best[0]:
@@ -346,6 +353,10 @@ class _Searches:
             objective.value(generation.mean), generation.sigma,
         )  # fmt: skip
         self._history.append(progress)
+        return progress
+
+    def _report(self, progress: Progress) -> bool:
+        """Report to the callback; whether the search goes on."""
         try:
             return self._callback is None or self._callback(progress) is not False
         except StopIteration:

@@ -10,6 +10,7 @@ from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.coordinator.experiments import minimise as module
 from dreamfleet.coordinator.experiments.search_arguments import read_bounds, read_objective
 from tests.support import objectives
+from tests.support.access import until
 from tests.support.processes import free_port
 
 FEW = {"workers": 1, "popsize": 8}
@@ -160,14 +161,26 @@ def test_a_fixed_parameter_stays_and_an_object_is_a_function(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_callback_ends_the_search(tmp_path):
+def test_a_callback_ends_the_search_and_all_numbers_are_of_one_moment(tmp_path):
+    seen = []
+
     def stop(progress):
-        if progress.generation == 1:
-            raise StopIteration
+        seen.append(progress)
+        with dreamfleet.open_run(progress.run, tmp_path) as run:
+            if progress.generation == 1:
+                until(lambda: len(run.history()) >= 4, "the search goes on meanwhile")
+                raise StopIteration
 
     found = dreamfleet.minimise(objectives.sphere, [0, 0], 1.0, callback=stop, restarts=2, runs_dir=tmp_path, **FEW)
-    assert (found.nit, len(found.runs), found.success) == (2, 1, False)
-    assert stop_kind(found, tmp_path) is None, "it was left open"
+    assert (len(found.runs), found.success) == (1, False)
+    assert found.history[:2] == tuple(seen)
+    with dreamfleet.open_run(found.run, tmp_path) as run:
+        assert (run.stop_kind, run.state) == (None, "open"), "it was left open"
+        history = run.history()
+        assert found.nit == len(found.history) == len(history) >= 4
+        assert found.history[-1].nfev == sum(each.steps for each in history)
+        assert found.nfev == run.result_count()
+        assert objectives.sphere(found.xbest) == -max(each.best for each in history)
 
 
 @pytest.mark.parametrize(
