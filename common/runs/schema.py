@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import sqlite3
+from contextlib import closing
+from functools import cache
 
-from dreamfleet.common.errors import JournalError
+from dreamfleet.common.errors import DamagedJournalError, JournalError
 
 APPLICATION_ID = 0x64666C74  # "dflt": marks the SQLite file as ours
 MIGRATIONS = (
@@ -102,6 +104,7 @@ MIGRATIONS = (
     ALTER TABLE generation ADD COLUMN checksum BLOB;
     ALTER TABLE evaluation ADD COLUMN checksum BLOB;
     ALTER TABLE strategy ADD COLUMN checksum BLOB;
+    ALTER TABLE recalled ADD COLUMN was_closed INTEGER;
     """,
 )
 """Entry i migrates a journal from version i to i + 1. Append only."""
@@ -120,6 +123,7 @@ _FOREIGN = (
     "SELECT count(*) FROM sqlite_master WHERE type NOT IN ('table', 'index') "
     "OR sql LIKE 'CREATE VIRTUAL%' OR sql LIKE '%GENERATED%'"
 )
+_COLUMNS = "SELECT m.name, c.name FROM sqlite_master m JOIN pragma_table_info(m.name) c WHERE m.type = 'table'"
 
 
 def check_schema(connection: sqlite3.Connection, path: object) -> int:
@@ -135,7 +139,21 @@ def check_schema(connection: sqlite3.Connection, path: object) -> int:
         raise JournalError(
             f"{path} has schema version {version}, this program knows {VERSION}: install a newer dreamfleet"
         )
+    found = {*connection.execute(_COLUMNS)}
+    if version < 0 or found & _columns(VERSION) != _columns(version):
+        raise DamagedJournalError(
+            f"{path} is damaged: it is not of its schema version {version}; restore it from a copy"
+        )
     return int(version)
+
+
+@cache
+def _columns(version: int) -> frozenset[tuple[str, str]]:
+    """Tables and columns of a journal of this version."""
+    with closing(sqlite3.connect(":memory:")) as connection:
+        for script in MIGRATIONS[:version]:
+            connection.executescript(script)
+        return frozenset(connection.execute(_COLUMNS))
 
 
 def migrate(connection: sqlite3.Connection, version: int) -> None:

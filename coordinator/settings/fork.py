@@ -35,7 +35,7 @@ class Fork:
     @classmethod
     def of(cls, runs_dir: Path, source: str, given: Collection[str]) -> Fork:
         """What a run takes over from the run `source`, which is only read; `given` are the settings of its own."""
-        with open_run(runs_dir, source) as stored:
+        with open_run(runs_dir, source) as stored, stored.verified_transaction():
             if stored.settings.is_external:
                 raise UsageError(
                     f"run {source} has no search of its own, and no mean to begin at: begin with --init CONTROLLER"

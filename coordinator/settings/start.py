@@ -117,7 +117,7 @@ def _describe_variant(variant: Variant) -> str:
 def find_start(name: str, runs_dir: Path) -> StartPoint:
     """A controller's file, a run (its reported controller, or its mean while it is open), or what ships."""
     if not is_file(Path(name)) and path_exists(runs_dir / name / JOURNAL):
-        with open_run(runs_dir, name) as stored:
+        with open_run(runs_dir, name) as stored, stored.verified_transaction():
             if stored.ended is None:  # what it reports so far is an older mean than the one that it stands at
                 return start_from_run(stored)
     controller, _ = find_controller(name, runs_dir)

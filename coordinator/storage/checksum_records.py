@@ -6,7 +6,7 @@ import sqlite3
 from pathlib import Path
 
 from dreamfleet.common.runs.journal import checksums
-from dreamfleet.common.runs.journal.checksums import RECORD, REST, state_checksum
+from dreamfleet.common.runs.journal.checksums import RECORD, REST, SEALED, sealed_text, state_checksum
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
 from dreamfleet.coordinator.storage.journal_connection import JournalConnection
 
@@ -19,9 +19,10 @@ class ChecksumRecords(JournalConnection):
         self._closed_now: list[int] = []  # generations since the last commit
         self._finished_now: list[int] = []  # evaluations, by generation
         self._is_record_changed = False
+        self._is_unsealed = False  # a row has lost its checksum since the last commit
 
     def _prepare(self, connection: sqlite3.Connection) -> None:
-        connection.create_function("state_checksum", 1, state_checksum, deterministic=True)
+        connection.create_function("state_checksum", 2, state_checksum, deterministic=True)
 
     def set_fact(self, key: str, value: str) -> None:
         """Write one of the run's facts."""
@@ -47,7 +48,9 @@ class ChecksumRecords(JournalConnection):
             parts = checksums.evaluation_parts(self._read, number)
             query = f"{checksums.EVALUATION_ROW} WHERE generation = ?"
             self._write_checksum(query, "evaluation", "generation", number, parts)
-        self._closed_now, self._finished_now = [], []
+        if self._closed_now or self._finished_now or self._is_unsealed:
+            self.set_fact(SEALED, sealed_text(self._read))
+        self._closed_now, self._finished_now, self._is_unsealed = [], [], False
         if self._is_record_changed:
             found = checksums.record_checksum(self._read("SELECT key, value FROM run"))
             super().set_fact(RECORD, found)
@@ -61,7 +64,7 @@ class ChecksumRecords(JournalConnection):
 
     def _write_state(self, generation: int, state: Checkpoint | bytes) -> None:
         """Write the strategy's state before a generation was asked for; the journal packs it when it writes."""
-        query = "INSERT INTO strategy (generation, state, checksum) VALUES (?1, ?2, state_checksum(?2))"
+        query = "INSERT INTO strategy (generation, state, checksum) VALUES (?1, ?2, state_checksum(?1, ?2))"
         self._write(query, generation, state)
 
     def set_rest_checksum(self) -> None:

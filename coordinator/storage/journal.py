@@ -341,7 +341,7 @@ class Journal(RecallRecords):
         )  # fmt: skip
         if row is None:
             return None
-        if row[-1] not in (None, state_checksum(row[0])):
+        if row[-1] not in (None, state_checksum(number, row[0])):
             raise DamagedJournalError(
                 f"{self.path} is damaged: the optimiser's state differs from its checksum; restore it from a copy"
             )

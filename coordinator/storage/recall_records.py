@@ -19,6 +19,7 @@ from dreamfleet.coordinator.storage.verification_records import VerificationReco
 
 # Why a result does not count: its host is barred, its generation was dropped, or its closed race did not want it.
 BARRED, REWOUND, SURPLUS = "barred", "rewound", "surplus"
+WAS_CLOSED = "EXISTS (SELECT 1 FROM generation WHERE number = result.generation AND closed IS NOT NULL)"
 COLUMNS = (
     "digest, kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, fingerprint, incarnation, "
     "host_class, measures"
@@ -186,8 +187,8 @@ class RecallRecords(VerificationRecords):
     def _set_aside(self, because: str, where: str, *values: object) -> None:
         """Move results into the table of those that do not count."""
         self._write(
-            f"INSERT INTO recalled ({COLUMNS}, because, happened) SELECT {COLUMNS}, '{because}', ? "  # noqa: S608
-            f"FROM result WHERE {where}",
+            f"INSERT INTO recalled ({COLUMNS}, because, happened, was_closed) SELECT {COLUMNS}, '{because}', ?, "  # noqa: S608
+            f"{WAS_CLOSED} FROM result WHERE {where}",
             time(), *values,
         )  # fmt: skip
         self._write(f"DELETE FROM result WHERE {where}", *values)  # noqa: S608
@@ -200,6 +201,7 @@ class RecallRecords(VerificationRecords):
         taken = self._read(f"SELECT DISTINCT digest FROM recalled WHERE {where}", *values)  # noqa: S608
         changed = f"generation IN (SELECT generation FROM recalled WHERE {where})"  # noqa: S608
         self._write(f"UPDATE evaluation SET checksum = NULL WHERE {changed}", *values)  # noqa: S608
+        self._is_unsealed = True
         self._write(f"INSERT OR IGNORE INTO result ({COLUMNS}) SELECT {COLUMNS} FROM recalled WHERE {where}",  # noqa: S608
                     *values)  # fmt: skip
         self._write(f"DELETE FROM recalled WHERE {where}", *values)  # noqa: S608
@@ -223,4 +225,5 @@ class RecallRecords(VerificationRecords):
         self._write("UPDATE verification SET stands = 0 WHERE digest NOT IN (SELECT digest FROM result)")
         for fact in (ENDING, STOP_KIND, "ended", ENDED_AT, CONFIRMED):
             self.drop_fact(fact)
+        self._is_unsealed = True
         self._effort = self._counted = self._has_set_aside = None

@@ -12,10 +12,8 @@ from dreamfleet.common.runs.scoring_params import ScheduleState
 
 SOME = 500  # variables of a query
 RESULTS = "SELECT digest, steps, seconds FROM result WHERE kind = 'score' AND generation = ?"
-RECALLED = (
-    "SELECT digest, recalled.steps, recalled.seconds FROM recalled JOIN generation ON number = generation "
-    "WHERE kind = 'score' AND generation = ? AND happened > closed"
-)
+RECALLED = "SELECT digest, steps, seconds FROM recalled WHERE kind = 'score' AND generation = ? AND {}"
+BY_TIME = "happened > (SELECT closed FROM generation WHERE number = recalled.generation)"  # in older journals
 
 
 class CandidateCounts:
@@ -33,6 +31,8 @@ class CandidateCounts:
         self._journal, self._history = journal, history
         self._schedule = ScheduleState(settings)
         self._finished = {each.generation: each for each in evaluations}
+        has_mark = journal.version >= schema.CHECKSUM_VERSION
+        self._was_closed = f"ifnull(was_closed, {BY_TIME})" if has_mark else BY_TIME
         self._shares_results = settings.is_external  # among generations: batches of others repeat jobs
 
     def rows(self, number: int, seeds: Sequence[int], *, is_open: bool) -> Iterator[StoredCandidate]:
@@ -58,7 +58,7 @@ class CandidateCounts:
         """
         results = self._journal.rows("bif", RESULTS, number)
         if self._shares_results and self._journal.version >= schema.VERIFICATION_VERSION:
-            results = self._journal.rows("bif", RECALLED, number) + results
+            results = self._journal.rows("bif", RECALLED.format(self._was_closed), number) + results
         return {digest: (steps, seconds) for digest, steps, seconds in results}
 
     def _failed_jobs(self, number: int) -> set[bytes]:

@@ -15,6 +15,11 @@ Read = Callable[..., list[Any]]
 """Takes a query and its values, and gives all rows."""
 SIZE = 16  # bytes of a checksum; a generation's and an evaluation's are two, of the row and of its parts
 RECORD, REST = "checksum", "rest_checksum"  # names of facts: of all other facts, and of what belongs to no generation
+SEALED = "sealed"  # the fact with the numbers of generations and evaluations that have a checksum
+COUNT_SEALED = (
+    "SELECT (SELECT count(*) FROM generation WHERE checksum IS NOT NULL), "
+    "(SELECT count(*) FROM evaluation WHERE checksum IS NOT NULL)"
+)
 GENERATION_ROW = (
     "SELECT number, seeds, opened, closed, mean, std, best, worst, sigma, steps, seconds, failed, checksum "
     "FROM generation WHERE closed IS NOT NULL"
@@ -28,6 +33,7 @@ _GENERATION_PARTS = (
     "SELECT number, vector, fitness, measures FROM candidate WHERE generation = ? ORDER BY number",
     "SELECT round, candidate, vector FROM redraw WHERE generation = ? ORDER BY round, candidate",
     f"{_RESULT} 'score' AND generation = ? ORDER BY candidate, episode, digest",
+    "SELECT number, id, content, seeds, population, state, errors FROM batch WHERE generation = ?",
 )
 _EVALUATION_PARTS = (
     f"{_RESULT} 'evaluate' AND generation = ? AND episode < {CHOOSING_OFFSET} ORDER BY candidate, episode, digest",
@@ -72,9 +78,15 @@ def record_checksum(facts: Iterable[tuple[str, str]]) -> str:
     return checksum_of(sorted(each for each in facts if each[0] != RECORD)).hex()
 
 
-def state_checksum(state: bytes) -> bytes:
-    """The checksum of a strategy's packed state."""
-    return checksum_of(state)
+def state_checksum(generation: int, state: bytes) -> bytes:
+    """The checksum of a strategy's packed state before a generation."""
+    return checksum_of(generation, state)
+
+
+def sealed_text(read: Read) -> str:
+    """How many generations and evaluations have a checksum: a row that is lost takes its own checksum with it."""
+    ((generations, evaluations),) = read(COUNT_SEALED)
+    return f"{generations} {evaluations}"
 
 
 def row_checksum(row: tuple[Any, ...], parts: bytes) -> bytes:

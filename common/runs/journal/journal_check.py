@@ -14,7 +14,11 @@ from dreamfleet.common.runs.journal.candidate_counts import CandidateCounts
 from dreamfleet.common.runs.journal_reader import JournalReader
 from dreamfleet.common.runs.records import StoredCandidate, StoredGeneration
 
-TOLERANCE = 1e-9  # of a mean: the writer summed in another order
+TOLERANCE = 1e-9  # of a mean, as a part of the largest fitness: the writer summed in another order
+STRAY = (
+    "SELECT 1 FROM result WHERE kind NOT IN ('score', 'evaluate', 'collect') "
+    "OR generation NOT IN (SELECT number FROM generation) LIMIT 1"
+)
 
 
 class JournalCheck:
@@ -59,7 +63,7 @@ class JournalCheck:
         """Compare the strategy's states."""
         query = "SELECT generation, state, checksum FROM strategy"
         for number, state, written in self._journal.rows("ibn", query) if self._has_checksums else ():
-            if written not in (None, checksums.state_checksum(state)):
+            if written not in (None, checksums.state_checksum(number, state)):
                 raise self._journal.damage_error(f"the optimiser's state of {number} differs from its checksum")
 
     def check_all(
@@ -92,6 +96,11 @@ class JournalCheck:
         """Compare what belongs to no generation, and that the last generation has the strategy's state before it."""
         if not self._has_checksums:
             return
+        sealed = self._journal.fact(checksums.SEALED)
+        if sealed is not None and sealed != checksums.sealed_text(self._journal.read):
+            raise self._journal.damage_error("generations or evaluations are missing")
+        if self._journal.row(STRAY):
+            raise self._journal.damage_error("a result belongs to no generation")
         rest = self._journal.fact(checksums.REST)
         if rest is not None and rest != checksums.rest_checksum(self._journal.read):
             raise self._journal.damage_error("what belongs to no generation differs from its checksum")
@@ -107,6 +116,7 @@ class JournalCheck:
         is_sound = steps == closed.steps
         if fitness:
             is_sound &= (max(fitness), min(fitness)) == (closed.best, closed.worst)
-            is_sound &= isclose(fmean(fitness), closed.mean, rel_tol=TOLERANCE, abs_tol=TOLERANCE)
+            largest = max(map(abs, fitness))  # of which the rounding of a sum is a part, also where the mean is near 0
+            is_sound &= isclose(fmean(fitness), closed.mean, abs_tol=TOLERANCE * max(largest, 1.0))
         if not is_sound:
             raise self._journal.damage_error(f"generation {closed.number} is not the sum of its results")

@@ -1,0 +1,142 @@
+"""What a journal's checksums find beside changed bits: rows that are lost, exchanged or not of its version."""
+
+import sqlite3
+from contextlib import closing
+from dataclasses import replace
+
+import pytest
+
+from dreamfleet.common.errors import DamagedJournalError, JournalError
+from dreamfleet.common.protocol.messages import Result
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.run_paths import JOURNAL
+from dreamfleet.coordinator.settings.fork import Fork
+from dreamfleet.coordinator.settings.start import find_start
+from dreamfleet.coordinator.storage import recall_records
+from dreamfleet.coordinator.storage.journal import Journal
+from tests.coordinator.run.test_batches import Door
+from tests.coordinator.run.test_failures import SETTINGS, Failing
+
+ENDING = replace(SETTINGS, evaluate_every=1, evaluation_episodes=2)
+
+
+class Scoring(Failing):
+    """Episodes of which a generation's fitness adds up to nearly nothing beside its parts."""
+
+    largest = 1.0
+
+    def answer_one(self, name, job):
+        sign = -1 if job.candidate % 2 else 1
+        fitness = sign * self.largest * (1 + job.candidate // 2 / 3) + 1e-3 * job.candidate
+        self.deliver(name, Result(job.digest, fitness, 10, 0.1, None, None))
+
+
+@pytest.fixture
+def ended(tmp_path, random_bundle):
+    """The folder of a run that ended."""
+    return end(Failing(tmp_path / "night", random_bundle.path, ENDING, fails=lambda _: False))
+
+
+def end(bench):
+    bench.serve()
+    assert bench.run.ended
+    bench.journal.end_incarnation()
+    bench.journal.commit()
+    bench.journal.close()
+    verify(bench.path)
+    return bench.path
+
+
+def verify(folder):
+    with RunFolder(folder) as run:
+        run.verify()
+
+
+def edit(folder, *statements):
+    with closing(sqlite3.connect(folder / JOURNAL)) as connection, connection:
+        for each in statements:
+            connection.execute(each)
+
+
+REST = (
+    "candidate, episode, seed, fitness, steps, seconds, worker, fingerprint, incarnation, host_class, measures "
+    "FROM result LIMIT 1"
+)
+
+
+@pytest.mark.parametrize(
+    "statements",
+    [
+        ("DELETE FROM evaluation WHERE generation = 1",),
+        ("DELETE FROM evaluation",),
+        (f"INSERT INTO result SELECT digest, 'other', generation, {REST}",),
+        (f"INSERT INTO result SELECT digest, kind, 900, {REST}",),
+        # The states before the last two generations change places, with their checksums.
+        ("UPDATE strategy SET generation = -generation", "UPDATE strategy SET generation = 5 + generation"),
+    ],
+)
+def test_rows_that_are_lost_added_or_exchanged_are_damage(ended, statements):
+    edit(ended, *statements)
+    with pytest.raises(DamagedJournalError):
+        verify(ended)
+
+
+@pytest.mark.parametrize("version", [-5, 0, 2, 8, 9])
+def test_a_journal_that_is_not_of_its_version_is_damaged_and_not_migrated(ended, version):
+    edit(ended, f"PRAGMA user_version = {version}")
+    whole = (ended / JOURNAL).read_bytes()
+    with pytest.raises(JournalError):
+        RunFolder(ended)
+    with pytest.raises(JournalError):
+        Journal(ended / JOURNAL)
+    assert (ended / JOURNAL).read_bytes() == whole
+
+
+@pytest.mark.parametrize("begin", [lambda folder: Fork.of(folder.parent, folder.name, ()),
+                                   lambda folder: find_start(folder.name, folder.parent)])  # fmt: skip
+def test_no_run_begins_at_a_damaged_one(ended, begin):
+    edit(ended, "UPDATE result SET steps = steps + 1000 WHERE generation = 1",
+         "DELETE FROM run WHERE key IN ('ended', 'checksum')")  # fmt: skip
+    with pytest.raises(DamagedJournalError):
+        begin(ended)
+
+
+@pytest.mark.parametrize("largest", [1.0, 1e9, 1e90])
+def test_large_scores_that_cancel_out_are_no_damage(tmp_path, random_bundle, largest):
+    bench = Scoring(tmp_path / "night", random_bundle.path, ENDING, fails=lambda _: False)
+    bench.largest = largest
+    end(bench)
+
+
+@pytest.fixture
+def door(tmp_path):
+    made = Door(tmp_path / "search")
+    for name, first in (("a", 0.0), ("b", 500.0)):
+        made.submit(name, first=first)
+    made.step()
+    made.work()
+    made.work()
+    assert made.query("read", id="b").state == "complete"
+    return made
+
+
+def test_batches_that_exchange_their_scores_are_damage(door):
+    door.journal.close()
+    verify(door.path)
+    edit(door.path, "UPDATE batch SET generation = 9 - generation", "UPDATE batch SET generation = generation - 8")
+    with pytest.raises(DamagedJournalError):
+        verify(door.path)
+
+
+def test_a_clock_that_is_set_back_before_a_bar_is_no_damage(door, monkeypatch):
+    with RunFolder(door.path) as run:
+        before = run.candidates()
+    monkeypatch.setattr(recall_records, "time", lambda: 0.0)
+    assert not door.run.bar("a")
+    assert door.run.commit()
+    door.journal.close()
+    verify(door.path)
+    with RunFolder(door.path) as run:
+        assert [each for each in run.candidates() if each.fitness is not None] == [
+            each for each in before if each.fitness is not None
+        ]
