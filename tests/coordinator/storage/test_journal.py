@@ -86,7 +86,8 @@ def test_results_of_an_older_journal_lie_where_those_of_today_do(journal, folder
         kept = old.execute("SELECT * FROM result").fetchall()
         old.executescript(
             "ALTER TABLE generation DROP COLUMN checksum; ALTER TABLE evaluation DROP COLUMN checksum; "
-            "ALTER TABLE strategy DROP COLUMN checksum; ALTER TABLE recalled DROP COLUMN was_closed; DROP TABLE result; "
+            "ALTER TABLE strategy DROP COLUMN checksum; ALTER TABLE recalled DROP COLUMN was_closed; "
+            "DROP TABLE result; "
             "CREATE TABLE result (digest BLOB PRIMARY KEY, kind TEXT NOT NULL, generation INTEGER NOT NULL, candidate "
             "INTEGER NOT NULL, episode INTEGER NOT NULL, seed INTEGER NOT NULL, fitness REAL NOT NULL, steps INTEGER "
             "NOT NULL, seconds REAL NOT NULL, worker TEXT NOT NULL, fingerprint TEXT NOT NULL, incarnation INTEGER "
