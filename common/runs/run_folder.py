@@ -255,6 +255,8 @@ class RunFolder(Displayed):
         with self.read_transaction():
             counts = CandidateCounts(self._journal, self.settings, self.history(), self.evaluations())
             generations = self._journal.rows("ii", "SELECT number, closed IS NULL FROM generation ORDER BY number")
+            if [number for number, _ in generations] != [*range(len(generations))]:
+                raise self._journal.damage_error("a generation is missing")
             return [
                 each
                 for number, is_open in generations

@@ -44,7 +44,7 @@ def test_results_of_another_host_class_are_counted_and_optionally_compared(proce
     replay = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
     code, out, err = processes.call(*replay)
     assert (code, out.count("same bits"), out.count("not checkable here: of class there")) == (0, 1, 1)
-    assert "1 of 2 episodes were scored by hosts of another class" in err
+    assert "1 of 2 episodes was scored by hosts of another class" in err
     found = json.loads(processes.call(*replay, "--json")[1])
     assert (found["identical"], found["unchecked"]) == (False, 1)
     code, out, err = processes.call(*replay, "--tolerance", 1)
