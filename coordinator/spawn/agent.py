@@ -264,6 +264,18 @@ def process_start(pid: int) -> str:
     return "" if facts[0] in "ZX" else f"{boot} {facts[19]}"  # proc_pid_stat(5): state, and the start in ticks
 
 
+def workers_in(folder: Path) -> list[int]:
+    """The processes of workers that were started in a folder, whatever their state says; none without `/proc`."""
+    found = list[int]()
+    for each in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has ended, or is another user's
+            words, pid = (each / "cmdline").read_bytes().split(b"\0"), int(each.name)
+            begun = b"worker" in words and ONCE_KNOWN[2].encode() not in words  # else the shell, which ends by itself
+            if begun and os.getsid(pid) == pid and (each / "cwd").samefile(folder):
+                found.append(pid)
+    return sorted(found)
+
+
 class WorkerProcess:
     """A worker's stored state, and whether it still runs."""
 
@@ -275,21 +287,41 @@ class WorkerProcess:
 
     @property
     def is_elsewhere(self) -> bool:
-        """Whether another host with the same shared folder started it."""
-        return bool(self.state) and self.state["node"] != platform.node()
+        """Whether a host of another name started it, and it does not run here: that name may also be a former one."""
+        return bool(self.state) and self.state["node"] != platform.node() and not self._runs_here
 
     @property
     def is_alive(self) -> bool:
         """Whether the process that was started still runs."""
         with suppress(ChildProcessError):
             os.waitpid(-1, os.WNOHANG)  # reap our own children
-        return bool(self.state) and not self.is_elsewhere and process_start(self.state["pid"]) == self.state["birth"]
+        return bool(self.state) and self._runs_here
+
+    @property
+    def _runs_here(self) -> bool:
+        """Whether its process runs on this host: a start names the boot too, so that no other host's is equal."""
+        return bool(process_start(self.state["pid"]) == self.state["birth"])
 
     @property
     def tunnel_pid(self) -> int:
         """The agent process that holds the worker's tunnel; 0 if there is none or it ended."""
         pid, began = self.state.get("holder", (0, ""))
         return pid if pid and process_start(pid) == began else 0
+
+    def check_known(self) -> None:
+        """`FailedError` with the remedy if it may run although this agent cannot end it."""
+        name = self.folder.name
+        if self.is_elsewhere:
+            raise FailedError(
+                f"worker {name} was started by {self.state['node']}, which shares this folder or is this host's former "
+                "name: give each host a name of its own, or run `dreamfleet down` for that host; if the worker no "
+                f"longer runs, remove it with: rm -rf {shlex.quote(str(self.folder))}"
+            )
+        if not self.state and (found := workers_in(self.folder)):
+            raise FailedError(
+                f"worker {name} runs, and its {STATE} is lost or damaged: end it there with "
+                f"`kill {' '.join(map(str, found))}`, then repeat this"
+            )
 
     def describe(self) -> dict[str, Any]:
         """Its state, as sent to the other side."""
@@ -413,11 +445,7 @@ def start(host_folder: HostFolder, request: dict[str, Any], files: dict[str, byt
             raise FailedError("a worker of this name runs by the tunnel of another command: end that one first")
         if found.is_alive and not request["held"] and found.state["digest"] == request["digest"]:
             return {**found.describe(), "outcome": "running"}
-        if found.is_elsewhere:
-            raise FailedError(
-                f"worker {folder.name} was started by {found.state['node']}, which shares this folder: give each host "
-                "a name of its own, or end that one first"
-            )
+        found.check_known()
         outcome = "replaced" if found.is_alive else "started"
         found.end(host_folder.channel, STOP_DRAINED)
         folder.mkdir(parents=True, exist_ok=True)
@@ -488,14 +516,22 @@ def follow(host_folder: HostFolder, request: dict[str, Any]) -> dict[str, Any]:
 
 
 def end(host_folder: HostFolder, request: dict[str, Any]) -> dict[str, Any]:
-    """End and remove the named workers, or all; remove the whole folder after the last one unless `keep` is set."""
-    channel, ended = host_folder.channel, list[dict[str, Any]]()
+    """End and remove the named workers, or all; remove the whole folder after the last one unless `keep` is set.
+
+    `FailedError` names those that were left alone, once the others have ended.
+    """
+    channel, ended, left = host_folder.channel, list[dict[str, Any]](), list[str]()
     if not host_folder.is_ours:
         return {"ended": ended}
     with host_folder.locked():
         for name in request["names"] or host_folder.names("workers"):
             found = WorkerProcess(host_folder.worker(name))
-            if found.is_elsewhere or not found.folder.exists():
+            if not found.folder.exists():
+                continue
+            try:
+                found.check_known()
+            except FailedError as error:
+                left.append(str(error))
                 continue
             ended += [found.describe()]
             if found.is_alive:
@@ -504,6 +540,8 @@ def end(host_folder: HostFolder, request: dict[str, Any]) -> dict[str, Any]:
             remove_tree(found.folder)
         if not host_folder.names("workers") and not request["keep"]:
             host_folder.remove()
+    if left:
+        raise FailedError("; ".join(left))
     return {"ended": ended}
 
 

@@ -2,7 +2,9 @@
 
 import json
 import os
+import platform
 import shutil
+import signal
 import subprocess
 import sys
 
@@ -116,3 +118,63 @@ def test_what_cannot_be_removed_stays_ours_and_is_named_with_the_command(tmp_pat
     monkeypatch.setattr(shutil, "rmtree", remove)
     agent.handle_request(asked, Channel())
     assert not host_folder.root.exists()
+
+
+@pytest.fixture
+def started(tmp_path):
+    """A request to start a worker, the folder in which it runs already, and its process id."""
+    host_folder = HostFolder(str(tmp_path / "place"), Channel())
+    folder = host_folder.worker("box")
+    with host_folder.locked():
+        folder.mkdir(parents=True)
+    words = [sys.executable, "-c", "import time; time.sleep(1000)", "worker"]
+    child = subprocess.Popen(words, cwd=folder, start_new_session=True)
+    state = {"digest": "1", "slots": 1, "since": 0.0, "node": platform.node(), "pid": child.pid,
+             "birth": agent.process_start(child.pid)}  # fmt: skip
+    (folder / STATE).write_text(json.dumps(state))
+    yield {"do": "start", "root": str(host_folder.root), "name": "box", "held": False, "digest": "1"}, folder, child.pid
+    child.kill()
+    child.wait()
+
+
+def answer(asked, capsys):
+    agent.handle_request(asked, Channel())
+    return json.loads(capsys.readouterr().out.splitlines()[-1].removeprefix(MARK))
+
+
+def ending(asked):
+    return {"do": "end", "root": asked["root"], "names": None, "now": True, "keep": False}
+
+
+def test_a_worker_is_this_hosts_after_the_host_is_renamed(started, capsys, monkeypatch):
+    asked, folder, pid = started
+    monkeypatch.setattr(platform, "node", lambda: "renamed")
+    assert answer(asked, capsys)["ok"]["outcome"] == "running"
+    assert [each["running"] for each in answer(ending(asked), capsys)["ok"]["ended"]] == [True]
+    assert agent.process_start(pid) == ""
+    assert not folder.parents[1].exists()
+
+
+def test_a_worker_of_another_host_is_named_with_the_command_that_removes_it(started, capsys):
+    asked, folder, pid = started
+    state = json.loads((folder / STATE).read_text())
+    (folder / STATE).write_text(json.dumps({**state, "node": "other", "birth": "another"}))
+    for request in (asked, ending(asked)):
+        said = answer(request, capsys)["failed"]
+        assert "other" in said
+        assert said.endswith(f"rm -rf {folder}")
+    assert folder.exists()
+    assert agent.process_start(pid)
+
+
+@pytest.mark.parametrize("damage", [None, '{"pid"'])
+def test_a_worker_that_runs_without_its_state_is_named_and_keeps_its_folder(started, capsys, damage):
+    asked, folder, pid = started
+    (folder / STATE).unlink() if damage is None else (folder / STATE).write_text(damage)
+    for request in (asked, ending(asked)):
+        assert f"`kill {pid}`" in answer(request, capsys)["failed"]
+    assert folder.exists()
+    os.kill(pid, signal.SIGKILL)
+    os.waitpid(pid, 0)
+    assert len(answer(ending(asked), capsys)["ok"]["ended"]) == 1
+    assert not folder.parents[1].exists()
