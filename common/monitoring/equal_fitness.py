@@ -2,37 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable
 
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import is_function_task
-from dreamfleet.common.runs.records import RunSettings, StoredGeneration
+from dreamfleet.common.runs.records import StoredGeneration
 
-ENOUGH = 5  # such generations in a row before a warning
-
-
-def has_equal_fitness(row: StoredGeneration) -> bool:
-    """Whether no candidate of a closed generation failed, and all have one fitness."""
-    return not row.failed and row.best == row.worst
+ENOUGH = 5  # such generations in a row before a warning, and other ones before the next
 
 
-def count_equal_fitness(rows: Sequence[StoredGeneration], settings: RunSettings) -> int:
-    """How many of the last generations in a row have candidates of one fitness; 0 for submitted candidates."""
-    if settings.is_external:
-        return 0
-    return next((number for number, row in enumerate(reversed(rows)) if not has_equal_fitness(row)), len(rows))
+class EqualFitness:
+    """Follows closed generations: how many of the last ones in a row have candidates of one fitness."""
+
+    def __init__(self, rows: Iterable[StoredGeneration] = ()) -> None:
+        self.count = 0
+        self.has_risen = False  # the last generation's worst candidate is better than the worst of all
+        self.is_due = False  # the last generation is one to warn at
+        self._worst, self._others, self._is_warned = math.inf, 0, False
+        for row in rows:
+            self.add(row)
+
+    def add(self, row: StoredGeneration) -> None:
+        """Add the generation that closed next."""
+        is_equal = not row.failed and row.best == row.worst
+        self.count, self._others = (self.count + 1, 0) if is_equal else (0, self._others + 1)
+        self._worst = min(self._worst, row.worst)
+        self.has_risen = row.worst > self._worst
+        self.is_due = self.count >= ENOUGH and not self._is_warned
+        self._is_warned = self.is_due or (self._is_warned and self._others < ENOUGH)
+
+    def describe(self, task: TaskSpec) -> str:
+        """As `describe_equal_fitness`, of the generations so far."""
+        return describe_equal_fitness(self.count, task, has_risen=self.has_risen)
 
 
-def describe_equal_fitness(generations: int, task: TaskSpec) -> str:
+def describe_equal_fitness(generations: int, task: TaskSpec, *, has_risen: bool) -> str:
     """A warning with what helps, after `ENOUGH` such generations in a row; before, empty."""
     if generations < ENOUGH:
         return ""
-    helps = (
-        "let the function differ nearby, or choose a larger scale="
-        if is_function_task(task.task)
-        else "give a reward on the way to the goal, a larger --sigma0 or a longer --horizon"
-    )
-    return (
-        f"all candidates of the last {generations} generations have the same fitness, so nothing guides the search: "
-        f"{helps}"
-    )
+    text = f"all candidates of the last {generations} generations have the same fitness, so nothing guides the search: "
+    if has_risen:
+        return text + "earlier ones had less, so this may be the best that there is"
+    if is_function_task(task.task):
+        return text + "let the function differ nearby, or choose a larger scale="
+    return text + "give a reward on the way to the goal, a larger --sigma0 or a longer --horizon"

@@ -324,6 +324,8 @@ class Status(Displayed):
     # Since the run began, by the wall clock: pauses, and time without coordinator or workers, included.
     elapsed: Seconds | None = field(default=None, metadata=OPTIONAL)
     equal: Count = field(default=0, metadata=OPTIONAL)  # last generations in a row whose candidates have one fitness
+    # The worst candidate of the last generation is better than the worst of all.
+    has_risen: bool = field(default=False, metadata=OPTIONAL)
     open_batches: Count = field(default=0, metadata=OPTIONAL)  # submitted ones that wait or are scored
     ending: bool = field(default=False, metadata=OPTIONAL)  # a limit is reached: only evaluations are left
     # Episodes of evaluations and of the confirmation until the run's end.
@@ -366,7 +368,7 @@ class Status(Displayed):
     @property
     def equal_fitness(self) -> str:
         """A warning that the candidates of the last generations all have one fitness; empty: they do not."""
-        return describe_equal_fitness(self.equal, self.settings.task)
+        return describe_equal_fitness(self.equal, self.settings.task, has_risen=self.has_risen)
 
     @property
     def refusals(self) -> list[str]:

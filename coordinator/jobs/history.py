@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from dreamfleet.common.monitoring.equal_fitness import has_equal_fitness
+from dreamfleet.common.monitoring.equal_fitness import EqualFitness
 from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite
 from dreamfleet.common.runs.records import StoredGeneration
 
@@ -18,7 +18,7 @@ class History:
         self.steps = 0  # environment steps of all generations
         self.seconds = 0.0  # in which they could be scored
         self.failed = 0  # candidates
-        self.equal = 0  # last generations in a row whose candidates all have one fitness
+        self.equal = EqualFitness()
         self.best: float | None = None  # fitness of a candidate
         self.improved = 0  # the last generation whose best candidate beat the one of the last such generation
         self.least_improvement = LEAST_IMPROVEMENT  # of the best fitness that counts
@@ -35,7 +35,7 @@ class History:
             self._level, self.improved = row.best, len(self._rows)
         self.best = row.best if self.best is None else max(self.best, row.best)
         self._rows.append(row)
-        self.equal = self.equal + 1 if has_equal_fitness(row) else 0
+        self.equal.add(row)
         self.steps = clamp_count(self.steps + row.steps)
         self.failed = clamp_count(self.failed + row.failed)
         self.seconds = to_finite(self.seconds + row.seconds)

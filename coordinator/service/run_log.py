@@ -13,7 +13,7 @@ from itertools import islice
 from time import monotonic, time
 from typing import Any
 
-from dreamfleet.common.monitoring.equal_fitness import ENOUGH, describe_equal_fitness, has_equal_fitness
+from dreamfleet.common.monitoring.equal_fitness import EqualFitness
 from dreamfleet.common.monitoring.eta import estimate_eta, summarise_status
 from dreamfleet.common.monitoring.status import Status
 from dreamfleet.common.printable import format_number, plural
@@ -44,7 +44,7 @@ class RunLog:
         self._no_worker_since = now
         self._expiry_at = 0.0
         self._clock_offset = time() - monotonic()
-        self._equal = run.history.equal
+        self._equal = EqualFitness(run.history.rows)
 
     def begin(self) -> None:
         """The run is served from now on."""
@@ -82,10 +82,11 @@ class RunLog:
             self._evaluations_logged = len(evaluations)
 
     def _warn_of_equal_fitness(self, closed: StoredGeneration) -> None:
-        """Warn once per spell of generations whose candidates all have one fitness."""
-        self._equal = self._equal + 1 if has_equal_fitness(closed) else 0
-        if self._equal == ENOUGH and not self._run.settings.is_external:
-            text = describe_equal_fitness(self._equal, self._run.settings.task)
+        """Warn of generations whose candidates all have one fitness; again only after as many others in a row."""
+        equal = self._equal
+        equal.add(closed)
+        if equal.is_due and not self._run.settings.is_external:
+            text = equal.describe(self._run.settings.task)
             log.warning("%s", text, extra={"facts": {"event": "equal fitness", "generation": closed.number}})
 
     def write_notes(self) -> None:

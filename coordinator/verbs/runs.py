@@ -17,7 +17,7 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.files.regular_files import is_folder, path_exists
 from dreamfleet.common.monitoring.elites import EliteArchive
-from dreamfleet.common.monitoring.equal_fitness import count_equal_fitness, describe_equal_fitness
+from dreamfleet.common.monitoring.equal_fitness import EqualFitness
 from dreamfleet.common.monitoring.eta import format_duration
 from dreamfleet.common.printable import format_number, format_setting, plural
 from dreamfleet.common.protocol.function_values import value_of
@@ -133,7 +133,7 @@ def show_run(args: argparse.Namespace) -> int:
             "fingerprint": stored.fingerprint,
             "failed_candidates": count_failed(history),
             "replaced_seeds": (reseeds := stored.count_reseeds(history)),
-            "equal_generations": (equal := count_equal_fitness(history, settings)),
+            "equal_generations": (equal := EqualFitness(() if settings.is_external else history)).count,
         }
         unscored = stored.unscored_generations()
         best = best_evaluation(evaluations)
@@ -154,7 +154,7 @@ def show_run(args: argparse.Namespace) -> int:
         print(json.dumps({**facts, "settings": asdict(settings), "confirmed": reported, **rows}, indent=2))
         return 0
     del facts["lasted_seconds"], facts["replaced_seeds"], facts["equal_generations"]
-    facts |= {"warning": warning} if (warning := describe_equal_fitness(equal, settings.task)) else {}
+    facts |= {"warning": warning} if (warning := equal.describe(settings.task)) else {}
     if duration_seconds is not None:
         facts["ended_at"] = f"{facts['ended_at']}, {format_duration(duration_seconds)} after it began"
     facts["failed_candidates"] = describe_failed(settings, history, reseeds)

@@ -3,9 +3,10 @@
 import json
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 
 from dreamfleet.common.cli import command_line
-from dreamfleet.common.monitoring.equal_fitness import ENOUGH
+from dreamfleet.common.monitoring.equal_fitness import ENOUGH, EqualFitness
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.coordinator.analysis.plot import fitness_figure
 from dreamfleet.coordinator.verbs import runs as verb
@@ -39,5 +40,7 @@ def test_a_limit_of_the_environment_below_the_horizon_is_said(runs, capsys):
 
 def test_generations_of_one_fitness_are_warned_of(runs, capsys, monkeypatch):
     assert "warning" not in show(capsys, runs, "reality")
-    monkeypatch.setattr(verb, "count_equal_fitness", lambda *_: ENOUGH)
+    monkeypatch.setattr(
+        verb, "EqualFitness", lambda rows: EqualFitness([replace(rows[0], worst=rows[0].best)] * ENOUGH)
+    )
     assert "--sigma0" in show(capsys, runs, "reality")["warning"]

@@ -232,7 +232,7 @@ def test_a_workers_status_holds_its_job_seconds_round_trip_and_resent_batches(be
 
 
 def test_generations_of_one_fitness_are_counted_and_warned_of_once(tmp_path, random_bundle, caplog):
-    bench = Bench(tmp_path / "equal", random_bundle.path, SCORED, generations=8)
+    bench = Bench(tmp_path / "equal", random_bundle.path, SCORED, generations=20)
     log = RunLog(bench.run, "night", Network(), bench.now)
     for closed in range(7):
         score(bench, 8, lambda job: 1.0)
@@ -244,4 +244,12 @@ def test_generations_of_one_fitness_are_counted_and_warned_of_once(tmp_path, ran
     score(bench, 8)
     assert snapshot_of(bench).status.equal == 0
     assert not read_status(answered(snapshot_of(bench))).equal_fitness
+    log.report_closed([bench.run.history.last])
+    for _ in range(ENOUGH):
+        score(bench, 8, lambda job: 500.0)
+        log.report_closed([bench.run.history.last])
+    assert snapshot_of(bench).status.has_risen
+    assert snapshot_of(bench).status.equal == ENOUGH
+    warned = [each.facts for each in caplog.records if getattr(each, "facts", {}).get("event") == "equal fitness"]
+    assert len(warned) == 1, "one generation of other fitness in between makes no second warning"
     bench.journal.close()
