@@ -20,7 +20,13 @@ from dreamfleet.common.errors import AccessError, UsageError
 from dreamfleet.common.host.logs import set_log_format
 from dreamfleet.common.host.trusted_modules import PLACES, trust
 from dreamfleet.common.protocol.tasks import module_of
-from dreamfleet.common.security.credentials import EXPIRY_WARNING, Credentials, describe_time_left, read_join_file
+from dreamfleet.common.security.credentials import (
+    EXPIRY_WARNING,
+    Credentials,
+    describe_time_left,
+    issue_command,
+    read_join_file,
+)
 from dreamfleet.common.transport.network import DEFAULT_ENDPOINT, Network, check_endpoint
 
 log = logging.getLogger(__name__)
@@ -124,7 +130,7 @@ def load_credentials(args: argparse.Namespace, roles: Collection[str] = ()) -> C
     if roles and credentials.role not in roles:
         raise AccessError(
             f"{path} is for the role {credentials.role}, and this needs {' or '.join(roles)}: have it issued "
-            f"with `dreamfleet access issue {next(iter(roles))} NAME --out FILE`"
+            f"with `{issue_command(next(iter(roles)), 'NAME')}`"
         )
     check_certificate(credentials)
     left = credentials.time_left(datetime.now(UTC))

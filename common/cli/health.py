@@ -16,6 +16,7 @@ from dreamfleet.common.cli.task_check import try_task
 from dreamfleet.common.errors import AccessError, CacheError, DreamfleetError
 from dreamfleet.common.files.file_system import file_system_type, is_network, lock_problem
 from dreamfleet.common.host.packages import PACKAGES, install_command, package_version, wrong_version
+from dreamfleet.common.security.certificate_check import check_certificate
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, describe_time_left, read_join_file
 
 GROUP = "dreamfleet.checks"
@@ -70,6 +71,7 @@ def _check_join_file(path: Path) -> Finding:
     """Whether a join file is valid; not ok within `EXPIRY_WARNING` of its end."""
     try:
         credentials = read_join_file(path)
+        check_certificate(credentials)
     except AccessError as error:
         return Finding("join file", False, True, str(error), "everything", "have another issued")
     left = credentials.time_left(datetime.now(UTC))

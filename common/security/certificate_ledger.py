@@ -13,7 +13,7 @@ from pathlib import Path
 from dreamfleet.common.errors import AccessError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import read_regular
-from dreamfleet.common.security.credentials import Credentials, identity
+from dreamfleet.common.security.credentials import Credentials, identity, issue_command
 from dreamfleet.common.serialization.validation import MalformedError, Moment, from_plain
 
 log = logging.getLogger(__name__)
@@ -132,7 +132,7 @@ class RevocationWatcher:
         if is_revoked or own.time_left(datetime.now(UTC)) <= timedelta():
             raise AccessError(
                 f"the join file of {own.identity} ({own.name}) {'is revoked' if is_revoked else 'has expired'}: have "
-                f"another issued with `dreamfleet access issue {own.role} {own.name} --out FILE`"
+                f"another issued with `{issue_command(own.role, own.name)}`"
             )
 
     def reload_if_changed(self, now: float) -> None:

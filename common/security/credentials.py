@@ -75,6 +75,12 @@ class Credentials:
         return self.expires - now
 
 
+def issue_command(role: str, name: str) -> str:
+    """The command by which a join file of this role is issued, in full; a listener is reached by names."""
+    reached = "--host HOST" if role in LISTENERS else "--connect tls/HOST:7447"
+    return f"dreamfleet access issue {role} {name} {reached} --out FILE"
+
+
 def identity(role: str, seat: int) -> str:
     """The identity of a seat at the router."""
     return f"{role}.{seat}"

@@ -1,14 +1,17 @@
 """A join file that was edited, or is used while the clock is wrong, is found before it is used."""
 
+import shlex
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
 import pytest
 
 from dreamfleet.common.cli.command_line import main
+from dreamfleet.common.cli.health import _check_join_file
 from dreamfleet.common.errors import AccessError
+from dreamfleet.common.security.authority import Authority
 from dreamfleet.common.security.certificate_check import check_certificate
-from dreamfleet.common.security.credentials import format_join_file, read_join_file
+from dreamfleet.common.security.credentials import SEATS, format_join_file, issue_command, read_join_file
 from tests.support.access import Access
 
 ROLES = ("coordinator", "first", "viewer", "operator")
@@ -60,6 +63,22 @@ def test_every_verb_refuses_an_edited_file(access, tmp_path, capsys, verb):
     path.write_text(format_join_file(replace(whole, seat=7, role=role)))
     assert main([verb, "--join", str(path)]) == 1
     assert f"{whole.role}.{whole.seat}" in capsys.readouterr().err
+
+
+def test_doctor_finds_an_edited_file_unusable(access, tmp_path):
+    path = tmp_path / "edited.join"
+    path.touch(mode=0o600)
+    path.write_text(format_join_file(replace(read_join_file(access.path("first")), seat=7)))
+    found = [_check_join_file(each) for each in (path, access.path("first"))]
+    assert [(each.ok, each.needed) for each in found] == [(False, True), (True, False)]
+
+
+@pytest.mark.parametrize("role", SEATS)
+def test_the_command_that_an_error_names_issues_a_file(tmp_path, role):
+    Authority.create(tmp_path / "access")
+    words = shlex.split(issue_command(role, "box").replace("FILE", str(tmp_path / "join")))
+    assert main([*words[1:], "--access-dir", str(tmp_path / "access")]) == 0
+    assert read_join_file(tmp_path / "join").role == role
 
 
 @pytest.mark.parametrize("days", [-91, 3])
