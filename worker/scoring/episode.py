@@ -68,10 +68,19 @@ class OpenEpisode:
         """Take one step with an action.
 
         The episode is over when the environment ends it, after `horizon` steps, or after `patience` steps without a
-        positive reward.
+        positive reward. `ValueError` if the environment fails at an action that is not finite because of what was seen.
         """
         seen = self.observation
-        self.observation, given, terminated, truncated, info = self._environment.step(action)
+        try:
+            answer = self._environment.step(action)
+        except Exception as error:
+            if _is_finite(action) or _is_finite(seen):
+                raise
+            raise ValueError(
+                "an observation holds NaN, infinity or a number beyond 3.4e38, which is infinite in the single "
+                f"precision of controllers, and so the action is NaN: {type(error).__name__}"
+            ) from error
+        self.observation, given, terminated, truncated, info = answer
         reward = float(given)
         self._steps += 1
         self._idle = 0 if reward > 0 else self._idle + 1
@@ -186,6 +195,15 @@ def score_together(
             policies.keep(rows)
             open_ones = [open_ones[row] for row in rows]
     return [each.score() for each in tallies]
+
+
+def _is_finite(value: Any) -> bool:
+    """Whether all numbers are finite in single precision; also of what is no array of numbers."""
+    try:
+        with np.errstate(over="ignore"):
+            return bool(np.isfinite(np.asarray(value, np.float32)).all())
+    except (TypeError, ValueError):
+        return True
 
 
 def _check_finite(parameters: NDArray[np.float32]) -> None:

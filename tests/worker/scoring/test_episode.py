@@ -130,3 +130,44 @@ def test_a_sum_that_is_not_finite_is_an_error(value):
         score(Scripted([1.0]), Still(), np.full(3, value, np.float32), EpisodeConfig(1, 10))
     with pytest.raises(ValueError, match="add up"):
         score(Scripted([value]), Still(), PARAMETERS, EpisodeConfig(1, 10))
+
+
+class Demanding(Scripted):
+    """An environment that takes finite actions alone, and begins with a given observation."""
+
+    def __init__(self, first):
+        super().__init__([1.0])
+        self._first = first
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.array([self._first]), {}
+
+    def step(self, action):
+        if not np.isfinite(action).all():
+            raise ZeroDivisionError
+        return super().step(action)
+
+
+class Copying(Still):
+    def act(self, observation):
+        return np.float32(observation) * np.float32(0)
+
+
+class Lost(Still):
+    def act(self, observation):
+        return np.full(1, np.nan)
+
+
+@pytest.mark.parametrize("first", [1e300, np.nan, -np.inf])
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
+def test_a_failure_at_an_action_that_an_observation_made_nan_names_the_observation(first):
+    with pytest.raises(ValueError, match=r"3\.4e38") as caught:
+        score(Demanding(first), Copying(), PARAMETERS, EpisodeConfig(1, 10))
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
+
+
+def test_other_failures_of_an_environment_stay_as_they_are():
+    assert score(Demanding(1.0), Copying(), PARAMETERS, EpisodeConfig(1, 10)).steps == 1
+    with pytest.raises(ZeroDivisionError):
+        score(Demanding(1.0), Lost(), PARAMETERS, EpisodeConfig(1, 10))
