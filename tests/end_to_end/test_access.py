@@ -227,7 +227,8 @@ def test_a_worker_that_is_revoked_counts_no_more_while_the_run_goes_on(processes
 
 
 @pytest.mark.slow
-def test_a_coordinator_whose_own_file_is_revoked_leaves_and_does_not_come_back(processes, access, endpoint):
+def test_a_coordinator_whose_own_file_is_revoked_leaves_and_does_not_come_back(processes, tmp_path, endpoint):
+    access = Access(tmp_path / "access")  # others need a coordinator's file that serves
     coordinator = begin(processes, access, endpoint, None, "--generations", 10_000)
     assert processes.call("access", "revoke", "home", "--access-dir", access.folder)[0] == 0
     assert coordinator.finish()[0] == 1

@@ -146,7 +146,7 @@ def test_bad_requests_are_refused_with_a_reason_and_lose_nothing(bridge):
     refused(413, b" " * (65 << 20), "split the batch")
     refused(415, good, "Content-Type: application/json", **{"Content-Type": "text/plain"})
     assert bridge.submit(good, run="nobody")[0] == 404
-    assert bridge.submit(good, run="NO")[0] == 400
+    assert bridge.submit(good, run="a%20b")[0] == 400
     assert bridge.batch("other")[0] == 404
     assert bridge.ask("GET", "/v1/runs/test/batches/other/events")[0] == 404
     assert bridge.ask("DELETE", "/v1/runs/test/batches/other")[0] == 404

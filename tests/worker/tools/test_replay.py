@@ -147,7 +147,7 @@ def test_a_candidate_that_failed_is_driven_again_and_its_cause_compared(processe
     change_failures(folder, "slot crashed (killed by SIGSEGV)")
     code, out, err = processes.call(*replay)
     assert (out.count("not driven again"), "DIFFERS" in out, "Traceback" in err) == (failed, False, False)
-    assert "crashed or hung their process" in err
+    assert "crashed or hung the process" in err
 
 
 @pytest.mark.slow
