@@ -38,8 +38,8 @@ class ScoringParams:
     def job_digests(self, vectors: Iterable[bytes], seeds: Sequence[int]) -> Iterator[list[bytes]]:
         """The digests of each candidate's jobs, one a seed, from its float32 vector.
 
-        R1: a digest names the vector and the seed, so it tells a result that counts from one of a discarded vector or
-        of a replaced seed, which has the same place.
+        R1: a digest names the vector and the seed, so a result that counts has another one than that of a
+        discarded vector or of a replaced seed in the same place.
         """
         texts = [self.episode_spec(each).digest_text("score", (seed,)) for each, seed in enumerate(seeds)]
         for vector in vectors:
