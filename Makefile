@@ -9,7 +9,7 @@ SOURCES := pyproject.toml constraints.txt $(wildcard worker/car_racing/native/*)
 # Every process of every test would compile our modules again where an environment forbids the cache.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-doom test-newest slow setup check wheel long box2d-py simulate chaos weekend fuzz sanitize bundle worker-size \
+.PHONY: demo test test-doom test-newest short slow setup check wheel long box2d-py simulate chaos weekend fuzz sanitize bundle worker-size \
   stranger reproduce reproduce-evolution lock audit sbom structure words site reference clean
 
 demo: $(VENV)/.demo $(if $(filter takecover,$(WORLD)),$(VENV)/.demo-doom)  ## evolve a controller here (WORLD=takecover: there), judge it, plot it, record it
@@ -29,13 +29,22 @@ test-doom: $(VENV)/.doom  ## the tests that play Doom; they need the package viz
 	$(BIN)/pytest -m "needs_doom and not long" --numprocesses 2 --dist worksteal $(ARGS)
 
 NEWEST ?= $(shell deploy/newest_python.sh)
-test-newest:  ## a short part of the tests on the newest Python that is here, in an environment of its own
+test-newest:  ## a short part of the tests, those without torch, on the newest Python that is here, in its own environment
 	@if [ -z "$(NEWEST)" ]; then echo "neither Python 3.13 nor 3.12 is here: nothing was run"; \
-	else $(MAKE) test VENV=.venv-newest PYTHON=$(NEWEST) ARGS="$(SHORT) $(ARGS)"; fi
+	else $(MAKE) short VENV=.venv-newest PYTHON=$(NEWEST); fi
 # What another version of Python breaks first: syntax, dataclasses, threads and processes, pickles, warnings, one run.
 SHORT := tests/common/files tests/common/host tests/common/protocol tests/common/serialization tests/common/cli/test_config.py \
   tests/coordinator/settings tests/coordinator/storage tests/coordinator/run tests/coordinator/experiments/test_minimise.py \
   tests/worker/service tests/worker/scoring tests/test_structure.py
+WITHOUT_TORCH := --ignore tests/worker/scoring/test_other_processors.py \
+  --deselect tests/worker/service/test_slot_pool.py::test_a_torch_device_that_is_not_there_ends_the_worker_at_once
+
+short: $(VENV)/.short  # of `test-newest`
+	$(BIN)/pytest -m "not slow and not long" --numprocesses 3 --dist worksteal $(SHORT) $(WITHOUT_TORCH) $(ARGS)
+
+$(VENV)/.short: $(VENV)/bin/python $(SOURCES)
+	$(PIP) --editable '.[short-tests]'
+	touch $@
 
 setup: $(VENV)/.dev  ## everything that development needs
 

@@ -2,35 +2,93 @@
 
 import io
 from dataclasses import replace
+from math import sqrt
 
 import numpy as np
-import torch
 
 from dreamfleet.common.artifacts.bundle import (
     DECODER,
     DREAM_GRAPH,
     ENCODER,
     INITIAL_LATENTS_PART,
+    LAYERED_CONTROLLER,
+    LINEAR_CONTROLLER,
+    POLICY,
     RECORDED_STATES,
     BundleManifest,
     write_bundle,
 )
 from dreamfleet.common.serialization.optional_fields import to_dict
-from dreamfleet.worker.training.assemble import export_graphs, make_manifest
-from dreamfleet.worker.worldmodel.export import export_decoder, export_dream, export_encoder
-from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
+from dreamfleet.worker.training.data.dataset import find_world, preprocessing_of_size
+from dreamfleet.worker.worldmodel.export import (
+    export_controller,
+    export_decoder,
+    export_dream,
+    export_encoder,
+    export_policy,
+)
 from dreamfleet.worker.worldmodel.mdnrnn_config import REWARDED
-from dreamfleet.worker.worldmodel.vae import VAE
 from dreamfleet.worker.worldmodel.vae_config import PAPER
 
 
-def random_models(seed=0, vae=PAPER, rnn=REWARDED):
-    torch.manual_seed(seed)
-    models = VAE(vae), MDNRNN(rnn)
-    for name, values in models[0].state_dict().items():
-        if "running" in name:  # as after training
-            values.uniform_(0.5, 1.5)
-    return models[0].eval(), models[1].eval()
+class RandomWeights(dict):
+    """Weights by their names in torch, each uniform within 1 / sqrt(inputs), as torch begins."""
+
+    def __init__(self, seed):
+        super().__init__()
+        self._random = np.random.default_rng(seed)
+
+    def draw(self, name, shape, inputs):
+        self[name] = self._random.uniform(-1, 1, shape).astype(np.float32) / np.float32(sqrt(inputs))
+
+    def add_layer(self, name, shape, inputs, outputs):
+        self.draw(f"{name}.weight", shape, inputs)
+        self.draw(f"{name}.bias", outputs, inputs)
+
+    def add_dense(self, name, inputs, outputs):
+        self.add_layer(name, (outputs, inputs), inputs, outputs)
+
+    def add_norm(self, name, channels):
+        """As after training."""
+        self[f"{name}.weight"] = np.ones(channels, np.float32)
+        self[f"{name}.bias"] = np.zeros(channels, np.float32)
+        for running in ("running_mean", "running_var"):
+            self[f"{name}.{running}"] = self._random.uniform(0.5, 1.5, channels).astype(np.float32)
+        self[f"{name}.num_batches_tracked"] = np.array(1)
+
+
+def random_vae_weights(seed=0, vae=PAPER):
+    weights = RandomWeights(seed)
+    for number, layer in enumerate(vae.down):
+        name = f"encoder.{number * vae.modules_a_layer}"
+        shape = (layer.outputs, layer.inputs, layer.kernel, layer.kernel)
+        weights.add_layer(name, shape, layer.inputs * layer.kernel**2, layer.outputs)
+        if vae.batch_norm:
+            weights.add_norm(f"encoder.{number * vae.modules_a_layer + 1}", layer.outputs)
+    weights.add_dense("mu", vae.flat, vae.latent)
+    weights.add_dense("logvar", vae.flat, vae.latent)
+    weights.add_dense("dense", vae.latent, vae.up[0].inputs * vae.decoder_sides[0] ** 2)
+    for number, layer in enumerate(vae.up):
+        name = f"decoder.{number * vae.modules_a_layer}"
+        shape = (layer.inputs, layer.outputs, layer.kernel, layer.kernel)
+        weights.add_layer(name, shape, layer.outputs * layer.kernel**2, layer.outputs)
+        if vae.batch_norm and number < len(vae.up) - 1:
+            weights.add_norm(f"decoder.{number * vae.modules_a_layer + 1}", layer.outputs)
+    return weights
+
+
+def random_rnn_weights(seed=0, rnn=REWARDED):
+    weights = RandomWeights(seed)
+    weights.draw("lstm.weight_ih_l0", (4 * rnn.hidden, rnn.lstm_inputs), rnn.hidden)
+    weights.draw("lstm.weight_hh_l0", (4 * rnn.hidden, rnn.hidden), rnn.hidden)
+    weights.draw("lstm.bias_ih_l0", 4 * rnn.hidden, rnn.hidden)
+    weights["lstm.bias_hh_l0"] = np.zeros(4 * rnn.hidden, np.float32)  # one bias as in the sources
+    weights.add_dense("heads", rnn.hidden, rnn.outputs)
+    if rnn.window:
+        weights.add_dense("keys", rnn.latent + rnn.actions, rnn.attention_units)
+        weights.draw("query.weight", (rnn.attention_units, rnn.hidden), rnn.hidden)
+        weights.draw("score.weight", (1, rnn.attention_units), rnn.attention_units)
+    return weights
 
 
 def npy(array):
@@ -39,23 +97,22 @@ def npy(array):
     return buffer.getvalue()
 
 
-def weights(model):
-    return {name: tensor.detach().numpy() for name, tensor in model.state_dict().items()}
-
-
 def states(count, vae=PAPER, rnn=REWARDED, seed=0):
     """So many made-up recorded states, as a bundle holds them."""
     return np.random.default_rng(seed).uniform(-1, 1, (count, 2 * vae.latent + rnn.state)).astype(np.float16)
 
 
 def write_random_bundle(path, seed=0, vae=PAPER, rnn=REWARDED, initial=None, recorded=None):
-    models = [weights(each) for each in random_models(seed, vae, rnn)]
-    if initial is None:
-        initial = np.random.default_rng(seed).normal(size=(4, 2, vae.latent)).astype(np.float32)
-    parts = export_graphs(*models, initial, vae, rnn)
-    if recorded is not None:
-        parts[RECORDED_STATES] = npy(recorded)
-    return write_bundle(path, make_manifest("random", {"seed": seed}, vae, rnn), parts)
+    """A bundle of CarRacing, with graphs that hold a controller."""
+    weights = random_vae_weights(seed, vae), random_rnn_weights(seed, rnn)
+    actions = find_world().world.actions
+    more = {
+        POLICY: export_policy(*weights, vae, rnn, actions),
+        LINEAR_CONTROLLER: export_controller(actions, hidden=False),
+        LAYERED_CONTROLLER: export_controller(actions, hidden=True),
+    }
+    preprocessing = preprocessing_of_size(vae.picture).name
+    return _write(path, "car-racing", preprocessing, seed, vae, rnn, weights, initial, recorded, more)
 
 
 def write_world_bundle(
@@ -64,11 +121,16 @@ def write_world_bundle(
 ):  # fmt: skip
     """A bundle of a world that its manifest describes by `facts`; its MDN-RNN takes the world's actions."""
     rnn = replace(rnn, actions=facts.actions.actions)
-    vae_weights, rnn_weights = (weights(each) for each in random_models(seed, vae, rnn))
-    initial = np.random.default_rng(seed).normal(size=(4, 2, vae.latent)).astype(np.float32)
+    weights = random_vae_weights(seed, vae), random_rnn_weights(seed, rnn)
+    return _write(path, task, preprocessing, seed, vae, rnn, weights, None, recorded, facts=facts)
+
+
+def _write(path, task, preprocessing, seed, vae, rnn, weights, initial, recorded, more=(), facts=None):
+    if initial is None:
+        initial = np.random.default_rng(seed).normal(size=(4, 2, vae.latent)).astype(np.float32)
     parts = {
-        ENCODER: export_encoder(vae_weights, vae), DECODER: export_decoder(vae_weights, vae),
-        DREAM_GRAPH: export_dream(rnn_weights, rnn), INITIAL_LATENTS_PART: npy(initial),
+        ENCODER: export_encoder(weights[0], vae), DECODER: export_decoder(weights[0], vae),
+        DREAM_GRAPH: export_dream(weights[1], rnn), INITIAL_LATENTS_PART: npy(initial), **dict(more),
     }  # fmt: skip
     if recorded is not None:
         parts[RECORDED_STATES] = npy(recorded)

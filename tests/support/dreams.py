@@ -3,7 +3,6 @@
 import dataclasses
 
 import numpy as np
-import torch
 
 from dreamfleet.common.artifacts.actions import Continuous, grouped, one_hot
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, write_bundle
@@ -11,7 +10,7 @@ from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts, WorldF
 from dreamfleet.worker.worldmodel.export import export_dream
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
-from tests.support.bundles import random_models, weights, write_random_bundle, write_world_bundle
+from tests.support.bundles import random_rnn_weights, write_random_bundle, write_world_bundle
 
 VAE = VAEConfig(latent=3, channels=(2, 2, 2, 2))
 ABOUT = {"packages": ("numpy", "onnxruntime"), "horizon": 200, "frames_per_second": 10}
@@ -46,10 +45,9 @@ def write_bundle_of(world, path, recorded=None, **options):
 def with_end(bundle, path, probability, **facts):
     """The bundle with a model that predicts the end with this probability at every step, and changed facts."""
     rnn = MDNRNNConfig(**bundle.manifest.models["mdnrnn"])
-    _, model = random_models(0, VAE, rnn)
-    with torch.no_grad():
-        model.heads.weight[-1] = 0.0
-        model.heads.bias[-1] = float(np.log(probability / (1 - probability)))
+    weights = random_rnn_weights(0, rnn)
+    weights["heads.weight"][-1] = 0.0
+    weights["heads.bias"][-1] = np.log(probability / (1 - probability))
     parts = {name: bundle.read(name) for name in bundle.manifest.parts}
     manifest = dataclasses.replace(bundle.manifest, world=dataclasses.replace(bundle.manifest.world, **facts))
-    return write_bundle(path, manifest, {**parts, DREAM_GRAPH: export_dream(weights(model), rnn)})
+    return write_bundle(path, manifest, {**parts, DREAM_GRAPH: export_dream(weights, rnn)})

@@ -49,7 +49,7 @@ from dreamfleet.worker.training.torch_setup import on_one_thread
 from dreamfleet.worker.worldmodel.mdnrnn import reward_labels
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
-from tests.support.bundles import random_models, weights
+from tests.support.bundles import random_rnn_weights, random_vae_weights
 from tests.support.drives import write_drives
 from tests.support.processes import processes_in
 from tests.support.variants import VARIANTS, vectors
@@ -123,7 +123,8 @@ def made_bundle(path, vae, rnn):
         low, high = (0.5, 1.5) if "running" in name else (-1.0, 1.0)
         return random.uniform(low, high, array.shape).astype(np.float32)
 
-    models = [{n: made(n, a) for n, a in sorted(weights(each).items())} for each in random_models(vae=vae, rnn=rnn)]
+    drawn = random_vae_weights(vae=vae), random_rnn_weights(rnn=rnn)  # their names and shapes
+    models = [{name: made(name, array) for name, array in sorted(each.items())} for each in drawn]
     initial = random.uniform(-1, 1, (4, 2, vae.latent)).astype(np.float32)
     parts = export_graphs(*models, initial, vae, rnn)
     return write_bundle(path, make_manifest("made", {"seed": 3}, vae, rnn), parts)

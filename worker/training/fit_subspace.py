@@ -49,6 +49,7 @@ ACTION_WINDOWS = (
 NEXT_WINDOW = (0, 5)  # of other actions
 REWARD_WINDOWS = ((0, 6), (6, 20), (20, 40))
 LEAST_STEPS = 500  # usable steps of all drives, since [z, h] has hundreds of columns
+LEAST_VARIANCE = 0.001  # of a view, after whitening: what varies less is rounding beside the ridge
 MIN_R_SQUARED = 0.05  # on held-out drives, for a predictable target
 VIEW_STEPS = 15  # steps ahead that a view predicts
 
@@ -174,8 +175,10 @@ def _canonical_features(fit: LeastSquaresSums, held_out: LeastSquaresSums, count
     left, _, right = np.linalg.svd(whitened[0] @ shared @ whitened[1])
     now, then = whitened[0] @ left[:, :count], whitened[1] @ right[:count].T
     spread, shared, later = _covariances(held_out)
-    sizes = (now * (spread @ now)).sum(axis=0) * (then * (later @ then)).sum(axis=0)
-    correlated = (now * (shared @ then)).sum(axis=0) ** 2 / sizes
+    variances = [(now * (spread @ now)).sum(axis=0), (then * (later @ then)).sum(axis=0)]
+    varies = np.minimum(*variances) >= LEAST_VARIANCE
+    products = np.where(varies, variances[0] * variances[1], np.inf)
+    correlated = (now * (shared @ then)).sum(axis=0) ** 2 / products
     kept = correlated >= MIN_R_SQUARED
     signs = np.sign(now[np.abs(now).argmax(axis=0), np.arange(now.shape[1])])  # an arbitrary sign, fixed here
     solved = np.concatenate([now * signs, np.zeros((1, now.shape[1]))])[:, kept]

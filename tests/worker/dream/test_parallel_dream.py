@@ -9,7 +9,8 @@ from dreamfleet.worker.training.assemble import export_graphs, make_manifest
 from dreamfleet.worker.worldmodel.inference import DreamStep
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae import VAEConfig
-from tests.support.bundles import random_models, weights, write_random_bundle
+from tests.support.bundles import write_random_bundle
+from tests.support.models import random_models, weights
 
 TINY = VAEConfig(latent=3, channels=(2, 2, 2, 2))
 

@@ -91,7 +91,7 @@ def test_a_variant_dreams_the_same_bits_alone_in_any_batch_and_step_by_step(rand
 
 def test_rows_that_end_do_not_change_the_others(tmp_path):
     rnn = MDNRNNConfig(latent=3, hidden=4, done=True)
-    plain = write_random_bundle(tmp_path / "b.zip", vae=VAEConfig(latent=3, channels=(2, 2, 2, 2)), rnn=rnn)
+    plain = write_random_bundle(tmp_path / "b.zip", 5, VAEConfig(latent=3, channels=(2, 2, 2, 2)), rnn)
     bundle = plain.with_controllers(None, VARIANTS["all"])
     dreamer = DreamBatch(bundle, spec(bundle, temperature=3.0))
     dreams = [(vector, seed) for vector in candidates(bundle, 20) for seed in range(3)]

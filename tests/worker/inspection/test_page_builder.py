@@ -15,7 +15,8 @@ from dreamfleet.worker.inspection.page_builder import InspectionSubject, find_su
 from dreamfleet.worker.worldmodel.inference import DreamStep
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae import VAEConfig
-from tests.support.bundles import random_models, write_random_bundle
+from tests.support.bundles import write_random_bundle
+from tests.support.models import random_models
 
 PNG = b"\x89PNG\r\n\x1a\n"
 VAE = VAEConfig(latent=5, channels=(4, 4, 4, 8))

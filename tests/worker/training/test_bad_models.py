@@ -20,8 +20,9 @@ from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, PolicyStep
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
-from tests.support.bundles import npy, random_models, weights
+from tests.support.bundles import npy
 from tests.support.drives import write_drives
+from tests.support.models import random_models, weights
 
 LAYERS, RNN = VAEConfig(latent=4, channels=(4, 4, 8, 8)), MDNRNNConfig(latent=4, hidden=8, mixtures=2)
 SHORT = TrainConfig(updates=2, batch=8, rate=1e-3)

@@ -18,8 +18,9 @@ from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.training.unbundle import unbundle
 from dreamfleet.worker.worldmodel.mdnrnn_config import ATTENTIVE, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
-from tests.support.bundles import random_models, weights, write_random_bundle
+from tests.support.bundles import write_random_bundle
 from tests.support.drives import write_drives
+from tests.support.models import random_models, weights
 
 EYES = VAEConfig(latent=4, channels=(2, 3, 2, 2))
 MEMORY = MDNRNNConfig(latent=4, hidden=6)

@@ -12,7 +12,8 @@ from dreamfleet.common.errors import BundleError
 from dreamfleet.worker.worldmodel.inference import DreamStep, PolicyStep
 from dreamfleet.worker.worldmodel.mdnrnn_config import ARTICLE, ATTENTIVE, NOTEBOOK, PAPER, REWARDED, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
-from tests.support.bundles import random_models, write_random_bundle
+from tests.support.bundles import write_random_bundle
+from tests.support.models import random_models
 
 ROWS = 256
 SMALL = {"latent": 4, "hidden": 8, "mixtures": 3, "attention_units": 6}

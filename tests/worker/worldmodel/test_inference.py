@@ -11,7 +11,7 @@ from dreamfleet.common.artifacts.bundle import POLICY, write_bundle
 from dreamfleet.common.artifacts.controller import act
 from dreamfleet.common.errors import BundleError
 from dreamfleet.worker.worldmodel.inference import Decoder, Encoder, PolicyStep, open_part
-from tests.support.bundles import random_models
+from tests.support.models import random_models
 
 ROWS = 64
 

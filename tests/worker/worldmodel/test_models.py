@@ -15,7 +15,8 @@ from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, reward_labels
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae import VAE, Up
 from dreamfleet.worker.worldmodel.vae_config import ConvolutionLayer, VAEConfig
-from tests.support.bundles import random_models, write_random_bundle
+from tests.support.bundles import write_random_bundle
+from tests.support.models import random_models
 
 TINY = {"latent": 4, "channels": (4, 4, 8, 8)}
 VAES = {
