@@ -33,7 +33,8 @@ class Part:
         cache = Path("build/ci") / self.name
         record = cache / "v/cache/lastfailed"
         record.unlink(missing_ok=True)
-        arguments = [f"ARGS=-o cache_dir={cache} --durations=20"] if self.name in VENVS else []
+        options = f"ARGS=-o cache_dir={cache} --durations=20 --junit-xml={cache}/times.xml"  # the seconds of each test
+        arguments = [options] if self.name in VENVS else []
         passed = subprocess.run(["make", self.name, *arguments], check=False).returncode == 0
         if not passed:
             tests = sorted(json.loads(record.read_text())) if record.exists() else []

@@ -54,7 +54,7 @@ def check_page(processes, cell):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("optimiser", ["cma-me", "map-elites"])
+@pytest.mark.parametrize("optimiser", [pytest.param("cma-me", marks=pytest.mark.long), "map-elites"])
 def test_a_killed_run_goes_on_to_the_same_archive(processes, settings, optimiser):
     flags = (*settings, "--optimiser", optimiser)
     whole = processes.coordinator(*flags, name="whole")

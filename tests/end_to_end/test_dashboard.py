@@ -16,6 +16,7 @@ from pathlib import Path
 from statistics import median
 
 import pytest
+from playwright.sync_api import TimeoutError as SlowPageError
 
 from dreamfleet.common.host.processes import command
 from tests.support import tasks
@@ -59,19 +60,23 @@ def page(browser, processes):
         yield page
 
 
+def until(page, script, arg):
+    try:
+        page.wait_for_function(script, arg=arg, timeout=PATIENCE, polling=200)  # also without a frame
+    except SlowPageError as error:
+        error.add_note(f"said: {page.said}; shown: {page.locator('body').inner_text()[:2000]}")
+        raise
+
+
 def wait(page, text, part="state"):
-    page.wait_for_function(
-        "([part, text]) => document.querySelector(`[data-part=${part}]`)?.textContent.includes(text)", arg=[part, text],
-        timeout=PATIENCE,
-    )  # fmt: skip
+    until(page, "([part, text]) => document.querySelector(`[data-part=${part}]`)?.textContent.includes(text)",
+          [part, text])  # fmt: skip
 
 
 def drawn(page, text):
     """Wait until the fitness chart says so of its last generation."""
-    page.wait_for_function(
-        "text => document.querySelector('[data-part=fitness]')?.getAttribute('aria-label')?.includes(text)", arg=text,
-        timeout=PATIENCE,
-    )  # fmt: skip
+    until(page, "text => document.querySelector('[data-part=fitness]')?.getAttribute('aria-label')?.includes(text)",
+          text)  # fmt: skip
 
 
 def part(page, name):
@@ -338,7 +343,7 @@ def busy(page):
     return 1000 * seconds, page.evaluate("performance.getEntriesByName('update').length")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_five_thousand_generations_and_five_hundred_workers_are_painted_in_no_time(browser, processes):
     with serving(processes.endpoint, snapshot(5000, workers=500, population=400)) as served, \
             dashboard(processes, "--port", 0) as started, tab(browser) as page:  # fmt: skip

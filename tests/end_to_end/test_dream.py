@@ -52,7 +52,7 @@ def test_who_dreams_and_who_dies_meanwhile_changes_no_bit(processes, random_bund
     assert code == 0, err
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_who_dreams_on_a_torch_device_changes_no_bit_either(processes, random_bundle, monkeypatch):
     coordinator = begin(processes, random_bundle, "plain", "--generations", 1)
     worker = processes.worker("--run", "plain")

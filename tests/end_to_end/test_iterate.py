@@ -236,6 +236,7 @@ def test_what_is_finished_is_not_done_again_and_other_settings_are_refused(undis
     assert layout.ledger.read_bytes() == before
 
 
+@pytest.mark.long
 def test_a_later_round_searches_what_its_model_foretells(processes):
     layout = IterationFolder(processes.folder / "data")
     flags = ("--go-on", "--subspace", "--drive-steps", 150, "--own-drives", 6, "--drives", 6, "--gate-drives", 0)
@@ -260,6 +261,7 @@ def pilot(tmp_path_factory):
     return folder / "pilot.npz"
 
 
+@pytest.mark.long
 def test_an_iteration_goes_on_from_a_controller_and_its_world_model(processes, pilot):
     layout = IterationFolder(processes.folder / "data")
     flags = ("--rounds", 1, "--init", pilot, "--vae", "keep", "--go-on")
@@ -392,6 +394,7 @@ def disturb(processes, layout, phases):
     return json.loads(out)
 
 
+@pytest.mark.long
 def test_killed_it_goes_on_to_the_same_models(undisturbed, processes):
     whole, answer, _ = undisturbed
     layout = IterationFolder(processes.folder / "data")

@@ -19,7 +19,7 @@ SHELLS = {
 GOOD = ("fish", "tcsh")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.needs_programs("sshd", "ssh", "fish", "tcsh")
 def test_any_login_shell_serves_and_a_broken_one_is_one_row(processes, hosts):
     for name, (command, file, text) in SHELLS.items():

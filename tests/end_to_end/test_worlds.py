@@ -100,7 +100,7 @@ def test_a_gymnasium_world_goes_from_drives_to_a_video(processes, tmp_path):
     assert (tmp_path / "page" / "index.html").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_rounds_of_a_gymnasium_world_learn_from_drives_of_its_own_controllers(processes):
     data = processes.folder / "data"
     code, out, err = processes.call(

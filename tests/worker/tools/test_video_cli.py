@@ -45,7 +45,7 @@ def test_each_track_has_its_own_video(verb, tmp_path, capsys):
         np.testing.assert_allclose(pictures(tmp_path / "alone.mp4"), pictures(video), atol=8)  # x264 differs by a bit
 
 
-@pytest.mark.slow  # whole laps: a mean is shown beside nothing less
+@pytest.mark.long  # whole laps: a mean is shown beside nothing less
 def test_without_a_seed_a_shipped_controllers_median_game_is_shown_beside_its_mean(tmp_path, capsys):
     words = ("record", "--controller", "tiny", "--out", str(tmp_path / "drive.mp4"))
     for given, says in (
