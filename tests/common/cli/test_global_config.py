@@ -85,7 +85,8 @@ def test_an_invalid_environment_is_refused(environment, said):
 
 
 def test_other_programs_variables_are_ignored():
-    settled(environment={"DREAMFLEET_CACHE": "x", "DREAMFLEET_TEST_STEPS": "y", "DREAMFLEET_WORKER_SLOTS": "1"})
+    others = {"DREAMFLEET_CACHE": "x", "DREAMFLEET_TEST_STEPS": "y", "DREAMFLEET_WORKER_SLOTS": "1"}
+    assert settled(environment=others).global_config == settled().global_config
 
 
 @pytest.mark.parametrize(

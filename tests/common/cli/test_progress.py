@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from dreamfleet.common.cli.progress import Bar, make_progress, progress_bar
+from dreamfleet.common.cli.progress import LARGEST_TOTAL, Bar, make_progress, progress_bar
 
 NOTE = "likelihood -12.345  reward 0.0123"
 
@@ -50,11 +50,13 @@ def test_a_quiet_verb_draws_no_bar(capsys, monkeypatch, level, drawn):
 
 
 def test_a_total_beyond_every_number_is_drawn():
-    progress = make_progress("updates", Console(file=io.StringIO(), width=80))
+    console = Console(file=io.StringIO(), width=200)
+    progress = make_progress("updates", console)
     bar = Bar(progress, "training", 10**400)
     for done in range(9):
         bar.update(done)
-        progress.get_renderable()
+        console.print(progress.get_renderable())
+        assert f"{done}/{LARGEST_TOTAL}" in console.file.getvalue()
 
 
 def test_what_a_simulator_prints_and_where_it_goes_meanwhile_is_undone(capfd):

@@ -2,6 +2,7 @@
 
 import os
 import threading
+from pathlib import Path
 
 from dreamfleet.common.host import foreign_code
 from dreamfleet.common.host.descendants import VARIABLE
@@ -33,3 +34,4 @@ def test_a_current_folder_that_is_gone_is_no_error(tmp_path, monkeypatch):
     gone.rmdir()
     with contained("it"):
         os.chdir(tmp_path)
+    assert Path.cwd() == tmp_path

@@ -136,6 +136,7 @@ def test_two_candidates_are_enough_for_pycma_below_its_two_point_step_size():
     evolution = build("cma", dimension=299, population=2)
     for _ in range(12):
         evolution.tell(evolution.ask()[:, 0])
+    assert evolution.mean[0] > 0
 
 
 def test_starting_the_command_line_imports_no_optimiser():

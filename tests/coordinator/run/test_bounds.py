@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dreamfleet.common.protocol.codec import encode_json
-from dreamfleet.common.protocol.messages import HelloRequest, Result
+from dreamfleet.common.protocol.messages import MAX_SLOTS, HelloRequest, Result
 from dreamfleet.common.protocol.result_bounds import (
     LARGEST_FITNESS,
     MAX_COUNT,
@@ -26,7 +26,7 @@ from dreamfleet.coordinator.jobs.work import vector_bytes
 from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
 from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.service.status import encode_part
-from tests.coordinator.run.test_run import SETTINGS, A, B, Bench
+from tests.coordinator.run.test_run import SETTINGS, A, Bench
 from tests.support.samples import SPEC
 
 PLAIN = replace(SETTINGS, collect_every=0, population=4, episodes=2, evaluate_every=1, evaluation_episodes=2)
@@ -124,10 +124,11 @@ def test_a_pending_excessive_evaluation_of_an_older_coordinator_is_driven_again(
 
 
 def test_huge_counts_of_slots_and_steps_can_be_encoded(bench):
-    for name in (A, B):
-        bench.run.admission.admit(HelloRequest(2, 2, "0", name, (SPEC.task,), "f", MAX_COUNT), bench.now)
+    bench.run.admission.admit(HelloRequest(2, 2, "0", "c/00000003", (SPEC.task,), "f", MAX_COUNT), bench.now)
     bench.run.fleet.counts["discarded_steps"] = 3 * MAX_COUNT
-    answers_of(bench)
+    answers = answers_of(bench)
+    assert [row["slots"] for row in answers["workers"]["workers"]] == [4, 4, MAX_SLOTS]
+    assert answers[""]["waste"]["discarded_steps"] == MAX_COUNT
 
 
 def test_an_error_with_too_many_steps_is_an_error(bench):
@@ -137,7 +138,9 @@ def test_an_error_with_too_many_steps_is_an_error(bench):
         ]
         for name, job in given[:1]:
             bench.deliver(name, Result(job.digest, None, MAX_COUNT, 0.1, "boom", None))
+            assert bench.run.fleet.jobs[job.digest].attempts[-1].error == "boom"
         answers_of(bench)
+    assert bench.run.fleet.counts["errors"] == 3
 
 
 @given(st.floats(), st.integers(), st.floats())
@@ -164,3 +167,4 @@ def test_an_optimiser_accepts_all_fitness_within_the_bounds(optimiser):
             asked = evolution.ask()
             evolution.tell(np.clip(-(asked**2).sum(axis=1) * scale, -LARGEST_FITNESS, LARGEST_FITNESS))
             evolution.restore(evolution.state().packed())
+            assert np.isfinite(asked).all()

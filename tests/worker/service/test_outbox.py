@@ -53,8 +53,11 @@ def test_a_new_coordinator_gets_every_result_again():
     assert outbox.due(0.1) == [(result(1),)]
 
 
-def test_verdicts_on_nothing_are_harmless():
-    Outbox(repeat=1.0).acknowledge([b"x" * 32])
+def test_verdicts_on_nothing_settle_nothing():
+    outbox = Outbox(repeat=1.0)
+    outbox.add(result(1))
+    outbox.acknowledge([b"x" * 32])
+    assert outbox.due(0.0) == [(result(1),)]
 
 
 def drain(uploads, now, seconds):

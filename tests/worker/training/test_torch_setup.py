@@ -44,8 +44,16 @@ def test_what_the_user_set_stays(allocator_calls, monkeypatch):
 
 
 def test_a_system_without_such_a_heap_is_left_alone(monkeypatch):
-    monkeypatch.setattr(torch_setup.ctypes, "CDLL", lambda _name: object())
+    asked = []
+
+    class Library:
+        def __getattr__(self, name):
+            asked.append(name)
+            raise AttributeError(name)
+
+    monkeypatch.setattr(torch_setup.ctypes, "CDLL", lambda _name: Library())
     torch_setup._keep_freed_memory()
+    assert asked == ["mallopt"]
 
 
 @pytest.mark.slow

@@ -47,7 +47,7 @@ def finished(layout):
 
 
 def test_what_is_there_as_it_was_made_is_no_fault(layout, finished):
-    artefacts.check(layout, finished)
+    assert artefacts.check(layout, finished) is None
 
 
 @pytest.mark.parametrize(
