@@ -1,6 +1,19 @@
 """The structure that architecture.md describes: what must not grow again."""
 
-from deploy.structure import SIDES, WORLDS, class_names, floors, names_outside_rooms, room_arrows, sources, surface
+import re
+from pathlib import Path
+
+from deploy.structure import (
+    ROOT,
+    SIDES,
+    WORLDS,
+    class_names,
+    floors,
+    names_outside_rooms,
+    room_arrows,
+    sources,
+    surface,
+)
 from dreamfleet.common.worlds import shipped
 
 MOST_FILES = 20  # in a folder
@@ -15,6 +28,19 @@ NAMING_WORLDS = {
     "worker/bench/environment.py": "compares our CarRacing with gymnasium's, by the episode loop above its room",
     "worker/baselines/agents.py": "baselines without a world model are agents of CarRacing, trained by rooms above its",
 }
+# Modules whose test no name leads to. This list may only shrink.
+WITHOUT_TEST = {
+    "common/errors.py",  # exceptions alone
+    # measurements, which people start
+    *(f"worker/bench/{name}.py" for name in ("batches", "dream", "live", "policy", "torch_steps")),
+}
+
+
+def listed_modules(test: Path) -> set[str]:
+    """The files that a test's docstring lists behind "Tests": with their folders, or of the folder that it mirrors."""
+    docstring = re.match(r'"""(.*?)"""', (ROOT / test).read_text(), re.DOTALL)
+    names = re.findall(r"[\w/]+\.py\b", docstring[1].partition("Tests ")[2]) if docstring else []
+    return {name if "/" in name else str(test.relative_to("tests").with_name(name)) for name in names}
 
 
 def test_no_room_imports_a_room_above_it():
@@ -50,3 +76,14 @@ def test_no_world_is_named_outside_its_room():
     assert NAMING_WORLDS.keys() - named == set(), "no longer needed"
     for world in shipped.WORLDS:
         assert any(name.search(world) for name in WORLDS), f"{world} has no rooms in deploy/structure.py"
+
+
+def test_a_test_of_each_module_has_its_name_or_lists_it():
+    modules = {str(path) for path in sources(*SIDES) if path.name != "__init__.py"}
+    tests = [path for path in sources("tests") if path.name.startswith("test_")]
+    named = {str(path.relative_to("tests").with_name(path.name.removeprefix("test_"))) for path in tests}
+    listed = set().union(*(listed_modules(path) for path in tests))
+    assert listed - modules == set(), "a docstring of a test lists what is not there"
+    missing = modules - named - listed
+    assert missing - WITHOUT_TEST == set(), 'name its test like it, or list it behind "Tests" in a docstring'
+    assert WITHOUT_TEST - missing == set(), "no longer needed"

@@ -1,4 +1,5 @@
-"""The citation is valid and of this version; what the issue templates ask for can be typed."""
+"""The citation is valid and of this version; what the issue templates ask for can be typed.
+Tests coordinator/analysis/citation.py."""
 
 import re
 import subprocess

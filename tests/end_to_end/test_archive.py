@@ -1,4 +1,5 @@
-"""A run with an archive: killed amid, it goes on to the same bits, and its elites can be listed, drawn and judged."""
+"""A run with an archive: killed amid, it goes on to the same bits, and its elites can be listed, drawn and judged.
+Tests coordinator/analysis/archive_plot.py."""
 
 import json
 import re

@@ -1,4 +1,5 @@
-"""A search of somebody else's over a real fleet: batches over Zenoh, and what is killed amid one."""
+"""A search of somebody else's over a real fleet: batches over Zenoh, and what is killed amid one.
+Tests common/monitoring/batch_client.py, common/monitoring/remote_scorer.py and coordinator/service/batch_queries.py."""
 
 import subprocess
 import sys

@@ -1,4 +1,7 @@
-"""Batches over HTTP: the bridge's answers to good and bad requests, and to connections that stop."""
+"""Batches over HTTP: the bridge's answers to good and bad requests, and to connections that stop.
+Tests coordinator/bridge/app.py, coordinator/bridge/changes.py, coordinator/bridge/config.py,
+coordinator/bridge/guard.py, coordinator/bridge/openapi.py, coordinator/bridge/server.py and
+coordinator/verbs/serve.py."""
 
 import base64
 import http.client

@@ -1,4 +1,5 @@
-"""A run keeps drives of its own mean: the same files on disk, with any workers and any losses."""
+"""A run keeps drives of its own mean: the same files on disk, with any workers and any losses.
+Tests coordinator/jobs/rollout_collection.py."""
 
 import hashlib
 import io

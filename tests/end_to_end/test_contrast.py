@@ -1,4 +1,5 @@
-"""Two kinds of MDN-RNNs on one small data set, killed in between."""
+"""Two kinds of MDN-RNNs on one small data set, killed in between.
+Tests coordinator/experiments/contrast/trials.py and coordinator/verbs/contrast.py."""
 
 import json
 import signal

@@ -1,4 +1,5 @@
-"""The demonstration, seconds long."""
+"""The demonstration, seconds long.
+Tests coordinator/experiments/demo.py, coordinator/experiments/demo_plans.py and coordinator/verbs/demo.py."""
 
 import os
 import re

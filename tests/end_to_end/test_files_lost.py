@@ -1,4 +1,5 @@
-"""A live run whose files are removed, replaced or moved: nothing is lost, it says so soon, and it can be continued."""
+"""A live run whose files are removed, replaced or moved: nothing is lost, it says so soon, and it can be continued.
+Tests coordinator/storage/file_watch.py and coordinator/storage/served_bundle.py."""
 
 import errno
 import os

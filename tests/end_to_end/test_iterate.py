@@ -1,4 +1,5 @@
-"""Two rounds of world models and evolutions, seconds long each, left alone and killed."""
+"""Two rounds of world models and evolutions, seconds long each, left alone and killed.
+Tests coordinator/experiments/iteration/runner.py and coordinator/verbs/iterate.py."""
 
 import json
 import os

@@ -1,4 +1,5 @@
-"""Watching a live run: real coordinator, real workers, viewers that come, stay too long, and lie."""
+"""Watching a live run: real coordinator, real workers, viewers that come, stay too long, and lie.
+Tests common/monitoring/live.py and worker/verbs/live.py."""
 
 import json
 import signal

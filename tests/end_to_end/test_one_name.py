@@ -1,4 +1,5 @@
-"""Two coordinators of one name: whenever they see each other one of them leaves, and nobody leaves for a ghost."""
+"""Two coordinators of one name: whenever they see each other one of them leaves, and nobody leaves for a ghost.
+Tests coordinator/service/name_lock.py."""
 
 import shutil
 import signal

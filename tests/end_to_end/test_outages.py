@@ -1,4 +1,5 @@
-"""Workers whose coordinator is out of sight for a while, and what a run says of workers that left."""
+"""Workers whose coordinator is out of sight for a while, and what a run says of workers that left.
+Tests common/verbs/story.py."""
 
 import json
 import time

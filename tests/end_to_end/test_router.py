@@ -1,4 +1,5 @@
-"""Routers of their own: coordinator and workers only connect out, and meet there."""
+"""Routers of their own: coordinator and workers only connect out, and meet there.
+Tests common/transport/router.py and common/verbs/router.py."""
 
 import json
 import os

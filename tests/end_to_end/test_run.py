@@ -1,4 +1,6 @@
-"""A run with a task that scores in no time: what its coordinator, workers, status and journal do."""
+"""A run with a task that scores in no time: what its coordinator, workers, status and journal do.
+Tests common/verbs/control.py, coordinator/service/main.py, coordinator/verbs/coordinator.py and
+worker/verbs/worker.py."""
 
 import json
 import signal

@@ -1,4 +1,5 @@
-"""Workers on hosts that a real sshd leads to: brought up, left, followed, ended; and whatever stands in the way."""
+"""Workers on hosts that a real sshd leads to: brought up, left, followed, ended; and whatever stands in the way.
+Tests coordinator/verbs/spawn.py."""
 
 import json
 import os

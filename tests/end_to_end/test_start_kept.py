@@ -1,4 +1,5 @@
-"""A run's start is in its journal before anything is scored: a coordinator that is continued begins there."""
+"""A run's start is in its journal before anything is scored: a coordinator that is continued begins there.
+Tests coordinator/settings/start.py."""
 
 import signal
 

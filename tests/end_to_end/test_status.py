@@ -1,4 +1,5 @@
-"""Watching a run from anywhere, to its end, and judging what it reports."""
+"""Watching a run from anywhere, to its end, and judging what it reports.
+Tests common/monitoring/client.py, common/verbs/status.py and coordinator/service/queryables.py."""
 
 import json
 import os

@@ -1,4 +1,6 @@
-"""A sweep with real processes: it ends with a comparison, survives the loss of everything, and refuses bad input."""
+"""A sweep with real processes: it ends with a comparison, survives the loss of everything, and refuses bad input.
+Tests coordinator/experiments/sweep/display.py, coordinator/experiments/sweep/runner.py and
+coordinator/verbs/sweep.py."""
 
 import json
 import os

@@ -1,4 +1,5 @@
-"""A share of the results is scored again on another host: who lies, or whose memory fails, is barred and recalled."""
+"""A share of the results is scored again on another host: who lies, or whose memory fails, is barred and recalled.
+Tests common/protocol/check_counts.py, coordinator/run/verification.py and coordinator/verbs/bar.py."""
 
 import signal
 import sqlite3

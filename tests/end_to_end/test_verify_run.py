@@ -1,4 +1,5 @@
-"""A run is repeated from its controller's provenance alone, with real processes, to the bit."""
+"""A run is repeated from its controller's provenance alone, with real processes, to the bit.
+Tests coordinator/verbs/verify_run.py."""
 
 import json
 import os

@@ -1,3 +1,5 @@
+"""Tests bundle.py and bundle_store.py."""
+
 import os
 import shutil
 import zipfile

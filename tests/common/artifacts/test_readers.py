@@ -1,4 +1,5 @@
-"""Files from untrusted sources, damaged in thousands of ways: each is read, or is a one-line error."""
+"""Files from untrusted sources, damaged in thousands of ways: each is read, or is a one-line error.
+Tests task_options.py and coordinator/settings/task_options.py."""
 
 import hashlib
 import io

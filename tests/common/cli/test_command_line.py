@@ -1,4 +1,5 @@
-"""The command line: finding and loading verbs, help, and errors for typing mistakes."""
+"""The command line: finding and loading verbs, help, and errors for typing mistakes.
+Tests first_flags.py, key_values.py, overview.py, parser.py, removed.py and common/host/standard_streams.py."""
 
 import os
 import re

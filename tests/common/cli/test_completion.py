@@ -1,4 +1,4 @@
-"""`dreamfleet completion` writes scripts that complete in real shells."""
+"""`dreamfleet completion` writes scripts that complete in real shells. Tests common/verbs/completion.py."""
 
 import subprocess
 

@@ -1,4 +1,5 @@
-"""`doctor` in an installation with only a coordinator's packages, built from links."""
+"""`doctor` in an installation with only a coordinator's packages, built from links.
+Tests health.py, common/verbs/doctor.py and worker/health.py."""
 
 import json
 import os

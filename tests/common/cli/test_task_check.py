@@ -1,4 +1,5 @@
-"""Dry runs of real environments, each with one fault, in real child processes."""
+"""Dry runs of real environments, each with one fault, in real child processes.
+Tests dry_run_process.py and common/verbs/tasks.py."""
 
 import os
 import re

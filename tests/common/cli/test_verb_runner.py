@@ -1,4 +1,5 @@
-"""Verbs that other verbs run, in this process and in their own, and the command lines that spell them."""
+"""Verbs that other verbs run, in this process and in their own, and the command lines that spell them.
+Tests model_commands.py."""
 
 from pathlib import Path
 

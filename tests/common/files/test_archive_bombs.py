@@ -1,4 +1,5 @@
-"""Small files that claim, or unpack to, far more than they hold: one line, in bounded memory and time."""
+"""Small files that claim, or unpack to, far more than they hold: one line, in bounded memory and time.
+Tests archives.py."""
 
 import hashlib
 import json

@@ -1,4 +1,5 @@
-"""A lock file is a regular file whose content stays; anything else is refused in one line, at once."""
+"""A lock file is a regular file whose content stays; anything else is refused in one line, at once.
+Tests common/runs/run_lock.py."""
 
 import os
 

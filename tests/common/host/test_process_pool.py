@@ -1,4 +1,4 @@
-"""Work in several processes, of which some crash, leave others behind, or hang."""
+"""Work in several processes, of which some crash, leave others behind, or hang. Tests stall_watch.py."""
 
 import os
 import signal

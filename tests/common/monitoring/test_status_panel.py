@@ -1,4 +1,4 @@
-"""The panel in a terminal of any width."""
+"""The panel in a terminal of any width. Tests terminal_charts.py and worker_table.py."""
 
 import dataclasses
 import io

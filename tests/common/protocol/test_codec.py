@@ -1,6 +1,8 @@
 """The codec and the golden fixtures: each message as its protocol version first wrote it, each document for ever.
 
 `python -m tests.common.protocol.test_codec` writes a new message's fixture; it never writes one that exists.
+
+Tests messages.py, common/serialization/optional_fields.py and common/serialization/validation.py.
 """
 
 import dataclasses

@@ -1,3 +1,5 @@
+"""Tests keys.py and common/runs/seeds.py."""
+
 import re
 import socket
 

@@ -1,4 +1,5 @@
-"""Damaged journals: each value is read, or is a one-line error."""
+"""Damaged journals: each value is read, or is a one-line error.
+Tests journal_reader.py, run_folder.py and schema.py."""
 
 import json
 import os

@@ -1,4 +1,5 @@
-"""Evaluation results: statistics, reports, comparison and reproduction."""
+"""Evaluation results: statistics, reports, comparison and reproduction.
+Tests paired_difference.py and reproduction.py."""
 
 import json
 from dataclasses import replace

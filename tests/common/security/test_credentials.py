@@ -1,4 +1,5 @@
-"""Join files: issued by an authority, validated strictly, and private."""
+"""Join files: issued by an authority, validated strictly, and private.
+Tests authority.py, certificate_ledger.py and handshake.py."""
 
 import errno
 import os

@@ -1,4 +1,5 @@
-"""Runs beside each other: what differs, and what a difference is worth."""
+"""Runs beside each other: what differs, and what a difference is worth.
+Tests common/runs/comparison.py and coordinator/verbs/compare.py."""
 
 import json
 import sqlite3

@@ -1,4 +1,5 @@
-"""A run's fitness over its generations, as a picture that is read without its journal."""
+"""A run's fitness over its generations, as a picture that is read without its journal.
+Tests plot.py and common/monitoring/fitness_chart.py."""
 
 import sqlite3
 from contextlib import closing

@@ -1,4 +1,5 @@
-"""What people read of a function that is minimised: its own values, where a run has fitness."""
+"""What people read of a function that is minimised: its own values, where a run has fitness.
+Tests common/protocol/function_values.py and coordinator/dashboard/compared_runs.py."""
 
 import json
 import sqlite3

@@ -1,4 +1,5 @@
-"""What runs learnt from what they spent, as data and as a picture."""
+"""What runs learnt from what they spent, as data and as a picture.
+Tests common/runs/effort.py and common/runs/learning.py."""
 
 import html
 import sqlite3

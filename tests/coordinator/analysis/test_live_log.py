@@ -1,4 +1,5 @@
-"""A run's curves in the records of other programs, as its journal has them."""
+"""A run's curves in the records of other programs, as its journal has them.
+Tests sinks.py, coordinator/settings/live_log.py and common/files/tensorboard.py."""
 
 import sqlite3
 from collections import Counter

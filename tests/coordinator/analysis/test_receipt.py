@@ -1,4 +1,5 @@
-"""A receipt says what is true of its run, and its commands run as they are printed."""
+"""A receipt says what is true of its run, and its commands run as they are printed.
+Tests coordinator/verbs/runs_analysis.py."""
 
 import json
 import shlex

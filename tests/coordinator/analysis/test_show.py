@@ -1,4 +1,4 @@
-"""What `runs show` prints of a run's settings."""
+"""What `runs show` prints of a run's settings. Tests coordinator/verbs/runs.py."""
 
 import json
 import sqlite3

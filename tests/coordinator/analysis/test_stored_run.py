@@ -1,4 +1,5 @@
-"""A run in a user's program: tables as data frames, the picture of `runs plot`, its controller and world model."""
+"""A run in a user's program: tables as data frames, the picture of `runs plot`, its controller and world model.
+Tests shown_figure.py."""
 
 import shutil
 import subprocess

@@ -1,4 +1,4 @@
-"""The routes of the page and their access control."""
+"""The routes of the page and their access control. Tests assets.py, guard.py, server.py and sse.py."""
 
 import asyncio
 import json

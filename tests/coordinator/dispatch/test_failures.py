@@ -1,4 +1,4 @@
-"""What failed attempts prove."""
+"""What failed attempts prove. Tests failure_judge.py."""
 
 import pytest
 

@@ -1,3 +1,5 @@
+"""Tests fleet.py, member.py, pending_jobs.py and speculative_execution.py."""
+
 import tracemalloc
 from dataclasses import replace
 from itertools import pairwise

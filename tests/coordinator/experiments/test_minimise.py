@@ -1,4 +1,4 @@
-"""Searching a function's minimum on processes of this host."""
+"""Searching a function's minimum on processes of this host. Tests search_arguments.py."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,5 @@
-"""A run that a program starts: real coordinator and workers on this host, which end with it in every case."""
+"""A run that a program starts: real coordinator and workers on this host, which end with it in every case.
+Tests run_arguments.py."""
 
 import os
 import signal

@@ -1,3 +1,5 @@
+"""Tests generation.py and work.py."""
+
 from dataclasses import replace
 from math import nan
 

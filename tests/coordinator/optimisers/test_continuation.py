@@ -1,4 +1,4 @@
-"""Every optimiser that ships, and one of a third party, against the same contract."""
+"""Every optimiser that ships, and one of a third party, against the same contract. Tests api.py and pycma_state.py."""
 
 from dataclasses import replace
 

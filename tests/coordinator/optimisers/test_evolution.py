@@ -1,3 +1,5 @@
+"""Tests evolution.py and pycma.py."""
+
 import numpy as np
 import pytest
 

@@ -1,4 +1,5 @@
-"""The first accepted result fixes a run's class; in a strict run all accepted results are of that class."""
+"""The first accepted result fixes a run's class; in a strict run all accepted results are of that class.
+Tests common/protocol/host_classes.py."""
 
 import sqlite3
 from dataclasses import replace

@@ -1,4 +1,5 @@
-"""Submitted batches without a transport: parts in any order, ids, bounds, restarts anywhere, cancels."""
+"""Submitted batches without a transport: parts in any order, ids, bounds, restarts anywhere, cancels.
+Tests external_generations.py, common/protocol/batches.py and coordinator/storage/batch_records.py."""
 
 import hashlib
 from dataclasses import replace

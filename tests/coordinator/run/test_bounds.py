@@ -1,4 +1,5 @@
-"""Extreme numbers fail their job, and never end a run; nor do those in older journals."""
+"""Extreme numbers fail their job, and never end a run; nor do those in older journals.
+Tests common/protocol/result_bounds.py."""
 
 import json
 import sqlite3

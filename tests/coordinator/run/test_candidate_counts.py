@@ -1,6 +1,8 @@
 """Each candidate's episodes and steps in a run's tables, against what its generations and its search say.
 
 The runs are real journals: candidates fail, are drawn anew, get other seeds, race, and are scored again after recalls.
+
+Tests common/runs/journal/candidate_counts.py.
 """
 
 import csv

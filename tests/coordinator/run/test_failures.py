@@ -1,4 +1,5 @@
-"""Candidates whose episodes fail wherever they are scored."""
+"""Candidates whose episodes fail wherever they are scored.
+Tests failure_limit.py, work_clock.py and common/protocol/failures.py."""
 
 import itertools
 import json

@@ -1,4 +1,4 @@
-"""A run with its worker protocol and its journal, without a transport."""
+"""A run with its worker protocol and its journal, without a transport. Tests background_jobs.py and generations.py."""
 
 import hashlib
 import json

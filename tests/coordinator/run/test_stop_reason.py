@@ -1,4 +1,5 @@
-"""Limits that read the candidates' fitness: a target of one candidate, and generations without a better one."""
+"""Limits that read the candidates' fitness: a target of one candidate, and generations without a better one.
+Tests common/protocol/stop_kind.py."""
 
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""When the coordinator commits."""
+"""When the coordinator commits. Tests service.py."""
 
 import pytest
 

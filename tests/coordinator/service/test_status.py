@@ -1,4 +1,5 @@
-"""Snapshots of a run and the answers that are cut from them, without a transport."""
+"""Snapshots of a run and the answers that are cut from them, without a transport.
+Tests snapshot.py and coordinator/jobs/history.py."""
 
 import dataclasses
 import json

@@ -1,3 +1,5 @@
+"""Tests config.py, bounds.py, limits.py, network.py, presets.py and run_checks.py."""
+
 import json
 
 import numpy as np

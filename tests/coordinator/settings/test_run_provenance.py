@@ -1,4 +1,5 @@
-"""The receipt in a reported controller: drawn up from the journal, and enough to begin the run again."""
+"""The receipt in a reported controller: drawn up from the journal, and enough to begin the run again.
+Tests rerun.py."""
 
 import json
 import sys

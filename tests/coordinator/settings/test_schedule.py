@@ -1,4 +1,4 @@
-"""A schedule as people write it: what it may say, and what is wrong with it in one line."""
+"""A schedule as people write it: what it may say, and what is wrong with it in one line. Tests run_setup.py."""
 
 import argparse
 

@@ -1,4 +1,4 @@
-"""A run of several stages, against its journal, without a transport."""
+"""A run of several stages, against its journal, without a transport. Tests fork.py."""
 
 import io
 import random

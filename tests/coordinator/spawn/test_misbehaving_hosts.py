@@ -1,4 +1,5 @@
-"""Hosts that answer nonsense, print without end or say nothing: each is one row, and the others go on."""
+"""Hosts that answer nonsense, print without end or say nothing: each is one row, and the others go on.
+Tests answers.py, parallel.py and remote_host.py."""
 
 import resource
 import shlex

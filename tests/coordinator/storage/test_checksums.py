@@ -1,4 +1,5 @@
-"""What a journal's checksums find beside changed bits: rows that are lost, exchanged or not of its version."""
+"""What a journal's checksums find beside changed bits: rows that are lost, exchanged or not of its version.
+Tests checksum_records.py and common/runs/journal/checksums.py."""
 
 import sqlite3
 from contextlib import closing

@@ -1,6 +1,8 @@
 """Copies of real journals, damaged: each figure that a table, a receipt or a continued run takes is equal, or an error.
 
 What is open is not compared: nothing says yet what it should be.
+
+Tests common/runs/journal/journal_check.py.
 """
 
 import csv

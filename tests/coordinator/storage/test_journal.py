@@ -1,3 +1,5 @@
+"""Tests journal.py, journal_connection.py, journal_file.py, verification_records.py and common/runs/records.py."""
+
 import os
 import shutil
 import sqlite3

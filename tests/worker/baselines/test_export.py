@@ -1,4 +1,5 @@
-"""An exported agent drives like the trained network, without torch; any other file is refused."""
+"""An exported agent drives like the trained network, without torch; any other file is refused.
+Tests policies.py and common/artifacts/trained_agent.py."""
 
 import hashlib
 import json

@@ -1,4 +1,5 @@
-"""Baselines are evaluated and recorded in gymnasium's own environment, like controllers."""
+"""Baselines are evaluated and recorded in gymnasium's own environment, like controllers.
+Tests worker/car_racing/agents.py and worker/tasks/frame_skip_policy.py."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,5 @@
-"""The equations of an update against numbers worked out by hand; updates converge, and the target network lags."""
+"""The equations of an update against numbers worked out by hand; updates converge, and the target network lags.
+Tests learning_config.py and network.py."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,5 @@
-"""Uniform random actions are judged in any environment by the path that judges a controller of that task."""
+"""Uniform random actions are judged in any environment by the path that judges a controller of that task.
+Tests agents.py."""
 
 import json
 

@@ -1,4 +1,5 @@
-"""The network learns in the real CarRacing; an interrupted training resumes to the same bits."""
+"""The network learns in the real CarRacing; an interrupted training resumes to the same bits.
+Tests agent_config.py, episode_files.py, presets.py, progress.py, train.py and worker/verbs/baseline.py."""
 
 import argparse
 import json

@@ -1,4 +1,4 @@
-"""The peers of `lab bench dispatch`: whatever they do, the benchmark ends."""
+"""The peers of `lab bench dispatch`: whatever they do, the benchmark ends. Tests simulated_workers.py."""
 
 import time
 from contextlib import contextmanager

@@ -1,4 +1,5 @@
-"""The lower bounds of `lab bench policy` and `lab bench dream` ignore slow libraries and inherited settings."""
+"""The lower bounds of `lab bench policy` and `lab bench dream` ignore slow libraries and inherited settings.
+Tests measurement.py and worker/verbs/bench.py."""
 
 import os
 

@@ -1,4 +1,5 @@
-"""The native picture is gymnasium's, to the bit. `dreamfleet lab bench env --exact` compares far more."""
+"""The native picture is gymnasium's, to the bit. `dreamfleet lab bench env --exact` compares far more.
+Tests environment.py, native_check.py and worker/bench/environment.py."""
 
 import copy
 import os

@@ -1,4 +1,5 @@
-"""CarRacing through a world model: gymnasium's environment with the observations of controllers and dreams."""
+"""CarRacing through a world model: gymnasium's environment with the observations of controllers and dreams.
+Tests worker/worldmodel/observation.py."""
 
 import gymnasium
 import numpy as np

@@ -1,3 +1,5 @@
+"""Tests ends.py and world.py."""
+
 import dataclasses
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Tests batch.py and task.py."""
+
 import dataclasses
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Tests torch_batch.py and worker/worldmodel/torch_dream_step.py."""
+
 import dataclasses
 import os
 import sys

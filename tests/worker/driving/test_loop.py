@@ -1,3 +1,5 @@
+"""Tests loop.py, drive_window.py and scene.py."""
+
 import os
 
 import pygame

@@ -1,4 +1,5 @@
-"""The verb `drive` in a window on a virtual screen, with keys of a virtual keyboard."""
+"""The verb `drive` in a window on a virtual screen, with keys of a virtual keyboard.
+Tests worker/car_racing/scene.py and worker/verbs/drive.py."""
 
 import os
 import re

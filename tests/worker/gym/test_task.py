@@ -1,3 +1,5 @@
+"""Tests task.py and environments.py."""
+
 import json
 import re
 import sys

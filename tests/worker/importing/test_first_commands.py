@@ -1,4 +1,5 @@
-"""What people who come from another project type first: it works, or the answer names the command that does it."""
+"""What people who come from another project type first: it works, or the answer names the command that does it.
+Tests refusals.py, sources.py and worker/verbs/import_files.py."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Vectors of parameters, and drives, of other programs."""
+"""Vectors of parameters, and drives, of other programs. Tests drives.py and vectors.py."""
 
 import json
 import sys

@@ -1,4 +1,5 @@
-"""World models and controllers in the exact layout of hardmaru/WorldModelsExperiments, carracing."""
+"""World models and controllers in the exact layout of hardmaru/WorldModelsExperiments, carracing.
+Tests bundles.py and json_weights.py."""
 
 import json
 from itertools import pairwise

@@ -1,4 +1,5 @@
-"""`inspect --probe` and `inspect --losses`: what they print, and the allowed drivers."""
+"""`inspect --probe` and `inspect --losses`: what they print, and the allowed drivers.
+Tests measurements.py and worker/verbs/inspect.py."""
 
 import argparse
 import json

@@ -1,3 +1,5 @@
+"""Tests page_builder.py, charts.py, encoded_rollout.py, mdnrnn_sections.py and page.py."""
+
 import json
 import re
 from html.parser import HTMLParser

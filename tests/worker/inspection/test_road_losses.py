@@ -1,4 +1,5 @@
-"""Dreams begun before real losses of the road, judged by probes on the dream."""
+"""Dreams begun before real losses of the road, judged by probes on the dream.
+Tests knowledge.py, likeness.py and tables.py."""
 
 from dataclasses import replace
 

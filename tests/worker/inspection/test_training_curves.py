@@ -1,4 +1,5 @@
-"""Trainings loaded from their loss curves: whole, stopped, gone back, side by side, damaged."""
+"""Trainings loaded from their loss curves: whole, stopped, gone back, side by side, damaged.
+Tests curve_sections.py."""
 
 import argparse
 import json

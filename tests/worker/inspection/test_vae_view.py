@@ -1,4 +1,4 @@
-"""Pages of a VAE without an MDN-RNN or a bundle, and of the user's own pictures."""
+"""Pages of a VAE without an MDN-RNN or a bundle, and of the user's own pictures. Tests vae_sections.py."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Figures of a world model under a controller that repeats its choices."""
+"""Figures of a world model under a controller that repeats its choices. Tests drive_dreams.py."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Drives under disturbed actions."""
+"""Drives under disturbed actions. Tests actors.py and worker/worldmodel/recurrent_state.py."""
 
 import numpy as np
 import pytest

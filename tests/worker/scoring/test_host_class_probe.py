@@ -1,4 +1,4 @@
-"""The class of a host depends only on the bits that it computes on fixed inputs."""
+"""The class of a host depends only on the bits that it computes on fixed inputs. Tests common/host/fingerprint.py."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,5 @@
-"""`Controller.predict` acts as the controller's policy does, from any state that it returned."""
+"""`Controller.predict` acts as the controller's policy does, from any state that it returned.
+Tests worker/tools/public_api.py."""
 
 import pickle
 import subprocess

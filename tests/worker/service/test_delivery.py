@@ -1,4 +1,5 @@
-"""A worker receives and delivers correctly although messages are lost, repeated or foreign."""
+"""A worker receives and delivers correctly although messages are lost, repeated or foreign.
+Tests run_session.py and sender.py."""
 
 import hashlib
 

@@ -1,4 +1,4 @@
-"""The frames that a worker sends while somebody subscribes; they change and delay nothing."""
+"""The frames that a worker sends while somebody subscribes; they change and delay nothing. Tests frame_sampler.py."""
 
 import multiprocessing
 import queue

@@ -1,4 +1,4 @@
-"""How a worker joins a run: it waits, is welcomed or is refused."""
+"""How a worker joins a run: it waits, is welcomed or is refused. Tests admission.py, config.py and worker.py."""
 
 import os
 import queue

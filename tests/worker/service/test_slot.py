@@ -1,3 +1,5 @@
+"""Tests slot.py, child.py and child_process.py."""
+
 import hashlib
 import io
 import os

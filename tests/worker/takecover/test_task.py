@@ -1,4 +1,4 @@
-"""Take Cover as a task and as an environment."""
+"""Take Cover as a task and as an environment. Tests game.py, options.py and picture.py."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Measures of an episode beside its fitness, in reality and in a dream."""
+"""Measures of an episode beside its fitness, in reality and in a dream. Tests common/protocol/measures.py."""
 
 import dataclasses
 

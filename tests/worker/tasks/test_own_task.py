@@ -1,4 +1,4 @@
-"""The example package of docs/reference/tasks.md, installed with pip."""
+"""The example package of docs/reference/tasks.md, installed with pip. Tests registry.py."""
 
 import os
 import re

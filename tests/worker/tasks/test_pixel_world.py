@@ -1,4 +1,5 @@
-"""Pictures, actions and drivers of any world, and what holds of every recordable task."""
+"""Pictures, actions and drivers of any world, and what holds of every recordable task.
+Tests drivers.py and pictures.py."""
 
 from fractions import Fraction
 from functools import cache

@@ -1,3 +1,5 @@
+"""Tests api.py, policy.py, common/protocol/tasks.py and worker/scoring/scorer.py."""
+
 from dataclasses import replace
 
 import gymnasium

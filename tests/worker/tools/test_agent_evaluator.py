@@ -1,4 +1,4 @@
-"""An evaluator reports how an episode was driven, and the statistics change nothing."""
+"""An evaluator reports how an episode was driven, and the statistics change nothing. Tests worker/scoring/agents.py."""
 
 from dataclasses import replace
 

@@ -1,4 +1,6 @@
-"""`dreamfleet card`: the folder, and its script without dreamfleet."""
+"""`dreamfleet card`: the folder, and its script without dreamfleet.
+Tests card_page.py, score_chart.py, worker/verbs/card.py, worker/car_racing/standalone_drive.py and
+worker/gym/standalone_play.py."""
 
 import json
 import subprocess

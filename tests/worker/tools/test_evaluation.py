@@ -1,3 +1,5 @@
+"""Tests evaluation.py, common/runs/evaluation_report.py, worker/verbs/evaluate.py and worker/verbs/verify_report.py."""
+
 import json
 import os
 import signal

@@ -1,4 +1,5 @@
-"""Live frames of workers and of drives for the viewer, and their outputs."""
+"""Live frames of workers and of drives for the viewer, and their outputs.
+Tests frame_sinks.py, live_view.py and common/monitoring/mjpeg.py."""
 
 import io
 import json

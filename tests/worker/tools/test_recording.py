@@ -1,3 +1,5 @@
+"""Tests recording.py and drive_frames.py."""
+
 import json
 from dataclasses import replace
 from functools import partial

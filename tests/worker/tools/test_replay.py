@@ -1,3 +1,5 @@
+"""Tests replay.py, common/runs/run_paths.py and worker/verbs/verify_candidate.py."""
+
 import json
 import sqlite3
 from contextlib import closing

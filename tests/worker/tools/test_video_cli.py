@@ -1,4 +1,5 @@
-"""`record` takes the same arguments of a controller and of a random driver, and prints the same answers."""
+"""`record` takes the same arguments of a controller and of a random driver, and prints the same answers.
+Tests worker/verbs/record.py."""
 
 import json
 

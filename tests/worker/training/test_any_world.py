@@ -1,4 +1,5 @@
-"""A world with what docs/reference/worlds.md requires, from drives to a world model in which candidates evolve."""
+"""A world with what docs/reference/worlds.md requires, from drives to a world model in which candidates evolve.
+Tests worker/scoring/rollout.py."""
 
 import json
 import shutil

@@ -1,4 +1,5 @@
-"""Malformed bundles and data sets are refused in one line before anything runs."""
+"""Malformed bundles and data sets are refused in one line before anything runs.
+Tests common/artifacts/onnx_checks.py."""
 
 import shutil
 from dataclasses import replace

@@ -1,4 +1,5 @@
-"""World models whose encoder and LSTM multiply eight-bit integers."""
+"""World models whose encoder and LSTM multiply eight-bit integers.
+Tests worker/worldmodel/eight_bits.py and worker/worldmodel/onnx_graph.py."""
 
 from dataclasses import replace
 

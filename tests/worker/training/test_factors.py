@@ -1,4 +1,5 @@
-"""Factors weight the parts of a loss; the default 1 is not serialised, and reported losses are unweighted."""
+"""Factors weight the parts of a loss; the default 1 is not serialised, and reported losses are unweighted.
+Tests worker/worldmodel/loss_factors.py."""
 
 import argparse
 import json

@@ -1,4 +1,4 @@
-"""A subspace of features that predict a driver's actions and rewards."""
+"""A subspace of features that predict a driver's actions and rewards. Tests worker/verbs/subspace.py."""
 
 import argparse
 import json

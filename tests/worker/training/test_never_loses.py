@@ -1,4 +1,5 @@
-"""A training that is interrupted, killed, or out of disk space resumes to the same bits."""
+"""A training that is interrupted, killed, or out of disk space resumes to the same bits.
+Tests loss_curve.py and training_cli.py."""
 
 import argparse
 import json

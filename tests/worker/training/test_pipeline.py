@@ -1,4 +1,6 @@
-"""From drives to a bundle: each stage by itself, and the pipeline of all of them."""
+"""From drives to a bundle: each stage by itself, and the pipeline of all of them.
+Tests assemble.py, encode.py, prediction_quality.py, train_mdnrnn.py, train_vae.py, worker/verbs/encode.py and
+worker/verbs/pipeline.py."""
 
 import argparse
 import json

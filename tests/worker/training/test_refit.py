@@ -1,4 +1,4 @@
-"""A controller fitted to another world model."""
+"""A controller fitted to another world model. Tests drive_regression.py and worker/verbs/refit.py."""
 
 import argparse
 import json

@@ -1,3 +1,5 @@
+"""Tests training_state.py and checkpoint.py."""
+
 import shutil
 from dataclasses import replace
 from pathlib import Path

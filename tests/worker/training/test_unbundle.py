@@ -1,4 +1,4 @@
-"""Checkpoints from a bundle's models, from which training resumes."""
+"""Checkpoints from a bundle's models, from which training resumes. Tests worker/worldmodel/weights_from_graphs.py."""
 
 import json
 from dataclasses import replace

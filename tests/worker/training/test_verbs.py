@@ -1,3 +1,5 @@
+"""Tests config_flags.py, worker/verbs/collect.py and worker/verbs/train.py."""
+
 import argparse
 import json
 

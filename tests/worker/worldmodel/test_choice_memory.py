@@ -1,4 +1,5 @@
-"""A variant's controllers follow their formula, repeat choices as configured, and give the same bits in any batch."""
+"""A variant's controllers follow their formula, repeat choices as configured, and give the same bits in any batch.
+Tests policy.py."""
 
 from dataclasses import replace
 from itertools import pairwise

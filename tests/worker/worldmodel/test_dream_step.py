@@ -1,3 +1,5 @@
+"""Tests mdnrnn_graph.py."""
+
 from dataclasses import replace
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Tests mdnrnn.py and mdnrnn_config.py."""
+
 import torch
 
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, latent_loss

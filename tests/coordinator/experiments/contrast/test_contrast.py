@@ -1,4 +1,4 @@
-"""What a contrast trains, what it refuses, and what its figures come to."""
+"""What a contrast trains, what it refuses, and what its figures come to. Tests config.py and summary.py."""
 
 from dataclasses import asdict
 

@@ -1,4 +1,4 @@
-"""The files of an iteration: missed when they are needed, and undone."""
+"""The files of an iteration: missed when they are needed, and undone. Tests layout.py."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What an iteration may begin with."""
+"""What an iteration may begin with. Tests phases.py."""
 
 import pytest
 

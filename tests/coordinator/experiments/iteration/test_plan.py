@@ -1,4 +1,5 @@
-"""What an iteration does, and in which order, as a function of its settings and of what is finished."""
+"""What an iteration does, and in which order, as a function of its settings and of what is finished.
+Tests config.py."""
 
 import pytest
 

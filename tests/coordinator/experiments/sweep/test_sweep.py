@@ -1,4 +1,5 @@
-"""A sweep's plan, what it keeps, and its results, without processes."""
+"""A sweep's plan, what it keeps, and its results, without processes.
+Tests check.py, figure.py, folder.py, options.py, plan.py and summary.py."""
 
 import argparse
 import json

@@ -1,4 +1,5 @@
-"""Collecting rollouts: driven here, or imported from a run; a full disk and damaged rollouts name their files."""
+"""Collecting rollouts: driven here, or imported from a run; a full disk and damaged rollouts name their files.
+Tests collect_config.py, pilot.py, rollouts.py, worker/car_racing/drivers.py and worker/car_racing/random_network.py."""
 
 import errno
 import os

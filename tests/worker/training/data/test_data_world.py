@@ -1,4 +1,5 @@
-"""The world of a data set: what is collected in it, how it is named, and that two of them never mix."""
+"""The world of a data set: what is collected in it, how it is named, and that two of them never mix.
+Tests data_folder.py and common/cli/world_flags.py."""
 
 import argparse
 import json

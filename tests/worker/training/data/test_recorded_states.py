@@ -1,3 +1,5 @@
+"""Tests recorded_states.py and worker/verbs/bundle.py."""
+
 import argparse
 import json
 import shutil
