@@ -30,12 +30,12 @@ from dreamfleet.common.security.credentials import Credentials
 from dreamfleet.common.transport.session import Network
 from dreamfleet.common.worlds.score_words import score_word
 from dreamfleet.coordinator.analysis.live_log import live_log
+from dreamfleet.coordinator.analysis.sinks import check_sinks
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.service.service import OpenRun, Service
 from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, RunConfig
 from dreamfleet.coordinator.settings.environment_check import check_environment
 from dreamfleet.coordinator.settings.limits import LimitsConfig
-from dreamfleet.coordinator.settings.live_log import check_sinks
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.settings.resume_settings import serving_facts
 from dreamfleet.coordinator.settings.start import SUBSPACE_FACT, StartPoint

@@ -2,34 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
-from importlib.util import find_spec
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from dreamfleet.common.errors import UsageError
 
-MODULES = {"tensorboard": "tensorboardX", "wandb": "wandb", "mlflow": "mlflow"}
-INSTALL = {"tensorboardX": "'dreamfleet[export]'"}  # what pip installs, where that is not the module's name
+TENSORBOARD = "tensorboard"
 
 
 class SinkName(NamedTuple):
-    """A kind of record, and its folder, project or address; empty: the default one."""
+    """`tensorboard` or the MODULE:CLASS of a sink of the user's own, and where it writes; empty: its default place."""
 
     kind: str
     where: str
 
+    @property
+    def module(self) -> str:
+        """The module that has the sink; empty for TensorBoard's."""
+        return self.kind.partition(":")[0] if ":" in self.kind else ""
+
 
 def parse_sink(text: str) -> SinkName:
-    """KIND or KIND:WHERE; `UsageError` for another kind.
+    """`tensorboard` or MODULE:CLASS, perhaps with :WHERE behind it; `UsageError` for anything else.
 
-    >>> parse_sink("mlflow:http://127.0.0.1:5000")
-    SinkName(kind='mlflow', where='http://127.0.0.1:5000')
+    >>> parse_sink("tensorboard:/tmp/curves")
+    SinkName(kind='tensorboard', where='/tmp/curves')
+    >>> parse_sink("mine.sinks:Server:http://127.0.0.1:5000")
+    SinkName(kind='mine.sinks:Server', where='http://127.0.0.1:5000')
     """
-    kind, _, where = text.partition(":")
-    if kind not in MODULES:
-        raise UsageError(f"log_to {text!r}: name one of {', '.join(MODULES)}, or one with :WHERE behind it")
-    return SinkName(kind, where)
+    module, _, rest = text.partition(":")
+    if module == TENSORBOARD:
+        return SinkName(module, rest)
+    name, _, where = rest.partition(":")
+    if not all(map(str.isidentifier, (*module.split("."), name))):
+        raise UsageError(
+            f"log_to {text!r}: give tensorboard, or a sink of your own as MODULE:CLASS; :WHERE may stand behind it "
+            "(docs/how-to/monitor.md has sinks for Weights & Biases and MLflow)"
+        )
+    return SinkName(f"{module}:{name}", where)
 
 
 def parse_sinks(texts: Sequence[str]) -> tuple[SinkName, ...]:
@@ -38,21 +48,3 @@ def parse_sinks(texts: Sequence[str]) -> tuple[SinkName, ...]:
     if len({each.kind for each in found}) < len(found):
         raise UsageError(f"log_to names a kind twice: {', '.join(texts)}")
     return found
-
-
-def check_sinks(texts: Iterable[str]) -> None:
-    """`UsageError` if a package is not installed on this host."""
-    for text in texts:
-        module = MODULES[parse_sink(text).kind]
-        if not _is_installed(module):
-            raise UsageError(
-                f"log_to {text!r} needs the package {module!r}, which is not installed: "
-                f"pip install {INSTALL.get(module, module)}"
-            )
-
-
-def _is_installed(module: str) -> bool:
-    with suppress(ModuleNotFoundError):
-        spec = find_spec(module)
-        return spec is not None and spec.origin is not None  # a folder of this name is no package
-    return False

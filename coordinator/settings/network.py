@@ -46,8 +46,8 @@ class NetworkConfig:
     )
     log_to: tuple[str, ...] = option(
         (),
-        "also write the run's curves, as it goes on, to tensorboard, wandb or mlflow, or to several of them; a folder, "
-        "project or address may stand behind a colon (docs/how-to/monitor.md). It has no flag",
+        "also write the run's curves, as it goes on, to tensorboard, or to sinks of your own as MODULE:CLASS; a "
+        "folder, project or address may stand behind a colon (docs/how-to/monitor.md). It has no flag",
         flag=False,
     )
     insecure: bool = option(

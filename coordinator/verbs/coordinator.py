@@ -19,12 +19,14 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.logs import label_logs
 from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking
 from dreamfleet.common.host.resource_limits import check_room_for_session, raise_open_file_limit
+from dreamfleet.common.host.trusted_modules import trust
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.failures import error_text
 from dreamfleet.common.protocol.tasks import module_of
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.limits import LimitsConfig
+from dreamfleet.coordinator.settings.live_log import parse_sinks
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.settings.presets import find_preset
 from dreamfleet.coordinator.settings.run_checks import NO_SUBSPACE
@@ -115,11 +117,13 @@ def build_request(
     network = choose_addresses(own, args.global_config, kept, credentials)
     Network(network.listen, network.connect, credentials).check_open(insecure=network.insecure)
     global_config = args.global_config
-    code = module_of(config.optimiser) if config else ""
-    trust = tuple(dict.fromkeys(filter(None, (*(global_config.trust if "trust" in args.given else ()), code))))
+    trust(each.module for each in parse_sinks(load(NetworkConfig, "network", **args.sources).log_to))  # not the run's
+    code = [module_of(config.optimiser)] if config else []
+    code += [each.module for each in parse_sinks(own.log_to)]
+    trusted = tuple(dict.fromkeys(filter(None, (*(global_config.trust if "trust" in args.given else ()), *code))))
     return RunRequest(
         name, args.runs_dir, config, limits, network, start, credentials, global_config.join, global_config.access_dir,
-        trust,
+        trusted,
     )  # fmt: skip
 
 
