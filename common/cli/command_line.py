@@ -19,8 +19,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import NoReturn, Protocol
 
+from dreamfleet.common.cli.elsewhere import OTHER_NAMES
 from dreamfleet.common.cli.parser import Parser
-from dreamfleet.common.cli.removed import OTHER_NAMES, describe_removed
 from dreamfleet.common.errors import DreamfleetError, MissingExtraError, UsageError
 from dreamfleet.common.host.logs import configure_logging, report_failure
 from dreamfleet.common.host.packages import GYMNASIUM, extra_of, wrong_version
@@ -174,7 +174,7 @@ def _show_overview(points: Mapping[str, EntryPoint], words: Sequence[str]) -> No
     group = [name for name in points if name.startswith(f"{first}.")] if first else []
     spoken = list(words[: 2 if group else 1])
     if spoken and not spoken[-1].startswith("-") and (not group or len(spoken) == 2):
-        raise UsageError(describe_removed(words) or _unknown_verb_text(words, spoken, points))
+        raise UsageError(_unknown_verb_text(words, spoken, points))
     parser = _help_parser(f"dreamfleet {first}", group, points) if group else _Overview(points)
     parser.add_argument("--version", action="version", version=f"dreamfleet {version('dreamfleet')}")
     parser.parse_args(words[1:] if group else words)

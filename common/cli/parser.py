@@ -10,9 +10,9 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, NoReturn
 
+from dreamfleet.common.cli.elsewhere import FLAGS_ELSEWHERE
 from dreamfleet.common.cli.first_flags import FIRST_FLAGS, FLAGS_OF_ALL
 from dreamfleet.common.cli.key_values import as_setting
-from dreamfleet.common.cli.removed import FLAGS_ELSEWHERE, REMOVED_FLAGS
 from dreamfleet.common.errors import UsageError
 
 MIN_LIKENESS = 0.65  # of an unknown flag and the one that is suggested
@@ -125,7 +125,7 @@ class Parser(argparse.ArgumentParser):
             )
         said = f"unrecognized arguments: {' '.join(unknown)}"
         for at, word in enumerate(unknown):
-            if word.startswith("--") and (answer := self._describe_moved(word, unknown[at + 1 :])):
+            if word.startswith("--") and (answer := self._describe_elsewhere(word, unknown[at + 1 :])):
                 raise UsageError(answer)
         flags = [word.split("=")[0] for word in unknown if word.startswith("--")]
         near = [each for flag in flags for each in _near_flags(flag, self._option_string_actions)]
@@ -134,16 +134,14 @@ class Parser(argparse.ArgumentParser):
         self._refuse_bare(words)
         self.error(said)
 
-    def _describe_moved(self, word: str, following: Sequence[str]) -> str | None:
-        """The answer to a flag that was removed, or that is a setting of `--set` now."""
+    def _describe_elsewhere(self, word: str, following: Sequence[str]) -> str | None:
+        """The answer to a flag of another verb, or to a setting of `--set` that is given as a flag."""
         flag, equals, value = word.partition("=")
-        if new := REMOVED_FLAGS.get((self._verb, flag)):
-            return f"{flag} is gone: {new}"
         if other := FLAGS_ELSEWHERE.get((self._verb, flag)):
             return f"{self.prog} has no {flag}: {other}"
         keys = {key for texts in self.keys.values() for key in texts}
         setting = as_setting(flag, (value,) if equals else tuple(takewhile(_is_value, following)))
-        return f"{flag} is a setting now: give --set {setting}" if setting.partition("=")[0] in keys else None
+        return f"{flag} is no flag but a setting: give --set {setting}" if setting.partition("=")[0] in keys else None
 
     def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
         if action.option_strings and "--" in arg_strings:  # of `--flag=--`: Python 3.11 drops it and gives a list

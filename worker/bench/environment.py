@@ -21,13 +21,13 @@ from dreamfleet.common.runs.seeds import VALIDATION
 from dreamfleet.worker.car_racing.native_check import ActionSource, Mismatch, compare, make_car_racing, random_action
 from dreamfleet.worker.car_racing.preprocessing import BOX
 from dreamfleet.worker.car_racing.task import (
-    CarRacingPolicy,
     CarRacingTask,
     PictureObservation,
     make_reference_environment,
 )
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode, score_together
 from dreamfleet.worker.tasks.api import Assignment
+from dreamfleet.worker.worldmodel.policy import ModelPolicy
 
 STEPS = 1000
 Policy = Callable[[NDArray[np.uint8]], Any]
@@ -184,9 +184,9 @@ class Repetition(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self.env.step(next(self._actions))
 
 
-def make_random_policy(bundle: Bundle) -> CarRacingPolicy:
+def make_random_policy(bundle: Bundle) -> ModelPolicy:
     """A policy of the bundle with random parameters."""
-    policy = CarRacingPolicy(bundle)
+    policy = ModelPolicy(bundle)
     policy.begin(random_parameters(bundle))
     return policy
 
@@ -246,9 +246,9 @@ def make_driver(bundle: Bundle) -> ActionSource:
     return lambda _step, picture, _random: policy.act(picture)
 
 
-def shipped_driver(bundle: Bundle) -> tuple[CarRacingPolicy, Controller]:
+def shipped_driver(bundle: Bundle) -> tuple[ModelPolicy, Controller]:
     """A bundle's policy and the controller shipped with it; `ControllerError` if it belongs to another bundle."""
     controller = Controller.load(pretrained_folder() / f"{bundle.manifest.name}.npz")
     if controller.bundle != bundle.sha256:
         raise ControllerError(f"the shipped controller {bundle.manifest.name} is not of {bundle.path}")
-    return CarRacingPolicy(bundle), controller
+    return ModelPolicy(bundle), controller

@@ -51,7 +51,6 @@ WORLD = World(
     preset="tiny",
 )
 
-CarRacingPolicy = ModelPolicy  # its former name
 POLICIES: dict[str, Callable[[np.random.Generator], Policy]] = {
     "uniform": lambda random: DriverPolicy(UniformDriver(random)),
     "pushed": lambda random: DriverPolicy(PushedDriver(random)),

@@ -72,8 +72,6 @@ class HostClassProbe:
         """Add a step."""
         self.add_value(tuple(look()))
 
-    due, see = is_due, observe  # former names, which batches of other packages may call
-
     def add_value(self, value: Any) -> None:
         """Add the bits of a value of an environment or a policy: numbers, arrays, texts, and containers of them."""
         if isinstance(value, Mapping):

@@ -37,7 +37,6 @@ from dreamfleet.worker.tasks.api import (
     World,
 )
 from dreamfleet.worker.tasks.closing import close_environment
-from dreamfleet.worker.tasks.former_names import FORMER_OBSERVER_NAMES, accept_former_names
 from dreamfleet.worker.tasks.measures import Measurer
 from dreamfleet.worker.tasks.registry import find_scored_task
 
@@ -62,7 +61,7 @@ class Scorer(Displayed):
 
     def __init__(self, spec: TaskSpec, bundle: Bundle | None = None, torch_device: str = "") -> None:
         """With a `torch_device`, such as "cuda", dreams are dreamt there."""
-        self._observer: StepObserver | None = None
+        self.observer: StepObserver | None = None  # of steps of the next jobs; `None` costs an episode nothing
         task = find_scored_task(spec.task, bundle)
         fitting = None if bundle is None else bundle.with_options(spec.controller, spec.options)
         assignment = Assignment(spec, fitting, torch_device)
@@ -110,16 +109,6 @@ class Scorer(Displayed):
             f"Scorer of {spec.task}: {plural(size, 'parameter')}, episodes of {plural(spec.horizon, 'step')} at most",
             facts,
         )
-
-    @property
-    def observer(self) -> StepObserver | None:
-        """Who sees steps of the next jobs; `None`, which costs an episode nothing. May be set between jobs."""
-        return self._observer
-
-    @observer.setter
-    def observer(self, observer: StepObserver | None) -> None:
-        accept_former_names(observer, FORMER_OBSERVER_NAMES)
-        self._observer = observer
 
     def score(
         self, kind: Kind, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None,

@@ -70,8 +70,6 @@ class FrameSampler:
             self._send(_make_frame(self._group, episode, look()))
         self._next_at = began + max(FRAME_INTERVAL, (self._cpu_time() - before) / MAX_TIME_SHARE)
 
-    due, see = is_due, observe  # former names, which batches of other packages may call
-
 
 def _make_frame(group: int, episode: int, step: StepSnapshot) -> SampledFrame:
     no_picture = 1, 1, b""

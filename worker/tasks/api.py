@@ -24,7 +24,6 @@ from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import Description
 from dreamfleet.common.serialization.display import DisplayedFields
-from dreamfleet.worker.tasks.former_names import FormerFields, accept_former_names, add_former_names
 from dreamfleet.worker.tasks.policy import Driver, FlatPolicy
 
 __all__ = [
@@ -161,8 +160,6 @@ class StepSnapshot(NamedTuple):
 class StepObserver(Protocol):
     """Receives some steps of episodes while they are scored. It changes no score.
 
-    The observer that a task gets also answers to the methods' former names `due` and `see`.
-
     >>> from dreamfleet import Scorer
     >>> class Steps(list):
     ...     def is_due(self):
@@ -199,11 +196,10 @@ class DreamReward:
 
 
 @dataclass(frozen=True, repr=False)
-class World(DisplayedFields, metaclass=FormerFields):
+class World(DisplayedFields):
     """What the rest of the system must know of a world; `UsageError` for a mirror or names of other actions.
 
     The last six fields are of worlds in which world models are trained (docs/reference/worlds.md).
-    `off_course` and `off_course_cost` may also be given and read by their former names `stray` and `stray_cost`.
 
     >>> from dreamfleet import Continuous, Discrete, World
     >>> World(Continuous.between(low=[-2], high=[2]), horizon=200).actions.outputs
@@ -232,9 +228,6 @@ class World(DisplayedFields, metaclass=FormerFields):
     lost_after: int = 0  # steps without a reward that are a loss of the course; 0: a loss is a death
     opening: int = 0  # first steps of an episode that measurements leave out, while a camera moves
     preset: str = "pixels"  # training preset of a new data set
-
-    stray = property(lambda self: self.off_course)
-    stray_cost = property(lambda self: self.off_course_cost)
 
     def __post_init__(self) -> None:
         own = self.actions.actions if isinstance(self.actions, Continuous) else 0
@@ -309,9 +302,6 @@ class Task:
     option. The default policy is a linear or hidden controller on the flat observation.
     An incomplete task is refused when it is looked up, with a list of what is missing.
 
-    Three members have former names that still work, defined or called: `make_judge` is
-    `make_evaluation_environment`, `make_shown` is `make_watched_environment`, and `width` is `batch_size`.
-
     >>> import gymnasium
     >>> from dreamfleet import Description, Discrete, Task, World
     >>> class Balance(Task):
@@ -332,11 +322,6 @@ class Task:
     # before it scores anything. 0: there is no such episode, and the host's fingerprint determines the class.
     probe_steps: ClassVar[int] = 16
     world: World
-
-    def __init_subclass__(cls, **arguments: Any) -> None:
-        super().__init_subclass__(**arguments)
-        for each in cls.__mro__:
-            add_former_names(each)
 
     def world_of(self, assignment: Assignment) -> World:  # noqa: ARG002 - other tasks' worlds depend on the assignment
         """The world that is scored in."""
@@ -380,9 +365,6 @@ class Task:
     def make_policy(self, assignment: Assignment) -> Policy:
         """A new policy; `BundleError` if the bundle belongs to another task."""
         return FlatPolicy(assignment.controller, self.world_of(assignment).actions)
-
-
-accept_former_names(Task)
 
 
 class Batch(Protocol):

@@ -14,7 +14,6 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import BundleError, RefusedError, UsageError
 from dreamfleet.common.protocol.tasks import family_of, load_task, registered_tasks
 from dreamfleet.worker.tasks.api import Preprocessing, RecordableTask, Task, TaskWithOptions, World
-from dreamfleet.worker.tasks.former_names import accept_former_names
 
 REQUIRED_METHODS = ("make_environment", "make_evaluation_environment", "make_policy", "world_of")
 
@@ -42,7 +41,6 @@ def known_tasks() -> tuple[str, ...]:
 def find_task(name: str) -> Task:
     """A task by name; `UsageError` lists the registered ones, or says what this one lacks."""
     task = load_task(name)
-    accept_former_names(task)
     if missing := list(_find_problems(task)):
         raise UsageError(
             f"task {name!r} is incomplete: {'; '.join(missing)}; docs/reference/tasks.md shows a whole one"

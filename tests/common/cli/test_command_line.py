@@ -1,5 +1,5 @@
 """The command line: finding and loading verbs, help, and errors for typing mistakes.
-Tests first_flags.py, key_values.py, overview.py, parser.py, removed.py and common/host/standard_streams.py."""
+Tests elsewhere.py, first_flags.py, key_values.py, overview.py, parser.py and common/host/standard_streams.py."""
 
 import os
 import re
@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from dreamfleet.common.cli import command_line
+from dreamfleet.common.cli.elsewhere import FLAGS_ELSEWHERE, OTHER_NAMES
 from dreamfleet.common.cli.first_flags import FIRST_FLAGS
 from dreamfleet.common.cli.overview import GROUPS, WIDTH
-from dreamfleet.common.cli.removed import REMOVED_FLAGS, REMOVED_VERBS
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host import packages
 from dreamfleet.common.host.standard_streams import LAST_STREAM
@@ -38,7 +38,6 @@ def points(*more):
         (("record", "--controler", "real"), "unrecognized arguments: --controler; did you mean --controller?"),
         (("coordinator", "--workers", "2"), "coordinator has no --workers: workers are programs of their own"),
         (("coordinator", "--popsize", "8"), "unrecognized arguments: --popsize 8; did you mean --population?"),
-        (("evaluate", "drqn", "--data", "x"), "--data is gone: name the training's folder as --controller FOLDER"),
         (("runs", "export", "dream", "--csv", "out.csv"), "--csv takes no value, and 'out.csv' stands behind it"),
         (("runs", "export", "--csv", "out.csv"), "write dreamfleet runs export RUN --csv --out FOLDER"),
         (("worker", "--conect", "tcp/a:1"), "did you mean --connect?"),
@@ -140,7 +139,7 @@ def test_the_module_and_the_version():
 
 def test_closed_streams_are_replaced(tmp_path):
     program = (
-        "import os, sys; from dreamfleet.common.cli.command_line import main; assert sys.stdout is None; "
+        "import os, sys;  import main; assert sys.stdout is None; "
         "main(['runs', 'list']); raise SystemExit(os.open('journal', os.O_CREAT | os.O_WRONLY))"
     )
     command = ["bash", "-c", '"$@" <&- >&- 2>&-', "-", sys.executable, "-c", program]
@@ -304,8 +303,9 @@ def test_help_shows_the_first_flags_and_help_all_the_rest(name):
 
 def test_the_tables_of_flags_name_what_is_there():
     assert FIRST_FLAGS.keys() <= points().keys()
-    for verb, flag in REMOVED_FLAGS:
+    for verb, flag in FLAGS_ELSEWHERE:
         assert flag not in command_line.build_parser(verb, points()[verb].load())._option_string_actions
+    assert {*OTHER_NAMES.values()} <= {*points(), "--help"}
 
 
 def test_each_verb_stands_once_in_the_overview():
@@ -322,13 +322,3 @@ def test_the_overview_fits_a_terminal_and_loads_no_verb(capsys, monkeypatch):
     assert max(map(len, lines[: lines.index("Documents")])) <= WIDTH
     assert len(lines) <= 75
     assert Path(lines[-1].strip()).read_text().startswith("# ")  # the documents are in the wheel
-
-
-@pytest.mark.parametrize("old", sorted(REMOVED_VERBS))
-def test_a_removed_verb_is_answered_with_the_new_one(old, capsys):
-    new = REMOVED_VERBS[old]
-    assert {old, old.replace(" ", ".")}.isdisjoint(points())
-    assert any(new.split(" --")[0] == name.replace(".", " ") for name in points())
-    assert command_line.main([*old.split(), "night", "--seed", "3"]) == UsageError.exit_code
-    error = capsys.readouterr().err
-    assert error == f"dreamfleet: `{old}` is now `{new}`: dreamfleet {new} night --seed 3\n"

@@ -213,7 +213,7 @@ def test_a_lap_that_is_over_costs_no_more_time(random_bundle):
     environment.close()
 
 
-def test_an_older_worker_does_not_score_a_variant(random_bundle):
+def test_a_variant_is_another_version_of_the_task(random_bundle):
     spec, _ = varied(random_bundle, decide_every=4)
     assert (spec.version, spec.controller) == (2, random_bundle.default_shape)
     with pytest.raises(UsageError, match="version 1 of task car-racing, here is version 2"):

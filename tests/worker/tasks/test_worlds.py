@@ -11,7 +11,6 @@ from gymnasium import spaces
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
 from dreamfleet.common.errors import BundleError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.worker.car_racing.task import CarRacingPolicy
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tasks.api import (
     Assignment,
@@ -156,7 +155,6 @@ def test_a_policy_of_any_world_gives_its_actions(bundle):
     policy.reward(1.0)
     assert action.tolist() == [1, 0, 0]
     assert action.dtype == np.float32
-    assert CarRacingPolicy is ModelPolicy
 
 
 def test_a_worlds_facts_are_what_the_coordinator_needs(bundle):

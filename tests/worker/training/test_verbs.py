@@ -65,10 +65,10 @@ def test_a_file_and_variables_say_settings_too(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("vae", "--latent", "64"), "--latent is a setting now: give --set latent=64"),
-        (("vae", "--channels", "2", "4"), "--channels is a setting now: give --set channels=2,4"),
-        (("mdnrnn", "--done"), "--done is a setting now: give --set done=true"),
-        (("vae", "--no-batch-norm"), "--no-batch-norm is a setting now: give --set batch_norm=false"),
+        (("vae", "--latent", "64"), "--set latent=64"),
+        (("vae", "--channels", "2", "4"), "--set channels=2,4"),
+        (("mdnrnn", "--done"), "--set done=true"),
+        (("vae", "--no-batch-norm"), "--set batch_norm=false"),
         (("vae", "--set", "latnt=3"), "unknown key 'latnt': did you mean 'latent'?"),
         (("vae", "--set", "hidden=3"), "unknown key 'hidden'"),
         (("vae", "--set", "xyzzy=3"), "known are updates, batch, rate"),
