@@ -139,7 +139,7 @@ def test_the_module_and_the_version():
 
 def test_closed_streams_are_replaced(tmp_path):
     program = (
-        "import os, sys;  import main; assert sys.stdout is None; "
+        "import os, sys; from dreamfleet.common.cli.command_line import main; assert sys.stdout is None; "
         "main(['runs', 'list']); raise SystemExit(os.open('journal', os.O_CREAT | os.O_WRONLY))"
     )
     command = ["bash", "-c", '"$@" <&- >&- 2>&-', "-", sys.executable, "-c", program]
