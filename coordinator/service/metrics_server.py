@@ -11,7 +11,6 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from time import monotonic, sleep
 
 from dreamfleet.common.errors import ConnectionFailedError
-from dreamfleet.common.monitoring.prometheus import CONTENT_TYPE, exposition
 from dreamfleet.common.transport.network import parse_metrics_address
 from dreamfleet.coordinator.service.snapshot import Snapshot
 
@@ -78,6 +77,8 @@ class _MetricsServer(HTTPServer):
 
 
 def _handler(snapshot: Callable[[], Snapshot]) -> type[BaseHTTPRequestHandler]:
+    from dreamfleet.common.monitoring.prometheus import CONTENT_TYPE, exposition  # only where they are served
+
     class Handler(BaseHTTPRequestHandler):
         timeout = PATIENCE
         server_version = "dreamfleet"
@@ -102,7 +103,7 @@ def _handler(snapshot: Callable[[], Snapshot]) -> type[BaseHTTPRequestHandler]:
                 self.send_error(HTTPStatus.NOT_FOUND, "there is only /metrics")
                 return
             status = snapshot().full_status()
-            body = exposition(status).encode()
+            body = exposition(status)
             self.send_response(HTTPStatus.OK)
             self.send_header("Content-Type", CONTENT_TYPE)
             self.send_header("Content-Length", str(len(body)))

@@ -103,7 +103,7 @@ def test_workers_are_scaled_by_metrics_that_are_there():
     query = scaled["spec"]["triggers"][0]["metadata"]["query"]
     promql_parser.parse(query)
     names = set(re.findall(r"dreamfleet_[a-z_]+", query))
-    text = exposition(dataclasses.replace(STATUS, run="night"))
+    text = exposition(dataclasses.replace(STATUS, run="night")).decode()
     assert names
     assert all(f'{name}{{run="night"}}' in text for name in names)
 

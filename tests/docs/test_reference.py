@@ -56,4 +56,6 @@ def test_every_metric_is_described():
         name: (kind, text)
         for name, kind, text in re.findall(r"^\| `(\w+)`[^|]*\| (\w+) \| (.*?) \|", page, re.MULTILINE)
     }
-    assert rows == {each.name: (each.kind, each.text) for each in collect_metrics(STATUS)}
+    metrics = list(collect_metrics(STATUS))
+    names = [f"{each.name}_total" if each.type == "counter" else each.name for each in metrics]
+    assert rows == {name: (each.type, each.documentation) for name, each in zip(names, metrics, strict=True)}

@@ -13,7 +13,10 @@ import pytest
 from dreamfleet.common.cli.health import missing_for_role, run_checks
 from tests.support.processes import DEADLINE, ROOT, environment
 
-COORDINATOR = ("cma", "eclipse-zenoh", "msgpack", "numpy", "rich", "pygments", "markdown-it-py", "mdurl", "dreamfleet")
+COORDINATOR = (
+    "cma", "eclipse-zenoh", "msgpack", "numpy", "prometheus-client", "rich", "pygments", "markdown-it-py", "mdurl",
+    "dreamfleet",
+)  # fmt: skip
 
 
 def top_of(name):

@@ -69,7 +69,7 @@ def test_a_worker_that_vanishes_is_logged_and_a_stranger_is_not(bench):
     status = read_status(answered(snapshot_of(bench)))
     assert (status.workers, status.worker_list[-1].worker) == (WorkerCount(1, 2, 1), B)
     assert (status.worker_list[-1].state, status.worker_list[-1].leases) == ("lost", 0)
-    assert 'dreamfleet_workers{run="night",which="lost"} 1.0' in exposition(status)
+    assert b'dreamfleet_workers{run="night",which="lost"} 1.0' in exposition(status)
     assert [what for what, _, _ in events(bench, what="lost,joined")] == ["joined", "joined", "lost"]
     before = len(events(bench))
     bench.deliver("stranger/00000009", Result(b"x" * 32, 1.0, 10, 0.1, None, None))
