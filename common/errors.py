@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from errno import EACCES, EDQUOT, EISDIR, ENOSPC, EPERM, EROFS
 
 
@@ -98,7 +99,11 @@ class AccessError(DreamfleetError):
 
 
 class RefusedError(DreamfleetError):
-    """The other side answered and refused the request."""
+    """The other side answered and refused the request; a worker started with `flag`, its name and value, may join."""
+
+    def __init__(self, text: str, flag: tuple[str, str] | None = None) -> None:
+        super().__init__(text if flag is None else f"{text}: `{shlex.join(('dreamfleet', 'worker', *flag))}`")
+        self.text, self.flag = text, flag
 
 
 class MissingExtraError(DreamfleetError):

@@ -24,6 +24,7 @@ from dreamfleet.common.cli.parser import Parser
 from dreamfleet.common.errors import DreamfleetError, MissingExtraError, UsageError
 from dreamfleet.common.host.logs import configure_logging, report_failure
 from dreamfleet.common.host.packages import GYMNASIUM, extra_of, wrong_version
+from dreamfleet.common.host.reports import adopt_reports
 from dreamfleet.common.host.standard_streams import discard_stdout, prepare_streams
 from dreamfleet.common.host.stop_signals import interrupts
 from dreamfleet.common.printable import one_line
@@ -68,6 +69,7 @@ class SimpleVerb:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb; returns the exit code. An expected error becomes one line on stderr and a non-zero exit code."""
     prepare_streams()
+    adopt_reports()
     configure_logging()
     words = list(sys.argv[1:] if argv is None else argv)
     try:

@@ -12,6 +12,7 @@ import sys
 from datetime import UTC, datetime
 from typing import Literal
 
+from dreamfleet.common.host.reports import FAILURE, report
 from dreamfleet.common.printable import PrintableFormatter, one_line, printable, shorten_words
 
 PROCESSES = ("coordinator", "worker")  # loggers whose lines are their process's
@@ -71,8 +72,9 @@ def set_log_format(log_format: Literal["text", "json", "auto"]) -> None:
 
 
 def report_failure(text: str) -> None:
-    """Report why a verb fails: as a line on stderr, or as a log record if the log is JSON."""
+    """Report why a verb fails: as a line on stderr, or as a log record if the log is JSON; and to who started it."""
     text = shorten_words(one_line(text))
+    report(FAILURE, text)
     if any(isinstance(handler.formatter, JsonFormatter) for handler in logging.getLogger().handlers):
         logging.getLogger("dreamfleet").error("%s", text)
     else:

@@ -19,8 +19,10 @@ from pathlib import Path
 from typing import IO, Any
 
 from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.host.reports import FAILURE, VARIABLE, ReportPipe
 
 KEPT_LINES = 10_000  # the last lines of each stream that are kept, at least
+POLL_INTERVAL = 0.02  # seconds between two looks at what a verb reported
 PATIENCE = 3.0  # seconds to wait after each SIGTERM
 KILL_LIMIT = 30.0  # seconds to wait after SIGKILL: a process in a system call that does not return does not end
 
@@ -81,13 +83,17 @@ class VerbProcess:
         self._log = log
         self._out: deque[str] = deque(maxlen=KEPT_LINES)
         self._new_lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._reports = ReportPipe()
+        inherited = {**(os.environ if environment is None else environment), VARIABLE: str(self._reports.write)}
         with ExitStack() as stack:
+            stack.callback(os.close, self._reports.write)
             if log is not None:
                 log.parent.mkdir(parents=True, exist_ok=True)
             target = subprocess.PIPE if log is None else stack.enter_context(log.open("wb"))
             self.popen = subprocess.Popen(  # noqa: S603 - our own interpreter and verb
-                [*inside, *command(*words)], stdout=target, stderr=target, env=environment, start_new_session=True
-            )
+                [*inside, *command(*words)], stdout=target, stderr=target, env=inherited, start_new_session=True,
+                pass_fds=(self._reports.write,),
+            )  # fmt: skip
         streams = (
             (self.popen.stdout, read or (lambda stream: _drain(stream, self._out.append, None))),
             (self.popen.stderr, lambda stream: _drain(stream, self._add_line, self._new_lines)),
@@ -125,6 +131,21 @@ class VerbProcess:
                 lines.append(line)
         return lines
 
+    def reports(self, name: str) -> list[Any]:
+        """What it reported under this name so far, the oldest first."""
+        return self._reports.find(name)
+
+    def wait_for_report(self, name: str, timeout: float = 60.0) -> Any:
+        """Block until it reports a value of this name; `DreamfleetError` if it ends before, or does not in time."""
+        deadline = time.monotonic() + timeout
+        while True:
+            has_ended = self.popen.poll() is not None
+            if found := self.reports(name):
+                return found[0]
+            if has_ended or time.monotonic() > deadline:
+                raise DreamfleetError(f"it reported no {name} within {timeout:g} s; {self.last_line()}")
+            time.sleep(POLL_INTERVAL)
+
     def finish(self, timeout: float | None = None) -> tuple[int, str]:
         """Wait for the end; returns the exit code and stdout."""
         code = self.popen.wait(timeout)
@@ -132,10 +153,12 @@ class VerbProcess:
         return code, "".join(self._out)
 
     def last_line(self) -> str:
-        """The last line of its log, or of stderr; after which signal killed it, if one did."""
+        """Why it failed, as it reported; else the last line of its log, or of stderr, and which signal killed it."""
+        if reported := self.reports(FAILURE):
+            return str(reported[-1])
         lines: Iterable[str] = self.lines if self._log is None else self._log.read_text(errors="replace").splitlines()
         printed = [line.strip() for line in lines if line.strip()]
-        said = printed[-1].removeprefix("dreamfleet: ") if printed else "it printed nothing"
+        said = printed[-1] if printed else "it printed nothing"
         code = self.popen.poll()
         return said if code is None or code >= 0 else f"killed by signal {-code}; its last line: {said}"
 

@@ -80,8 +80,14 @@ def estimate_eta(status: Status) -> Eta:
 
 def describe_state(status: Status) -> str:
     """Describe what the run does now, or waits for; without its name."""
-    describe = STATE_DESCRIPTIONS.get(status.state)
-    return status.state if describe is None else describe(status)
+    detail = describe_detail(status)
+    return f"{status.state}: {detail}" if detail and status.state in NAMED_STATES else detail or status.state
+
+
+def describe_detail(status: Status) -> str:
+    """The description of a state, without the state's own name; empty if that says all."""
+    describe = STATE_DETAILS.get(status.state)
+    return "" if describe is None else describe(status)
 
 
 def summarise_status(status: Status) -> str:
@@ -274,27 +280,23 @@ def _describe_evaluating(status: Status) -> str:
 def _describe_waiting(status: Status) -> str:
     if status.refused:
         name, why = next(iter(status.refused.items()))
-        return f"waiting for workers; {name} was refused: {why}"
+        return f"{name} was refused: {why}"
     known = status.workers.known
     if not known and not status.throughput.environment_steps:
-        return "waiting for workers: none has joined yet"
+        return "none has joined yet"
     left = sorted((each for each in status.worker_list if each.reason), key=lambda each: each.heard)
     last = f"; {left[0].worker} left {format_duration(left[0].heard)} ago: {left[0].reason}" if left else ""
     gone = describe_departed(status.workers)
-    return f"waiting for workers: none is present{f' ({gone})' if gone else ''}{last}"
+    return f"none is present{f' ({gone})' if gone else ''}{last}"
 
 
 def _format_episodes(part: EpisodeProgress) -> str:
     return f"{part.episodes_done:,} of {plural(part.episodes, 'episode')}"
 
 
-def _describe_paused(status: Status) -> str:
-    return f"paused: {status.why}" if status.why else "paused"
-
-
 def _describe_ended(status: Status) -> str:
     score = describe_score(in_values(status.confirmed or status.best, status.settings.task), status.score_word)
-    return f"ended: {status.why or 'stopped'}; {score}"
+    return f"{status.why or 'stopped'}; {score}"
 
 
 def _describe_left(status: Status) -> str:
@@ -303,11 +305,12 @@ def _describe_left(status: Status) -> str:
     )
 
 
-STATE_DESCRIPTIONS: dict[str, Callable[[Status], str]] = {
+STATE_DETAILS: dict[str, Callable[[Status], str]] = {
     "running": _describe_running,
     "evaluating": _describe_evaluating,
     "waiting for workers": _describe_waiting,
-    "paused": _describe_paused,
+    "paused": lambda status: status.why,
     "ended": _describe_ended,
     "left": _describe_left,
 }
+NAMED_STATES = ("waiting for workers", "paused", "ended")  # whose descriptions begin with their name

@@ -1,39 +1,37 @@
-"""What failed, in words, and what a worker's error says: its cause, and whether the host is at fault."""
+"""Why an attempt at a job failed, as data and in words; and what a job scores, in words."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
 
-HOST_PREFIX = "host: "
-OF_FUNCTION = "ObjectiveError"  # the cause where a function raised, or returned no finite number
+from dreamfleet.common.serialization.optional_fields import OPTIONAL
+from dreamfleet.common.serialization.validation import Length, Text
 
-
-def failure_cause(error: str) -> str:
-    """The part of an error that is equal for equal failures: the text before the first colon.
-
-    >>> failure_cause("ValueError: array at 0x7f3a is not finite")
-    'ValueError'
-    """
-    return error.partition(":")[0]
+MAX_CAUSE = 128  # characters
+FailureKind = Literal["host", "usage", "crash", "other"]
+"""`host`: short of memory, disk or processes, which says nothing of the job. `usage`: asked for what it cannot do.
+`crash`: the scoring process ended or was killed."""
 
 
-def error_text(error: str) -> str:
-    """An error without its cause, if a function raised it: the text itself names the exception.
+@dataclass(frozen=True)
+class Failure:
+    """Why an attempt at a job failed; `cause` is equal for equal failures, on every host and in every run."""
 
-    >>> error_text("ObjectiveError: cost returned nan"), error_text("slot crashed (exit status 3)")
-    ('cost returned nan', 'slot crashed (exit status 3)')
-    """
-    cause, _, text = error.partition(": ")
-    return text if cause == OF_FUNCTION else error
+    text: Text  # for people
+    cause: Annotated[str, Length(1, MAX_CAUSE)]  # an exception's class, or fixed words: no number, path or address
+    kind: FailureKind = field(default="other", metadata=OPTIONAL)
 
+    @classmethod
+    def of_host(cls, what: str) -> Failure:
+        """A failure that the host is to blame for, and not the job."""
+        return cls(f"host: {what}", "host", "host")
 
-def is_host_failure(error: str) -> bool:
-    """Whether a shortage of the host (memory, disk, processes) ended the attempt.
-
-    >>> is_host_failure("host: killed by SIGKILL")
-    True
-    """
-    return error.startswith(HOST_PREFIX)
+    @property
+    def ends_process(self) -> bool:
+        """Whether the attempt ended its process, or may have, so that a process that drives it again would end too."""
+        return self.kind in ("crash", "host")
 
 
 def describe_job(kind: str, generation: int | str, candidate: int | str, seeds: Sequence[int]) -> str:

@@ -14,6 +14,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
+from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.measures import MeasureNames, Measures
 from dreamfleet.common.serialization.display import DisplayedFields
 from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
@@ -201,7 +202,7 @@ class Result:
     fitness: float | None
     steps: Count
     seconds: Seconds
-    error: Text | None
+    error: Failure | None
     upload: Digest | None
     measures: Measures = field(default=(), metadata=OPTIONAL)  # those that the specification names, in its order
 
@@ -350,6 +351,8 @@ class HelloReply:
     share: FleetShare = field(default=1.0, metadata=OPTIONAL)  # of a worker's slots, relative to its other runs
     taken: bool = field(default=False, metadata=OPTIONAL)  # whether it reads `Heartbeat.taken`
     together: bool = field(default=False, metadata=OPTIONAL)  # whether it reads `Heartbeat.together`
+    # Refused, as the worker did not announce this task of no package: its user may start it with that.
+    unannounced_task: Annotated[str, Length(0, 128)] = field(default="", metadata=OPTIONAL)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import sys
 
+from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.messages import MAX_LEASES
 
 # Its square, summed over the largest run, is far below the largest double, 1.8e308.
@@ -22,16 +23,22 @@ def max_steps(horizon: int) -> int:
     return horizon * MAX_LEASES
 
 
-def rejection_reason(fitness: float, steps: int, seconds: float, horizon: int) -> str | None:
-    """Why a result must be rejected, a cause without numbers and a colon first; `None` if it is valid."""
+def rejection_reason(fitness: float, steps: int, seconds: float, horizon: int) -> Failure | None:
+    """Why a result must be rejected; `None` if it is valid."""
     if not abs(fitness) <= LARGEST_FITNESS:  # false of NaN too
         limits = f"within ±{LARGEST_FITNESS:g}"
-        return f"fitness out of bounds: the episode gave {fitness:g}, which must lie {limits}: scale the reward"
+        return _rejection(
+            "fitness out of bounds", f"the episode gave {fitness:g}, which must lie {limits}: scale the reward"
+        )
     if not 0 <= steps <= max_steps(horizon):
-        return f"too many steps: the episode has {steps:.6g} steps, more than the allowed {horizon}"
+        return _rejection("too many steps", f"the episode has {steps:.6g} steps, more than the allowed {horizon}")
     if not 0 <= seconds <= MAX_SECONDS:
-        return f"impossible time: the episode took {seconds:g} seconds"
+        return _rejection("impossible time", f"the episode took {seconds:g} seconds")
     return None
+
+
+def _rejection(cause: str, detail: str) -> Failure:
+    return Failure(f"{cause}: {detail}", cause)
 
 
 def clamp_count(number: int) -> int:

@@ -102,9 +102,10 @@ class EqualBudget:
     evaluated_means: tuple[EvaluatedMean | None, ...]
 
 
+STEPS, CORE_HOURS = "steps in reality", "core-hours"
 BUDGETS: dict[str, Callable[[Effort], float]] = {
-    "steps in reality": lambda effort: effort.steps,
-    "core-hours": lambda effort: effort.core_hours,
+    STEPS: lambda effort: effort.steps,
+    CORE_HOURS: lambda effort: effort.core_hours,
 }
 
 

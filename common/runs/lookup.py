@@ -122,11 +122,12 @@ def find_evaluated_mean(name: str, runs_dir: Path, generation: int) -> tuple[Con
 
 
 def find_bundle_of(
-    controller: Controller | TrainedAgent, named: str | None, beside: Path | None = None
-) -> Bundle | None:
+    controller: Controller | TrainedAgent, named: str | None, beside: Path | None = None,
+    remedy: str = "name it with --bundle FILE",
+) -> Bundle | None:  # fmt: skip
     """The world model that a controller was evolved with: the `named` one, or one beside it, cached or shipped.
 
-    `None` for a trained agent, and if the controller's task needs none.
+    `None` for a trained agent, and if its task needs none. `BundleError` with the `remedy` if it is missing.
     """
     if isinstance(controller, TrainedAgent) or not controller.bundle:
         return None
@@ -137,9 +138,7 @@ def find_bundle_of(
     else:
         found = BundleStore(default_cache()).find(controller.bundle)
         if found is None:
-            raise BundleError(
-                f"the controller's world model {controller.bundle[:12]}... is not here: name it with --bundle FILE"
-            )
+            raise BundleError(f"the controller's world model {controller.bundle[:12]}... is not here: {remedy}")
         bundle = found
     return bundle.for_controller(controller)
 

@@ -12,6 +12,7 @@ from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.printable import plural
+from dreamfleet.common.protocol.failures import Failure, FailureKind
 from dreamfleet.common.protocol.function_values import is_minimised
 from dreamfleet.common.protocol.measures import MAX_AXES, MAX_AXIS
 from dreamfleet.common.protocol.messages import Horizon, Packages, Patience, Share, TaskSpec
@@ -162,6 +163,8 @@ class StoredEvent:
     happened: float  # seconds since 1970, by the coordinator's wall clock
     incarnation: int
     text: str
+    what: str = ""  # became of the worker, or `leaves` where the coordinator left by itself
+    worker: str = ""
 
 
 @dataclass(frozen=True)
@@ -174,10 +177,17 @@ class StoredFailure:
     episode: int
     seed: int
     error: str  # of the last attempt
+    cause: str  # equal for equal failures
+    fault: FailureKind
     workers: str  # where it was tried, comma-separated
     attempts: int
     happened: float  # seconds since 1970
     digest: str  # of its job, hexadecimal
+
+    @property
+    def failure(self) -> Failure:
+        """The failure of the last attempt."""
+        return Failure(self.error, self.cause, self.fault)
 
 
 @dataclass(frozen=True)

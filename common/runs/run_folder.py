@@ -361,20 +361,24 @@ class RunFolder(Displayed):
 
     def events(self) -> list[StoredEvent]:
         """What happened to the run, oldest first: workers that came and went, pauses, failures, lives."""
-        if not self._has_failures:
+        if self._journal.version < schema.KINDS_VERSION:
             return []
-        query = "SELECT happened, incarnation, substr(text, 1, 1000) FROM event ORDER BY number"
-        return [StoredEvent(*row) for row in self._journal.rows("fis", query)]
+        query = (
+            "SELECT happened, incarnation, substr(text, 1, 1000), substr(what, 1, 100), substr(worker, 1, 100) "
+            "FROM event ORDER BY number"
+        )
+        return [StoredEvent(*row) for row in self._journal.rows("fisss", query)]
 
     def failures(self) -> list[StoredFailure]:
         """Every episode that has no score because it failed everywhere, oldest first."""
-        if not self._has_failures:
+        if self._journal.version < schema.KINDS_VERSION:
             return []
         query = (
-            "SELECT kind, generation, candidate, episode, seed, substr(error, 1, 1000), substr(workers, 1, 1000), "
-            "attempts, happened, hex(digest) FROM failure ORDER BY happened, generation, candidate, episode"
+            "SELECT kind, generation, candidate, episode, seed, substr(error, 1, 1000), substr(cause, 1, 1000), "
+            "substr(fault, 1, 10), substr(workers, 1, 1000), attempts, happened, hex(digest) FROM failure "
+            "ORDER BY happened, generation, candidate, episode"
         )
-        return [StoredFailure(*row) for row in self._journal.rows("siiiissifs", query)]
+        return [StoredFailure(*row) for row in self._journal.rows("siiiissssifs", query)]
 
     def confirmation(self) -> StoredConfirmation | None:
         """The confirmed score of the reported mean; `None` if that mean is not confirmed."""

@@ -106,10 +106,17 @@ MIGRATIONS = (
     ALTER TABLE strategy ADD COLUMN checksum BLOB;
     ALTER TABLE recalled ADD COLUMN was_closed INTEGER;
     """,
+    """
+    ALTER TABLE failure ADD COLUMN cause TEXT NOT NULL DEFAULT '';
+    ALTER TABLE failure ADD COLUMN fault TEXT NOT NULL DEFAULT 'other';
+    ALTER TABLE event ADD COLUMN what TEXT NOT NULL DEFAULT '';
+    ALTER TABLE event ADD COLUMN worker TEXT NOT NULL DEFAULT '';
+    """,
 )
 """Entry i migrates a journal from version i to i + 1. Append only."""
 VERSION = len(MIGRATIONS)
-CHECKSUM_VERSION = 10  # the first version with checksums; what an older one wrote has none, and is not compared
+CHECKSUM_VERSION = 11  # the first version whose checksums are compared: those of an older one cover less, or are none
+KINDS_VERSION = 11  # the first version whose failures and events are data beside their text
 PLACED_VERSION = 9  # the first version whose results lie in the order in which they come
 OPERATOR_VERSION = 7  # the first version that keeps which hosts the operator barred
 VERIFICATION_VERSION = 6  # the first version with results that were checked, barred hosts and recalled results

@@ -152,7 +152,7 @@ class _Mirror:
         except BaseException as error:  # a library may raise anything
             self._retry_at = now + RETRY
             if not self._has_failed:
-                what = truncate(one_line(f"{type(error).__name__}: {error}".partition(";")[0]), LONGEST)
+                what = truncate(one_line(f"{type(error).__name__}: {error}"), LONGEST)
                 self._report(f"the curves do not go to {self._name.kind} ({what}): the run goes on, and every "
                              f"{RETRY:g} s this is tried again")  # fmt: skip
             self._has_failed = True

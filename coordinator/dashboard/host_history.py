@@ -6,7 +6,6 @@ keeps no number of slots either: what is known is the slot time of results, and 
 
 from __future__ import annotations
 
-import re
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,8 +18,7 @@ BINS = 120  # of the run's time
 MOST_HOSTS = 200  # in the document; the others are summed
 MOST_EVENTS = 200  # the latest arrivals and departures
 Times = Mapping[int, tuple[float, float | None]]  # by generation: opened and closed
-_WORKER = re.compile(r"worker (\S+?)/(\S+) (.+)", re.DOTALL)
-_CAME = ("joined", "is back")
+_CAME, _GONE = ("joined", "back"), ("silent", "lost", "left")  # what becomes of a worker
 
 
 @dataclass
@@ -66,7 +64,7 @@ def host_history(
         "width": width,
         "hosts": [_row(name, each, since, width) for name, each in ordered[:MOST_HOSTS]],
         "more": max(len(ordered) - MOST_HOSTS, 0),
-        "events": [_event_row(each) for each in events if _WORKER.fullmatch(each.text)][: -MOST_EVENTS - 1 : -1],
+        "events": [_event_row(each) for each in events if each.what in (*_CAME, *_GONE)][: -MOST_EVENTS - 1 : -1],
     }
 
 
@@ -116,12 +114,11 @@ def _stays(
             last = moments[max(bisect_left(moments, each.happened) - 1, 0)]
             yield from ((*worker, came, max(last, came)) for worker, came in here.items())
             here.clear()
-        if (found := _WORKER.fullmatch(each.text)) is None:
-            continue
-        worker = found[1], found[2]
-        if found[3] in _CAME:
+        name, _, life = each.worker.partition("/")
+        worker = name, life
+        if each.what in _CAME:
             here.setdefault(worker, each.happened)
-        elif worker in here:
+        elif each.what in _GONE and worker in here:
             came = here.pop(worker)
             yield *worker, came, max(each.happened, came)
     yield from ((*worker, came, max(end, came)) for worker, came in here.items())

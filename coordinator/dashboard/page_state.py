@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from dreamfleet.common.artifacts.objective import describe_sign
-from dreamfleet.common.monitoring.eta import Eta, describe_state, estimate_eta, format_duration
+from dreamfleet.common.monitoring.eta import Eta, describe_detail, estimate_eta, format_duration
 from dreamfleet.common.monitoring.status import ArchiveStatus, Population, Status, WorkerStatus
 from dreamfleet.common.printable import format_number, plural, printable
 from dreamfleet.common.protocol.function_values import fitness_word, is_minimised, value_of
@@ -81,7 +81,7 @@ def _sentence(status: Status) -> str:
     """What the run does or waits for, without its state; empty while the open generation's card says it."""
     if status.state == "running":
         return ""
-    text = printable(describe_state(status)).removeprefix(f"{status.state}: ")
+    text = printable(describe_detail(status) or status.state)
     return text[:1].upper() + text[1:]
 
 

@@ -47,7 +47,7 @@ from dreamfleet.coordinator.dashboard.page_state import (
 
 COLUMNS = (
     "run", "created", "begun", "task", "generations", "mean", "best", "confirmed", "best_error", "confirmed_error",
-    "again", "state", "damaged",
+    "again", "state", "ended", "damaged",
 )  # fmt: skip
 LAST = 20  # generations in the table
 MOST_READ = 256 << 20  # bytes of candidates that are read for quartiles
@@ -73,6 +73,7 @@ def describe_run(runs_dir: Path, name: str) -> dict[str, Any]:
         return {
             "run": run.name,
             "state": printable(run.state),
+            "ended": run.ended is not None,
             "tiles": _tiles(run, data, total, word),
             "again": _resume_command(run),
             "facts": _about(run, settings),
@@ -183,6 +184,7 @@ def _run_row(path: Path) -> dict[str, Any]:
                 "confirmed_error": confirmed.error if confirmed else None,
                 "again": _resume_command(run),
                 "state": printable(run.state),
+                "ended": run.ended is not None,
                 "damaged": False,
             }
     except JournalError as error:

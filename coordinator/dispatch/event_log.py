@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import OrderedDict, deque
 from collections.abc import Collection, Iterator
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from dreamfleet.common.monitoring.status import EventKind
 from dreamfleet.common.protocol.messages import Job
@@ -24,6 +24,14 @@ class FleetEvent(NamedTuple):
     worker: str
     job: tuple[str, int, int, int] | None
     why: str = ""
+
+
+class Note(NamedTuple):
+    """A line for the log and the journal; `what` became of which `worker`, if it is of one."""
+
+    text: str
+    what: EventKind | Literal[""] = ""
+    worker: str = ""
 
 
 class EventLogView:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 
-from dreamfleet.common.protocol.failures import failure_cause, is_host_failure
 from dreamfleet.coordinator.dispatch.failures import Attempt, JobFailure, host_of
 from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJobs
@@ -30,7 +29,7 @@ class FailureJudge:
 
     def is_new_cause(self, failure: JobFailure) -> bool:
         """Whether a job's last attempt failed for a cause that was not seen before; of the first causes only."""
-        cause = failure_cause(failure.history[-1].error)
+        cause = failure.history[-1].error.cause
         is_new = cause not in self._causes and len(self._causes) < MAX_CAUSES
         if is_new:
             self._causes.add(cause)
@@ -122,13 +121,13 @@ def is_lasting(attempts: Sequence[Attempt], working: Collection[str], present: C
     disk, processes) counts only after ten attempts.
     """
     able = [each for each in attempts if each.host in working]
-    own = [each for each in able if not is_host_failure(each.error)]
+    own = [each for each in able if each.error.kind != "host"]
     if len(able) - len(own) >= HOST_ATTEMPTS:
         return True
     is_untried = bool(set(present) - {each.host for each in attempts})
     if is_untried and len({each.host for each in own}) < 2:
         return False
-    most = max(Counter(failure_cause(each.error) for each in own).values(), default=0)
+    most = max(Counter(each.error.cause for each in own).values(), default=0)
     return most >= EQUAL_ATTEMPTS or len(own) >= ANY_ATTEMPTS
 
 

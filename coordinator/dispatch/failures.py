@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass
 
 from dreamfleet.common.printable import truncate
-from dreamfleet.common.protocol.failures import describe_job
+from dreamfleet.common.protocol.failures import Failure, describe_job
 from dreamfleet.coordinator.jobs.work import Work
 
 LONGEST_ERROR = 300  # characters of a worker's error that are shown
@@ -24,7 +24,7 @@ class Attempt:
     """One failed attempt: on which worker, and the error that it sent."""
 
     worker: str
-    error: str
+    error: Failure
 
     @property
     def host(self) -> str:
@@ -42,8 +42,8 @@ class JobFailure:
 
     @property
     def errors(self) -> dict[str, str]:
-        """The last error of each worker."""
-        return {each.worker: each.error for each in self.history}
+        """The last error of each worker, in words."""
+        return {each.worker: each.error.text for each in self.history}
 
     @property
     def attempts(self) -> dict[str, int]:

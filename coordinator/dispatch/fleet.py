@@ -15,7 +15,7 @@ from typing import Literal
 from dreamfleet.common.monitoring.status import EventKind
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.messages import MAX_SLOTS, Heartbeat, Result, Verdict, VerdictWord
-from dreamfleet.coordinator.dispatch.event_log import EventLog
+from dreamfleet.coordinator.dispatch.event_log import EventLog, Note
 from dreamfleet.coordinator.dispatch.failure_judge import FailureJudge
 from dreamfleet.coordinator.dispatch.failures import JobFailure, host_of
 from dreamfleet.coordinator.dispatch.host_stats import HostRecords
@@ -65,7 +65,7 @@ class Fleet:
         self.counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()  # results and reports that were not accepted, by reason
         self.event_log = EventLog()
-        self.notes: list[str] = []  # lines for a log; its writer clears them
+        self.notes: list[Note] = []  # their writer clears them
         self.failure_judge = FailureJudge(self.jobs, self.members)
         self.drain_background = False  # only evaluations and kept rollouts are left to wait for
         self.paused = False
@@ -107,7 +107,11 @@ class Fleet:
         if (member := self.members.get(identity)) and member.gone_since is None:
             member.gone_since = now
 
-    def note_refusal(self, identity: str, note: str, why: str) -> None:
+    def note(self, text: str) -> None:
+        """Note something for the log and the journal."""
+        self.notes.append(Note(text))
+
+    def note_refusal(self, identity: str, note: Note, why: str) -> None:
         """Log that a worker was refused; the caller bounds how many are (R26)."""
         self.notes.append(note)
         self.event_log.add(self._now, "left", identity, why=f"refused: {why}")
@@ -400,7 +404,7 @@ class Fleet:
         self.counts["errors"] += 1
         failure = self.jobs[digest].failure
         if self.failure_judge.is_new_cause(failure):
-            self.notes.append(f"{failure}; it is tried again")
+            self.note(f"{failure}; it is tried again")
 
     def _cancel(self, digest: bytes, pending: PendingJob) -> None:
         """End all leases of a job that is wanted no more.
@@ -440,16 +444,17 @@ class Fleet:
     def _note_arrival(self, identity: str, now: float, what: Literal["joined", "back"]) -> None:
         self.event_log.add(now, what, identity)
         self.jobs.forgive_losses(identity)
-        self.notes.append(f"worker {identity} {'joined' if what == 'joined' else 'is back'}")
+        words = "joined" if what == "joined" else "is back"
+        self.notes.append(Note(f"worker {identity} {words}", what, identity))
 
     def _release_lost(self, member: Member, now: float, what: str) -> None:
         """Release and log a worker that is gone or silent; its host's record counts a loss of jobs."""
         if member.is_guest:
             return  # it has no jobs, and a stranger can invent names without end
         freed = f"; {plural(len(member.leases), 'job')} requeued" if member.leases else ""
-        self.notes.append(f"worker {member.identity} {what}{freed}")
-        gone: EventKind = "lost" if member.is_lost else "left"
-        self.event_log.add(now, "silent" if member.gone_since is None else gone, member.identity, why=member.farewell)
+        gone: EventKind = "silent" if member.gone_since is None else "lost" if member.is_lost else "left"
+        self.notes.append(Note(f"worker {member.identity} {what}{freed}", gone, member.identity))
+        self.event_log.add(now, gone, member.identity, why=member.farewell)
         if member.is_lost:
             self._record_losses(member)
         elif member.silent:  # it may have ended: its token says so later

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from enum import Enum, auto
 
-from dreamfleet.common.protocol.failures import HOST_PREFIX
+from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.messages import TAG_BYTES, Kind, Result
 from dreamfleet.coordinator.dispatch.deficit_round_robin import DeficitCounter
 from dreamfleet.coordinator.dispatch.failures import Attempt, JobFailure, host_of, pause_before_retry
@@ -17,7 +17,8 @@ from dreamfleet.coordinator.jobs.work import Work
 MAX_FAILED = 64  # failed attempts of a job that are remembered
 MAX_HOLDERS = 2  # workers that a job is leased to at a time
 SUSPECT_LOSSES = 2  # workers that ended while they held a job: it may be what ended them
-WORKER_ENDED = f"{HOST_PREFIX}its worker was lost"
+WORKER_ENDED = Failure.of_host("its worker was lost")
+NO_REASON = Failure("no fitness and no reason", "no reason")
 
 
 class JobState(Enum):
@@ -251,7 +252,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
 
         R8: an error is no fitness; it decides who is given the job next and when, and whether the job has failed.
         """
-        self._add_attempt(result.digest, Attempt(worker, result.error or "no fitness and no reason"), now)
+        self._add_attempt(result.digest, Attempt(worker, result.error or NO_REASON), now)
 
     def record_loss(self, worker: str, digest: bytes, now: float) -> bool:
         """Note that a worker ended without a word while it held a wanted job; whether that counts as a failed attempt.

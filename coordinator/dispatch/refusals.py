@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.printable import truncate
@@ -16,10 +18,18 @@ MAX_TASKS = 8  # of a worker that a refusal names
 LONGEST = 600  # characters of what a worker says of itself: two of them fit into an answer
 
 
+class Refusal(NamedTuple):
+    """Why a worker may not join a run, and what to do; `task`: it may be started with that where its user trusts it."""
+
+    why: str
+    remedy: str
+    task: str = ""
+
+
 def find_refusal(
     request: HelloRequest, task: str, admitted: str | None, packages: tuple[str, ...] = NUMERIC_PACKAGES
-) -> tuple[str, str] | None:
-    """Why a worker cannot join a run of `task`, and the remedy; `None` if it may.
+) -> Refusal | None:
+    """Why a worker cannot join a run of `task`; `None` if it may.
 
     `admitted` is the class of a strict run, `None` admits any. Fingerprints name the versions of `packages`. A worker
     that does not know its class yet may join; its class is checked when a heartbeat names it. R23: a refusal has a
@@ -28,33 +38,33 @@ def find_refusal(
     if not request.protocol_min <= PROTOCOL_VERSION <= request.protocol_max:
         worker = f"the worker (dreamfleet {truncate(request.package, LONGEST)})"
         spoken = f"{worker} speaks protocol {request.protocol_min} to {request.protocol_max}"
-        return f"{spoken}, this run {PROTOCOL_VERSION}", (
-            f"install dreamfleet {package_version('dreamfleet')} on the worker's host"
-        )
+        remedy = f"install dreamfleet {package_version('dreamfleet')} on the worker's host"
+        return Refusal(f"{spoken}, this run {PROTOCOL_VERSION}", remedy)
     family = task.partition(":")[0]
     if not ({task} if family in ARGUMENTS and module_of(task) else {task, family}) & set(request.tasks):
         remedy = "install the package that registers this task on the worker's host"
         if is_unregistered(task):
-            remedy = f"start it with `dreamfleet worker --task {task}`, if you trust that, or {remedy}"
-        return (
+            remedy += "; or, if you trust it, start the worker with it"
+        return Refusal(
             f"this run scores in {task!r}, which the worker does not know (it knows: {_describe_tasks(request.tasks)})",
-            remedy,
-        )
+            remedy, task if is_unregistered(task) else "",
+        )  # fmt: skip
     if request.packages != packages:
         named, own = (truncate(", ".join(each), LONGEST) for each in (request.packages, packages))
-        return f"its fingerprint names {named}, this run's {own}", "start the worker again"
+        return Refusal(f"its fingerprint names {named}, this run's {own}", "start the worker again")
     host_class = effective_class(request.host_class, request.fingerprint, admitted)
     if admitted is None or host_class in ("", admitted):
         return None
     return class_mismatch(admitted, host_class, request.fingerprint)
 
 
-def class_mismatch(run: str | None, host_class: str, fingerprint: str) -> tuple[str, str]:
+def class_mismatch(run: str | None, host_class: str, fingerprint: str) -> Refusal:
     """Why a strict run refuses a worker of another class, and the remedy."""
     own, other, host = (truncate(each or "", LONGEST) for each in (run, host_class, fingerprint))
-    return f"classes differ: the run is --strict with class {own}, and this host has class {other} [{host}]", (
+    return Refusal(
+        f"classes differ: the run is --strict with class {own}, and this host has class {other} [{host}]",
         "install the same dreamfleet and package versions on a host of the same CPU features; or continue the run with "
-        "--no-strict, which takes results of any host, but makes the run not repeatable bit by bit"
+        "--no-strict, which takes results of any host, but makes the run not repeatable bit by bit",
     )
 
 

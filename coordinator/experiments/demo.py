@@ -34,6 +34,7 @@ from dreamfleet.common.host.processes import (
     run_verb_to_end,
     shell_command,
 )
+from dreamfleet.common.host.reports import ADDRESS
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import never_stop
 from dreamfleet.common.monitoring.client import Client
@@ -181,7 +182,7 @@ class Demo:
             VerbProcess("dashboard", *where, "--host", "127.0.0.1", "--port", 0, inside=parent_death_command())
         )
         with suppress(DreamfleetError):
-            self._print(page.wait_for("the dashboard is at", timeout=START_SECONDS).strip())
+            self._print(f"the dashboard is at {page.wait_for_report(ADDRESS, START_SECONDS)}")
 
     def _confirmed(self, demo_run: DemoRun) -> float:
         """A stage's confirmed score: in reality, on fresh tracks that are the same in every stage."""

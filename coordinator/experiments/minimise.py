@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.objective import Objective, takes_seed
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import format_number, plural
-from dreamfleet.common.protocol.failures import error_text
 from dreamfleet.common.protocol.stop_kind import StopKind, StopReason
 from dreamfleet.common.runs.records import StoredGeneration, best_evaluation
 from dreamfleet.common.runs.run_paths import default_runs_dir
@@ -33,7 +32,7 @@ MOST = 2**53  # of calls and candidates
 FULL_DIMENSION = 200  # up to which CMA-ES learns the full matrix by default
 DETERMINISTIC = {"episodes": 1, "evaluate_every": 10, "evaluation_episodes": 1, "confirm_episodes": 0}
 NOISY = {"episodes": 2, "evaluate_every": 10, "evaluation_episodes": 20, "confirm_episodes": 20}
-CALLER = 5  # frames from what a search run warns in to the program that searches
+CALLER = 4  # frames from `_Searches._run` to the program that searches
 CONVERGED = (StopKind.STAGNATION, StopKind.ONE_POINT)
 
 
@@ -162,15 +161,6 @@ def _is_noisy(function: Callable[..., Any] | str) -> bool:
         raise UsageError(f"no function {name} of module {module} here: {error}") from error
 
 
-def _pass_on_warnings(run: StartedRun) -> None:
-    """Warn of what the check before the run found, such as a function that varies: the coordinator only logs it."""
-    log = (run.path / "coordinator.log").read_text(encoding="utf-8", errors="replace")
-    for line in log.splitlines():
-        _, is_warning, text = line.partition(" WARNING ")
-        if is_warning and run.spec.task in text:
-            warnings.warn(text[text.index(run.spec.task) :], RuntimeWarning, stacklevel=CALLER)
-
-
 class _Plan(NamedTuple):
     """One search of several: its population, its first step in steps of sigma0, its seed, and most calls."""
 
@@ -284,8 +274,8 @@ class _Searches:
             own["steps"] = candidate_calls(plan.calls, {**own, **settings})
         with start_run_in(self._function.environment, self._workers, self._runs_dir, {**own, **settings}) as run:
             self._runs.append(run.name)
-            if not number:
-                _pass_on_warnings(run)
+            for text in () if number else run.warnings:
+                warnings.warn(text, RuntimeWarning, stacklevel=CALLER)
             ended = self._follow_all(run, objective)
         self._follow_rest(run, objective)
         self._read_means(run, objective)
@@ -313,7 +303,7 @@ class _Searches:
             if self._best is not None or not errors:
                 raise
             raise UsageError(
-                f"no candidate has a value, first: {error_text(errors[0])}. Begin where the function has one (x0, a "
+                f"no candidate has a value, first: {errors[0]}. Begin where the function has one (x0, a "
                 "smaller sigma0, bounds), or give a penalty in place of NaN and infinity"
             ) from None
         return StopReason(run.stop_kind, run.ended or run.state)
@@ -366,10 +356,10 @@ class _Searches:
         """Count failed candidates, and warn of the first one."""
         if failed and not self._failed:
             self._first_failure = next(
-                (error_text(each.error) for each in run.failures() if each.kind == "score"), "its error is in the log"
+                (each.error for each in run.failures() if each.kind == "score"), "its error is in the log"
             )
             text = f"{self._first_failure}; failed candidates rank last, and only this one is warned of"
-            warnings.warn(text, RuntimeWarning, stacklevel=CALLER + 2)
+            warnings.warn(text, RuntimeWarning, stacklevel=CALLER + 3)
         self._failed += failed
 
     def _read_means(self, run: StartedRun, objective: Objective) -> None:

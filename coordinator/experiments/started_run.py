@@ -22,6 +22,7 @@ from dreamfleet.common.cli.verb_runner import POLL_INTERVAL
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
 from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
 from dreamfleet.common.files.locks import open_lock, try_lock
+from dreamfleet.common.host.reports import WARNING
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.trusted_modules import check_trusted
 from dreamfleet.common.host.user_code import own_arguments
@@ -78,6 +79,11 @@ class StartedRun(StoredRun):
         self._status_due = time.monotonic() + STATUS_INTERVAL
         self._end: Callable[[], object] = lambda: None
         finalize(self, self._journal.close)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the check of its task found before it began, such as a function whose values vary."""
+        return tuple(map(str, self._processes.coordinator.reports(WARNING)))
 
     def end_with(self, stack: ExitStack) -> None:
         """Close this stack when the run is ended, or when nothing refers to it any more."""

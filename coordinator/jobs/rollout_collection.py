@@ -9,11 +9,14 @@ from pathlib import Path
 
 from dreamfleet.common.errors import write_error
 from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.messages import Job, Result, TaskSpec
 from dreamfleet.common.runs.run_paths import rollout_path
 from dreamfleet.common.runs.seeds import collection_seed
 from dreamfleet.coordinator.jobs.upload_assembler import UploadAssembler
 from dreamfleet.coordinator.jobs.work import Work, make_work
+
+NOT_KEPT = Failure("the rollout was not kept: update dreamfleet on this host", "the rollout was not kept")
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,7 @@ class RolloutCollections:
         if work is None or work.kind != "collect" or result.fitness is None:
             return result
         if result.upload is None:
-            return replace(result, fitness=None, error="the rollout was not kept: update dreamfleet on this host")
+            return replace(result, fitness=None, error=NOT_KEPT)
         data = self.uploads.get_complete(worker, result.digest, result.upload)
         if data is None:
             return None

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 
 from dreamfleet.common.protocol.messages import MAX_PART, MAX_UPLOAD, UploadPart
 
+TOO_MANY = "too many uploads"  # why an upload was dropped
+
 
 @dataclass(frozen=True)
 class UploadLimits:
@@ -92,7 +94,7 @@ class UploadAssembler:
             del self._open[key]
             self.dropped["replaced upload"] += 1
         if len(self._open) >= self._limits.count or self.size + part.total > self._limits.size:
-            self.dropped["too many uploads"] += 1
+            self.dropped[TOO_MANY] += 1
             return None
         self._open[key] = PartialUpload(part.sha256, part.total, now)
         return self._open[key]

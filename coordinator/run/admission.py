@@ -6,10 +6,11 @@ from dreamfleet.common.protocol.host_classes import effective_class
 from dreamfleet.common.protocol.messages import HelloRequest
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.security.anchor_key import is_proof
+from dreamfleet.coordinator.dispatch.event_log import Note
 from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.dispatch.member import Member
-from dreamfleet.coordinator.dispatch.refusals import RefusedWorkers, class_mismatch, find_refusal
+from dreamfleet.coordinator.dispatch.refusals import Refusal, RefusedWorkers, class_mismatch, find_refusal
 from dreamfleet.coordinator.storage.journal import FINGERPRINT, HOST_CLASS, Journal
 from dreamfleet.coordinator.storage.verification_records import StoredBar
 
@@ -33,16 +34,17 @@ class WorkerAdmission:
         self._fleet = fleet
         self._anchor_key = anchor_key
 
-    def find_refusal(self, request: HelloRequest) -> tuple[str, str] | None:
-        """Why a worker cannot join and what to do about it; `None` if it may."""
+    def find_refusal(self, request: HelloRequest) -> Refusal | None:
+        """Why a worker cannot join; `None` if it may."""
         settings = self._settings
         admitted = self.host_class if self.strict else None
         found = find_refusal(request, settings.task.task, admitted, settings.packages)
         if (bar := self.barred.get(host_of(request.worker))) is not None:
-            found = f"it is barred from this run: {bar.why}", OPERATOR_REMEDY if bar.by_operator else BARRED_REMEDY
+            remedy = OPERATOR_REMEDY if bar.by_operator else BARRED_REMEDY
+            found = Refusal(f"it is barred from this run: {bar.why}", remedy)
         final = request.packages == settings.packages  # otherwise the worker says hello again with these packages
-        if found is not None and final and self.refused_workers.add(request.worker, found[0]):
-            self._fleet.note_refusal(request.worker, f"refused worker {request.worker}: {found[0]}", found[0])
+        if found is not None and final and self.refused_workers.add(request.worker, found.why):
+            self._fleet.note_refusal(request.worker, Note(f"refused worker {request.worker}: {found.why}"), found.why)
         return found
 
     def admit(self, request: HelloRequest, now: float) -> int:
@@ -101,7 +103,7 @@ class WorkerAdmission:
         for worker in [each for each in self._fleet.members if host_of(each) == host]:
             self._fleet.remove_worker(worker)
         self.refused_workers.add(host, f"it is barred from this run: {why}")
-        self._fleet.note_refusal(host, f"host {host} is barred from this run: {why}", f"barred: {why}")
+        self._fleet.note_refusal(host, Note(f"host {host} is barred from this run: {why}"), f"barred: {why}")
 
     def unbar(self, host: str) -> None:
         """Let a host join this run again, by the journal too."""
@@ -121,7 +123,7 @@ class WorkerAdmission:
 
         Its results get no verdict, so that it does not take silence for success.
         """
-        why, _ = class_mismatch(self.host_class, host_class, fingerprint)
+        why = class_mismatch(self.host_class, host_class, fingerprint).why
         self._fleet.remove_worker(worker)
         if self.refused_workers.add(worker, why):
-            self._fleet.note_refusal(worker, f"worker {worker} must go: {why}", why)
+            self._fleet.note_refusal(worker, Note(f"worker {worker} must go: {why}", "left", worker), why)

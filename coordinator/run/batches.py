@@ -31,7 +31,7 @@ from dreamfleet.common.protocol.batches import (
 )
 from dreamfleet.common.protocol.messages import MAX_PART, UploadPart
 from dreamfleet.common.runs.seeds import remark_on_seeds, training_seed
-from dreamfleet.coordinator.jobs.upload_assembler import UploadAssembler
+from dreamfleet.coordinator.jobs.upload_assembler import TOO_MANY, UploadAssembler
 from dreamfleet.coordinator.run.external_generations import CANCELLED, ExternalGenerations
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.storage.batch_records import StoredBatch
@@ -159,7 +159,7 @@ class Batches:
         if body is not None:
             self._uploads.forget(key)
         elif dropped := self._uploads.dropped - before:
-            if "too many uploads" in dropped:
+            if TOO_MANY in dropped:
                 raise BatchError("busy", "too many batches are being sent at once: submit it again later")
             raise BatchError("malformed", "the body has another SHA-256 than sha256 says: submit it again")
         return body

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Collection, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from math import nan
 
@@ -75,7 +75,7 @@ class Run:
         self._journal = journal
         self._unpublished: list[StoredGeneration] = []
         if dropped := journal.drop_excessive(longest_horizon(settings)):
-            self.fleet.notes.append(f"{plural(dropped, 'result')} of an older version too large to count: scored again")
+            self.fleet.note(f"{plural(dropped, 'result')} of an older version too large to count: scored again")
         self.admission = WorkerAdmission(journal, settings, self.fleet, strict=network.strict, anchor_key=anchor_key)
         self.verification = Verification(journal, self.fleet, self.admission, network.verify, self.incarnation)
         self._ending = self._stored_end_reason()  # the limit that is reached; only background jobs remain
@@ -198,7 +198,7 @@ class Run:
             if not reseeds and (why := self.failure_limit.find_excess(self.generation)) is not None:
                 self.pause(f"{why} (`dreamfleet story` lists why)")
             elif (note := self.generations.try_again(self.generation)) is not None:
-                self.fleet.notes.append(note)
+                self.fleet.note(note)
                 self._replace_generation(self.generations.reload(self.generation.number))
             else:
                 self._close(now)
@@ -227,7 +227,7 @@ class Run:
         if self.stalled is not None:
             self.stalled, self.fleet.paused = None, self.paused is not None or self.is_rewound
             goes_on = "the run continues" if self.paused is None else f"the run stays paused: {self.paused}"
-            self.fleet.notes.append(f"the journal can be written again: {goes_on}")
+            self.fleet.note(f"the journal can be written again: {goes_on}")
         return True
 
     def _take_lock(self) -> bool:
@@ -242,7 +242,7 @@ class Run:
     def wait_until_writable(self, error: NotWritableNowError) -> None:
         """Give out no jobs until what could not be written is written."""
         if self.stalled is None:
-            self.fleet.notes.append(f"paused: {error}, and the run then continues by itself")
+            self.fleet.note(f"paused: {error}, and the run then continues by itself")
         self.stalled, self.fleet.paused = f"{error}, and the run then continues by itself", True
         self._retry_at = self._now + WRITE_RETRY
 
@@ -268,14 +268,14 @@ class Run:
         """Stop dispatching until the run is resumed."""
         self.paused, self._lacks_host = why, False
         self.fleet.paused = True
-        self.fleet.notes.append(f"paused: {why}")
+        self.fleet.note(f"paused: {why}")
 
     def resume(self) -> None:
         """Dispatch again; failed jobs may go to any worker again. It changes nothing while `stalled` says why."""
         if not self._take_lock():
             return
         if self.paused is not None:
-            self.fleet.notes.append("resumed")
+            self.fleet.note("resumed")
         self._go_on()
         self.verification.resume()
         self._journal.drop_fact(PAUSED)
@@ -306,14 +306,14 @@ class Run:
             self._rewind({host})
         else:
             self.admission.unbar(host)
-            self.fleet.notes.append(unbar_words(host))
+            self.fleet.note(unbar_words(host))
             self._journal_notes()
         return ""
 
     def _rewind(self, hosts: Collection[str]) -> None:
         """Take back what these hosts brought, in the transaction that bars them (R33)."""
         self.background_jobs.report.withdraw()
-        self.fleet.notes.append(recall(self._journal, self.settings, hosts))
+        self.fleet.note(recall(self._journal, self.settings, hosts))
         self._journal_notes()
         self.is_rewound = self.fleet.paused = True  # what it holds in memory is true no more
 
@@ -326,7 +326,7 @@ class Run:
                 self._record_failure(lasting)
         if self.paused is not None:
             if self._lacks_host and judge.has_hope:
-                self.fleet.notes.append("a host has joined that may be able to score: the run continues")
+                self.fleet.note("a host has joined that may be able to score: the run continues")
                 self._go_on()
             return
         if is_judged and (failure := judge.find_broken_fleet(at_once=self.failure_limit.share < 1)) is not None:
@@ -347,8 +347,10 @@ class Run:
         """Journal that a job's episode fails wherever it is scored; it is wanted no more."""
         job = failure.work.job
         self.fleet.give_up(failure)
-        self._journal.add_failure(job, shorten(failure.history[-1].error), list(failure.attempts), len(failure.history))
-        self.fleet.notes.append(f"{failure}; it counts as failed")
+        error = failure.history[-1].error
+        error = replace(error, text=shorten(error.text))
+        self._journal.add_failure(job, error, list(failure.attempts), len(failure.history))
+        self.fleet.note(f"{failure}; it counts as failed")
         self._count(job, nan, 0)
         if job.kind == "score":
             self.fleet.withdraw(self.generation.unwanted)
@@ -391,8 +393,8 @@ class Run:
 
     def _journal_notes(self) -> None:
         for note in self.fleet.notes:
-            self._journal.add_event(note)
-        self._notes += self.fleet.notes
+            self._journal.add_event(*note)
+            self._notes.append(note.text)
         self.fleet.notes = []
 
     def take_closed(self) -> list[StoredGeneration]:
@@ -411,7 +413,7 @@ class Run:
     def _begin(self, now: float) -> None:
         generation = self.generation
         if len(self._agenda.stages) > 1:
-            self.fleet.notes.append(f"generation {generation.number} is in {self._stage_text}")
+            self.fleet.note(f"generation {generation.number} is in {self._stage_text}")
         self.fleet.jobs.begin_generation(generation.number)
         self.verification.restore(generation.counted)
         if self._journal.fact(PAUSED) is not None:
@@ -449,7 +451,7 @@ class Run:
         begun, number = self.generations.scoring_params.begun, generation.number
         if begun.since == number:
             origin = "" if begun.origin is None else f", from the mean of generation {begun.origin}"
-            self.fleet.notes.append(f"{self._stage_text} begins with generation {number} after {begun.why}{origin}")
+            self.fleet.note(f"{self._stage_text} begins with generation {number} after {begun.why}{origin}")
 
     @property
     def _stage_text(self) -> str:
@@ -470,11 +472,11 @@ class Run:
         if not self._take_lock():
             return
         if work := self.background_jobs.confirm():
-            self.fleet.notes.append(self.background_jobs.round_description)
+            self.fleet.note(self.background_jobs.round_description)
             self.fleet.jobs.offer(work)
         elif not self.fleet.jobs.checks:  # else results of an earlier life are checked first
             if self.background_jobs.confirmation_failed:
-                self.fleet.notes.append("no confirmed score: every episode of the confirmation failed")
+                self.fleet.note("no confirmed score: every episode of the confirmation failed")
             self._end()
 
     def _begin_ending(self, reason: StopReason) -> None:

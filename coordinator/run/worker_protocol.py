@@ -11,6 +11,7 @@ from dreamfleet.common.errors import DreamfleetError, InternalError, NotWritable
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.printable import plural, truncate
 from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.messages import (
     MAX_REASON,
     Heartbeat,
@@ -29,6 +30,7 @@ from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.common.serialization.validation import MAX_TEXT
 from dreamfleet.coordinator.dispatch.failures import LONGEST_ERROR
 from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
+from dreamfleet.coordinator.dispatch.refusals import Refusal
 from dreamfleet.coordinator.jobs.work import Work
 from dreamfleet.coordinator.run.run import Run
 
@@ -49,17 +51,17 @@ class WorkerProtocol:
         self._horizon = run.settings.task.horizon  # of a scored episode whose job names none
         self._measures = len(run.settings.task.measures)
 
-    def answer_hello(self, request: HelloRequest | None, refusal: tuple[str, str] | None, now: float) -> HelloReply:
-        """Admit a worker or refuse it; `refusal` is why and what to do, if the caller knows a reason already.
+    def answer_hello(self, request: HelloRequest | None, refusal: Refusal | None, now: float) -> HelloReply:
+        """Admit a worker or refuse it; `refusal` says why, if the caller knows a reason already.
 
         A request of `None` was malformed. No reply exceeds what the schema allows, whatever the request was.
         """
         if request is None or not keys.is_worker_identity(request.worker):
-            refusal = "the request is not a hello", "update dreamfleet on the worker's host"
+            refusal = Refusal("the request is not a hello", "update dreamfleet on the worker's host")
         elif refusal is None:
             refusal = self._admission.find_refusal(request)
         numbering = 0 if request is None or refusal is not None else self._admission.admit(request, now)
-        why, remedy = refusal or ("", "")
+        why, remedy, task = refusal or Refusal("", "")
         return HelloReply(
             accepted=not why,
             protocol_min=keys.PROTOCOL_VERSION,
@@ -71,6 +73,7 @@ class WorkerProtocol:
             nonce=self._nonce,
             why=truncate(why, MAX_TEXT),
             remedy=truncate(remedy, MAX_TEXT),
+            unannounced_task=task,
             spec={} if why else to_dict(self._run.settings.task),
             intervals={} if why else asdict(self._intervals),
             packages=self._run.settings.packages,
@@ -199,10 +202,10 @@ def fail_if_excessive(result: Result, kind: Kind, horizon: int, measures: int = 
         return replace(result, steps=steps)
     why = rejection_reason(result.fitness, result.steps, result.seconds, horizon)
     if why is None and len(result.measures) != measures:
-        why = (
+        why = Failure(
             f"wrong measures: the episode gave {plural(len(result.measures), 'number')} beside its fitness, "
-            f"not {measures}"
-        )
+            f"not {measures}", "wrong measures",
+        )  # fmt: skip
     return result if why is None else replace(result, fitness=None, steps=steps, error=why, upload=None, measures=())
 
 

@@ -13,6 +13,7 @@ from itertools import islice
 from time import monotonic, time
 from typing import Any
 
+from dreamfleet.common.host.reports import ADDRESS, report
 from dreamfleet.common.monitoring.equal_fitness import EqualFitness
 from dreamfleet.common.monitoring.eta import estimate_eta, summarise_status
 from dreamfleet.common.monitoring.status import Status
@@ -57,6 +58,7 @@ class RunLog:
                      plural(run.settings.confirm_episodes, "whole episode"))  # fmt: skip
         if listen:
             log.info("listening on %s", ", ".join(listen))
+            report(ADDRESS, listen)
             if self._network.credentials is None and not all(is_loopback(each) for each in listen):
                 log.warning("this is neither encrypted nor authenticated: anyone who reaches the port controls the run "
                             "(docs/how-to/security.md)", extra={"facts": {"event": "insecure"}})  # fmt: skip
@@ -110,7 +112,7 @@ class RunLog:
         """Note that the wall clock moved against the monotonic one, by which all deadlines are kept."""
         offset = time() - monotonic()  # `now` may be older: a commit waits for a locked journal
         if abs(moved := offset - self._clock_offset) > CLOCK_STEP:
-            self._run.fleet.notes.append(f"the wall clock moved by {moved:+,.0f} s: it was set, or this host slept")
+            self._run.fleet.note(f"the wall clock moved by {moved:+,.0f} s: it was set, or this host slept")
             self._clock_offset = offset
 
     def _warn_if_no_worker(self, now: float) -> None:

@@ -35,6 +35,7 @@ from dreamfleet.common.security.credentials import worker_seat_identity
 from dreamfleet.common.serialization.validation import MalformedError
 from dreamfleet.common.transport.session import Network, open_session
 from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
+from dreamfleet.coordinator.dispatch.refusals import Refusal
 from dreamfleet.coordinator.run.batches import Batches
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.run.worker_protocol import WorkerMessage, WorkerProtocol
@@ -308,15 +309,15 @@ class Service:
         """The key of hellos: in a secured fleet each worker has its own."""
         return keys.secured_hello(self._name, worker) if self._secured else keys.hello(self._name)
 
-    def _find_refusal(self, request: HelloRequest, worker: str) -> tuple[str, str] | None:
+    def _find_refusal(self, request: HelloRequest, worker: str) -> Refusal | None:
         """Why the service admits nobody of this name, and what to do about it; `worker` is named by the hello's key."""
         if self._secured and request.worker != worker:
-            return "it uses another worker's name", "update dreamfleet on the worker's host"
+            return Refusal("it uses another worker's name", "update dreamfleet on the worker's host")
         if self._secured and self._is_revoked(request.worker):
             self._run.admission.refused_workers.add(request.worker, "its join file is revoked")
-            return "its join file is revoked", "have another issued"
+            return Refusal("its join file is revoked", "have another issued")
         if self._control.disbanding:
-            return "the run ends with its workers", "wait until the run is resumed"
+            return Refusal("the run ends with its workers", "wait until the run is resumed")
         return None
 
     def _is_revoked(self, worker: str) -> bool:

@@ -18,6 +18,8 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.locks import open_lock, wait_for_lock
 from dreamfleet.common.files.regular_files import path_exists, read_text
+from dreamfleet.common.host.reports import WARNING, report
+from dreamfleet.common.printable import printable
 from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.serialization.validation import MalformedError, from_plain, to_plain
 from dreamfleet.coordinator.settings.config import RunConfig
@@ -41,12 +43,17 @@ def check_environment(config: RunConfig, bundle: Bundle | None, *, strict: bool)
     if found.fault:
         raise UsageError(found.fault)
     for text in found.warnings:
-        log.warning("%s: %s", task, text)
+        _warn(f"{task}: {text}")
     if found.varies and strict:
         raise UsageError(f"{task} is not deterministic, so --strict cannot hold: {found.varies}; or omit --strict")
     if found.varies:
-        log.warning("%s is not deterministic, so a recomputed fitness differs: %s", task, found.varies)
+        _warn(f"{task} is not deterministic, so a recomputed fitness differs: {found.varies}")
     return replace(config, description=found.description)
+
+
+def _warn(text: str) -> None:
+    log.warning("%s", text)
+    report(WARNING, printable(text))
 
 
 def _check_once(task: str, options: Mapping[str, Any], measures: tuple[str, ...]) -> TaskReport:

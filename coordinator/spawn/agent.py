@@ -14,7 +14,6 @@ import importlib.util
 import json
 import os
 import platform
-import re
 import select
 import shlex
 import shutil
@@ -30,21 +29,22 @@ from typing import Any, BinaryIO
 
 MARK = "dreamfleet-host "
 TICK = 0.1  # seconds between polls
-START_TIMEOUT = 60.0  # seconds until a started worker must have logged something
+START_TIMEOUT = 60.0  # seconds until a started worker must have begun
 DRAIN_TIMEOUT = 900.0  # seconds that a draining worker may take
 STOP_AT_ONCE = ((signal.SIGTERM, 1.0), (signal.SIGTERM, 10.0), (signal.SIGKILL, 30.0))  # each with its timeout
 STOP_DRAINED = ((signal.SIGTERM, DRAIN_TIMEOUT),)
 LEAST_FREE = 700_000_000  # bytes needed while an environment is made
 LONGEST_TAIL = 8192  # bytes read from the end of a log for its last line
 JOIN, LOG, STATE, COMPLETE, CREATED = "join", "log", "worker.json", "whole", "made"
+REPORTS, REPORTS_VARIABLE = (
+    "reports",
+    "DREAMFLEET_REPORTS",
+)  # where a worker reports that it has begun, or why it failed
 FOLDERS = ("environments", "workers", "cache")  # under the root
 LOCK = "lock"
 # Starts a worker only once a line says that its state is written: one that nobody knows of could not be ended.
 ONCE_KNOWN = ("/bin/sh", "-c", 'read known && exec "$@" </dev/null', "sh")
 JOIN_HERE = "{join}"  # placeholder for the join file's path
-_TIME = r"^(?:\d{4}-\d\d-\d\d )?\d\d:\d\d:\d\d\S* "  # of a log line; its date stands in a day's first one
-_LOG_PREFIX = re.compile(rf"{_TIME}(?:[A-Z]+ )?[^:]*: |^dreamfleet: ")  # before the text of a log line or an error
-_LOG_RECORD = re.compile(rf"(?m){_TIME}|^\{{".encode())  # the start of a log line, as text or JSON
 
 
 class FailedError(Exception):
@@ -352,7 +352,7 @@ def _checked_state(state: Any) -> dict[str, Any]:
 
 
 def last_line(log: Path) -> str:
-    """The last log line of a worker, without its time."""
+    """The last log line of a worker."""
     try:
         with log.open("rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - LONGEST_TAIL))
@@ -360,7 +360,7 @@ def last_line(log: Path) -> str:
     except FileNotFoundError:
         return ""
     said = [each.strip() for each in lines if each.strip()]
-    return _LOG_PREFIX.sub("", said[-1]) if said else ""
+    return said[-1] if said else ""
 
 
 def inspect_host(host_folder: HostFolder) -> dict[str, Any]:
@@ -452,7 +452,7 @@ def start(host_folder: HostFolder, request: dict[str, Any], files: dict[str, byt
         for name, data in files.items():
             _write_private(folder / name, data)
         began = _launch(host_folder, folder, request)
-    _wait_for_log(began, folder, host_folder.channel)
+    _wait_for_begin(began, folder, host_folder.channel)
     return {**WorkerProcess(folder).describe(), "outcome": outcome}
 
 
@@ -471,14 +471,15 @@ def _write_private(path: Path, data: bytes) -> None:
 
 def _launch(host_folder: HostFolder, folder: Path, request: dict[str, Any]) -> subprocess.Popen[bytes]:
     log = folder / LOG
-    log.unlink(missing_ok=True)
+    for path in (log, folder / REPORTS):
+        path.unlink(missing_ok=True)
     _write_private(folder / STATE, b"{}")  # a full disk must fail before anything runs
     words = [request["python"], *(str(folder / JOIN) if each == JOIN_HERE else each for each in request["words"])]
     Path(request["python"]).stat()  # a shell's error would name no errno
     with log.open("xb") as out:
         began = subprocess.Popen(
             [*ONCE_KNOWN, *words], stdin=subprocess.PIPE, stdout=out, stderr=out, start_new_session=True, cwd=folder,
-            env={**os.environ, **host_folder.caches, **request["env"]},
+            env={**os.environ, **host_folder.caches, **request["env"], REPORTS_VARIABLE: str(folder / REPORTS)},
         )  # fmt: skip
     assert began.stdin is not None
     state = {"digest": request["digest"], "slots": request["slots"], "since": time.time(), "node": platform.node(),
@@ -491,14 +492,28 @@ def _launch(host_folder: HostFolder, folder: Path, request: dict[str, Any]) -> s
     return began
 
 
-def _wait_for_log(began: subprocess.Popen[bytes], folder: Path, channel: Channel) -> None:
-    """Wait for a proper log line, unlike a usage text or traceback; `FailedError` if the worker failed instead."""
+def _wait_for_begin(began: subprocess.Popen[bytes], folder: Path, channel: Channel) -> None:
+    """Wait until the worker reports that it has begun; `FailedError` if it failed instead."""
     deadline = time.monotonic() + START_TIMEOUT
-    while began.poll() is None and not _LOG_RECORD.search((folder / LOG).read_bytes()) and time.monotonic() < deadline:
+    while began.poll() is None and not _has_begun(folder) and time.monotonic() < deadline:
         channel.wait_for_request()
     if began.poll():
-        why = last_line(folder / LOG) or f"exit code {began.returncode}"
+        why = _reports(folder).get("failure") or last_line(folder / LOG) or f"exit code {began.returncode}"
         raise FailedError(f"its worker ended at once: {why}")
+
+
+def _has_begun(folder: Path) -> bool:
+    """Whether the worker has begun and logged something, which its status then shows."""
+    return "begun" in _reports(folder) and bool(last_line(folder / LOG))
+
+
+def _reports(folder: Path) -> dict[str, Any]:
+    """What a worker reported, as `common/host/reports.py` writes it."""
+    found: dict[str, Any] = {}
+    with suppress(FileNotFoundError, ValueError, TypeError):
+        for line in (folder / REPORTS).read_text().splitlines():
+            found.update(json.loads(line))
+    return found
 
 
 def follow(host_folder: HostFolder, request: dict[str, Any]) -> dict[str, Any]:

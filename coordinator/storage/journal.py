@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.errors import DamagedJournalError, JournalError
 from dreamfleet.common.files.atomic_write import atomic_write, fsync_path, reporting_unwritable_folder
+from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.host_classes import HostClasses, class_from_fingerprint, count_results
 from dreamfleet.common.protocol.messages import Job, Kind, Result
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS, LONGEST_EPISODE, max_steps, to_finite
@@ -45,7 +46,7 @@ from dreamfleet.coordinator.storage.recall_records import RecallRecords
 sqlite3.register_adapter(Checkpoint, Checkpoint.packed)  # when it is written, not while workers wait
 
 MAX_EVENTS = 10_000  # R26: strangers and failing hosts cause some
-LEAVES = "the coordinator leaves"  # the last event of an incarnation that was not killed
+LEAVES = "leaves"  # what the last event of an incarnation is that was not killed
 # Seconds for which a write waits for another program's lock. A run tries again, so that it answers meanwhile.
 SERVING_PATIENCE, LEAVING_PATIENCE = 0.5, 5.0
 FINGERPRINT, HOST_CLASS = "fingerprint", "host_class"  # the facts' names
@@ -154,7 +155,7 @@ class Journal(RecallRecords):
     def begin_incarnation(self) -> int:
         """Number of this life of the coordinator, from 1; durable before anything is published."""
         number = int(self.fact("incarnation") or 0) + 1
-        last = self._read_row("SELECT text FROM event ORDER BY number DESC LIMIT 1")
+        last = self._read_row("SELECT what FROM event ORDER BY number DESC LIMIT 1")
         killed = "; the last one was killed, crashed or could not write" if last not in (None, (LEAVES,)) else ""
         self._incarnation = number
         self.set_fact("incarnation", str(number))
@@ -168,7 +169,7 @@ class Journal(RecallRecords):
     def end_incarnation(self) -> None:
         """Write that the coordinator leaves by itself."""
         self.set_patience(LEAVING_PATIENCE)
-        self.add_event(LEAVES)
+        self.add_event("the coordinator leaves", LEAVES)
         if self.fact("ended") is not None:
             self.set_rest_checksum()
 
@@ -233,18 +234,21 @@ class Journal(RecallRecords):
             [(vector, generation, index) for vector, index in zip(vectors, indices, strict=True)],
         )
 
-    def add_failure(self, job: Job, error: str, workers: Sequence[str], attempts: int) -> None:
+    def add_failure(self, job: Job, error: Failure, workers: Sequence[str], attempts: int) -> None:
         """Write that a job's episode failed for good."""
         self._write(
-            "INSERT INTO failure (digest, kind, generation, candidate, episode, seed, error, workers, attempts, "
-            "incarnation, happened) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            job.digest, job.kind, job.generation, job.candidate, job.episode, job.seeds[0], error, ",".join(workers),
-            attempts, self._incarnation, time(),
+            "INSERT INTO failure (digest, kind, generation, candidate, episode, seed, error, cause, fault, workers, "
+            "attempts, incarnation, happened) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            job.digest, job.kind, job.generation, job.candidate, job.episode, job.seeds[0], error.text, error.cause,
+            error.kind, ",".join(workers), attempts, self._incarnation, time(),
         )  # fmt: skip
 
-    def add_event(self, text: str) -> None:
-        """Write what happened to the run, for people; the last `MAX_EVENTS` are kept."""
-        self._write("INSERT INTO event (happened, incarnation, text) VALUES (?, ?, ?)", time(), self._incarnation, text)
+    def add_event(self, text: str, what: str = "", worker: str = "") -> None:
+        """Write what happened to the run, for people, and to which worker; the last `MAX_EVENTS` are kept."""
+        self._write(
+            "INSERT INTO event (happened, incarnation, text, what, worker) VALUES (?, ?, ?, ?, ?)",
+            time(), self._incarnation, text, what, worker,
+        )  # fmt: skip
         self._write("DELETE FROM event WHERE number <= (SELECT max(number) FROM event) - ?", MAX_EVENTS)
 
     def drop_failures(self, generation: int) -> None:

@@ -194,7 +194,9 @@ def _print_settings(sides: Sequence[ComparedRun], settings: Mapping[str, Sequenc
 
 
 def _format_budget(sides: Sequence[ComparedRun], equal: EqualBudget) -> str:
-    spent = f"{equal.spent:,.0f}" if equal.what.startswith("steps") else f"{equal.spent:.3g}"
+    from dreamfleet.common.runs.comparison import CORE_HOURS
+
+    spent = f"{equal.spent:.3g}" if equal.what == CORE_HOURS else f"{equal.spent:,.0f}"
     what = _describe_budget(sides, equal)
     parts = [f"{side.name} {_format_evaluation(look)}" for side, look in zip(sides, equal.evaluated_means, strict=True)]
     return f"at {spent} {what}: {', '.join(parts)}"
@@ -202,8 +204,10 @@ def _format_budget(sides: Sequence[ComparedRun], equal: EqualBudget) -> str:
 
 def _describe_budget(sides: Sequence[ComparedRun], equal: EqualBudget) -> str:
     """What was spent, in words: a function has calls, and no steps."""
+    from dreamfleet.common.runs.comparison import STEPS
+
     is_function = all(is_function_task(each.settings.task.task) for each in sides)
-    return equal.what.replace("steps in reality", "calls") if is_function else equal.what
+    return "calls" if is_function and equal.what == STEPS else equal.what
 
 
 def _format_evaluation(look: EvaluatedMean | None) -> str:

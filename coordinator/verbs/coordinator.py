@@ -21,7 +21,6 @@ from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking
 from dreamfleet.common.host.resource_limits import check_room_for_session, raise_open_file_limit
 from dreamfleet.common.host.trusted_modules import trust
 from dreamfleet.common.printable import plural
-from dreamfleet.common.protocol.failures import error_text
 from dreamfleet.common.protocol.tasks import module_of
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.settings.config import RunConfig
@@ -207,7 +206,7 @@ def _describe_failures(request: RunRequest, failed: int) -> str:
     if not failed:
         return ""
     with open_run(request.runs_dir, request.name) as stored:
-        errors = [error_text(each.error) for each in stored.failures() if each.kind == "score"]
+        errors = [each.error for each in stored.failures() if each.kind == "score"]
     return f"; {plural(failed, 'candidate')} failed, first: {errors[0] if errors else 'its error is not kept'}"
 
 

@@ -7,6 +7,7 @@ import sys
 
 from dreamfleet.common.cli.config import add_flags, load
 from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
+from dreamfleet.common.host.reports import ADDRESS, report
 from dreamfleet.coordinator.dashboard.config import DashboardConfig
 
 SUMMARY = "serve a read-only web page about live runs and those on this disk"
@@ -36,3 +37,4 @@ def run(args: argparse.Namespace) -> int:
 
 def _print_address(address: str) -> None:
     print(f"the dashboard is at {address}", file=sys.stderr, flush=True)
+    report(ADDRESS, address)

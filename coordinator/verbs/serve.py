@@ -8,6 +8,7 @@ import sys
 from dreamfleet.common.cli.config import add_flags, load
 from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
 from dreamfleet.common.cli.output import print_next
+from dreamfleet.common.host.reports import ADDRESS, report
 from dreamfleet.coordinator.bridge.config import BridgeConfig
 
 SUMMARY = "let a search in any language score batches over HTTP"
@@ -32,3 +33,4 @@ def run(args: argparse.Namespace) -> int:
 
 def _print_address(address: str) -> None:
     print(f"the bridge is at {address}\nnext: curl {address}/v1/runs", file=sys.stderr, flush=True)
+    report(ADDRESS, address)

@@ -217,7 +217,7 @@ def outcome(processes, generations):
             2 - len(run.results(*place)) for place, value in zip(places, fitness, strict=True) if value is not None
         )
         story = [each.text for each in run.events()]
-        return computed, lost, story, Counter(each.error.partition(":")[0] for each in run.failures())
+        return computed, lost, story, Counter(each.cause for each in run.failures())
 
 
 def is_told(story, happened, restarts):

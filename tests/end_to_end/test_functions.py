@@ -53,5 +53,5 @@ def test_a_worker_that_did_not_announce_the_function_is_refused_and_nan_ranks_la
     with open_run(processes.runs, "holed") as stored:
         assert len(stored.history()) == GENERATIONS
         assert sum(each.failed for each in stored.history()) > 0
-        assert {each.error.partition(":")[0] for each in stored.failures()} == {"ObjectiveError"}
+        assert {each.cause for each in stored.failures()} == {"ObjectiveError"}
     assert processes.call("runs", "show", "holed", "--runs-dir", processes.runs)[1].count("reported x") == 1

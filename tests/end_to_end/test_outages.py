@@ -84,7 +84,7 @@ def test_a_run_says_why_its_worker_left_and_the_worker_in_one_line(processes):
     )
     assert code == 1
     assert "Traceback" not in err
-    why = "a slot cannot start: UsageError: gymnasium makes no environment"
+    why = "a slot cannot start: gymnasium makes no environment"
     assert why in err.splitlines()[-1]
     coordinator.wait_for("left (a slot cannot start")
     deadline = time.monotonic() + DEADLINE

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.messages import Job, Kind, Result
 from dreamfleet.common.runs.effort import Effort
@@ -133,7 +134,7 @@ class MemoryJournal:
     def set_seconds(self, generation: int, seconds: float) -> None:
         """No rule hangs on it."""
 
-    def add_event(self, text: str) -> None:
+    def add_event(self, text: str, what: str = "", worker: str = "") -> None:
         """No rule hangs on it."""
 
     def workers(self, *, recalled: bool = False) -> list[str]:
@@ -320,7 +321,7 @@ class MemoryJournal:
         evaluation, _ = self._tables["evaluation"][generation]
         self._put("evaluation", generation, (evaluation, found))
 
-    def add_failure(self, job: Job, error: str, workers: Sequence[str], attempts: int) -> None:
+    def add_failure(self, job: Job, error: Failure, workers: Sequence[str], attempts: int) -> None:
         self._witness.failed(job)
         self._insert("failure", job.digest, (job, tuple(workers)))
 

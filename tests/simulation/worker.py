@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
+from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.keys import PROTOCOL_VERSION
 from dreamfleet.common.protocol.messages import (
     MAX_LEASES,
@@ -36,6 +37,7 @@ from tests.simulation.schedule import Shape
 from tests.simulation.truth import STEPS, TASK, fitness_of, rollout_of
 from tests.simulation.truth import fails as truth_fails
 from tests.simulation.violation import Violation
+from tests.support.failures import failure
 
 UID = "0123456789abcdef" * 2
 HELLO_TIMEOUT = 2.0
@@ -283,12 +285,12 @@ class Worker:
         for job, vector in turn.work:
             if fails:
                 self._scored.errors += 1  # of the host, where failures become facts
-                error = "host: boom" if self._shape.on_failure != "pause" else "boom"
+                error = Failure.of_host("boom") if self._shape.on_failure != "pause" else failure("boom")
                 self.outbox.add(Result(job.digest, None, STEPS, 0.1, error, None))
                 continue
             if job.kind == "score" and truth_fails(self._shape.failing, job.vector, job.seeds[0]):
                 self._scored.failures += 1
-                self.outbox.add(Result(job.digest, None, STEPS, 0.1, f"ValueError: at {turn.ends}", None))
+                self.outbox.add(Result(job.digest, None, STEPS, 0.1, failure("ValueError", f"at {turn.ends}"), None))
                 continue
             fitness, upload = self.lie(job, fitness_of(vector, job.seeds[0], job.overrides)), None
             if job.kind == "collect":

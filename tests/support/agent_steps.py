@@ -18,7 +18,10 @@ from pathlib import Path
 from dreamfleet.coordinator.spawn import agent
 
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT
-WORKER = "import os, sys, time; open(sys.argv[1], 'w').write(str(os.getpid())); print('12:00:00 x'); time.sleep(600)"
+WORKER = (
+    "import os, sys, time; open(sys.argv[1], 'w').write(str(os.getpid())); print('x', flush=True); "
+    "open(os.environ['DREAMFLEET_REPORTS'], 'w').write('{\"begun\": true}\\n'); time.sleep(600)"
+)
 
 
 def counts(event, arguments, root):

@@ -27,6 +27,7 @@ from dreamfleet.common.protocol.messages import (
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.transport.session import open_session
 from tests.support import tasks
+from tests.support.failures import failure
 from tests.support.samples import JSON, MSGPACK
 
 RUN, GENERATIONS, POPULATION = "test", 4, 4
@@ -166,7 +167,7 @@ def lie(digest):
 
 
 def fail(digest):
-    return Result(digest, None, 0, 0.1, "forged", None)
+    return Result(digest, None, 0, 0.1, failure("forged"), None)
 
 
 def reports_results_of_all_jobs(evil, _round):

@@ -14,6 +14,7 @@ from dreamfleet.common.monitoring.status import (
     WorkerCount,
     WorkerStatus,
 )
+from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.messages import (
     BundlePart,
     ClaimNote,
@@ -78,7 +79,7 @@ MSGPACK = {
         **HEAD, fingerprint="x86_64 avx2 glibc-2.36 numpy-2.4.6",
         results=(
             Result(b"\x01" * 32, 812.5, 1000, 7.25, None, None),
-            Result(b"\x02" * 32, None, 17, 0.5, "slot crashed (signal 11)", None),
+            Result(b"\x02" * 32, None, 17, 0.5, Failure("slot crashed (signal 11)", "signal 11", "crash"), None),
             Result(b"\x03" * 32, 0.0, 300, 2.0, None, b"\x04" * 32),
         ),
     ),

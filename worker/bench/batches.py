@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from dreamfleet.common.host.processes import VerbProcess
+from dreamfleet.common.host.reports import ADDRESS
 from dreamfleet.common.monitoring.remote_scorer import RemoteScorer
 from dreamfleet.worker.bench.dispatch import BenchRun, Figures
 from dreamfleet.worker.bench.sleep_tasks import NULL_TASK
@@ -20,7 +21,6 @@ from dreamfleet.worker.bench.sleep_tasks import NULL_TASK
 BLOCKS = 9  # of each kind, in turn; the first of each is not counted
 POPULATIONS = (1, 64, 1024)
 EPISODES = 1
-READY = "the bridge is at "
 
 
 def bench_batches() -> Figures:
@@ -29,13 +29,12 @@ def bench_batches() -> Figures:
     An evaluation is one episode of one vector of 867 numbers. The caller waits for each batch before the next.
     """
     with BenchRun(NULL_TASK, 64, EPISODES, external=True) as run, run.crowd(2, 32):
-        run.coordinator.wait_for("listening on", timeout=60.0)
+        run.coordinator.wait_for_report(ADDRESS)
         with (
             RemoteScorer(run.endpoint, "bench") as scorer,
             VerbProcess("serve", "--connect", run.endpoint, "--port", 0) as bridge,
         ):
-            bridge.wait_for(READY)
-            address = next(line for line in bridge.lines if READY in line).split(READY)[1].split()[0]
+            address = bridge.wait_for_report(ADDRESS)
             ways: dict[str, Callable[[np.ndarray[Any, Any], list[int]], None]] = {
                 "zenoh": lambda vectors, seeds: _score(scorer, vectors, seeds),
                 "http": HttpCaller(address, packed=False).score, "http_base64": HttpCaller(address, packed=True).score,

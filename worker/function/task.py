@@ -32,10 +32,7 @@ Floats = NDArray[np.float64]
 
 
 class ObjectiveError(DreamfleetError):
-    """A function raised, or returned what is not one finite number; the text says which.
-
-    Its name is the cause `OF_FUNCTION` of `common/protocol/failures.py`.
-    """
+    """A function raised, or returned what is not one finite number; the text says which."""
 
 
 class FunctionTask(Task):

@@ -1,7 +1,4 @@
-"""The cause of a failure, as an error's text begins: the same on every host and in every run. Pure.
-
-The coordinator compares the text before the first colon, so this part holds no number, path or address.
-"""
+"""What made an episode fail: an exception or the end of its process as a `Failure`. Pure."""
 
 from __future__ import annotations
 
@@ -9,13 +6,13 @@ import errno
 import signal
 from contextlib import suppress
 
+from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host.user_code import find_user_line
 from dreamfleet.common.printable import one_line
-from dreamfleet.common.protocol.failures import HOST_PREFIX, is_host_failure
+from dreamfleet.common.protocol.failures import MAX_CAUSE, Failure
 
 MAX_TEXT = 500  # characters of an error's text
 MAX_CAUSES = 10  # causes of causes that are looked at
-CRASH = "slot crashed"
 NO_ROOM = (
     errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EMFILE, errno.ENFILE, errno.EAGAIN, errno.ENOMEM,
 )  # fmt: skip
@@ -39,17 +36,17 @@ def is_hosts_fault(cause: BaseException | int) -> bool:
     return False
 
 
-def describe_exception(error: BaseException) -> str:
-    """One line: the exception's class, a colon, and the first line of its message."""
-    name = one_line(type(error).__name__[:MAX_TEXT]).replace(":", " ") or "Exception"
-    host = HOST_PREFIX if is_hosts_fault(error) else ""
-    return encodable(f"{host}{name}: {_text(error)}"[:MAX_TEXT])
+def failure_of(error: BaseException) -> Failure:
+    """The failure that an exception is: its class and the first line of its message; an expected error's text alone."""
+    name = encodable(one_line(type(error).__name__[:MAX_CAUSE]))[:MAX_CAUSE] or "Exception"
+    text = _text(error) if isinstance(error, DreamfleetError) else f"{name}: {_text(error)}"
+    if is_hosts_fault(error):
+        return Failure.of_host(encodable(text[:MAX_TEXT]))
+    return Failure(encodable(text[:MAX_TEXT]), name, "usage" if isinstance(error, UsageError) else "other")
 
 
 def describe_exit(status: int) -> str:
     """How a child ended by itself; `status` is its exit status, or the negative number of a signal."""
-    if is_hosts_fault(status):
-        return f"{HOST_PREFIX}killed by SIGKILL, as the kernel does when memory is short"
     if status >= 0:
         return f"exit status {status}"
     name = f"signal {-status}"
@@ -58,19 +55,12 @@ def describe_exit(status: int) -> str:
     return f"killed by {name}"
 
 
-def describe_crash(reason: str) -> str:
-    """The error of the jobs that a child took with it; `reason` is of `describe_exit` or why it was killed."""
-    return reason if is_host_failure(reason) else f"{CRASH} ({reason})"
-
-
-def describe_loss(reason: int | str) -> str:
-    """The error of the episode that a process of a pool was lost with; `reason` as `map_in_processes` gives it."""
-    return describe_crash(reason if isinstance(reason, str) else describe_exit(reason))
-
-
-def is_crash(error: str) -> bool:
-    """Whether the child died of the episode or was killed, so that the process that drives it again would too."""
-    return error.startswith(CRASH) or is_host_failure(error)
+def crash(reason: int | str) -> Failure:
+    """The failure of the jobs that a child took with it; `reason` is its exit status, or why it was killed."""
+    if isinstance(reason, int) and is_hosts_fault(reason):
+        return Failure.of_host(f"{describe_exit(reason)}, as the kernel does when memory is short")
+    words = reason if isinstance(reason, str) else describe_exit(reason)
+    return Failure(f"slot crashed ({words})", words[:MAX_CAUSE], "crash")
 
 
 def encodable(text: str) -> str:

@@ -102,7 +102,7 @@ def _send_hello(
         return None
     if len(names := sorted({reply.run for reply in replies})) > 1:
         listed = ", ".join(names[:MAX_RUNS_LISTED])
-        raise RefusedError(f"several runs are live, {listed}: choose one with `dreamfleet worker --run {names[0]}`")
+        raise RefusedError(f"several runs are live, {listed}; choose one", ("--run", names[0]))
     return max(replies, key=lambda reply: (reply.run_uid == joined_run_uid, reply.accepted, random.random()))  # noqa: S311
 
 
@@ -168,7 +168,8 @@ def _read_admission(reply: HelloReply) -> Admission:
     if not reply.accepted:
         own = package_version("dreamfleet")
         versions = "" if reply.package == own else f" (dreamfleet {reply.package}, here is {own})"
-        raise RefusedError(one_line(f"run {reply.run}{versions} refused this worker: {reply.why}; {reply.remedy}"))
+        why = one_line(f"run {reply.run}{versions} refused this worker: {reply.why}; {reply.remedy}")
+        raise RefusedError(why, ("--task", reply.unannounced_task) if reply.unannounced_task else None)
     try:
         spec, intervals = from_plain(TaskSpec, reply.spec), from_plain(Intervals, reply.intervals)
     except MalformedError as error:

@@ -11,14 +11,14 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from math import prod
 
-from dreamfleet.common.protocol.failures import HOST_PREFIX
+from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.messages import MAX_LEASES, Job, JobBatch, TaskSpec, VectorPart
 
 # R26: strangers can send batches too, so what they can fill is limited. The coordinator gives a dropped job again,
 # because the next heartbeats do not list it.
 MAX_UNUSED_VECTORS = 64  # vectors that no queued job needs
 MAX_BATCHES_AHEAD = 1024  # batches after a missing one
-DAMAGED = f"{HOST_PREFIX}the job's digest is not of its content"  # it says nothing of the candidate
+DAMAGED = Failure.of_host("the job's digest is not of its content")  # it says nothing of the candidate
 MAX_VECTOR_BYTES = 256 << 20  # of all vectors; with 1024 candidates: 65,000 parameters each
 
 
@@ -70,7 +70,7 @@ class Backlog:
         """Digests of the queued jobs."""
         return list(self._jobs)
 
-    def add_batch(self, batch: JobBatch, in_slots: Collection[bytes] = ()) -> list[tuple[Job, str]]:
+    def add_batch(self, batch: JobBatch, in_slots: Collection[bytes] = ()) -> list[tuple[Job, Failure]]:
         """Queue the jobs of a batch; return those that are refused, each with the reason.
 
         R10: a batch counts once, so a repeated one changes nothing and a reordered one fills its gap.

@@ -6,9 +6,9 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from dreamfleet.common.protocol.failures import describe_job
+from dreamfleet.common.protocol.failures import Failure, describe_job
 from dreamfleet.common.protocol.messages import Job
-from dreamfleet.worker.scoring.failure_cause import describe_exception, encodable
+from dreamfleet.worker.scoring.failure_cause import encodable, failure_of
 
 MAX_TRACE = 8000  # characters of a traceback that are kept, from its end, where the cause stands
 MAX_KINDS = 100  # kinds of failures that are logged at most
@@ -18,11 +18,11 @@ MAX_KINDS = 100  # kinds of failures that are logged at most
 class ScoringFailure:
     """An exception that was raised while scoring.
 
-    `text` is one line, `trace` the traceback. `kind` is the exception's type and the line of code that raised it, so
+    `trace` is the traceback. `kind` is the exception's type and the line of code that raised it, so
     two failures with different numbers in their texts have the same kind.
     """
 
-    text: str
+    error: Failure
     kind: str
     trace: str
 
@@ -36,7 +36,7 @@ class ScoringFailure:
             places, trace = traceback.StackSummary(), "its traceback cannot be formatted"
         place = f"{places[-1].filename}:{places[-1].lineno}" if places else "nowhere"
         kind = encodable(f"{type(error).__name__} at {place}")
-        return cls(describe_exception(error), kind, encodable(trace[-MAX_TRACE:]))
+        return cls(failure_of(error), kind, encodable(trace[-MAX_TRACE:]))
 
 
 class FailureLog:
@@ -57,7 +57,8 @@ class FailureLog:
             return None
         self._logged_kinds.add(failure.kind)
         return (
-            f"task {task}: {failure.text} ({_describe_jobs(jobs)}); later failures from this line are not logged\n"
+            f"task {task}: {failure.error.text} ({_describe_jobs(jobs)}); later failures from this line are not "
+            f"logged\n"
             f"{failure.trace}"
         ).rstrip()
 

@@ -113,7 +113,7 @@ def score_group(scorer: Scorer, group: int, work: Sequence[JobWithVector], count
         return GroupDone(group, ())
     except BaseException as error:
         failure = ScoringFailure.of(error)
-        each = clamp_count(made // len(work)), (perf_counter() - started) / len(work), failure.text
+        each = clamp_count(made // len(work)), (perf_counter() - started) / len(work), failure.error
         return GroupDone(group, tuple(Result(job.digest, None, *each, None) for job, _ in work), failure=failure)
 
 

@@ -91,7 +91,7 @@ def _split_into_messages(results: list[Result]) -> list[tuple[Result, ...]]:
     messages: list[list[Result]] = []
     room = 0
     for result in results:
-        size = len((result.error or "").encode(errors="replace"))
+        size = 0 if result.error is None else len(f"{result.error.text}{result.error.cause}".encode(errors="replace"))
         if not messages or len(messages[-1]) == MAX_RESULTS or size > room:
             messages.append([])
             room = MAX_ERROR_BYTES

@@ -14,9 +14,9 @@ from typing import Any
 from dreamfleet.common.errors import BundleError, DreamfleetError
 from dreamfleet.common.host.stall_watch import START_LIMIT, StallWatch, describe_slow_start, describe_stall
 from dreamfleet.common.printable import truncate
-from dreamfleet.common.protocol.failures import is_host_failure
+from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.messages import Job, Result
-from dreamfleet.worker.scoring.failure_cause import describe_crash, describe_exit, is_hosts_fault
+from dreamfleet.worker.scoring.failure_cause import crash, is_hosts_fault
 from dreamfleet.worker.service.child import ChildReady, ScorerArguments
 from dreamfleet.worker.service.child_process import EXIT_GRACE, ChildMessage, ChildProcess
 from dreamfleet.worker.service.failure_log import ScoringFailure
@@ -32,7 +32,6 @@ MAX_NAME_LENGTH = 100  # characters of `drawn_by`
 REMEDY = "give it fewer --slots, or this host more room (ulimit -n, ulimit -u, memory, the disk of temporary files)"
 MAX_START_DELAY = 30.0  # the longest pause before a new child, where children end one after another without a result
 LOOK_INTERVAL = 0.5  # seconds between two looks whether the child still runs
-WRONG_USAGE = "UsageError: "  # how the failure of a child begins that was asked for what this host cannot do
 SHORT_GROUP = 0.25  # seconds; after a group that was shorter, a second group is queued in the child
 MAX_PIPELINED_BYTES = 64 * 1024  # bytes of vectors that a pipe accepts while its child is busy
 
@@ -92,7 +91,8 @@ class Slot:
         self._useless_children = 0  # children in a row that ended without a finished group
         self._start_at = 0.0
         self._child: ChildProcess | None = None  # `None` until `_start_at`
-        self._kill_reason, self._last_error = "", ""
+        self._kill_reason = ""
+        self._start_failure: Failure | None = None  # that the child reported
         self._looked_at = 0.0
         self._weigh_at = 0.0  # when the child's memory is looked at next
         self._given_up_at = math.inf  # when a child that was killed or has exited counts as gone in any case
@@ -213,7 +213,7 @@ class Slot:
             running = self._groups[0].number if self._groups else None  # a forked copy of the child may answer again
             return self._finish_group(event.message) if event.message.group == running else ()
         elif isinstance(event.message, ScoringFailure):
-            self._last_error = event.message.text
+            self._start_failure = event.message.error
         elif not isinstance(event.message, SampledFrame):
             return self._replace_child()
         return ()
@@ -301,13 +301,13 @@ class Slot:
             self._child.wait_for_exit()
         steps, status = self.steps, self._child.exit_status
         self._child.close(LOOK_INTERVAL)
-        ended_by = "it closed its pipe and ran on" if status is None else self._last_error or describe_exit(status)
-        reason = self._kill_reason or ended_by
+        failure = self._why_ended(status)
+        reason = failure.cause if failure.kind == "crash" else failure.text
         running = self.running if self.ready else []  # before it was ready it ran nothing
-        if not self._was_ready and reason.startswith(WRONG_USAGE):  # another child would say the same
+        if not self._was_ready and failure.kind == "usage":  # another child would say the same
             raise _cannot_start(reason)
         log.warning("slot %d ended (%s)%s; starting another", self.number, reason, describe_jobs(running))
-        if not self.ready and is_host_failure(reason):
+        if not self.ready and failure.kind == "host":
             self._count_starved_start(reason)
             return ()
         if not self.ready:
@@ -319,8 +319,13 @@ class Slot:
         if running:
             self._groups.popleft()
         self._start_after_pause()
-        error = describe_crash(reason)
-        return tuple(Result(job.digest, None, steps // len(running), 0.0, error, None) for job in running)
+        return tuple(Result(job.digest, None, steps // len(running), 0.0, failure, None) for job in running)
+
+    def _why_ended(self, status: int | None) -> Failure:
+        """Why the child is gone; `status` is its exit status, `None` if it still runs."""
+        if self._kill_reason or status is None:
+            return crash(self._kill_reason or "it closed its pipe and ran on")
+        return self._start_failure or crash(status)
 
     def _count_failed_start(self, reason: str) -> None:
         self._failed_starts += 1
@@ -360,7 +365,7 @@ class Slot:
     def start(self) -> None:
         """Start a child and send it the groups that waited for the last one."""
         self._clear_child(0.0)
-        self._kill_reason, self._last_error = "", ""
+        self._kill_reason, self._start_failure = "", None
         self._sent = 0
         number, child_number, events = self.number, self._child_number, self._events
         try:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from itertools import takewhile
 
-from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.errors import DreamfleetError, RefusedError
 from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.printable import join_some, one_line, truncate
 from dreamfleet.common.protocol.messages import MAX_REASON
@@ -15,7 +14,6 @@ from dreamfleet.worker.service.config import WorkerConfig
 
 WAIT_LIMIT = 30.0  # seconds after which a worker says how to start a coordinator
 SHOWN_RUNS = 4
-_COMMAND = re.compile(r"`dreamfleet worker (--task|--run) ([^\s`]+)`")
 
 
 def describe_failure(error: BaseException) -> str:
@@ -24,17 +22,17 @@ def describe_failure(error: BaseException) -> str:
     return truncate(text if isinstance(error, DreamfleetError) else f"{type(error).__name__}: {text}", MAX_REASON)
 
 
-def complete_commands(text: str, typed: Sequence[str]) -> str:
-    """`text`, in which each `dreamfleet worker --FLAG VALUE` has become the command as it was `typed`, with that flag.
+def describe_refusal(error: RefusedError, typed: Sequence[str]) -> str:
+    """A refusal, with the command that may be accepted: as it was `typed`, with the flag that was lacking.
 
-    Nothing typed, as in a program: the text stays.
+    Nothing typed, as in a program: the command has that flag alone.
 
-    >>> complete_commands("start `dreamfleet worker --task my:World`", ())
-    'start `dreamfleet worker --task my:World`'
+    >>> describe_refusal(RefusedError("choose one", ("--run", "day")), ())
+    'choose one: `dreamfleet worker --run day`'
     """
-    if not typed:
-        return text
-    return _COMMAND.sub(lambda found: f"`{shell_command(*_with_flag(typed, found[1], found[2]))}`", text)
+    if error.flag is None or not typed:
+        return str(error)
+    return f"{error.text}: `{shell_command(*_with_flag(typed, *error.flag))}`"
 
 
 def _with_flag(typed: Sequence[str], flag: str, value: str) -> tuple[str, ...]:

@@ -48,7 +48,7 @@ from dreamfleet.worker.service.run_session import CoordinatorLink, Events, RunSe
 from dreamfleet.worker.service.sender import CoordinatorSender
 from dreamfleet.worker.service.slot_budget import SharedSlots
 from dreamfleet.worker.service.slot_pool import SlotPool
-from dreamfleet.worker.service.wording import WaitingText, complete_commands, describe_failure
+from dreamfleet.worker.service.wording import WaitingText, describe_failure, describe_refusal
 from dreamfleet.worker.tasks.registry import check_world_allowed, find_task, known_tasks
 
 log = logging.getLogger(__name__)
@@ -353,7 +353,7 @@ class Worker:
         R23: the reason may pass and anybody could have answered, so the worker asks again with growing pauses.
         """
         if isinstance(error, RefusedError):
-            error = RefusedError(complete_commands(str(error), self._typed))
+            error = RefusedError(describe_refusal(error, self._typed))
         if self._config.exit_when_done:
             raise error
         refuser = self._refusal_key(run)

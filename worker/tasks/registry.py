@@ -22,9 +22,9 @@ def check_task_allowed(task: str, allowed_tasks: Collection[str]) -> None:
     """`RefusedError` unless this worker announced the task or its family."""
     if family_of(task) not in allowed_tasks:
         raise RefusedError(
-            f"the run scores in task {task!r}, which this worker did not announce: start it with `dreamfleet worker "
-            f"--task {task}` if you trust that, or install the package that registers it"
-        )
+            f"the run scores in task {task!r}, which this worker did not announce: install the package that "
+            "registers it; or, if you trust it, start the worker with it", ("--task", task),
+        )  # fmt: skip
 
 
 def check_world_allowed(bundle: Bundle, allowed_tasks: Collection[str]) -> None:

@@ -18,7 +18,7 @@ from dreamfleet.common.worlds.score_words import profile_of
 from dreamfleet.worker.dream.parallel_dream import ParallelDream, ParallelDreamConfig, can_dream
 from dreamfleet.worker.scoring.agents import Agent
 from dreamfleet.worker.scoring.episode import Transition
-from dreamfleet.worker.scoring.failure_cause import describe_exception
+from dreamfleet.worker.scoring.failure_cause import failure_of
 from dreamfleet.worker.tasks.pictures import drawn_pixels
 from dreamfleet.worker.tools.canvas import (
     AWAKE,
@@ -159,4 +159,4 @@ def episode_errors(seed: int) -> Iterator[None]:
     except DreamfleetError:
         raise
     except (Exception, SystemExit) as error:  # a simulator may raise anything
-        raise DreamfleetError(f"the episode of seed {seed} failed: {describe_exception(error)}") from error
+        raise DreamfleetError(f"the episode of seed {seed} failed: {failure_of(error).text}") from error

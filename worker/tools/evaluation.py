@@ -21,7 +21,7 @@ from dreamfleet.common.protocol.result_bounds import rejection_reason
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.common.runs.evaluation_report import EvaluationReport
 from dreamfleet.worker.scoring.agents import Agent
-from dreamfleet.worker.scoring.failure_cause import describe_exception, describe_loss
+from dreamfleet.worker.scoring.failure_cause import crash, failure_of
 from dreamfleet.worker.tools.agent_evaluator import AgentEvaluator
 
 Episode = EpisodeResult | FailedEpisode
@@ -66,7 +66,7 @@ def evaluate_in_processes(
     ended = False
 
     def lose(seed: int, reason: int | str) -> Episode:
-        error = describe_loss(reason)
+        error = crash(reason).text
         lost.append(FailedEpisode(seed, error))
         if not ended and len(lost) == max(jobs, FIRST_LOSSES):
             raise DreamfleetError(
@@ -114,13 +114,14 @@ class _Driver:
                 self._evaluator = AgentEvaluator(self._agent)
                 count_step()  # it is ready
             found = self._evaluator.drive(seed, count_step)
-            why = rejection_reason(found.score, found.steps, 0.0, found.steps)
-            if why is None:
+            rejection = rejection_reason(found.score, found.steps, 0.0, found.steps)
+            if rejection is None:
                 return found
+            why = rejection.text
         except DreamfleetError:
             raise
         except self._caught as error:  # a simulator may raise anything
-            why = describe_exception(error)
+            why = failure_of(error).text
         with suppress(*self._caught):
             self.close()
         self._evaluator = None

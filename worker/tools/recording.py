@@ -20,7 +20,7 @@ from dreamfleet.common.host.stop_signals import Stop, never_stop, outlive_stop_s
 from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
 from dreamfleet.worker.scoring.agents import Agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
-from dreamfleet.worker.scoring.failure_cause import describe_exception, describe_loss
+from dreamfleet.worker.scoring.failure_cause import crash, failure_of
 from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tools.drive_frames import FilmedPolicy, FramePainter, WorldModelView, episode_errors
 from dreamfleet.worker.tools.video import Video
@@ -71,7 +71,7 @@ def record_in_process(
         is_stopped.value = stop()
 
     def lose(_item: object, reason: int | str) -> NoReturn:
-        raise DreamfleetError(f"the episode of seed {seed} failed: {describe_loss(reason)}")
+        raise DreamfleetError(f"the episode of seed {seed} failed: {crash(reason).text}")
 
     arguments = os.getpid(), is_stopped
     with reporting_write_errors(out), TemporaryDirectory(prefix=f".{out.stem}-", dir=out.parent) as folder:
@@ -108,5 +108,5 @@ class _Recorder:
         try:
             score = film(seed=seed, out=out, on_step=on_step, stop=lambda: bool(cls.is_stopped.value))
         except (KeyboardInterrupt, SystemExit, GeneratorExit) as error:  # of the simulator: no Ctrl-C raises here
-            raise DreamfleetError(f"the episode of seed {seed} failed: {describe_exception(error)}") from error
+            raise DreamfleetError(f"the episode of seed {seed} failed: {failure_of(error).text}") from error
         return score, steps

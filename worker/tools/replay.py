@@ -19,14 +19,14 @@ from dreamfleet.common.host.stall_watch import STALL_SECONDS
 from dreamfleet.common.host.stop_signals import outlive_stop_signals
 from dreamfleet.common.host.trusted_modules import check_trusted
 from dreamfleet.common.host.unseen_drawing import draw_unseen
-from dreamfleet.common.protocol.failures import failure_cause
+from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, class_from_fingerprint
 from dreamfleet.common.protocol.tasks import module_of
 from dreamfleet.common.runs.own_runs import trust_own_run
 from dreamfleet.common.runs.records import StoredFailure, StoredResult
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.scoring_params import ScoringParams, scoring_params_of
-from dreamfleet.worker.scoring.failure_cause import describe_exception, describe_loss, is_crash
+from dreamfleet.worker.scoring.failure_cause import crash, failure_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -45,7 +45,7 @@ class ReplayAttempt:
     episode: int
     host_class: str = ""  # of this host; empty: unknown
     fitness: float | None = None
-    error: str = ""
+    error: Failure | None = None
 
 
 @dataclass(frozen=True)
@@ -59,18 +59,18 @@ class ReplayedEpisode:
     host_class: str  # of the host that scored it
     own: bool  # whether this host is of the same class, so that the bits must be equal
     deterministic: bool = True  # whether equal episodes give equal bits, as far as hosts have found
-    failure: str = ""  # the stored error; empty: it has a score
-    error: str = ""  # the error now
+    failure: Failure | None = None  # the stored one; `None`: it has a score
+    error: Failure | None = None  # now
 
     @property
     def same(self) -> bool:
         """Whether both are equal to the bit, or failed for the same cause."""
-        return self.stored == self.replayed and failure_cause(self.failure) == failure_cause(self.error)
+        return self.stored == self.replayed and _cause(self.failure) == _cause(self.error)
 
     @property
     def attempted(self) -> bool:
         """Whether it was driven again; an episode that would end or block its process is not."""
-        return self.replayed is not None or bool(self.error)
+        return self.replayed is not None or self.error is not None
 
     def agrees(self, tolerance: float | None) -> bool | None:
         """Whether both agree; `None` if this host cannot decide it.
@@ -102,12 +102,12 @@ def replay(
         parameters = run.candidate(generation, candidate)
         scoring_params, own = scoring_params_of(run, generation), run.spec
         stored = _stored_episodes(run, generation, candidate, scoring_params)
-    failures = {each.episode: each.error for each in stored if isinstance(each, StoredFailure)}
+    failures = {each.episode: each.failure for each in stored if isinstance(each, StoredFailure)}
     specs = {each.episode: scoring_params.episode_spec(each.episode) for each in stored}
     items = [
         (each.episode, parameters, each.seed, specs[each.episode])
         for each in stored
-        if not is_crash(failures.get(each.episode, ""))
+        if not _ends_process(failures.get(each.episode))
     ]
     driven = _drive_all(own, run.bundle_path if own.bundle else None, items, stall, torch_device)
     here = {*(each.host_class for each in driven.values()), class_from_fingerprint(fingerprint(run.settings.packages))}
@@ -118,13 +118,21 @@ def replay(
             fitness, host_class, comparable = None, "", True
         else:
             # An episode that ends or blocks its process differs, wherever it had a score.
-            fitness, host_class, comparable = each.fitness, each.host_class, is_crash(now.error)
+            fitness, host_class, comparable = each.fitness, each.host_class, _ends_process(now.error)
         comparable = comparable or host_class in here
         deterministic = NON_DETERMINISTIC not in (*here, host_class)
         yield ReplayedEpisode(
             each.episode, each.seed, fitness, now.fitness, host_class, deterministic and comparable, deterministic,
-            failures.get(each.episode, ""), now.error,
+            failures.get(each.episode), now.error,
         )  # fmt: skip
+
+
+def _cause(failure: Failure | None) -> str | None:
+    return None if failure is None else failure.cause
+
+
+def _ends_process(failure: Failure | None) -> bool:
+    return failure is not None and failure.ends_process
 
 
 def _stored_episodes(
@@ -150,12 +158,12 @@ def _drive_all(
     """Drive the episodes one after another in a child process; the attempts by episode."""
 
     def lose(item: Item, reason: int | str) -> ReplayAttempt:
-        return ReplayAttempt(item[0], error=describe_loss(reason))
+        return ReplayAttempt(item[0], error=crash(reason))
 
     pin_thread_pools()
     attempts = map_in_processes(
         1, _Replayer.start, (os.getpid(), spec, bundle, torch_device), _Replayer.drive, items, lose, stall,
-        has_failed=lambda attempt: bool(attempt.error),
+        has_failed=lambda attempt: attempt.error is not None,
     )  # fmt: skip
     return {each.episode: each for each in attempts}
 
@@ -194,4 +202,4 @@ class _Replayer:
         except BaseException as error:  # a simulator may raise anything, and no Ctrl-C raises here
             if cls.scorer is None and isinstance(error, DreamfleetError):
                 raise
-            return ReplayAttempt(episode, host_class, error=describe_exception(error))
+            return ReplayAttempt(episode, host_class, error=failure_of(error))

@@ -56,7 +56,14 @@ def run(args: argparse.Namespace) -> int:
         same = all(each.same for each in episodes)
         fitness = [each.replayed for each in episodes if each.replayed is not None]
         mean = float(np.mean(fitness)) if len(fitness) == len(episodes) else None
-        rows = [vars(each) for each in episodes]
+        rows = [
+            {
+                **vars(each),
+                "failure": each.failure.text if each.failure else "",
+                "error": each.error.text if each.error else "",
+            }
+            for each in episodes
+        ]
         print(json.dumps({"identical": same, "unchecked": unchecked, "fitness": mean, "stored_fitness": stored_fitness,
                           "episodes": rows}))  # fmt: skip
     else:
@@ -79,10 +86,10 @@ def run(args: argparse.Namespace) -> int:
 def _describe(each: ReplayedEpisode, tolerance: float | None) -> str:
     if not each.failure and not each.error:
         return f"stored {each.stored!r}  replayed {each.replayed!r}  {_describe_match(each, tolerance)}"
-    then = f"failed then ({one_line(each.failure)})" if each.failure else f"stored {each.stored!r}"
+    then = f"failed then ({one_line(each.failure.text)})" if each.failure else f"stored {each.stored!r}"
     if not each.attempted:
         return f"{then}  not driven again, as it would end or block its process"
-    now = f"fails now ({one_line(each.error)})" if each.error else f"replayed {each.replayed!r}"
+    now = f"fails now ({one_line(each.error.text)})" if each.error else f"replayed {each.replayed!r}"
     return f"{then}  {now}  {'same cause' if each.same else _describe_match(each, tolerance)}"
 
 

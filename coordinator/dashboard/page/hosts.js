@@ -64,7 +64,7 @@ const fillPage = (page, found) => {
     return each;
   }, (each, { at, text }) => {
     say(each.firstChild, clock(at, width * 120));
-    say(each.lastChild, text.replace(/^worker /, ""));
+    say(each.lastChild, text);
   });
 };
 

@@ -116,7 +116,7 @@ const ways = (frame, run, runs, wanted) => {
   const past = make("a", "all runs", { href: "#/runs" });
   if (!stored) return ["Start one: ", make("code", `dreamfleet coordinator --run ${run || "NAME"} --listen ${frame.address.split(",")[0]}`), ". Or look at ", past, "."];
   const link = make("a", stored.run, { href: runLink(stored.run) });
-  if (wanted && stored.state.startsWith("ended")) location.replace(runLink(stored.run)); // its address leads to its result
+  if (wanted && stored.ended) location.replace(runLink(stored.run)); // its address leads to its result
   if (!stored.again) return ["Run ", link, ` lies here, ${stored.state}. Or look at `, past, "."];
   return ["Run ", link, " was left open here. Continue it: ", make("code", stored.again), ". If it had a join file, add ", make("code", "--join FILE"), ". Or look at ", past, "."];
 };

@@ -120,7 +120,7 @@ export const showRun = guarded(async (current, name) => {
   const page = open("run");
   say(page.run, found.run);
   say(page.state, found.state);
-  page.state.dataset.tone = found.state.startsWith("ended") ? "done" : found.state === "live" ? "good" : "wait";
+  page.state.dataset.tone = found.ended ? "done" : found.state === "live" ? "good" : "wait";
   page.again.hidden = !found.again;
   say(page.again.lastElementChild, found.again);
   page.live.hidden = found.state !== "live";

@@ -17,7 +17,7 @@ from dreamfleet.common.artifacts.bundle import SINGLE_PRECISION, WEIGHTS, Bundle
 from dreamfleet.common.artifacts.bundle_store import describe_bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli.model_commands import Model, Words
-from dreamfleet.common.errors import BundleError, DatasetError, UsageError
+from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.host.stop_signals import Stop
@@ -250,12 +250,7 @@ class PhaseRunner:
 def find_init(name: str, runs_dir: Path) -> tuple[Controller, Bundle]:
     """The controller of `--init` and its world model; `DreamfleetError` if one is missing."""
     controller, beside = find_controller(name, runs_dir)
-    try:
-        bundle = find_bundle_of(controller, None, beside)
-    except BundleError as error:
-        raise BundleError(
-            f"{error}".replace("name it with --bundle FILE", f"put it beside {name}, as {RUN_BUNDLE}")
-        ) from error
+    bundle = find_bundle_of(controller, None, beside, f"put it beside {name}, as {RUN_BUNDLE}")
     if bundle is None:
         raise UsageError(f"controller {name} sees no world model, and an iteration needs one")
     if (whole := bundle.manifest.provenance.get(SINGLE_PRECISION)) and WEIGHTS not in bundle.manifest.parts:

@@ -13,7 +13,7 @@ from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.function_values import is_minimised, spans_decades
 from dreamfleet.common.protocol.tasks import is_function_task
 from dreamfleet.coordinator.analysis.plot import save_figure
-from dreamfleet.coordinator.experiments.sweep.summary import RunResult, describe_kind, mean_curve
+from dreamfleet.coordinator.experiments.sweep.summary import RunResult, mean_curve, with_goal, word_of
 
 FEWEST = 3  # evaluations of a run that make a curve
 MARKERS = "os^vDPX*"
@@ -54,14 +54,14 @@ def sweep_figure(results: Sequence[RunResult]) -> Any:
         axes.fill_between(steps, low, high, color=colour, alpha=0.15, lw=0)
     is_function = all(each.task is not None and is_function_task(each.task.task) for each in results)
     axes.set_xlabel("calls for candidates" if is_function else "environment steps of candidates")
-    kind = "score of the evaluated mean" if evaluated else "mean fitness of a generation"
-    kind = kind.replace("score of", "value at") if is_function else kind
+    judged = f"{'value at' if is_function else 'score of'} the evaluated mean"
+    kind = judged if evaluated else f"mean {word_of(results)} of a generation"
     minimised = all(each.task is not None and is_minimised(each.task) for each in results)
     drawn = [each.score for run in results for each in (run.evaluated if evaluated else run.fitness)]
     if minimised and spans_decades(drawn):
         axes.set_yscale("log")
         kind += ", log scale"
-    axes.set_ylabel(describe_kind(kind, results))
+    axes.set_ylabel(with_goal(kind, results))
     axes.grid(alpha=0.3)
     figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     return figure

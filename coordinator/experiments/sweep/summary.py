@@ -105,10 +105,19 @@ def judged_by(results: Sequence[RunResult]) -> str | None:
 
 
 def describe_kind(kind: str, results: Sequence[RunResult]) -> str:
-    """What a score is, in words: a function has values, and no fitness."""
+    """What a score is, in words, and whether less is better."""
+    return with_goal(f"mean {word_of(results)} of the last generation" if kind == FITNESS else kind, results)
+
+
+def word_of(results: Sequence[RunResult]) -> str:
+    """What the optimiser is given: a function has values, and no fitness."""
     words = {fitness_word(each.task) for each in results if each.task is not None}
+    return words.pop() if len(words) == 1 else "fitness"
+
+
+def with_goal(text: str, results: Sequence[RunResult]) -> str:
+    """A score's name, with its goal if that is to be small."""
     goals = {"smaller is better" if is_minimised(each.task) else "" for each in results if each.task is not None}
-    text = kind.replace("fitness", words.pop()) if len(words) == 1 else kind
     goal = goals.pop() if len(goals) == 1 else ""
     return f"{text} ({goal})" if goal else text
 

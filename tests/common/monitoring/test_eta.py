@@ -183,7 +183,7 @@ def test_unknown_limits_are_ignored(strange):
         ),
         (
             {"state": "waiting for workers", "refused": {"old-host": "no AVX2"}},
-            "waiting for workers; old-host was refused: no AVX2",
+            "waiting for workers: old-host was refused: no AVX2",
         ),
         (
             {"state": "left"},

@@ -12,12 +12,12 @@ def work(worker="desk/0a", generation=0, kind="score", confirming=False, steps=6
     return StoredWork(worker, generation, kind, confirming, 6, steps, seconds)
 
 
-def event(at, text, incarnation=1):
-    return StoredEvent(at, incarnation, text)
+def event(at, what="", worker="", incarnation=1):
+    return StoredEvent(at, incarnation, "as it was noted", what, worker)
 
 
 def joined(worker, at=1000.0, incarnation=1):
-    return event(at, f"worker {worker} joined", incarnation)
+    return event(at, "joined", worker, incarnation)
 
 
 def only(found):
@@ -51,9 +51,9 @@ def test_a_mean_is_evaluated_until_the_next_ones_turn():
 def test_workers_are_there_from_when_they_come_until_they_go():
     events = [
         joined("desk/0a"), joined("desk/0b", 1010.0), joined("rack/0c", 1010.0),
-        event(1030.0, "worker desk/0a is silent: 2 jobs are free again"),
-        event(1040.0, "worker desk/0a is back"), event(1050.0, "worker rack/0c left (drained): 0 jobs are free again"),
-        event(1055.0, "ended: 2 generations"),
+        event(1030.0, "silent", "desk/0a"),
+        event(1040.0, "back", "desk/0a"), event(1050.0, "left", "rack/0c"),
+        event(1055.0),
     ]  # fmt: skip
     found = host_history([], TIMES, events, 1120.0)
     hosts = {each["host"]: each for each in found["hosts"]}
@@ -67,7 +67,7 @@ def test_workers_are_there_from_when_they_come_until_they_go():
 
 
 def test_a_killed_coordinators_workers_are_there_until_its_last_sign():
-    events = [joined("desk/0a"), event(5000.0, "incarnation 2 begins", 2), joined("desk/0a", 5010.0, 2)]
+    events = [joined("desk/0a"), event(5000.0, incarnation=2), joined("desk/0a", 5010.0, 2)]
     present = only(host_history([], TIMES, events, 5100.0))["present"]
     assert present == [(1000.0, 1120.0), (5010.0, 5100.0)]
 
@@ -75,7 +75,10 @@ def test_a_killed_coordinators_workers_are_there_until_its_last_sign():
 def test_a_run_without_any_sign_is_empty_and_a_strange_one_bounded():
     assert host_history([], {}, [], None)["hosts"] == []
     many = host_history(
-        [work(f"host-{each}/0a") for each in range(MOST_HOSTS + 5)], TIMES, [joined("\x1b[2J/0a")], None
+        [work(f"host-{each}/0a") for each in range(MOST_HOSTS + 5)],
+        TIMES,
+        [StoredEvent(1000.0, 1, "\x1b[2J", "joined", "\x1b[2J/0a")],
+        None,
     )
     assert (len(many["hosts"]), many["more"]) == (MOST_HOSTS, 6)
     assert "\x1b" not in str(many["events"])

@@ -17,6 +17,7 @@ from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.jobs.work import make_work, vector_bytes
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.outbox import Outbox
+from tests.support.failures import failure
 from tests.support.samples import HEAD, SPEC
 
 BEAT = 1.0
@@ -206,7 +207,7 @@ class AnyOrder(RuleBasedStateMachine):
         worker = self.workers.get(self.hosts.get(name))
         if worker is not None and worker.running:
             digest = worker.running.pop(0)
-            outcome = (None, 3, 0.1, "boom", None) if fails else (fitness_of(digest), 10, 0.1, None, None)
+            outcome = (None, 3, 0.1, failure("boom"), None) if fails else (fitness_of(digest), 10, 0.1, None, None)
             worker.outbox.add(Result(digest, *outcome))
             worker.fill()
 

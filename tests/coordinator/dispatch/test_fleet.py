@@ -19,6 +19,7 @@ from dreamfleet.coordinator.dispatch.fleet import Fleet as _Fleet
 from dreamfleet.coordinator.dispatch.member import DEPARTED_TIMEOUT, MAX_DEPARTED
 from dreamfleet.coordinator.dispatch.speculative_execution import LONGEST_HELD, LONGEST_HELD_TIMES, UPLOAD_SECONDS
 from dreamfleet.coordinator.jobs.work import make_work, vector_bytes
+from tests.support.failures import failure
 from tests.support.samples import HEAD, SPEC
 
 
@@ -202,7 +203,7 @@ def test_a_worker_that_says_why_it_leaves_is_listed_with_that_and_its_jobs_are_f
     assert (gone.farewell, gone.is_lost) == ("no room\\x1b[2J", False)
     event = next(each for each in fleet.event_log.view().latest(A) if each.what == "left")
     assert event.why == gone.farewell
-    assert gone.farewell in fleet.notes[-1]
+    assert gone.farewell in fleet.notes[-1].text
     fleet.add_worker(A, 1, "f", 3.0)
     fleet.handle_heartbeat(A, beat(), 3.0)
     assert not fleet.departed, "it is back"
@@ -261,7 +262,7 @@ def test_a_failed_job_is_wasted_once():
     fleet = fleet_of(A, B, jobs=1)
     (digest,) = digests(fleet.dispatch(0.0), A)
     fleet.handle_heartbeat(A, beat(seen=1, steps=4, running=[digest]), 1.0)
-    fleet.handle_result(A, result(digest, error="it broke"), 1.0)
+    fleet.handle_result(A, result(digest, error=failure("it broke")), 1.0)
     fleet.dispatch(1.0)
     fleet.handle_result(B, result(digest), 2.0)
     assert fleet.counts["discarded_steps"] == 10
@@ -323,10 +324,10 @@ def test_an_unconfirmed_batch_is_sent_again_under_its_number():
 def test_an_error_is_no_fitness_and_another_worker_tries():
     fleet = fleet_of(A, B, jobs=1)
     (digest,) = digests(fleet.dispatch(0.0), A)
-    assert fleet.handle_result(A, result(digest, error="boom"), 0.1) == ("refused", None)
+    assert fleet.handle_result(A, result(digest, error=failure("boom")), 0.1) == ("refused", None)
     assert digests(fleet.dispatch(0.1), B) == [digest]
     assert fleet.failure_judge.find_pausing() is None
-    fleet.handle_result(B, result(digest, error="boom"), 0.2)
+    fleet.handle_result(B, result(digest, error=failure("boom")), 0.2)
     errors = fleet.failure_judge.find_pausing().errors
     assert errors == {A: "boom", B: "boom"}
 
@@ -337,14 +338,14 @@ def test_the_only_worker_tries_a_failed_job_again_but_not_for_ever():
         fleet.tick(attempt)  # the third attempt waits for a second
         assert fleet.failure_judge.find_pausing() is None
         (digest,) = digests(fleet.dispatch(attempt), A)
-        fleet.handle_result(A, result(digest, error="boom"), attempt)
+        fleet.handle_result(A, result(digest, error=failure("boom")), attempt)
     assert fleet.failure_judge.find_pausing().errors == {A: "boom"}
 
 
 def test_a_failed_job_waits_for_another_worker_that_is_busy():
     fleet = fleet_of(A, B, jobs=4)
     first, *_ = digests(fleet.dispatch(0.0), A)
-    fleet.handle_result(A, result(first, error="boom"), 0.1)
+    fleet.handle_result(A, result(first, error=failure("boom")), 0.1)
     assert digests(fleet.dispatch(0.2), A) == []
     assert [failure.errors for failure in fleet.jobs.failures] == [{A: "boom"}]
 
@@ -542,7 +543,9 @@ def test_guests_without_a_heartbeat_are_few_and_soon_forgotten():
         fleet.handle_heartbeat(A, beat(), float(now))
         fleet.tick(float(now))
     assert set(fleet.members) == {A}
-    assert fleet.notes == [f"worker {A} joined"], "strangers cannot fill the log with names"
+    assert [(each.what, each.worker) for each in fleet.notes] == [("joined", A)], (
+        "strangers cannot fill the log with names"
+    )
 
 
 def test_a_member_is_forgotten_only_after_a_long_silence():
@@ -561,7 +564,7 @@ def test_a_guest_keeps_no_failing_job_from_being_tried_again():
     fleet = fleet_of(A, jobs=1)
     (digest,) = digests(fleet.dispatch(0.0), A)
     fleet.add_worker(B, 4, "f", 0.0)
-    fleet.handle_result(A, result(digest, error="killed"), 0.1)
+    fleet.handle_result(A, result(digest, error=failure("killed")), 0.1)
     assert digests(fleet.dispatch(0.2), A) == [digest]
 
 
@@ -690,7 +693,7 @@ def test_an_error_of_a_job_that_its_worker_does_not_hold_is_no_failure():
     fleet = fleet_of(A, B, jobs=1)
     (digest,) = digests(fleet.dispatch(0.0), A)
     for name in (B, "x/0badc0de", "y/0badc0de"):
-        fleet.handle_result(name, result(digest, error="boom"), 0.1)
+        fleet.handle_result(name, result(digest, error=failure("boom")), 0.1)
     assert not fleet.jobs.failures
     assert digest in fleet.members[A].leases
 

@@ -3,6 +3,7 @@
 import pytest
 
 from tests.coordinator.dispatch.test_fleet import A, B, digests, fleet_of, result
+from tests.support.failures import failure
 
 STRANGERS = ["x/00000003", "y/00000004"]  # they ended while they held the suspect
 C = "c/00000005"
@@ -15,7 +16,7 @@ def fleet_with_suspect(*names):
     fleet.jobs[suspect].lost_with += tuple(STRANGERS)
     proof = fleet.jobs[scored].work
     fleet.handle_result(A, result(scored), 0.1)
-    fleet.handle_result(A, result(suspect, error="OSError: once"), 0.2)
+    fleet.handle_result(A, result(suspect, error=failure("OSError", "once")), 0.2)
     for name in names:
         join(fleet, name, 0.3)
     return fleet, proof, suspect
@@ -63,9 +64,9 @@ def test_a_host_that_failed_what_another_has_scored_holds_up_no_judgement():
     fleet, proof, suspect = fleet_with_suspect(B)
     fleet.jobs.offer_proof(proof)
     fleet.dispatch(0.4)
-    fleet.handle_result(A, result(suspect, error="OSError: twice"), 0.5)
+    fleet.handle_result(A, result(suspect, error=failure("OSError", "twice")), 0.5)
     assert fleet.failure_judge.find_lasting() == [], "B may show that it can score"
-    fleet.handle_result(B, result(proof.job.digest, error="ImportError: broken"), 0.6)
+    fleet.handle_result(B, result(proof.job.digest, error=failure("ImportError", "broken")), 0.6)
     (lasting,) = fleet.failure_judge.find_lasting()
     assert lasting.work.job.digest == suspect
 
@@ -74,7 +75,7 @@ def test_a_host_that_failed_what_another_has_scored_holds_up_no_judgement():
 def test_a_failed_job_waits_for_no_worker_that_is_held_back(is_held):
     fleet = fleet_of(A, jobs=1)
     (job,) = digests(fleet.dispatch(0.0), A)
-    fleet.handle_result(A, result(job, error="OSError: once"), 0.1)
+    fleet.handle_result(A, result(job, error=failure("OSError", "once")), 0.1)
     join(fleet, B, 0.2)
     fleet.members[B].is_held = is_held
     sends = fleet.dispatch(0.3)
@@ -89,7 +90,7 @@ def test_a_host_that_fails_what_another_has_scored_pauses_only_a_run_without_tha
         sends = fleet.dispatch(moment)
         for name in (B, C):
             for digest in digests(sends, name):
-                fleet.handle_result(name, result(digest, error="ImportError: broken"), moment)
+                fleet.handle_result(name, result(digest, error=failure("ImportError", "broken")), moment)
     if gone:
         fleet.remove_worker(A)
     paused = fleet.failure_judge.find_pausing()

@@ -111,9 +111,11 @@ def test_restarts_are_runs_of_larger_populations_and_share_the_budget(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_function_that_varies_without_a_seed_is_warned_of(tmp_path):
-    with pytest.warns(RuntimeWarning, match="not deterministic.* second parameter `seed`"):
+def test_a_function_that_varies_without_a_seed_is_warned_of_whatever_the_log_looks_like(tmp_path, monkeypatch):
+    monkeypatch.setenv("DREAMFLEET_LOG_FORMAT", "json")
+    with pytest.warns(RuntimeWarning, match="varying") as warned:
         dreamfleet.minimise(objectives.varying, [0, 0], 1.0, generations=1, runs_dir=tmp_path, **FEW)
+    assert {each.filename for each in warned} == {__file__}
 
 
 @pytest.mark.slow

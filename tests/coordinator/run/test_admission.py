@@ -13,6 +13,7 @@ from dreamfleet.common.protocol.messages import HelloRequest, Result, ResultBatc
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.storage.journal import Journal
 from tests.coordinator.run.test_run import SETTINGS, A, B, Bench
+from tests.support.failures import failure
 from tests.support.samples import SPEC
 
 PLAIN = replace(SETTINGS, collect_every=0, population=4)
@@ -97,7 +98,7 @@ def test_the_first_accepted_result_fixes_the_class_and_the_other_host_is_removed
     bench.deliver(A, done(jobs[A][0]))
     assert bench.run.generation.done == 1, "a result of another class does not count"
     assert list(bench.run.fleet.members) == [B]
-    why, remedy = bench.hello(A)
+    why, remedy, _ = bench.hello(A)
     assert "classes differ" in why
     assert "--no-strict" in remedy
     assert any("classes differ" in note for note in bench.run.take_notes())
@@ -145,7 +146,7 @@ def test_hosts_of_one_fingerprint_may_be_of_two_classes_and_of_two_fingerprints_
 
 def test_an_error_does_not_fix_the_class(bench):
     jobs = bench.given()
-    bench.deliver(B, Result(jobs[B][0].digest, None, 0, 0.1, "boom", None))
+    bench.deliver(B, Result(jobs[B][0].digest, None, 0, 0.1, failure("boom"), None))
     assert bench.run.admission.host_class is None
     bench.deliver(A, done(jobs[A][0]))
     assert bench.run.admission.host_class == "a" * 16

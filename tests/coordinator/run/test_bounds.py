@@ -28,6 +28,7 @@ from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConf
 from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.service.status import encode_part
 from tests.coordinator.run.test_run import SETTINGS, A, Bench
+from tests.support.failures import failure
 from tests.support.samples import SPEC
 
 PLAIN = replace(SETTINGS, collect_every=0, population=4, episodes=2, evaluate_every=1, evaluation_episodes=2)
@@ -138,8 +139,8 @@ def test_an_error_with_too_many_steps_is_an_error(bench):
             (send.identity, each.job) for send in bench.run.fleet.dispatch(bench.now) for each in send.content.work
         ]
         for name, job in given[:1]:
-            bench.deliver(name, Result(job.digest, None, MAX_COUNT, 0.1, "boom", None))
-            assert bench.run.fleet.jobs[job.digest].attempts[-1].error == "boom"
+            bench.deliver(name, Result(job.digest, None, MAX_COUNT, 0.1, failure("boom"), None))
+            assert bench.run.fleet.jobs[job.digest].attempts[-1].error == failure("boom")
         answers_of(bench)
     assert bench.run.fleet.counts["errors"] == 3
 

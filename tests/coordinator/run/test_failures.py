@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.messages import Result, ResultBatch
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.seeds import CONFIRMING_OFFSET, training_seed
@@ -18,6 +19,7 @@ from dreamfleet.coordinator.run.run import BY_HAND
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from tests.coordinator.run.test_run import SETTINGS as TWO
 from tests.coordinator.run.test_run import A, B, Bench
+from tests.support.failures import failure
 
 SETTINGS = replace(TWO, population=6, episodes=2, collect_every=0, on_failure="worst")
 GENERATIONS = 3
@@ -43,7 +45,7 @@ class Failing(Bench):
         if self.host_errors:
             result = Result(job.digest, None, 0, 0.1, self.host_errors.pop(), None)
         elif self.fails(job):
-            result = Result(job.digest, None, 3, 0.1, f"ValueError: at {id(job):#x} on {name}", None)
+            result = Result(job.digest, None, 3, 0.1, failure("ValueError", f"at {id(job):#x} on {name}"), None)
         else:
             result = Result(job.digest, int.from_bytes(job.digest[:3]) / 1e6, 10, 0.1, None, None)
         self.deliver(name, result)
@@ -283,7 +285,7 @@ def test_a_host_that_never_scored_condemns_nobody(tmp_path, random_bundle):
     bench.answer_one = lambda name, job: (
         healthy(name, job)
         if name == A
-        else bench.deliver(name, Result(job.digest, None, 0, 0.1, "ValueError: sick", None))
+        else bench.deliver(name, Result(job.digest, None, 0, 0.1, failure("ValueError", "sick"), None))
     )
     bench.serve()
     assert bench.run.ended
@@ -371,7 +373,9 @@ def test_a_host_that_has_scored_ends_the_pause_of_a_fleet_that_cannot(left):
     left.fails = sound
     answer = left.answer_one
     left.answer_one = lambda name, job: (
-        answer(name, job) if name == A else left.deliver(name, Result(job.digest, None, 0, 0.1, "OSError: sick", None))
+        answer(name, job)
+        if name == A
+        else left.deliver(name, Result(job.digest, None, 0, 0.1, failure("OSError", "sick"), None))
     )
     left.hosts = [NEW, A]
     left.run.admission.admit(left.request(A), left.now)
@@ -398,7 +402,7 @@ def test_a_run_that_nobody_can_score_pauses_before_every_job_was_tried(tmp_path,
 
 def test_a_shortage_of_the_host_is_no_failure_of_the_candidate(failing):
     whole = failing("whole", fails=lambda job: False).story()
-    short = failing("short", fails=lambda job: False, host_errors=["host: killed by SIGKILL"] * 9)
+    short = failing("short", fails=lambda job: False, host_errors=[Failure.of_host("killed by SIGKILL")] * 9)
     assert short.story() == whole
     assert short.run.fleet.counts["errors"] == 9
 
@@ -587,7 +591,7 @@ def test_a_run_ends_though_a_suspect_failed_on_the_only_host_that_has_scored(
         is_first = job.candidate == 3 and job.generation == 0 and job.digest not in failed
         if is_first or (is_broken and name == B):
             failed.add(job.digest)
-            bench.deliver(name, Result(job.digest, None, 0, 0.1, f"OSError: on {name}", None))
+            bench.deliver(name, Result(job.digest, None, 0, 0.1, failure("OSError", f"on {name}"), None))
         else:
             answer(name, job)
 

@@ -8,6 +8,7 @@ from dreamfleet.common.protocol.messages import Result
 from dreamfleet.coordinator.run.recall import recall
 from tests.coordinator.run.test_failures import SETTINGS, Failing
 from tests.coordinator.run.test_run import A, B
+from tests.support.failures import failure
 
 NEW = "new/1"
 
@@ -54,7 +55,9 @@ def test_a_new_host_gets_the_suspects_when_the_only_host_that_has_scored_is_gone
 
 
 def test_a_new_host_that_fails_them_all_pauses_the_run(left):
-    left.answer_one = lambda name, job: left.deliver(name, Result(job.digest, None, 0, 0.1, "OSError: sick", None))
+    left.answer_one = lambda name, job: left.deliver(
+        name, Result(job.digest, None, 0, 0.1, failure("OSError", "sick"), None)
+    )
     left.serve()
     assert "no present host has ever scored" in left.run.paused
     assert left.run.generation.failed == []

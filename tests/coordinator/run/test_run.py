@@ -28,6 +28,7 @@ from dreamfleet.coordinator.run.worker_protocol import WorkerProtocol
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
+from tests.support.failures import failure
 from tests.support.samples import SPEC
 
 A, B = "a/00000001", "b/00000002"
@@ -235,7 +236,7 @@ def test_a_restart_during_an_upload_repeats_it_and_keeps_finished_rollouts(bench
 
 
 def fail(bench, name, digest, error):
-    bench.deliver(name, Result(digest, None, 0, 0.1, error, None))
+    bench.deliver(name, Result(digest, None, 0, 0.1, failure(error), None))
 
 
 def test_a_pause_names_candidate_seed_every_worker_how_often_and_why(bench):

@@ -5,6 +5,7 @@ import pytest
 from dreamfleet.common.errors import InternalError
 from dreamfleet.common.protocol.messages import Result, ResultBatch
 from dreamfleet.common.serialization.validation import MAX_TEXT
+from dreamfleet.coordinator.dispatch.refusals import Refusal
 from tests.coordinator.run.test_run import SETTINGS, B, Bench
 
 
@@ -68,7 +69,7 @@ def test_an_exception_while_a_result_is_counted_ends_the_incarnation_and_the_nex
 def test_a_malformed_hello_is_refused_and_a_hello_with_a_known_reason_admits_nobody(bench):
     assert "not a hello" in bench.worker_protocol.answer_hello(None, None, bench.now).why
     bench.run.fleet.remove_worker(B)
-    refused = bench.worker_protocol.answer_hello(bench.request(B), ("no " * 10_000, "wait"), bench.now)
+    refused = bench.worker_protocol.answer_hello(bench.request(B), Refusal("no " * 10_000, "wait"), bench.now)
     assert (refused.accepted, refused.remedy, refused.spec) == (False, "wait", {})
     assert len(refused.why) <= MAX_TEXT
     assert B not in bench.run.fleet.members

@@ -90,7 +90,7 @@ def test_the_operator_bars_a_host_and_lets_it_in_again_and_a_misspelt_one_change
     bench.run.commit()
     bench.restart()
     assert [*bench.run.admission.barred] == ["a"]
-    why, remedy = bench.run.admission.find_refusal(bench.request(A))
+    why, remedy, _ = bench.run.admission.find_refusal(bench.request(A))
     assert "barred from this run: the operator says so" in why
     assert "--no-longer" in remedy
     summary = bench.run.verification.summary

@@ -9,6 +9,7 @@ import pytest
 
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
@@ -89,7 +90,8 @@ def test_results_of_an_older_journal_lie_where_those_of_today_do(journal, folder
         old.executescript(
             "ALTER TABLE generation DROP COLUMN checksum; ALTER TABLE evaluation DROP COLUMN checksum; "
             "ALTER TABLE strategy DROP COLUMN checksum; ALTER TABLE recalled DROP COLUMN was_closed; "
-            "DROP TABLE result; "
+            "ALTER TABLE failure DROP COLUMN cause; ALTER TABLE failure DROP COLUMN fault; "
+            "ALTER TABLE event DROP COLUMN what; ALTER TABLE event DROP COLUMN worker; DROP TABLE result; "
             "CREATE TABLE result (digest BLOB PRIMARY KEY, kind TEXT NOT NULL, generation INTEGER NOT NULL, candidate "
             "INTEGER NOT NULL, episode INTEGER NOT NULL, seed INTEGER NOT NULL, fitness REAL NOT NULL, steps INTEGER "
             "NOT NULL, seconds REAL NOT NULL, worker TEXT NOT NULL, fingerprint TEXT NOT NULL, incarnation INTEGER "
@@ -301,7 +303,7 @@ def test_huge_texts_are_read_in_part(journal, folder):
     journal.begin_incarnation()
     journal.add_event("x" * 10_000_000)
     fill(journal)
-    journal.add_failure(Generation(1, SPEC, VECTORS, [8]).work[0].job, "y" * 10_000_000, ["w"], 3)
+    journal.add_failure(Generation(1, SPEC, VECTORS, [8]).work[0].job, Failure("y" * 10_000_000, "x"), ["w"], 3)
     journal.commit()
     with RunFolder(folder) as run:
         assert [len(each.text) for each in run.events()][1:] == [1000]

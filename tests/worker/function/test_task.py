@@ -9,7 +9,6 @@ from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.artifacts.objective import Objective
 from dreamfleet.common.cli.task_check import try_task
 from dreamfleet.common.errors import RefusedError, UsageError
-from dreamfleet.common.protocol.failures import OF_FUNCTION
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import family_of, module_of
 from dreamfleet.worker.function.task import ObjectiveError
@@ -72,7 +71,6 @@ def test_what_is_no_number_fails_the_candidate_and_refuses_the_run_before_it_beg
     with pytest.raises(ObjectiveError, match=says):
         score(function)
     assert re.search(says, try_task(name(function), {"environment": TWO}).fault)
-    assert ObjectiveError.__name__ == OF_FUNCTION
 
 
 def test_a_penalty_stands_for_nan_and_infinity():

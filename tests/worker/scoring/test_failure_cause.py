@@ -1,4 +1,4 @@
-"""The cause with which an error's text begins, and who is at fault."""
+"""What made an episode fail, and who is at fault."""
 
 import errno
 import signal
@@ -6,13 +6,9 @@ import signal
 import numpy as np
 import pytest
 
-from dreamfleet.worker.scoring.failure_cause import (
-    MAX_TEXT,
-    describe_crash,
-    describe_exception,
-    describe_exit,
-    is_hosts_fault,
-)
+from dreamfleet.common.errors import BundleError, UsageError
+from dreamfleet.common.protocol.failures import MAX_CAUSE
+from dreamfleet.worker.scoring.failure_cause import MAX_TEXT, crash, failure_of, is_hosts_fault
 
 
 def raised_from(cause):
@@ -41,8 +37,7 @@ def unbounded():
 )
 def test_the_host_is_at_fault(cause):
     assert is_hosts_fault(cause)
-    text = describe_exit(cause) if isinstance(cause, int) else describe_exception(cause)
-    assert text.startswith("host: ")
+    assert (crash(cause) if isinstance(cause, int) else failure_of(cause)).kind == "host"
 
 
 @pytest.mark.parametrize(
@@ -61,34 +56,42 @@ def test_the_host_is_at_fault(cause):
 )
 def test_the_candidate_is_at_fault(cause):
     assert not is_hosts_fault(cause)
+    assert (crash(cause) if isinstance(cause, int) else failure_of(cause)).kind == (
+        "crash" if isinstance(cause, int) else "other"
+    )
 
 
 def test_numpys_lack_of_memory_is_the_hosts_fault():
     with pytest.raises(MemoryError) as caught:
         unbounded()
-    assert describe_exception(caught.value).startswith("host: MemoryError: Unable to allocate")
+    assert failure_of(caught.value).kind == "host"
 
 
 @pytest.mark.parametrize(
-    ("status", "text"),
-    [
-        (3, "slot crashed (exit status 3)"),
-        (-signal.SIGSEGV, "slot crashed (killed by SIGSEGV)"),
-        (-63, "slot crashed (killed by signal 63)"),
-        (-signal.SIGKILL, "host: killed by SIGKILL, as the kernel does when memory is short"),
-    ],
+    ("reason", "cause"),
+    [(3, "exit status 3"), (-signal.SIGSEGV, "killed by SIGSEGV"), (-63, "killed by signal 63"), ("stuck", "stuck")],
 )
-def test_the_end_of_a_child(status, text):
-    assert describe_crash(describe_exit(status)) == text
+def test_equal_ends_of_a_child_have_an_equal_cause(reason, cause):
+    found = crash(reason)
+    assert (found.cause, found.kind, found.ends_process) == (cause, "crash", True)
 
 
-def test_a_class_with_an_odd_name_keeps_the_first_colon_for_the_cause():
-    odd = type("a:b\nc", (Exception,), {})
-    assert describe_exception(odd("1: 2")) == "a b c: 1: 2"
+def test_the_cause_is_the_class_whatever_the_message_says():
+    found = failure_of(ValueError("host: UsageError: slot crashed (exit status 3)"))
+    assert (found.cause, found.kind, found.ends_process) == ("ValueError", "other", False)
+
+
+def test_the_text_of_an_expected_error_stands_alone():
+    for error, kind in ((UsageError("give --task"), "usage"), (BundleError("it is damaged"), "other")):
+        found = failure_of(error)
+        assert (found.text, found.cause, found.kind) == (str(error), type(error).__name__, kind)
 
 
 def test_the_text_is_one_short_line_that_can_be_sent():
-    text = describe_exception(ValueError("\udc80\0" + "x" * 10_000_000 + "\nsecond"))
-    assert text.startswith(r"ValueError: \udc80\x00xxx")
-    assert len(text) == MAX_TEXT
-    assert text.encode()
+    failure = failure_of(ValueError("\udc80\0" + "x" * 10_000_000 + "\nsecond"))
+    assert failure.text.startswith(r"ValueError: \udc80\x00xxx")
+    assert len(failure.text) == MAX_TEXT
+    assert failure.text.encode()
+    odd = failure_of(type("a:b\n" * 1000, (Exception,), {})())
+    assert 0 < len(odd.cause) <= MAX_CAUSE
+    assert odd.cause.isprintable()

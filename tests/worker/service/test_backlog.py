@@ -3,7 +3,7 @@ import hashlib
 
 from dreamfleet.common.protocol.messages import MAX_LEASES, MAX_PART, JobBatch, VectorPart
 from dreamfleet.worker.service import backlog as room
-from dreamfleet.worker.service.backlog import MAX_BATCHES_AHEAD, MAX_UNUSED_VECTORS, Backlog
+from dreamfleet.worker.service.backlog import DAMAGED, MAX_BATCHES_AHEAD, MAX_UNUSED_VECTORS, Backlog
 from tests.support.samples import HEAD, SPEC, VECTOR, VECTOR_ID, job
 
 WHOLE = VectorPart(id=VECTOR_ID, dtype="<f4", shape=(16,), offset=0, data=VECTOR)
@@ -72,7 +72,7 @@ def test_a_job_that_a_slot_has_is_not_queued_again():
 def test_a_job_with_another_jobs_digest_is_refused():
     backlog = Backlog(SPEC)
     wrong = dataclasses.replace(job(0), seeds=(5,))
-    assert backlog.add_batch(batch(1, (wrong,))) == [(wrong, "host: the job's digest is not of its content")]
+    assert backlog.add_batch(batch(1, (wrong,))) == [(wrong, DAMAGED)]
     assert not backlog.take(1)
 
 

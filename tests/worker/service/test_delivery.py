@@ -73,7 +73,7 @@ def test_a_job_whose_content_differs_from_its_digest_is_an_error(stage, cached):
     hand.ready()
     job = MSGPACK["job"].jobs[0]  # of another run's task
     hand.send(1, job)
-    assert "digest" in hand.result(job).error
+    assert "digest" in hand.result(job).error.text
 
 
 def test_a_rollout_is_uploaded_repeatedly_until_its_verdict(stage, cached):

@@ -1,6 +1,7 @@
 from pathlib import Path
 
 from dreamfleet.worker.service.failure_log import MAX_KINDS, MAX_TRACE, FailureLog, ScoringFailure
+from tests.support.failures import failure
 from tests.support.samples import job
 
 
@@ -47,7 +48,8 @@ def test_the_first_of_several_jobs_is_named_and_the_others_are_counted():
 def test_the_log_is_bounded():
     failures = FailureLog()
     logged = [
-        failures.format_if_new(ScoringFailure("text", str(kind), "trace"), "moon", []) for kind in range(2 * MAX_KINDS)
+        failures.format_if_new(ScoringFailure(failure("text"), str(kind), "trace"), "moon", [])
+        for kind in range(2 * MAX_KINDS)
     ]
     assert sum(text is not None for text in logged) == MAX_KINDS
     assert len(raised(RuntimeError("x" * 100_000)).trace) == MAX_TRACE
@@ -55,6 +57,6 @@ def test_the_log_is_bounded():
 
 def test_an_error_that_cannot_be_encoded_is_replaced():
     failure = raised(OSError("no file \udcff\nsecond line"))
-    assert failure.text == r"OSError: no file \udcff"
+    assert failure.error.text == r"OSError: no file \udcff"
     assert failure.trace.encode()
-    assert raised(RuntimeError("")).text.startswith(f"RuntimeError: {Path(__file__).name}:")
+    assert raised(RuntimeError("")).error.text.startswith(f"RuntimeError: {Path(__file__).name}:")

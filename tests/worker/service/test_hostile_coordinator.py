@@ -1,6 +1,7 @@
 """Neither a coordinator's message nor a task ends a worker."""
 
 from dreamfleet.common.protocol.codec import encode
+from dreamfleet.common.protocol.failures import MAX_CAUSE, Failure
 from dreamfleet.common.protocol.messages import Result, ResultBatch
 from dreamfleet.common.serialization.validation import MAX_TEXT
 from dreamfleet.worker.service.outbox import Outbox
@@ -25,7 +26,7 @@ def test_a_batch_that_raises_costs_only_itself(stage, cached, said, monkeypatch)
 def test_results_with_long_errors_are_split_into_messages():
     outbox = Outbox(1.0)
     for number in range(200):
-        outbox.add(Result(number.to_bytes(32), None, 0, 0.0, "ü" * MAX_TEXT, None))
+        outbox.add(Result(number.to_bytes(32), None, 0, 0.0, Failure("ü" * MAX_TEXT, "ü" * MAX_CAUSE, "usage"), None))
     messages = outbox.due(0.0)
     for results in messages:
         encode(ResultBatch(**HEAD, fingerprint="f" * MAX_TEXT, results=results))

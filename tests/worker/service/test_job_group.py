@@ -51,7 +51,7 @@ def test_each_job_has_its_own_result_and_an_equal_share_of_the_time():
 def test_invalid_scores_are_the_tasks_error(scores, said):
     done = score_group(Scorer(*scores), 5, WORK, ignore)
     assert [each.fitness for each in done.results] == [None] * 3
-    assert all(said in each.error for each in done.results)
+    assert all(said in each.error.text for each in done.results)
     assert said in done.failure.trace
 
 
@@ -59,7 +59,7 @@ def test_invalid_scores_are_the_tasks_error(scores, said):
 def test_a_fitness_that_is_no_number_is_the_error_of_its_job_alone(number):
     done = score_group(Scorer(Score(1.0, 1), Score(number, 1), Score(2.0, 1)), 5, WORK, ignore)
     assert [each.fitness for each in done.results] == [1.0, None, 2.0]
-    assert done.results[1].error.startswith("fitness out of bounds: the episode gave")
+    assert done.results[1].error.cause == "fitness out of bounds"
     assert done.failure is None
 
 
@@ -85,5 +85,5 @@ def test_steps_before_an_error_are_divided_among_the_jobs():
 
     done = score_group(Failing(), 5, WORK, ignore)
     assert [each.steps for each in done.results] == [3, 3, 3]
-    assert done.failure.text == "RuntimeError: the road has ended"
-    assert done.results == tuple(replace(each, error=done.failure.text) for each in done.results)
+    assert done.failure.error.cause == "RuntimeError"
+    assert done.results == tuple(replace(each, error=done.failure.error) for each in done.results)

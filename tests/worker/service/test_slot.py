@@ -22,6 +22,7 @@ import pytest
 from dreamfleet.common.artifacts.bundle import hash_file
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.worker.scoring.failure_cause import crash
 from dreamfleet.worker.service.child import ScorerArguments
 from dreamfleet.worker.service.slot import (
     FAILED_STARTS,
@@ -36,7 +37,7 @@ from tests.support.bundles import write_random_bundle
 from tests.support.processes import DEADLINE, environment
 from tests.support.samples import VECTOR, job
 
-OUT_OF_MEMORY = "host: killed by SIGKILL, as the kernel does when memory is short"
+OUT_OF_MEMORY = crash(-signal.SIGKILL)
 
 
 @cache
@@ -140,10 +141,8 @@ def test_a_failed_collection_is_an_error_without_a_file(harness):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("task", "error"), [(tasks.RAISING, "RuntimeError: the road has ended"), (tasks.NAN, "ValueError: the episode's")]
-)
-def test_an_exception_in_a_fresh_child_is_the_jobs_error(harness, task, error):
+@pytest.mark.parametrize(("task", "cause"), [(tasks.RAISING, "RuntimeError"), (tasks.NAN, "ValueError")])
+def test_an_exception_in_a_fresh_child_is_the_jobs_error(harness, task, cause):
     slot = harness(task)
     slot.wait_ready()
     first = slot.slot.pid
@@ -151,7 +150,7 @@ def test_an_exception_in_a_fresh_child_is_the_jobs_error(harness, task, error):
     for _ in range(3):
         result = slot.score()
         assert result.fitness is None
-        assert result.error.startswith(error)
+        assert result.error.cause == cause
         pids.append(slot.slot.pid)
     assert pids[0] == first, "a failure in a fresh child replaces no child"
     assert len(set(pids)) == 3
@@ -161,7 +160,7 @@ def test_a_crash_costs_one_job_and_another_child_takes_its_place(harness):
     slot = harness(tasks.CRASHING)
     for _ in range(2):
         result = slot.score()
-        assert (result.fitness, result.error) == (None, "slot crashed (killed by SIGSEGV)")
+        assert (result.fitness, result.error) == (None, crash(-signal.SIGSEGV))
 
 
 @pytest.mark.slow
@@ -169,7 +168,7 @@ def test_a_child_that_lives_but_closed_its_pipe_is_replaced(harness):
     slot = harness(tasks.SILENT)
     slot.wait_ready()
     pid = slot.slot.pid
-    assert slot.score().error == "slot crashed (it closed its pipe and ran on)"
+    assert slot.score().error == crash("it closed its pipe and ran on")
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
 
@@ -257,7 +256,7 @@ def test_a_hung_job_is_killed_and_its_child_replaced(harness):
     assert slot.slot.running
     slot.slot.check(now + 9.5, 0.0)
     result = slot.result()
-    assert (result.fitness, result.error) == (None, "slot crashed (no step for 5 s)")
+    assert (result.fitness, result.error) == (None, crash("no step for 5 s"))
     slot.wait_ready()
 
 
@@ -346,7 +345,7 @@ def kill_as_it_starts(slot, times):
 
 def test_a_short_host_is_tried_for_ten_minutes(harness):
     slot = harness(tasks.TOY)
-    with pytest.raises(DreamfleetError, match=f"a slot cannot start: {OUT_OF_MEMORY}"):
+    with pytest.raises(DreamfleetError, match=OUT_OF_MEMORY.text):
         kill_as_it_starts(slot, FAILED_STARTS)  # it was never ready
     slot = harness(tasks.TOY)
     assert slot.score().fitness is not None
@@ -359,7 +358,7 @@ def test_a_short_host_is_tried_for_ten_minutes(harness):
     os.kill(slot.slot.pid, signal.SIGKILL)
     slot.slot.handle(slot.gone())
     kill_as_it_starts(slot, STARVED_STARTS - 1)
-    with pytest.raises(DreamfleetError, match=f"a slot cannot start: {OUT_OF_MEMORY}"):
+    with pytest.raises(DreamfleetError, match=OUT_OF_MEMORY.text):
         kill_as_it_starts(slot, 1)
 
 

@@ -2,13 +2,14 @@
 
 import pytest
 
+from dreamfleet.common.errors import RefusedError
 from dreamfleet.common.host import processes
 from dreamfleet.common.transport.session import Network
 from dreamfleet.worker.service.config import WorkerConfig
-from dreamfleet.worker.service.wording import WAIT_LIMIT, WaitingText, complete_commands
+from dreamfleet.worker.service.wording import WAIT_LIMIT, WaitingText, describe_refusal
 
 ADDRESS = "tcp/home.example:7447"
-TASK = "start it with `dreamfleet worker --task my:World`, if you trust that"
+TASK = RefusedError("start it", ("--task", "my:World"))
 
 
 @pytest.fixture(autouse=True)
@@ -27,18 +28,19 @@ def program(monkeypatch):
     ],
 )
 def test_a_refusals_command_has_all_flags_that_were_typed(typed, whole):
-    assert complete_commands(TASK, ("worker", *typed)) == TASK.replace("--task my:World", whole)
+    assert describe_refusal(TASK, ("worker", *typed)) == f"start it: `dreamfleet worker {whole}`"
 
 
 def test_a_command_that_chooses_a_run_replaces_the_one_that_was_named():
-    text = "choose one with `dreamfleet worker --run day`"
-    assert complete_commands(text, ("worker", "--run", "old", "--join", "f")) == text.replace("--run", "--join f --run")
+    error = RefusedError("choose one", ("--run", "day"))
+    typed = ("worker", "--run", "old", "--join", "f")
+    assert describe_refusal(error, typed) == "choose one: `dreamfleet worker --join f --run day`"
 
 
-@pytest.mark.parametrize("text", ["nothing to do", "start `dreamfleet worker --task a` `rm -r x`"])
-def test_other_text_stays(text):
-    assert complete_commands(text, ("worker",)).startswith(text[:20])
-    assert complete_commands(text, ()) == text
+def test_a_refusal_without_a_command_stays_and_a_program_names_the_lacking_flag_alone():
+    hostile = RefusedError("start `dreamfleet worker --task a` `rm -r x`")
+    assert describe_refusal(hostile, ("worker", "--any")) == str(hostile)
+    assert describe_refusal(TASK, ()) == str(TASK) == "start it: `dreamfleet worker --task my:World`"
 
 
 def said(texts, times, **how):

@@ -8,6 +8,7 @@ import pytest
 
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_paths import JOURNAL
+from dreamfleet.worker.scoring.failure_cause import crash
 from dreamfleet.worker.tools.replay import replay
 from tests.support import rough_tasks, tasks
 
@@ -74,7 +75,7 @@ def test_an_episode_that_hangs_or_ends_its_process_now_differs(processes, random
         monkeypatch.setenv(rough_tasks.EXIT, str(seeds[1]))
         monkeypatch.setenv("DREAMFLEET_TRUST", rough_tasks.MODULE)
         hung, crashed, sound = replay(run, 0, 1, stall=2.0)
-    assert (hung.error, crashed.error) == ("slot crashed (no step for 2 s)", "slot crashed (exit status 3)")
+    assert (hung.error, crashed.error) == (crash("no step for 2 s"), crash(3))
     assert (hung.agrees(None), crashed.agrees(None), sound.agrees(None)) == (False, False, True)
 
 
@@ -124,9 +125,9 @@ def brittle_run(processes, random_bundle):
     return run
 
 
-def change_failures(folder, error):
+def change_failures(folder, cause, fault="other"):
     with closing(sqlite3.connect(folder / JOURNAL)) as connection, connection:
-        connection.execute("UPDATE failure SET error = ?", (error,))
+        connection.execute("UPDATE failure SET cause = ?, fault = ?", (cause, fault))
     connection.close()
 
 
@@ -143,10 +144,10 @@ def test_a_candidate_that_failed_is_driven_again_and_its_cause_compared(processe
     assert "fails now (ArithmeticError: the world of" in out
     found = json.loads(processes.call(*replay, "--json")[1])
     assert (found["identical"], found["fitness"], found["stored_fitness"]) == (True, None, None)
-    change_failures(folder, "ValueError: another cause")
+    change_failures(folder, "ValueError")
     code, out, err = processes.call(*replay)
     assert (code, out.count("DIFFERS")) == (1, failed), err
-    change_failures(folder, "slot crashed (killed by SIGSEGV)")
+    change_failures(folder, "killed by SIGSEGV", "crash")
     code, out, err = processes.call(*replay)
     assert (out.count("not driven again"), "DIFFERS" in out, "Traceback" in err) == (failed, False, False)
     assert "crashed or hung the process" in err

@@ -24,7 +24,7 @@ from dreamfleet.common.host.stop_signals import outlive_stop_signals
 from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.printable import plural
 from dreamfleet.worker.scoring.episode import EpisodeConfig, ResetHook, run_episode
-from dreamfleet.worker.scoring.failure_cause import describe_exception, describe_loss
+from dreamfleet.worker.scoring.failure_cause import crash, failure_of
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld, Rollout, write_episode
 from dreamfleet.worker.scoring.scorer import DRIVER_NAME
 from dreamfleet.worker.tasks.api import Policy, RecordableTask, TaskWithBeginnings
@@ -88,7 +88,7 @@ def collect(
 
 def _lose(task: tuple[Path, CollectConfig, int, tuple[Pilot, ...], DataWorld], reason: int | str) -> NoReturn:
     raise DreamfleetError(
-        f"drive {task[2]} failed: {describe_loss(reason)}; what was written before is whole, and `dreamfleet doctor` "
+        f"drive {task[2]} failed: {crash(reason).text}; what was written before is whole, and `dreamfleet doctor` "
         "looks for a cause in this host"
     )
 
@@ -106,7 +106,7 @@ def _collect_one(task: tuple[Path, CollectConfig, int, tuple[Pilot, ...], DataWo
     except (DreamfleetError, MemoryError):
         raise
     except BaseException as error:  # a simulator may raise anything, also `SystemExit`
-        raise DreamfleetError(f"drive {number} failed: {describe_exception(error)}") from error
+        raise DreamfleetError(f"drive {number} failed: {failure_of(error).text}") from error
     path = episode_path(folder, number)
     with explain_write_errors(path), atomic_write(path) as file:
         write_episode(file, arrays)
