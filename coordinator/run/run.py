@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from math import nan
@@ -187,7 +187,7 @@ class Run:
         self.verification.settle(now)
         if self.verification.has_findings:
             if self._take_lock():
-                self._rewind(self.verification.condemn())
+                self._rewind(self.verification.condemn)
             return False
         self.background_jobs.settle()
         has_opened = self._open_batch()
@@ -259,10 +259,10 @@ class Run:
         """Prepare the next generation while workers are busy."""
         self.generations.prepare()
 
-    def keep_paused(self) -> None:
-        """Stay paused if the coordinator is started again before somebody resumes the run."""
+    def keep_paused(self) -> bool:
+        """Stay paused if the coordinator is started again before somebody resumes the run; whether that is durable."""
         self._journal.set_fact(PAUSED, BY_HAND)  # kept until it can be written
-        self.commit()
+        return self.commit()
 
     def pause(self, why: str) -> None:
         """Stop dispatching until the run is resumed."""
@@ -294,28 +294,46 @@ class Run:
     def bar(self, host: str, *, is_barred: bool = True) -> str:
         """Bar a host as the operator says, and take back what it brought (R33); else let it in again.
 
-        Why that cannot be done, in words; empty if it was.
+        Why that is not done, in words; empty if it is, durably.
         """
-        if self.is_rewound or not self._take_lock():
+        if self.is_rewound or self.stalled is not None or not self._take_lock():
             return f"the run cannot be changed now: {self.stalled or 'results are being recalled'}; ask again"
         known = {*map(host_of, (*self._journal.workers(recalled=True), *self.fleet.members, *self.fleet.departed))}
         if problem := find_bar_problem(host, self.admission.barred, known, is_barred=is_barred):
             return problem
         if is_barred:
-            self.admission.bar(host, BAR_BY_OPERATOR, self.incarnation)
-            self._rewind({host})
-        else:
-            self.admission.unbar(host)
-            self.fleet.note(unbar_words(host))
-            self._journal_notes()
-        return ""
 
-    def _rewind(self, hosts: Collection[str]) -> None:
-        """Take back what these hosts brought, in the transaction that bars them (R33)."""
-        self.background_jobs.report.withdraw()
-        self.fleet.note(recall(self._journal, self.settings, hosts))
+            def bar() -> set[str]:
+                self.admission.bar(host, BAR_BY_OPERATOR, self.incarnation)
+                return {host}
+
+            return "" if self._rewind(bar) else f"it cannot be barred now: {self.stalled}; ask again"
+        self.admission.unbar(host)
+        self.fleet.note(unbar_words(host))
         self._journal_notes()
-        self.is_rewound = self.fleet.paused = True  # what it holds in memory is true no more
+        return "" if self.commit() else f"that cannot be written now: {self.stalled}; it counts once it is written"
+
+    def _rewind(self, bar: Callable[[], Collection[str]]) -> bool:
+        """Bar hosts and take back what they brought, in one transaction (R33); whether that is durable.
+
+        If it is not, nothing of it was written, nor what came since the last commit. What the run holds in memory is
+        true no more in either case: another life goes on from the journal.
+        """
+        self.is_rewound = self.fleet.paused = True
+        before = [*self.fleet.notes]
+        try:
+            hosts = bar()
+            self.background_jobs.report.withdraw()
+            self.fleet.note(recall(self._journal, self.settings, hosts))
+            self._journal_notes()
+            self._journal.commit()
+        except NotWritableNowError as error:
+            self._journal.forget_writes()
+            self.fleet.notes = before  # without that it was done
+            self.wait_until_writable(error)
+            self._journal_notes()  # so that the next commit fails too, until there is room
+            return False
+        return True
 
     def _settle_failures(self) -> None:
         """Make lasting failures facts of the run (R8), and pause it where too many candidates or all hosts fail."""

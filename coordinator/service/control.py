@@ -86,9 +86,11 @@ class Control:
         return _empty_batches(each for each in self._run.fleet.members.values()
                               if (each.leaves_with_run or each.reads_end) and each.gone_since is None)  # fmt: skip
 
-    def _pause_by_hand(self) -> None:
+    def _pause_by_hand(self) -> str:
         self._pause(BY_HAND)
-        self._run.keep_paused()
+        if self._run.keep_paused():
+            return ""
+        return f"it is paused, and that cannot be written now: {self._run.stalled}; it lasts once it is written"
 
     def _pause(self, why: str) -> None:
         """Pause the run; an earlier reason is kept behind `why`."""

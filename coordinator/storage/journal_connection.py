@@ -146,6 +146,12 @@ class JournalConnection:
         with self._kept_writes():
             self._flush()
 
+    def forget_writes(self) -> None:
+        """Drop everything written since the last commit."""
+        with suppress(sqlite3.Error):
+            self._connection.rollback()
+        self._writes, self._uncommitted, self._opened = [], [], self._committed
+
     def take_lock(self) -> None:
         """Flush in a transaction: until its commit no other program can lock the journal. Errors as of `flush`."""
         self.flush()

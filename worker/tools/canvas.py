@@ -200,7 +200,9 @@ def choice_name(action: NDArray[Any], names: tuple[str, ...], actions: Actions |
         index = number - actions.first if isinstance(actions, Discrete) else number
         if 0 <= index < len(names):
             return names[index]
-        return f"{number} of {actions.outputs}" if isinstance(actions, Discrete) else str(number)
+        if isinstance(actions, Discrete):
+            return f"{number} of {actions.first} to {actions.first + actions.outputs - 1}"
+        return str(number)
     if not isinstance(actions, Continuous) or not len(choices := numbered_choices(actions)):
         return None
     if len(names) == len(action):

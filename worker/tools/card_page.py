@@ -17,6 +17,7 @@ from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.common.runs.episode_results import EpisodeResult
 from dreamfleet.common.runs.evaluation_report import EvaluationReport
 from dreamfleet.common.runs.standard_error import format_with_error
+from dreamfleet.common.worlds.known_score import find_known_score
 from dreamfleet.common.worlds.score_words import profile_of, score_word
 
 PAGE, CONTROLLER, BUNDLE, REPORT = "README.md", "controller.npz", "bundle.zip", "evaluation.json"
@@ -62,7 +63,7 @@ def describe_card(contents: CardContents, files: Sequence[str]) -> Iterator[str]
         yield from ("", f'<video src="{VIDEO}" controls width="100%"></video>', "", _describe_video(contents))
     yield from ("", "## Scores", "")
     if contents.report is None:
-        yield "Not evaluated."
+        yield _describe_known_score(contents)
     else:
         yield from (f"- {_plain(each)}" for each in contents.report.describe(score_word(contents.world)).splitlines())
         yield from ("", f"![The score of each seed]({SCORES})")
@@ -77,6 +78,15 @@ def describe_card(contents: CardContents, files: Sequence[str]) -> Iterator[str]
     yield from ("", "## Where it comes from", "", "```json")
     yield json.dumps(_origin(contents.controller, contents.bundle), indent=1, sort_keys=True)
     yield from ("```", "", "## Licence", "", "Not named yet: name yours here, and in the second line of this file.")
+
+
+def _describe_known_score(contents: CardContents) -> str:
+    """What is known without a report: of a run's controller its confirmation."""
+    command = "`dreamfleet evaluate --out REPORT.json` and `dreamfleet card CONTROLLER REPORT.json` show each score."
+    if (known := find_known_score(contents.controller)) is None:
+        return f"Not evaluated. {command}"
+    mean, word = format_with_error(known.mean, known.error), score_word(contents.world)
+    return _plain(f"{mean}, the mean of {plural(known.episodes, word)}.") + f" {command}"
 
 
 def _metadata(contents: CardContents, files: Sequence[str]) -> Iterator[str]:

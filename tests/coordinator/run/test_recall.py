@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.common.errors import JournalError, NotWritableNowError, UsageError
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_paths import CONTROLLER
@@ -286,12 +286,19 @@ def test_of_an_external_run_complete_batches_stay_and_what_the_host_brought_is_k
 
 
 def test_a_reported_controller_is_withdrawn_before_its_recall_is_durable_and_a_life_writes_it_again(
-    tmp_path, random_bundle
+    tmp_path, random_bundle, monkeypatch
 ):
     bench = ended(tmp_path, random_bundle.path, settings_of("cma"))
     path = bench.path / CONTROLLER
     before = Controller.load(path)
-    assert not bench.run.bar("a")
+
+    def killed(self):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Journal, "commit", killed)
+        with pytest.raises(KeyboardInterrupt):
+            bench.run.bar("a")
     assert not path.exists()
     bench.restart()  # it was killed before the commit
     assert bench.run.ended
@@ -339,6 +346,36 @@ def test_a_bar_that_is_killed_leaves_a_run_without_a_controller_or_all_of_the_re
         assert run.checks is None
     bar_stored(bench.path, "a", is_barred=True)
     assert not (bench.path / CONTROLLER).exists()
+
+
+def test_a_bar_on_a_full_disk_is_refused_and_changes_nothing(tmp_path, random_bundle, monkeypatch):
+    bench = Failing(tmp_path / "run", random_bundle.path, settings_of("cma"), fails=lambda job: False)
+    bench.serve(stop=lambda run: len(run.history) == 2)
+    bench.run.commit()
+    with RunFolder(bench.path) as run:
+        before = run.history()
+
+    def full(self):
+        raise NotWritableNowError("the disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Journal, "commit", full)
+        assert bench.run.bar("a")
+        assert bench.run.stalled is not None
+        assert not bench.run.commit()
+        assert bench.run.bar("a"), "it is not asked again while the disk is full"
+    bench.now += 10.0
+    bench.run.tick(bench.now)
+    assert bench.run.commit()
+    with RunFolder(bench.path) as run:
+        assert run.checks is None
+        assert run.history() == before
+    bench.restart()
+    assert not bench.run.admission.barred
+    assert bench.run.bar("a") == ""
+    bench.restart()
+    assert [*bench.run.admission.barred] == ["a"]
+    bench.journal.close()
 
 
 def test_rollouts_of_a_barred_host_are_removed_though_nobody_serves_the_run(tmp_path, random_bundle):

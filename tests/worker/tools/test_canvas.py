@@ -93,7 +93,7 @@ def test_the_cars_bars_need_no_names_of_pedals():
     [
         (np.array([0, 1, 0], np.float32), ("stay", "left", "right"), one_hot(3), "left"),
         (np.array([0, 1, 0], np.float32), (), one_hot(3), "1 of 3"),
-        (np.array([2]), (), Discrete(4), "2 of 4"),
+        (np.array([2]), (), Discrete(4), "2 of 0 to 3"),
         (np.array([2]), (), None, "2"),
         (np.array([2]), ("up", "down"), Discrete(2, first=1), "down"),
         (np.array([0.2], np.float32), ("push",), Continuous.between([-1], [1]), None),

@@ -20,6 +20,8 @@ from dreamfleet.common.artifacts.controller import IMPORTED, Controller, Control
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.runs.evaluation_report import read_evaluation_report
+from dreamfleet.common.runs.standard_error import format_with_error
+from dreamfleet.common.worlds.known_score import find_known_score
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.tools.card_page import CardContents, describe_card
 from dreamfleet.worker.tools.score_chart import draw_scores
@@ -120,7 +122,9 @@ def test_a_controller_that_the_script_cannot_drive_has_none(tmp_path):
     assert main(["card", "takecover", "--steps", "0", "--out", str(tmp_path / "cover")]) == 0
     assert not (tmp_path / "cover" / "drive.py").exists()
     assert (tmp_path / "cover" / "controller.onnx").exists()
-    assert "Not evaluated" in (tmp_path / "cover" / "README.md").read_text()
+    known = find_known_score(Controller.load(tmp_path / "cover" / "controller.npz"))
+    scores = (tmp_path / "cover" / "README.md").read_text().partition("## Scores")[2]
+    assert format_with_error(known.mean, known.error) in scores.partition("## Use")[0]
 
 
 def test_a_report_of_another_controller_is_refused(tmp_path, capsys):
