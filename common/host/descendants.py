@@ -46,7 +46,7 @@ class Descendants:
                 yield
             finally:
                 if before is None:
-                    del os.environ[VARIABLE]
+                    os.environ.pop(VARIABLE, None)  # what starts inside may have cleared the environment
                 else:
                     os.environ[VARIABLE] = before
 

@@ -165,7 +165,9 @@ class RevocationWatcher:
         if ledger.authority != self.authority:
             raise AccessError(f"{self._path} belongs to another authority than the join file: name its --access-dir")
         for each in sorted(ledger.revoked_seats() - self.revoked_seats):
-            log.warning("%s is revoked: its messages are ignored", each)
+            log.warning(
+                "%s is revoked: a worker's messages are ignored; a router refuses it from its next start on", each
+            )
         self.revoked_seats |= ledger.revoked_seats()
         self._seen = seen  # only now: a ledger that could not be read is tried again
 

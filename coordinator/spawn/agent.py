@@ -140,7 +140,7 @@ class HostFolder:
     def names(self, kind: str) -> list[str]:
         """The names of all `environments` or `workers`."""
         with suppress(FileNotFoundError):
-            return sorted(each.name for each in (self.root / kind).iterdir())
+            return sorted(each.name for each in (self.root / kind).iterdir() if each.is_dir())
         return []
 
     @contextmanager
@@ -348,7 +348,10 @@ def _checked_state(state: Any) -> dict[str, Any]:
     """A worker's state as `_launch` wrote it; empty if that was prevented, or something else wrote the file."""
     kinds: dict[str, type] = {"pid": int, "birth": str, "node": str, "digest": str, "slots": int, "since": float}
     whole = isinstance(state, dict) and all(isinstance(state.get(name), kind) for name, kind in kinds.items())
-    return state if whole else {}
+    if not whole:
+        return {}
+    holder = state.get("holder", [0, ""])
+    return state if isinstance(holder, list) and [type(each) for each in holder] == [int, str] else {}
 
 
 def last_line(log: Path) -> str:

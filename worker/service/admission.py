@@ -117,7 +117,7 @@ def find_run_with_fewest_slots(session: zenoh.Session, excluded: Collection[str]
     """The live run with the fewest slots by its share, without those in `excluded`; of equals the first by name."""
     found = []
     for document in _live_statuses(session):
-        with suppress(ValueError, KeyError, TypeError):  # another version may answer in another form
+        with suppress(ValueError, KeyError, TypeError, OverflowError):  # anybody may answer anything
             if document["state"] not in ("ended", "paused") and document["run"] not in excluded:
                 slots = int(document["slots"]) / max(float(document.get("share", 1.0)), MIN_SHARE)
                 found.append((slots, str(document["run"])))

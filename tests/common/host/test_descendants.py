@@ -10,7 +10,7 @@ from time import monotonic, sleep
 
 import pytest
 
-from dreamfleet.common.host.descendants import Descendants
+from dreamfleet.common.host.descendants import VARIABLE, Descendants
 from tests.support.processes import DEADLINE, environment
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="Linux")
@@ -50,6 +50,12 @@ def test_a_daemon_ends_and_another_childs_does_not():
     signal.pidfd_send_signal(lives, 0)
     others.kill()
     assert ends(lives)
+
+
+def test_what_clears_the_environment_meanwhile_is_no_error(monkeypatch):
+    with Descendants().starting():
+        monkeypatch.delenv(VARIABLE)
+    assert VARIABLE not in os.environ
 
 
 def test_a_process_of_the_session_without_the_mark_ends():

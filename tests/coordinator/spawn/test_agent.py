@@ -85,7 +85,10 @@ def test_an_agent_that_ends_at_any_step_leaves_what_the_next_one_removes(tmp_pat
     assert [each["left"] for each in found if each["left"] and (mode == "full" or each["left"] not in empty)] == []
 
 
-@pytest.mark.parametrize("damage", [b"", b"{", b"7", b'"x"', b"[1, [2]]", b'["/"]'])
+HOLDER = b'{"pid": 1, "birth": "", "node": "", "digest": "", "slots": 1, "since": 1.0, "holder": "oops"}'
+
+
+@pytest.mark.parametrize("damage", [b"", b"{", b"7", b'"x"', b"[1, [2]]", b'["/"]', HOLDER])
 def test_damaged_files_of_the_agent_are_read_as_nothing(tmp_path, capsys, damage):
     root = tmp_path / "place"
     host_folder = HostFolder(str(root), Channel())
@@ -93,6 +96,7 @@ def test_damaged_files_of_the_agent_are_read_as_nothing(tmp_path, capsys, damage
         host_folder.worker("box").mkdir(parents=True)
     (root / CREATED).write_bytes(damage)
     (host_folder.worker("box") / STATE).write_bytes(damage)
+    (root / "workers" / ".DS_Store").touch()
     assert agent.inspect_host(host_folder)["workers"][0]["running"] is False
     agent.handle_request({"do": "end", "root": str(root), "names": None, "now": True, "keep": False}, Channel())
     assert '"ok"' in capsys.readouterr().out

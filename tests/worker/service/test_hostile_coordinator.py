@@ -1,11 +1,19 @@
 """Neither a coordinator's message nor a task ends a worker."""
 
+import json
+
+import pytest
+
+from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import encode
 from dreamfleet.common.protocol.failures import MAX_CAUSE, Failure
 from dreamfleet.common.protocol.messages import Result, ResultBatch
 from dreamfleet.common.serialization.validation import MAX_TEXT
+from dreamfleet.common.transport.session import Network, open_session
+from dreamfleet.worker.service.admission import find_run_with_fewest_slots
 from dreamfleet.worker.service.outbox import Outbox
 from dreamfleet.worker.service.run_session import RunSession
+from tests.support.processes import free_port
 from tests.support.samples import HEAD
 from tests.support.stage import wait_for
 
@@ -31,3 +39,16 @@ def test_results_with_long_errors_are_split_into_messages():
     for results in messages:
         encode(ResultBatch(**HEAD, fingerprint="f" * MAX_TEXT, results=results))
     assert sum(map(len, messages)) == 200
+
+
+@pytest.mark.parametrize("slots", ["1e999", "1" + 400 * "0", "NaN", "[]"])
+def test_an_odd_status_of_another_run_keeps_no_worker_from_a_run(slots):
+    """Tests admission.py."""
+    good, odd = ({"state": "running", "run": name, "slots": 3} for name in ("good", "odd"))
+    answers = {"good": json.dumps(good), "odd": json.dumps(odd).replace("3", slots)}
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with open_session(Network(listen=(endpoint,))) as served:
+        for name, answer in answers.items():
+            served.declare_queryable(keys.status(name), lambda query, said=answer: query.reply(query.key_expr, said))
+        with open_session(Network(connect=(endpoint,))) as session:
+            assert find_run_with_fewest_slots(session) == "good"
