@@ -87,3 +87,9 @@ def test_a_test_of_each_module_has_its_name_or_lists_it():
     missing = modules - named - listed
     assert missing - WITHOUT_TEST == set(), 'name its test like it, or list it behind "Tests" in a docstring'
     assert WITHOUT_TEST - missing == set(), "no longer needed"
+
+
+def test_no_test_module_imports_another():
+    imports = re.compile(r"^ *from tests\.?[\w.]*(\.test_\w+ import| import .*\btest_)", re.MULTILINE)
+    importing = [str(path) for path in sources("tests") if imports.search((ROOT / path).read_text())]
+    assert importing == [], "what tests share lies in tests/support"

@@ -1,7 +1,7 @@
 """A run whose means are evaluated: its jobs are finished in any order, and its coordinator is killed anywhere."""
 
 from dreamfleet.common.protocol.messages import Result, ResultBatch
-from tests.coordinator.run.test_run import Bench
+from tests.support.run_bench import Bench
 
 EVERY = 2  # generations from one evaluation to the next
 

@@ -11,8 +11,8 @@ from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import BUNDLE, JOURNAL, ROLLOUTS
 from dreamfleet.coordinator.storage import backup
-from tests.end_to_end.test_same_bits import GENERATIONS, SETTINGS, outcome
 from tests.support.processes import call_here, processes_in
+from tests.support.same_bits import GENERATIONS, SETTINGS, outcome
 
 FLAGS = (*SETTINGS, "--evaluate-every", 0, "--collect-every", 1, "--collect-episodes", 1)
 

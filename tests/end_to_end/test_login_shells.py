@@ -2,9 +2,9 @@
 
 import pytest
 
-from tests.end_to_end.test_spawn import rows_of, words
 from tests.support.processes import DEADLINE
 from tests.support.programs import find_program
+from tests.support.spawned import rows_of, words
 
 BASH = 'BASH_ENV=$HOME/.bashrc exec bash -c "$SSH_ORIGINAL_COMMAND"'  # as bash reads it under sshd
 FISH, TCSH = (f'exec {shell} -c "$SSH_ORIGINAL_COMMAND"' for shell in ("fish", "tcsh"))  # as sshd calls a login shell

@@ -20,14 +20,11 @@ from tests.support import tasks
 from tests.support.disks import small_disk
 from tests.support.hosts import new_host, require_hosts
 from tests.support.processes import DEADLINE
+from tests.support.spawned import rows_of, words
 from tests.support.sshd import closed_port, new_key
 
 BARE = "/usr/local/bin:/usr/bin:/bin"  # where no dreamfleet is installed
 TOY = ("--task", tasks.TOY, "--population", 4, "--episodes", 1, "--evaluate-every", 0)
-
-
-def words(hosts, *more):
-    return ("--ssh", hosts.ssh, "--remote-python", sys.executable, *more)
 
 
 def write_file(processes, hosts, *names, more=""):
@@ -38,13 +35,6 @@ def write_file(processes, hosts, *names, more=""):
         f'worker_flags = "--task {tasks.TOY}"\n{more}\n{rows}'
     )
     return path
-
-
-def rows_of(processes, *arguments, code=0, patience=DEADLINE):
-    """The rows that a verb prints, by host."""
-    done, out, err = processes.call(*arguments, "--json", timeout=patience)
-    assert done == code, err
-    return {row["host"]: row for row in json.loads(out.splitlines()[-1])["hosts"]}
 
 
 def state(host, name=None):

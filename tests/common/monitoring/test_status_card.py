@@ -8,7 +8,7 @@ import pytest
 from nbclient import NotebookClient
 
 from dreamfleet.common.monitoring.status_card import MOST_WORKERS, fitness_chart, show_live
-from tests.common.monitoring.test_status_panel import LARGE
+from tests.support.large_status import LARGE
 from tests.support.processes import DEADLINE, ROOT
 from tests.support.samples import STATUS
 

@@ -10,10 +10,11 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from dreamfleet.common.monitoring.equal_fitness import ENOUGH
-from dreamfleet.common.monitoring.status import FailureStatus, Population, StageStatus, WorkerCount
+from dreamfleet.common.monitoring.status import FailureStatus, Population, StageStatus
 from dreamfleet.common.monitoring.status_panel import Block, RunPanel, allocate_lines, panel_lines
 from dreamfleet.common.monitoring.terminal_charts import bar_chart, candidate_grid
 from dreamfleet.common.monitoring.worker_table import WorkerTable, find_slowest
+from tests.support.large_status import FLEET, LARGE
 from tests.support.samples import STATUS
 
 LONG = "a-host-with-quite-a-long-name.example.org/0a1b2c3d"
@@ -43,20 +44,6 @@ def test_the_least_important_lines_are_left_out_first():
     )
     assert "state" in narrow
     assert "picture" not in narrow
-
-
-FLEET = tuple(
-    dataclasses.replace(
-        STATUS.worker_list[0], worker=f"a-host-of-thirty-letters-x{number:04d}/0a1b2c3d", job_seconds=1.2,
-        round_trip=0.05, resent=3,
-    )
-    for number in range(40)
-)  # fmt: skip
-RECENT = tuple(dataclasses.replace(STATUS.recent[0], number=number, mean=float(number)) for number in range(60))
-LARGE = dataclasses.replace(
-    STATUS, worker_list=FLEET, workers=WorkerCount(40, 40), recent=RECENT,
-    population=Population(7, 0, 64, (16,) * 30 + (4,) * 10 + (0,) * 24, (16,) * 64, (5.0,) * 40 + (None,) * 24),
-)  # fmt: skip
 
 
 @pytest.mark.parametrize(("width", "height"), [(80, 24), (60, 10), (200, 60), (20, 5)])

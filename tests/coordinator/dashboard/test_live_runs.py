@@ -13,8 +13,8 @@ from dreamfleet.coordinator.dashboard import live_runs
 from dreamfleet.coordinator.dashboard.lanes import STRETCH, UNKNOWN
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.service.snapshot import take_snapshot
-from tests.coordinator.run.test_run import SETTINGS, Bench
 from tests.support.processes import free_port
+from tests.support.run_bench import SETTINGS, Bench
 from tests.support.samples import STATUS
 from tests.support.served import serving, snapshot
 

@@ -7,8 +7,8 @@ from dreamfleet.common.monitoring.status import WorkerCount, read_status
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.coordinator.dispatch.event_log import BLOCK, BLOCKS, EventLog
 from dreamfleet.coordinator.dispatch.fleet import DEPARTURE_GRACE, SILENT_AFTER
-from tests.coordinator.run.test_run import A, B, Bench
-from tests.coordinator.service.test_status import SCORED, answered, score, snapshot_of
+from tests.support.run_bench import A, B, Bench
+from tests.support.snapshots import SCORED, answered, score, snapshot_of
 
 
 @pytest.fixture

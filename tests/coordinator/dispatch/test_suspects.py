@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.coordinator.dispatch.test_fleet import A, B, digests, fleet_of, result
+from tests.support.dispatched import A, B, digests, fleet_of, result
 from tests.support.failures import failure
 
 STRANGERS = ["x/00000003", "y/00000004"]  # they ended while they held the suspect

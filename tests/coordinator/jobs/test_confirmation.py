@@ -16,7 +16,7 @@ from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.common.runs.seeds import CHOOSING_OFFSET, CONFIRMING_OFFSET, VALIDATION
 from dreamfleet.coordinator.jobs.confirmation import FINALISTS, Confirmation, Finalist, total_episodes
 from dreamfleet.coordinator.settings.limits import LimitsConfig
-from tests.coordinator.run.test_run import SETTINGS, Bench
+from tests.support.run_bench import SETTINGS, Bench
 from tests.support.samples import SPEC
 
 JUDGED = replace(

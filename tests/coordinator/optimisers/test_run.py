@@ -9,7 +9,7 @@ from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.settings.start import latest_mean_and_sigma
-from tests.coordinator.run.test_run import SETTINGS, Bench
+from tests.support.run_bench import SETTINGS, Bench
 
 GENERATIONS = 6
 OPTIMISERS = ["cma", "cmaes-lra", "cmaes-sep", "tests.support.optimisers:ParentsAndChildren"]

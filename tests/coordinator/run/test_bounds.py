@@ -27,8 +27,8 @@ from dreamfleet.coordinator.jobs.work import vector_bytes
 from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
 from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.service.status import encode_part
-from tests.coordinator.run.test_run import SETTINGS, A, Bench
 from tests.support.failures import failure
+from tests.support.run_bench import SETTINGS, A, Bench
 from tests.support.samples import SPEC
 
 PLAIN = replace(SETTINGS, collect_every=0, population=4, episodes=2, evaluate_every=1, evaluation_episodes=2)

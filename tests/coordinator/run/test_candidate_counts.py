@@ -17,8 +17,8 @@ from dreamfleet.coordinator.analysis.export import export_csv, export_parquet, r
 from dreamfleet.coordinator.analysis.stored_run import StoredRun
 from dreamfleet.coordinator.run.recall import recall
 from dreamfleet.coordinator.storage.verification_records import StoredBar
-from tests.coordinator.run import test_batches
-from tests.coordinator.run.test_failures import SETTINGS, Failing
+from tests.support import batch_door
+from tests.support.failing_runs import SETTINGS, Failing
 
 SEEDS = range(6)
 
@@ -119,7 +119,7 @@ def test_every_table_has_the_same_candidates(tmp_path, random_bundle):
 
 
 def test_batches_of_others_share_results_and_keep_them_after_a_recall(tmp_path):
-    door = test_batches.Door(tmp_path / "search")
+    door = batch_door.Door(tmp_path / "search")
     door.submit("one", 2, seeds=(1, 2))
     door.submit("again", 3, seeds=(1, 2, 2))
     door.submit("cut", 3, seeds=(5, 6))
@@ -135,7 +135,7 @@ def test_batches_of_others_share_results_and_keep_them_after_a_recall(tmp_path):
         assert [each.episodes for each in before[0]] == [2, 2, 3, 3, 3, 2, 0, 0]
         assert [sum(each.steps for each in before[0] if each.generation == number) for number in range(3)] == before[1]
     door.journal.bar("a", StoredBar("a test"), 1)
-    recall(door.journal, test_batches.SETTINGS, {"a"})
+    recall(door.journal, batch_door.SETTINGS, {"a"})
     door.journal.commit()
     with RunFolder(door.path) as run:
         assert (run.candidates(), [each.steps for each in run.history()]) == before

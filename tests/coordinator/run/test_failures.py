@@ -17,72 +17,11 @@ from dreamfleet.common.runs.seeds import CONFIRMING_OFFSET, training_seed
 from dreamfleet.coordinator.jobs import generation
 from dreamfleet.coordinator.run.run import BY_HAND
 from dreamfleet.coordinator.settings.limits import LimitsConfig
-from tests.coordinator.run.test_run import SETTINGS as TWO
-from tests.coordinator.run.test_run import A, B, Bench
+from tests.support.failing_runs import GENERATIONS, SETTINGS, Failing, by_vector, finished
 from tests.support.failures import failure
+from tests.support.run_bench import A, B
 
-SETTINGS = replace(TWO, population=6, episodes=2, collect_every=0, on_failure="worst")
-GENERATIONS = 3
 NEW = "new/1"
-
-
-class Failing(Bench):
-    """A bench whose episodes fail where `fails(job)`; everything else scores by its digest."""
-
-    host_class = "0123456789abcdef"
-
-    def __init__(self, *args, fails, host_errors=(), limit=0.5, **kwargs):
-        self.fails, self.host_errors, self.failure_limit = fails, list(host_errors), limit
-        self.hosts = [A, B]
-        super().__init__(*args, generations=GENERATIONS, **kwargs)
-
-    def begin(self):
-        super().begin()
-        for name in self.hosts:
-            self.handle_heartbeat(name, host_class=self.host_class)
-
-    def answer_one(self, name, job):
-        if self.host_errors:
-            result = Result(job.digest, None, 0, 0.1, self.host_errors.pop(), None)
-        elif self.fails(job):
-            result = Result(job.digest, None, 3, 0.1, failure("ValueError", f"at {id(job):#x} on {name}"), None)
-        else:
-            result = Result(job.digest, int.from_bytes(job.digest[:3]) / 1e6, 10, 0.1, None, None)
-        self.deliver(name, result)
-
-    def serve(self, turns=400, stop=lambda run: False):
-        for _ in range(turns):
-            if self.run.ended or self.run.paused or stop(self.run):
-                return
-            self.now += 1.0
-            self.run.tick(self.now)
-            self.run.advance(self.now)
-            for name in self.hosts:
-                self.handle_heartbeat(name, host_class=self.host_class)
-            for send in self.run.fleet.dispatch(self.now):
-                for work in send.content.work:
-                    self.answer_one(send.identity, work.job)
-        raise AssertionError("the run does not end")
-
-    def story(self):
-        """What a run computed, without times."""
-        self.journal.commit()
-        with RunFolder(self.path) as folder:
-            rows = [replace(each, seconds=0.0) for each in folder.history()]
-            candidates = [(each.generation, each.number, each.fitness) for each in folder.candidates()]
-            vectors = [folder.candidate(*each[:2]).tobytes() for each in candidates]
-            return rows, candidates, vectors, folder.evaluations(), folder.confirmation()
-
-
-def by_vector(share):
-    """An episode fails by its parameters and its seed."""
-    return lambda job: job.kind == "score" and (job.vector[0] + job.seeds[0]) % 256 < share * 256
-
-
-def finished(path, bundle, settings=SETTINGS, **options):
-    bench = Failing(path / "night", bundle.path, settings, **options)
-    bench.serve()
-    return bench
 
 
 def story_of_killed(path, bundle, results, settings, **options):

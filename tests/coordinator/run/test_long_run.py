@@ -16,7 +16,7 @@ from dreamfleet.coordinator.service.status import encode_status
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
-from tests.coordinator.run.test_run import SETTINGS, A
+from tests.support.run_bench import SETTINGS, A
 
 BLOCK = 250  # generations of a measurement
 

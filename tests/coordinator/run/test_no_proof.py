@@ -6,9 +6,9 @@ import pytest
 
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.coordinator.run.recall import recall
-from tests.coordinator.run.test_failures import SETTINGS, Failing
-from tests.coordinator.run.test_run import A, B
+from tests.support.failing_runs import SETTINGS, Failing
 from tests.support.failures import failure
+from tests.support.run_bench import A, B
 
 NEW = "new/1"
 

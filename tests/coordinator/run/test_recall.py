@@ -20,9 +20,9 @@ from dreamfleet.coordinator.run.generations import Generations
 from dreamfleet.coordinator.run.recall import bar_stored, recall
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
-from tests.coordinator.run import test_run
-from tests.coordinator.run.test_failures import GENERATIONS, SETTINGS, Failing
-from tests.coordinator.run.test_run import A, B, Bench, result_of
+from tests.support import run_bench
+from tests.support.failing_runs import GENERATIONS, SETTINGS, Failing
+from tests.support.run_bench import A, B, Bench, result_of
 
 OPTIMISERS = ["cma", "full", "cmaes-lra", "openes", "pepg", "snes", "xnes"]
 
@@ -125,7 +125,7 @@ def test_a_race_that_is_resumed_after_the_fault_of_a_host_is_one_without_it(tmp_
 def test_what_a_candidate_has_that_failed_for_a_while_is_checked_once_it_is_scored(
     tmp_path, random_bundle, monkeypatch
 ):
-    monkeypatch.setattr(test_run, "NetworkConfig", partial(NetworkConfig, verify=1.0))
+    monkeypatch.setattr(run_bench, "NetworkConfig", partial(NetworkConfig, verify=1.0))
     bench = Broken(
         tmp_path / "run", random_bundle.path, replace(SETTINGS, episodes=4),
         fails=lambda job: bench.is_broken and job.candidate == 0 and job.episode == 1,

@@ -1,6 +1,5 @@
 """A run with its worker protocol and its journal, without a transport. Tests background_jobs.py and generations.py."""
 
-import hashlib
 import json
 from dataclasses import replace
 
@@ -8,139 +7,17 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.protocol.messages import (
-    MAX_PART,
-    TAG_BYTES,
-    Heartbeat,
-    HelloRequest,
-    Intervals,
     Result,
     ResultBatch,
-    UploadPart,
 )
 from dreamfleet.common.protocol.stop_kind import StopKind
-from dreamfleet.common.runs.records import RunSettings, StoredEvaluation
+from dreamfleet.common.runs.records import StoredEvaluation
 from dreamfleet.common.runs.run_folder import STOP_KIND, RunFolder
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
-from dreamfleet.coordinator.run.run import Run
-from dreamfleet.coordinator.run.worker_protocol import WorkerProtocol
 from dreamfleet.coordinator.settings.limits import LimitsConfig
-from dreamfleet.coordinator.settings.network import NetworkConfig
-from dreamfleet.coordinator.storage.journal import Journal
 from tests.support.failures import failure
-from tests.support.samples import SPEC
-
-A, B = "a/00000001", "b/00000002"
-DRIVES = 2
-SETTINGS = RunSettings(
-    SPEC, ControllerShape(1, 3), 2, 1, 0.1, "diagonal", 1, evaluate_every=0, evaluation_episodes=1, collect_every=1,
-    collect_episodes=DRIVES,
-)  # fmt: skip
-
-
-class Bench:
-    """A run in a folder; a test delivers its messages and moves its clock."""
-
-    strict = False
-    failure_limit = 0.5
-    host_class = None  # of both workers; `None`: they report no class
-
-    def __init__(self, path, bundle, settings=SETTINGS, generations=1):
-        self.path, self.now = path, 0.0
-        self.settings, self.limits = settings, LimitsConfig(generations=generations)
-        path.mkdir(parents=True)
-        self.journal = Journal.create(path, settings, bundle)
-        self.begin()
-
-    def begin(self):
-        network = NetworkConfig(beat=1.0, strict=self.strict, failure_limit=self.failure_limit)
-        self.run = Run(self.journal, self.settings, self.limits, network, self.now)
-        self.worker_protocol = WorkerProtocol(self.run, "night", "n", Intervals(1.0, 1.0))
-        self.run.advance(self.now)
-        self.run.commit()
-        for name in (A, B):
-            self.run.admission.admit(self.request(name), self.now)
-            self.handle_heartbeat(name)
-
-    def request(self, name):
-        return HelloRequest(2, 2, "0", name, (SPEC.task,), "f", 1)
-
-    def restart(self):
-        """Kill the coordinator, which loses everything that is not committed, and begin the next incarnation."""
-        self.journal.close()
-        self.journal = Journal(self.path / "journal.sqlite")
-        self.begin()
-
-    def handle_heartbeat(self, name, unacked=(), host_class=None):
-        if (member := self.run.fleet.members.get(name)) is None:
-            return
-        head = {"run_uid": self.run.uid, "incarnation": self.run.incarnation, "nonce": "n", "drawn_by": "-",
-                "numbering": member.numbering}  # fmt: skip
-        tags = tuple(digest[:TAG_BYTES] for digest in unacked)
-        self.worker_protocol.handle_heartbeat(
-            name,
-            Heartbeat(**head, seen=member.number, capacity=4, slots=4, queued=(), running=(), unacked=tags, load=0.0,
-                 steps_per_second=0.0, host_class=host_class),
-            self.now,
-        )  # fmt: skip
-
-    def deliver(self, name, result):
-        batch = ResultBatch(
-            run_uid=self.run.uid, incarnation=1, fingerprint="f", results=(result,), host_class=self.host_class
-        )
-        self.worker_protocol.handle_results(name, batch, self.now)
-        self.run.advance(self.now)
-        self.run.commit()
-
-    def answer(self, result):
-        """Deliver a result from a worker that holds the job."""
-        wanted = self.run.fleet.jobs.get(result.digest)
-        self.deliver(min(wanted.holders, default=A) if wanted else A, result)
-
-    def upload(self, name, part):
-        self.worker_protocol.handle_upload(name, part, self.now)
-
-    def parts(self, job):
-        data = drive_of(job)
-        return [
-            UploadPart(
-                run_uid=self.run.uid, incarnation=1, digest=job.digest, sha256=hashlib.sha256(data).digest(),
-                offset=offset, total=len(data), data=data[offset : offset + MAX_PART],
-            )
-            for offset in range(0, len(data), MAX_PART)
-        ]  # fmt: skip
-
-    def verdicts(self):
-        sends = self.run.fleet.dispatch(self.now)
-        return [(send.identity, each.digest, each.verdict) for send in sends for each in send.content.verdicts]
-
-    def reach_collection(self):
-        """Score the only generation; the collection jobs, each with its holder."""
-        while not self.run.fleet.drain_background:
-            for send in self.run.fleet.dispatch(self.now):
-                for work in send.content.work:
-                    self.deliver(send.identity, Result(work.job.digest, 1.0, 10, 0.1, None, None))
-        return self.collecting()
-
-    def collecting(self):
-        given = {}
-        for send in self.run.fleet.dispatch(self.now):
-            given.update({work.job.episode: (send.identity, work.job) for work in send.content.work})
-        return [given[episode] for episode in sorted(given)]
-
-    def kept(self):
-        with RunFolder(self.path) as folder:
-            return [path.read_bytes() for path in folder.rollouts()]
-
-
-def drive_of(job):
-    """A rollout of a little more than two parts, a pure function of the job."""
-    return hashlib.sha256(job.digest).digest() * (2 * MAX_PART // 32) + job.digest
-
-
-def result_of(job):
-    return Result(job.digest, 5.0, 10, 0.1, None, hashlib.sha256(drive_of(job)).digest())
+from tests.support.run_bench import DRIVES, SETTINGS, A, B, Bench, drive_of, result_of
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ import pytest
 
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.storage.journal import MAX_EVENTS
-from tests.coordinator.run.test_failures import SETTINGS, Failing
-from tests.coordinator.run.test_run import A
+from tests.support.failing_runs import SETTINGS, Failing
+from tests.support.run_bench import A
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from dreamfleet.common.errors import InternalError
 from dreamfleet.common.protocol.messages import Result, ResultBatch
 from dreamfleet.common.serialization.validation import MAX_TEXT
 from dreamfleet.coordinator.dispatch.refusals import Refusal
-from tests.coordinator.run.test_run import SETTINGS, B, Bench
+from tests.support.run_bench import SETTINGS, B, Bench
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import pytest
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.service.control import DISBAND_TIMEOUT, Control
-from tests.coordinator.run.test_run import A, B, Bench
+from tests.support.run_bench import A, B, Bench
 
 AGAIN = "dreamfleet coordinator --resume night"
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 
 from dreamfleet.common.monitoring.equal_fitness import ENOUGH
-from dreamfleet.common.monitoring.status import PARTS, Population, WorkerStatus, read_document, read_status
+from dreamfleet.common.monitoring.status import PARTS, Population, WorkerStatus, read_status
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, MAX_OPTIONS, Result
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
 from dreamfleet.common.serialization.validation import from_plain, from_plain_lenient
@@ -19,12 +19,11 @@ from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.generation import CandidateScores
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.service.run_log import RunLog
-from dreamfleet.coordinator.service.snapshot import Snapshot, take_snapshot
+from dreamfleet.coordinator.service.snapshot import Snapshot
 from dreamfleet.coordinator.service.status import encode_part, encode_status
-from tests.coordinator.run.test_run import SETTINGS, A, Bench
+from tests.support.run_bench import A, Bench
 from tests.support.samples import CLOSED, STATUS
-
-SCORED = dataclasses.replace(SETTINGS, population=4, episodes=2, collect_every=0)
+from tests.support.snapshots import SCORED, answered, score, snapshot_of
 
 
 @pytest.fixture
@@ -32,24 +31,6 @@ def bench(tmp_path, random_bundle):
     made = Bench(tmp_path / "night", random_bundle.path, SCORED, generations=3)
     yield made
     made.journal.close()
-
-
-def score(bench, count, fitness=lambda job: job.candidate + job.episode / 2):
-    """Answer `count` jobs, one after the other."""
-    while count:
-        for send in bench.run.fleet.dispatch(bench.now):
-            bench.given = getattr(bench, "given", []) + [work.job for work in send.content.work]
-        job = bench.given.pop(0)
-        bench.answer(Result(job.digest, fitness(job), 10, 0.1, None, None))
-        count -= 1
-
-
-def snapshot_of(bench):
-    return take_snapshot(bench.run, "night", Counter(), 0.0, bench.now)
-
-
-def answered(snapshot, part="", **parameters):
-    return read_document(encode_part(snapshot, part, {name: str(value) for name, value in parameters.items()}))
 
 
 def test_the_status_holds_every_candidate_of_the_open_and_of_the_last_generation(bench):

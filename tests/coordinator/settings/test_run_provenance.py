@@ -22,7 +22,7 @@ from dreamfleet.coordinator.settings.rerun import Rerun
 from dreamfleet.coordinator.settings.resume_settings import serving_facts
 from dreamfleet.coordinator.settings.start import StartPoint, find_start
 from dreamfleet.coordinator.storage.journal import Journal
-from tests.coordinator.run.test_report import EVALUATED, Reporting
+from tests.support.reporting_runs import EVALUATED, Reporting
 
 
 class Spending(Reporting):

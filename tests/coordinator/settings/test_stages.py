@@ -21,7 +21,7 @@ from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.settings.fork import Fork
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from tests.coordinator.evaluated import EVERY, Evaluated
-from tests.coordinator.run.test_run import SETTINGS
+from tests.support.run_bench import SETTINGS
 from tests.support.samples import SPEC
 
 GENERATIONS = 11

@@ -4,7 +4,7 @@ from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.coordinator.run.recall import bar_stored
 from dreamfleet.coordinator.storage import backup
-from tests.coordinator.run.test_failures import SETTINGS, finished
+from tests.support.failing_runs import SETTINGS, finished
 
 
 def test_a_copy_during_which_results_are_recalled_has_no_controller_of_theirs(tmp_path, random_bundle, monkeypatch):

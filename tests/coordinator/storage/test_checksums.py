@@ -15,8 +15,8 @@ from dreamfleet.coordinator.settings.fork import Fork
 from dreamfleet.coordinator.settings.start import find_start
 from dreamfleet.coordinator.storage import recall_records
 from dreamfleet.coordinator.storage.journal import Journal
-from tests.coordinator.run.test_batches import Door
-from tests.coordinator.run.test_failures import SETTINGS, Failing
+from tests.support.batch_door import Door
+from tests.support.failing_runs import SETTINGS, Failing
 
 ENDING = replace(SETTINGS, evaluate_every=1, evaluation_episodes=2)
 

@@ -27,7 +27,7 @@ from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.storage.backup import back_up
 from dreamfleet.coordinator.storage.journal import Journal
-from tests.coordinator.run.test_failures import SETTINGS, Failing, by_vector
+from tests.support.failing_runs import SETTINGS, Failing, by_vector
 
 PAGE = 4096
 COPIES, MANY = 10, 120  # of each of two runs

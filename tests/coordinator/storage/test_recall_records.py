@@ -7,7 +7,7 @@ from dreamfleet.common.runs.records import StoredEvaluation
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.storage.journal import Journal
-from tests.coordinator.run.test_run import SETTINGS
+from tests.support.run_bench import SETTINGS
 from tests.support.samples import SPEC
 
 VECTORS = [bytes(20), bytes([1]) * 20]

@@ -12,7 +12,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli.command_line import main
 from tests.support import checkpoint_files
-from tests.worker.importing.test_vectors_and_drives import ctallec_drive
+from tests.support.foreign_drives import ctallec_drive
 
 # What is typed, its exit code, and the command that the answer names, or "" where it is the result.
 FROM_WME = [

@@ -24,6 +24,7 @@ from dreamfleet.worker.training.data.dataset import (
     load_steps,
     preprocessing_of,
 )
+from tests.support.foreign_drives import ctallec_drive
 from tests.support.samples import SPEC
 
 
@@ -286,20 +287,6 @@ def test_the_writer_of_the_page_makes_a_data_set(tmp_path, monkeypatch):
     exec(page.split("```python\n")[1].split("```")[0], {})
     assert main(["import", "drives", "--out", "data"]) == 0
     assert len(load_pictures(episode_paths(Path("data"))[0])) == 20
-
-
-def ctallec_drive(folder, number, steps=6, size=64):
-    """A drive of ctallec/world-models: each picture is the one after its action, and actions are drawn in advance."""
-    random = np.random.default_rng(number)
-    folder.mkdir(parents=True, exist_ok=True)
-    arrays = {
-        "observations": random.integers(0, 256, (steps, size, size, 3), dtype=np.uint8),
-        "rewards": random.random(steps),
-        "actions": random.random((steps + 4, 3)),
-        "terminals": np.arange(steps) == steps - 1,
-    }
-    np.savez(folder / f"rollout_{number}.npz", **arrays)
-    return arrays
 
 
 @pytest.mark.parametrize("size", [64, 96])

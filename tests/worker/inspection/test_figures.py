@@ -1,7 +1,6 @@
 """`inspect --probe` and `inspect --losses`: what they print, and the allowed drivers.
 Tests measurements.py and worker/verbs/inspect.py."""
 
-import argparse
 import json
 from dataclasses import replace
 
@@ -10,31 +9,12 @@ import pytest
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.lookup import find_controller
-from dreamfleet.worker.inspection import probe
 from dreamfleet.worker.inspection.disturbed_rollouts import DisturbedDriveConfig
 from dreamfleet.worker.inspection.measurements import DriverChoice, measure_dream_losses
 from dreamfleet.worker.inspection.road_losses import RoadLossConfig
-from dreamfleet.worker.verbs import inspect
 from tests.support.tables import cells
 
 FOUND = {"z_linear", "z_network", "zh_linear", "zh_network"}
-
-
-@pytest.fixture
-def call(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(probe, "UPDATES", 30)
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"):
-        monkeypatch.setenv(name, "1")
-
-    def run(*arguments):
-        parser = argparse.ArgumentParser()
-        inspect.configure(parser)
-        args = parser.parse_args(arguments)
-        args.runs_dir = tmp_path
-        assert inspect.run(args) == 0
-        return capsys.readouterr().out
-
-    return run
 
 
 @pytest.mark.slow

@@ -26,7 +26,6 @@ from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle, write_world_bundle
 from tests.support.pixel_world import Dodge, DodgeTask
 from tests.support.tables import cells
-from tests.worker.inspection.test_figures import call  # noqa: F401 - a fixture
 
 VAE, ENDING = VAEConfig(latent=5, channels=(4, 4, 4, 8)), MDNRNNConfig(latent=5, hidden=8, reward="none", done=True)
 FACTS = DodgeTask.world.facts(RewardFacts("survival"), EndRule("drawn"))
@@ -105,7 +104,7 @@ def test_a_model_without_ends_and_a_stranger_are_refused(dodge, tmp_path):
         measure_survival(dodge, controller_of(endless), SurvivalConfig(2))
 
 
-def test_the_verb_prints_a_row_a_policy_or_json(dodge, call):  # noqa: F811
+def test_the_verb_prints_a_row_a_policy_or_json(dodge, call):
     lines = call(str(dodge.path), "--survival", "--episodes", "2").splitlines()
     assert cells(lines[0]) == ["policy", "reality", "dream", "dream / reality", "cut, reality", "cut, dream"]
     assert [cells(line)[0] for line in lines[1:-1]] == NAMES

@@ -20,7 +20,7 @@ from dreamfleet.worker.tasks.api import StepSnapshot
 from tests.support import tasks
 from tests.support.hand import DEADLINE, tag
 from tests.support.samples import VECTOR, job
-from tests.worker.service.test_slot import Harness
+from tests.support.slot_harness import Harness
 
 ACTION = (0.0, 1.0)
 

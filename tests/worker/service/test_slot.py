@@ -3,7 +3,6 @@
 import hashlib
 import io
 import os
-import queue
 import resource
 import select
 import shutil
@@ -12,89 +11,27 @@ import subprocess
 import sys
 import threading
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from time import monotonic
 
 import numpy as np
 import pytest
 
-from dreamfleet.common.artifacts.bundle import hash_file
 from dreamfleet.common.errors import DreamfleetError
-from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.scoring.failure_cause import crash
-from dreamfleet.worker.service.child import ScorerArguments
 from dreamfleet.worker.service.slot import (
     FAILED_STARTS,
     MAX_START_DELAY,
-    MAX_STARVED_DELAY,
     START_LIMIT,
     STARVED_STARTS,
-    Slot,
 )
 from tests.support import tasks
 from tests.support.bundles import write_random_bundle
 from tests.support.processes import DEADLINE, environment
 from tests.support.samples import VECTOR, job
+from tests.support.slot_harness import Harness, hash_of
 
 OUT_OF_MEMORY = crash(-signal.SIGKILL)
-
-
-@cache
-def hash_of(bundle):
-    return hash_file(bundle)
-
-
-def spec(task, bundle):
-    return TaskSpec(task=task, bundle=hash_of(bundle), horizon=100, patience=0)
-
-
-class Harness:
-    """A slot and its worker's queue."""
-
-    def __init__(self, task, bundle, memory_limit, **more):
-        self.spec = spec(task, bundle)
-        self.events = queue.SimpleQueue()
-        self.slot = Slot(0, ScorerArguments(self.spec, bundle, tasks.ALL), self.events, memory_limit, **more)
-
-    def pass_time(self):
-        """The longest pause before a start, in no time."""
-        self.slot.check(monotonic() + MAX_STARVED_DELAY + 1.0, 0.0)
-
-    def wait_ready(self):
-        while not self.slot.ready:
-            self.take()
-
-    def take(self):
-        """The slot's next event, handled; a child that waits to be started is."""
-        self.slot.check(monotonic(), 0.0)
-        if self.slot.pid == 0:
-            self.pass_time()
-        return self.slot.handle(self.events.get(timeout=DEADLINE)[1])
-
-    def result(self):
-        while True:
-            if results := self.take():
-                (result,) = results
-                return result
-
-    def outcome(self):
-        """The result, and the file that came with it."""
-        while True:
-            event = self.events.get(timeout=DEADLINE)[1]
-            if results := self.slot.handle(event):
-                return results[0], event.upload
-
-    def gone(self):
-        """The event that the child is gone, not handled yet."""
-        while (event := self.events.get(timeout=DEADLINE)[1]).message is not None:
-            self.slot.handle(event)
-        return event
-
-    def score(self, episode=0):
-        self.wait_ready()
-        self.slot.submit([(job(episode, spec=self.spec), VECTOR)])
-        return self.result()
 
 
 @pytest.fixture
@@ -420,7 +357,7 @@ def test_a_child_dies_with_its_worker(random_bundle, tmp_path):
         "import queue, sys, pathlib\n"
         "from tests.support import tasks\n"
         "from tests.support.samples import VECTOR, job\n"
-        "from tests.worker.service.test_slot import spec\n"
+        "from tests.support.slot_harness import spec\n"
         "from dreamfleet.worker.service.child import ScorerArguments\n"
         "from dreamfleet.worker.service.slot import Slot\n"
         "if __name__ == '__main__':\n"

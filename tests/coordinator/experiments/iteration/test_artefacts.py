@@ -9,7 +9,7 @@ from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
 from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
 from dreamfleet.coordinator.experiments.iteration.phases import PhaseRunner
 from dreamfleet.coordinator.experiments.iteration.plan import Phase, PhasePlan
-from tests.coordinator.experiments.iteration.test_ledger import entry, ledger
+from tests.support.ledgers import entry, ledger
 
 
 def write(path, text="content"):

@@ -5,18 +5,12 @@ from pathlib import Path
 import pytest
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.coordinator.experiments.iteration.commands import Commands
 from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
-from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
 from dreamfleet.coordinator.experiments.iteration.plan import Phase
-from tests.coordinator.experiments.iteration.test_ledger import entry, ledger
+from tests.support.ledgers import entry
+from tests.support.phase_commands import commands
 
-LAYOUT = IterationFolder(Path("data"))
 ROUND_2 = (entry(1, "collect", episodes=620), entry(1, "bundle"), entry(1, "evolve"))
-
-
-def commands(*entries, **changes):
-    return Commands(IterateConfig(**changes), LAYOUT, ledger(*entries))
 
 
 def said(words):

@@ -7,22 +7,8 @@ import pytest
 
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
-from dreamfleet.coordinator.experiments.iteration.ledger import Artefact, FinishedPhase, IterationLedger
-
-RUN = {"task": "dream", "population": 64, "collect_every": 0, "stages": ()}
-
-
-def entry(number, phase, made=(), **figures):
-    return FinishedPhase(
-        number, phase, 0, 1.5, "2026-01-01T00:00:00+00:00", (("encode", "--json"),), figures, tuple(made)
-    )
-
-
-def ledger(*entries):
-    found = IterationLedger.begin(IterateConfig(), RUN)
-    for each in entries:
-        found = found.add(each)
-    return found
+from dreamfleet.coordinator.experiments.iteration.ledger import Artefact, IterationLedger
+from tests.support.ledgers import RUN, entry, ledger
 
 
 def test_it_is_kept_whole(tmp_path):

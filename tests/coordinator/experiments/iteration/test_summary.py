@@ -6,7 +6,7 @@ import pytest
 
 from dreamfleet.coordinator.experiments.iteration import summary
 from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
-from tests.coordinator.experiments.iteration.test_ledger import entry, ledger
+from tests.support.ledgers import entry, ledger
 
 QUALITY = {"nats_per_dimension": 0.96, "reward_auc": 0.93}
 SCORE = {"mean": 812.4, "error": 15.2, "episodes": 32, "generation": 9, "confirmed": True}

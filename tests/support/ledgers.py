@@ -1,0 +1,19 @@
+"""Ledgers of iterations."""
+
+from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
+from dreamfleet.coordinator.experiments.iteration.ledger import FinishedPhase, IterationLedger
+
+RUN = {"task": "dream", "population": 64, "collect_every": 0, "stages": ()}
+
+
+def entry(number, phase, made=(), **figures):
+    return FinishedPhase(
+        number, phase, 0, 1.5, "2026-01-01T00:00:00+00:00", (("encode", "--json"),), figures, tuple(made)
+    )
+
+
+def ledger(*entries):
+    found = IterationLedger.begin(IterateConfig(), RUN)
+    for each in entries:
+        found = found.add(each)
+    return found
