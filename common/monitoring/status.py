@@ -334,6 +334,8 @@ class Status(Displayed):
     # Steps after which the environment itself ends an episode; `None`: it has no limit, or none is known.
     episode_limit: Count | None = field(default=None, metadata=OPTIONAL)
     archive: ArchiveStatus | None = field(default=None, metadata=OPTIONAL)  # of a run with `--archive`
+    # What paused it (`PauseKind`), the latest first; empty where the journal or differing hosts make it wait.
+    pauses: tuple[Word, ...] = field(default=(), metadata=OPTIONAL)
     score_word: Word = field(default="seed", metadata=OPTIONAL)  # what the world calls a scored seed: "track", "game"
 
     def _display(self) -> tuple[str, dict[str, object]]:

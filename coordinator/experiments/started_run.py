@@ -30,6 +30,7 @@ from dreamfleet.common.monitoring.client import Client
 from dreamfleet.common.monitoring.status import Status
 from dreamfleet.common.monitoring.status_card import show_live
 from dreamfleet.common.protocol.keys import check_run_name
+from dreamfleet.common.protocol.pause_kind import PauseKind
 from dreamfleet.common.protocol.tasks import module_of
 from dreamfleet.common.runs.own_runs import trust_own_run
 from dreamfleet.common.runs.records import StoredGeneration
@@ -39,7 +40,6 @@ from dreamfleet.coordinator.analysis.stored_run import StoredRun
 from dreamfleet.coordinator.experiments.function_names import environment_for
 from dreamfleet.coordinator.experiments.local_run import ALONE, LocalFleet, LocalRun, has_begun, task_flags
 from dreamfleet.coordinator.experiments.run_arguments import RunArguments
-from dreamfleet.coordinator.run.run import BY_HAND
 from dreamfleet.coordinator.settings import run_setup
 
 MOST_WORKERS = 1024  # processes of one slot
@@ -162,7 +162,7 @@ class StartedRun(StoredRun):
             status = self.client.status(self.name)
         except ConnectionFailedError:  # it is just ending
             return
-        if status.state == "paused" and status.why != BY_HAND:
+        if status.state == "paused" and status.pauses != (PauseKind.BY_HAND,):
             errors = tuple(text for each in status.failures for text in each.errors.values())
             raise RunPausedError(f"run {self.name} is paused: {status.why}; its logs are in {self.path}", errors)
 

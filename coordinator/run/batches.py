@@ -34,6 +34,7 @@ from dreamfleet.common.runs.seeds import remark_on_seeds, training_seed
 from dreamfleet.coordinator.jobs.upload_assembler import TOO_MANY, UploadAssembler
 from dreamfleet.coordinator.run.external_generations import CANCELLED, ExternalGenerations
 from dreamfleet.coordinator.run.run import Run
+from dreamfleet.coordinator.run.shown_state import shown_state
 from dreamfleet.coordinator.storage.batch_records import StoredBatch
 from dreamfleet.coordinator.storage.journal import Journal
 
@@ -218,9 +219,9 @@ class Batches:
 
     def _head(self) -> BatchReply:
         run = self._run
-        why = truncate(run.paused or run.stalled or "", 1000)
+        shown = shown_state(run)
         return BatchReply(v=keys.PROTOCOL_VERSION, run=self._name, size=run.settings.controller.size,
-                          run_state=run.state, run_why=why)  # fmt: skip
+                          run_state=shown.word, run_why=truncate(shown.why, 1000))  # fmt: skip
 
 
 def _fit(fitness: Sequence[float | None], errors: Mapping[int, str], offset: int) -> dict[str, Any]:

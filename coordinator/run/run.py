@@ -17,6 +17,7 @@ from dreamfleet.common.errors import NotWritableNowError
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.messages import Job, Result
+from dreamfleet.common.protocol.pause_kind import PauseKind
 from dreamfleet.common.protocol.result_bounds import MAX_SECONDS
 from dreamfleet.common.protocol.stop_kind import StopKind, StopReason
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
@@ -35,6 +36,7 @@ from dreamfleet.coordinator.run.external_generations import ExternalGenerations
 from dreamfleet.coordinator.run.failure_limit import FailureLimit
 from dreamfleet.coordinator.run.generations import Generations
 from dreamfleet.coordinator.run.recall import BAR_BY_OPERATOR, find_bar_problem, recall, unbar_words
+from dreamfleet.coordinator.run.run_state import Pause, Running, RunState
 from dreamfleet.coordinator.run.stop_reason import find_stop_reason
 from dreamfleet.coordinator.run.verification import Verification
 from dreamfleet.coordinator.run.work_clock import WorkClock
@@ -43,7 +45,8 @@ from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 
 OTHER_SEEDS = "; if the seeds of the first generation are bad for every candidate, begin a run with another --seed"
-PAUSED, BY_HAND = "paused", "by hand"  # the fact that somebody paused the run, and what it holds
+PAUSED = "paused"  # the fact that somebody paused the run
+BY_HAND = Pause(PauseKind.BY_HAND, "by hand")
 WRITE_RETRY = 2.0  # seconds until a full disk or a locked journal is tried again
 
 
@@ -59,12 +62,6 @@ class Run:
         self.limits = limits
         self.fleet = Fleet(network.beat, network.evaluation_share)
         self.fleet_share = network.share
-        self.ended: str | None = None
-        self.paused: str | None = None
-        self.is_rewound = False  # its journal was taken back to an earlier generation: another life continues it
-        self._lacks_host = False  # it is paused until a host comes that may score
-        self.stalled: str | None = None  # why the journal cannot be written now
-        self._retry_at = 0.0  # when it is tried again
         self._now = now
         self.uid = journal.fact("uid") or ""
         self.created = journal.fact("created") or ""  # ISO 8601, UTC
@@ -78,7 +75,8 @@ class Run:
             self.fleet.note(f"{plural(dropped, 'result')} of an older version too large to count: scored again")
         self.admission = WorkerAdmission(journal, settings, self.fleet, strict=network.strict, anchor_key=anchor_key)
         self.verification = Verification(journal, self.fleet, self.admission, network.verify, self.incarnation)
-        self._ending = self._stored_end_reason()  # the limit that is reached; only background jobs remain
+        reached = self._stored_end_reason()
+        self.state: RunState = Running() if reached is None else Running().reach_limit(reached)
         closed, evaluations = journal.read_closed()
         self.history = History(closed)
         self._agenda = ScheduleState(settings)
@@ -107,16 +105,6 @@ class Run:
         return self.background_jobs.confirmed
 
     @property
-    def ending(self) -> bool:
-        """Whether a limit is reached, so that only evaluations, kept rollouts and the confirmation remain."""
-        return self._ending is not None
-
-    @property
-    def stop_kind(self) -> StopKind | None:
-        """What ended the run; `None` while it has not ended, or if an older version did not write it."""
-        return None if self.ended is None or self._ending is None else self._ending.kind
-
-    @property
     def elapsed(self) -> float | None:
         """Wall-clock seconds since the run began; `None` if a clock was set so that they cannot be right."""
         seconds = elapsed_seconds(self.created, datetime.now(UTC).isoformat())
@@ -137,20 +125,9 @@ class Run:
         """Results, heartbeats and parts of uploads that were dropped, by reason."""
         return self.background_jobs.rollout_collections.uploads.dropped + self.fleet.dropped
 
-    @property
-    def state(self) -> str:
-        """The state in a word, as the status shows it."""
-        if self.ended is not None:
-            return "ended"
-        if self.paused is not None or self.stalled is not None:
-            return "paused"
-        if not self.fleet.has_workers:
-            return "waiting for workers"
-        if self.verification.waiting and not self.fleet.takes_jobs:
-            return "paused"
-        if not self.generation.population:
-            return "waiting for a batch"
-        return "evaluating" if self.fleet.drain_background else "running"
+    def _enter(self, state: RunState) -> None:
+        """The only place where the state changes."""
+        self.state, self.fleet.paused = state, not state.gives_jobs
 
     def record_result(self, work: Work, result: Result, worker: str, fingerprint: str, host_class: str) -> None:
         """Journal an accepted result, then count it for the generation or the background job that wants it."""
@@ -179,9 +156,10 @@ class Run:
     def advance(self, now: float) -> bool:
         """Close the complete generation and open the next one; whether a generation was opened."""
         closed = len(self.history)
-        if self.is_rewound or self.stalled is not None or (self.generation.complete and not self._take_lock()):
+        state = self.state
+        if state.is_rewound or state.stalled or (self.generation.complete and not self._take_lock()):
             return False
-        if self.generation.unmade and self._ending is None:  # first, for others judge by the open jobs
+        if self.generation.unmade and state.reached is None:  # first, for others judge by the open jobs
             self.fleet.jobs.offer(self.generation.make_more())
         self._settle_failures()
         self.verification.settle(now)
@@ -191,19 +169,19 @@ class Run:
             return False
         self.background_jobs.settle()
         has_opened = self._open_batch()
-        while self.ended is None and self.paused is None and self.generation.complete and not self._is_waiting:
+        while self.state.gives_jobs and self.generation.complete and not self._is_waiting:
             if self.verification.holds_generation:
                 break
             reseeds = self.generations.can_reseed(self.generation)
             if not reseeds and (why := self.failure_limit.find_excess(self.generation)) is not None:
-                self.pause(f"{why} (`dreamfleet story` lists why)")
+                self.pause(Pause(PauseKind.FAILED_CANDIDATES, f"{why} (`dreamfleet story` lists why)"))
             elif (note := self.generations.try_again(self.generation)) is not None:
                 self.fleet.note(note)
                 self._replace_generation(self.generations.reload(self.generation.number))
             else:
                 self._close(now)
         self.fleet.drain_background = self._is_waiting
-        self.fleet.jobs.unmade = self.generation.unmade if self._ending is None else 0
+        self.fleet.jobs.unmade = self.generation.unmade if self.state.reached is None else 0
         self._finish()
         return has_opened or len(self.history) > closed
 
@@ -213,20 +191,22 @@ class Run:
         On a full disk or a locked journal the run waits: it gives out no jobs and closes no generation until a later
         call succeeds.
         """
-        if self.stalled is None and self._journal.has_writes:
+        stalled = self.state.stalled
+        if stalled is None and self._journal.has_writes:
             self._journal.set_seconds(self.generation.number, self.work_clock.seconds)
-        elif self.stalled is not None and self._now < self._retry_at:
+        elif stalled is not None and self._now < stalled.retry_at:
             return False
         try:
             self._journal.commit()
-            if not self.is_rewound:
+            if not self.state.is_rewound:
                 self.background_jobs.report.save()
         except NotWritableNowError as error:
             self.wait_until_writable(error)
             return False
-        if self.stalled is not None:
-            self.stalled, self.fleet.paused = None, self.paused is not None or self.is_rewound
-            goes_on = "the run continues" if self.paused is None else f"the run stays paused: {self.paused}"
+        if stalled is not None:
+            self._enter(self.state.recover())
+            paused = self.state.paused
+            goes_on = "the run continues" if paused is None else f"the run stays paused: {paused.text}"
             self.fleet.note(f"the journal can be written again: {goes_on}")
         return True
 
@@ -241,10 +221,10 @@ class Run:
 
     def wait_until_writable(self, error: NotWritableNowError) -> None:
         """Give out no jobs until what could not be written is written."""
-        if self.stalled is None:
-            self.fleet.note(f"paused: {error}, and the run then continues by itself")
-        self.stalled, self.fleet.paused = f"{error}, and the run then continues by itself", True
-        self._retry_at = self._now + WRITE_RETRY
+        why = f"{error}, and the run then continues by itself"
+        if self.state.stalled is None:
+            self.fleet.note(f"paused: {why}")
+        self._enter(self.state.stall(why, self._now + WRITE_RETRY))
 
     def leave(self) -> None:
         """Make everything durable and write the reported controller before the coordinator exits."""
@@ -252,7 +232,9 @@ class Run:
         self._journal.end_incarnation()
         self._journal.set_seconds(self.generation.number, self.work_clock.seconds)
         self._journal.commit()
-        if not self.is_rewound:
+        if self.state.stalled is not None:
+            self._enter(self.state.recover())
+        if not self.state.is_rewound:
             self.background_jobs.report.save(at_once=True)
 
     def prepare(self) -> None:
@@ -261,20 +243,37 @@ class Run:
 
     def keep_paused(self) -> bool:
         """Stay paused if the coordinator is started again before somebody resumes the run; whether that is durable."""
-        self._journal.set_fact(PAUSED, BY_HAND)  # kept until it can be written
+        self._journal.set_fact(PAUSED, BY_HAND.text)  # kept until it can be written
         return self.commit()
 
-    def pause(self, why: str) -> None:
-        """Stop dispatching until the run is resumed."""
-        self.paused, self._lacks_host = why, False
-        self.fleet.paused = True
-        self.fleet.note(f"paused: {why}")
-
-    def resume(self) -> None:
-        """Dispatch again; failed jobs may go to any worker again. It changes nothing while `stalled` says why."""
-        if not self._take_lock():
+    def pause(self, pause: Pause) -> None:
+        """Stop dispatching until the run is resumed; a run that is over stays so."""
+        if self.state.is_over:
             return
-        if self.paused is not None:
+        before = self.state.paused
+        self._enter(self.state.pause(pause))
+        if (paused := self.state.paused) is not None and paused != before:
+            self.fleet.note(f"paused: {paused.text}")
+
+    def resume(self) -> str:
+        """Dispatch again; failed jobs may go to any worker again.
+
+        Why the run cannot continue now, in words; empty if it does.
+        """
+        if not self.state.is_over and self._take_lock():
+            self._resume()
+        why = self.obstacle
+        return f"it cannot continue now: {why}; repeat `resume` then" if why else ""
+
+    @property
+    def obstacle(self) -> str:
+        """Why nothing can be changed now, in words; empty if it can."""
+        if (stalled := self.state.stalled) is not None:
+            return stalled.why
+        return "results are being recalled" if self.state.is_rewound else ""
+
+    def _resume(self) -> None:
+        if self.state.paused is not None:
             self.fleet.note("resumed")
         self._go_on()
         self.verification.resume()
@@ -287,8 +286,7 @@ class Run:
 
     def _go_on(self) -> None:
         """Dispatch again, what failed too."""
-        self.paused, self._lacks_host = None, False
-        self.fleet.paused = self.stalled is not None
+        self._enter(self.state.resume())
         self.fleet.jobs.clear_failures()
 
     def bar(self, host: str, *, is_barred: bool = True) -> str:
@@ -296,8 +294,8 @@ class Run:
 
         Why that is not done, in words; empty if it is, durably.
         """
-        if self.is_rewound or self.stalled is not None or not self._take_lock():
-            return f"the run cannot be changed now: {self.stalled or 'results are being recalled'}; ask again"
+        if self.state.is_rewound or self.state.stalled or not self._take_lock():
+            return f"the run cannot be changed now: {self.obstacle}; ask again"
         known = {*map(host_of, (*self._journal.workers(recalled=True), *self.fleet.members, *self.fleet.departed))}
         if problem := find_bar_problem(host, self.admission.barred, known, is_barred=is_barred):
             return problem
@@ -307,11 +305,11 @@ class Run:
                 self.admission.bar(host, BAR_BY_OPERATOR, self.incarnation)
                 return {host}
 
-            return "" if self._rewind(bar) else f"it cannot be barred now: {self.stalled}; ask again"
+            return "" if self._rewind(bar) else f"it cannot be barred now: {self.obstacle}; ask again"
         self.admission.unbar(host)
         self.fleet.note(unbar_words(host))
         self._journal_notes()
-        return "" if self.commit() else f"that cannot be written now: {self.stalled}; it counts once it is written"
+        return "" if self.commit() else f"that cannot be written now: {self.obstacle}; it counts once it is written"
 
     def _rewind(self, bar: Callable[[], Collection[str]]) -> bool:
         """Bar hosts and take back what they brought, in one transaction (R33); whether that is durable.
@@ -319,7 +317,7 @@ class Run:
         If it is not, nothing of it was written, nor what came since the last commit. What the run holds in memory is
         true no more in either case: another life goes on from the journal.
         """
-        self.is_rewound = self.fleet.paused = True
+        self._enter(self.state.rewind())
         before = [*self.fleet.notes]
         try:
             hosts = bar()
@@ -342,21 +340,21 @@ class Run:
         if is_judged:
             for lasting in judge.find_lasting():
                 self._record_failure(lasting)
-        if self.paused is not None:
-            if self._lacks_host and judge.has_hope:
+        if (paused := self.state.paused) is not None:
+            if paused.until_host and judge.has_hope:
                 self.fleet.note("a host has joined that may be able to score: the run continues")
                 self._go_on()
             return
         if is_judged and (failure := judge.find_broken_fleet(at_once=self.failure_limit.share < 1)) is not None:
             proof = self.generations.find_scored(self.generation)
             if proof is None or judge.has_failed_proof or not self.fleet.jobs.offer_proof(proof):
-                self.pause(
+                why = (
                     f"no present host has ever scored a job, and all its jobs failed, such as {failure}; "
                     f"another host, or `dreamfleet resume`, tries them again{OTHER_SEEDS if proof is None else ''}"
                 )
-                self._lacks_host = not judge.has_hope
+                self.pause(Pause(PauseKind.NO_ABLE_HOST, why, until_host=not judge.has_hope))
         elif not is_judged and (failure := judge.find_pausing()) is not None:
-            self.pause(f"{failure}; `dreamfleet resume` tries it again")
+            self.pause(Pause(PauseKind.FAILED_JOB, f"{failure}; `dreamfleet resume` tries it again"))
         elif judge.awaits_proof:
             proof = self.generations.find_scored(self.generation)
             judge.lacks_proof = proof is None or not self.fleet.jobs.offer_proof(proof)
@@ -375,7 +373,7 @@ class Run:
 
     def _open_batch(self) -> bool:
         """Open the next batch of a run that waits for one; whether one was opened."""
-        if self.generation.population or self.paused is not None or not self.generations.has_waiting:
+        if self.generation.population or self.state.paused or not self.generations.has_waiting:
             return False
         if not self._take_lock():
             return False
@@ -424,7 +422,7 @@ class Run:
     def _is_waiting(self) -> bool:
         """Whether the run is ending, or an evaluation in progress decides the next generation's parameters."""
         deciding = self._agenda.required_evaluation(self.generation.number + 1)
-        return self._ending is not None or (
+        return self.state.reached is not None or (
             self.background_jobs.evaluations.is_open(deciding) and self.generation.complete
         )
 
@@ -434,18 +432,18 @@ class Run:
             self.fleet.note(f"generation {generation.number} is in {self._stage_text}")
         self.fleet.jobs.begin_generation(generation.number)
         self.verification.restore(generation.counted)
+        work = self.background_jobs.begin(self.generations.mean, now)
+        if self.state.reached is None and not generation.done and (reason := self._stop_reason(generation)):
+            self._begin_ending(reason)
         if self._journal.fact(PAUSED) is not None:
             self.pause(BY_HAND)
-        work = self.background_jobs.begin(self.generations.mean, now)
-        if self._ending is None and not generation.done and (reason := self._stop_reason(generation)):
-            self._begin_ending(reason)
-        if self._ending is None:
+        if self.state.reached is None:
             self._journal.drop_fact("ended")
             self.fleet.jobs.offer([*work, *generation.missing])
         else:
             self.fleet.jobs.offer(work)
             self._finish()
-            if self.ended is not None:
+            if self.state.ended is not None:
                 self.commit()
 
     def _close(self, now: float) -> None:
@@ -483,9 +481,9 @@ class Run:
 
     def _finish(self) -> None:
         """Once a limit is reached and no background job is left: confirm the reported mean, then end the run."""
-        if self._ending is None or self.background_jobs.in_progress or self.ended is not None:
+        if self.state.reached is None or self.state.is_over:
             return
-        if self.fleet.jobs.checks:
+        if self.background_jobs.in_progress or self.fleet.jobs.checks:
             return
         if not self._take_lock():
             return
@@ -499,7 +497,7 @@ class Run:
 
     def _begin_ending(self, reason: StopReason) -> None:
         """Journal the reached limit with all limits: the last evaluations may make it look unreached again."""
-        self._ending = reason
+        self._enter(self.state.reach_limit(reason))
         self._journal.set_fact(ENDING, json.dumps([reason.text, asdict(self.limits)]))
         self._journal.set_fact(STOP_KIND, reason.kind or "")
 
@@ -512,10 +510,10 @@ class Run:
         return StopReason(StopKind.parse(self._journal.fact(STOP_KIND)), reason)
 
     def _end(self) -> None:
-        assert self._ending is not None
-        self.ended = self._ending.text
+        ended = self.state.end()
+        self._enter(ended)
         self.fleet.withdraw(self.fleet.jobs.digests_of_kind("score"))  # a new host may still have one to show itself
-        self._journal.end(self.ended)
+        self._journal.end(ended.reason.text)
         self._journal_notes()
-        self._journal.add_event(f"ended: {self.ended}")
+        self._journal.add_event(f"ended: {ended.reason.text}")
         self.background_jobs.report.finish()

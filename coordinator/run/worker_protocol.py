@@ -87,7 +87,7 @@ class WorkerProtocol:
 
     def handle(self, worker: str, message: WorkerMessage, now: float) -> None:
         """Handle a worker's message; one for another run, or a heartbeat for another coordinator, is dropped."""
-        if self._run.is_rewound:
+        if self._run.state.is_rewound:
             return  # the next life of the coordinator hears it again
         if message.run_uid != self._run.uid:
             self._fleet.dropped["foreign run"] += 1
@@ -142,7 +142,7 @@ class WorkerProtocol:
     def job_batch(self, batch: OutgoingBatch, *, leave: bool = False, ended: bool = False) -> JobBatch:
         """The message for a batch; with `leave` it asks the worker to leave the run, with `ended` it says why."""
         content, member = batch.content, self._fleet.members.get(batch.identity)
-        reads_why = ended and member is not None and member.reads_end
+        reason = self._run.state.ended if ended and member is not None and member.reads_end else None
         return JobBatch(
             run_uid=self._run.uid,
             incarnation=self._run.incarnation,
@@ -155,7 +155,7 @@ class WorkerProtocol:
             verdicts=tuple(content.verdicts),
             leave=leave,
             ended=ended,
-            why=truncate(self._run.ended or "", MAX_REASON) if reads_why else "",
+            why="" if reason is None else truncate(reason.text, MAX_REASON),
         )
 
     def _handle_result(

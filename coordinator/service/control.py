@@ -8,13 +8,17 @@ from collections.abc import Callable, Iterable
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.messages import ControlReply
+from dreamfleet.common.protocol.pause_kind import PauseKind
 from dreamfleet.common.serialization.validation import MAX_TEXT
 from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.packing import BatchContent, OutgoingBatch
 from dreamfleet.coordinator.run.run import BY_HAND, Run
+from dreamfleet.coordinator.run.run_state import Pause
 
 LONGEST_VERB = 60  # characters of an unknown verb in the reply
 LEAVING_VERBS = ("drain", "stop", "disband")
+DRAINING = Pause(PauseKind.DRAINING, "draining")
+DISBANDING = Pause(PauseKind.DISBANDING, "ending with its workers")
 DISBAND_TIMEOUT = 10.0  # seconds that workers may take to leave a disbanded run
 
 
@@ -61,8 +65,6 @@ class Control:
             why = f"{truncate(verb, LONGEST_VERB)!r} is not a control verb of this version; known are {known}"
         else:
             why = truncate(self._verbs[verb]() or "", MAX_TEXT)
-            if verb == "resume" and self._run.stalled is not None:
-                why = f"it cannot continue now: {self._run.stalled}; repeat `resume` then"
             if verb in LEAVING_VERBS and len(resume_command) <= MAX_TEXT and resume_command.isprintable():
                 again = resume_command
         return ControlReply(v=keys.PROTOCOL_VERSION, run=self._name, accepted=not why, why=why, again=again)
@@ -87,20 +89,14 @@ class Control:
                               if (each.leaves_with_run or each.reads_end) and each.gone_since is None)  # fmt: skip
 
     def _pause_by_hand(self) -> str:
-        self._pause(BY_HAND)
+        self._run.pause(BY_HAND)
         if self._run.keep_paused():
             return ""
-        return f"it is paused, and that cannot be written now: {self._run.stalled}; it lasts once it is written"
+        return f"it is paused, and that cannot be written now: {self._run.obstacle}; it lasts once it is written"
 
-    def _pause(self, why: str) -> None:
-        """Pause the run; an earlier reason is kept behind `why`."""
-        before = self._run.paused
-        if before is None or not before.startswith(why):
-            self._run.pause(why if before is None else f"{why}; before: {before}")
-
-    def _resume(self) -> None:
+    def _resume(self) -> str:
         self._draining = False
-        self._run.resume()
+        return self._run.resume()
 
     def _bar(self, *, is_barred: bool) -> str:
         if self._draining or self.disbanding:
@@ -109,10 +105,10 @@ class Control:
 
     def _drain(self) -> None:
         self._draining = True
-        self._pause("draining")
+        self._run.pause(DRAINING)
 
     def _disband(self) -> None:
-        self._pause("ending with its workers")
+        self._run.pause(DISBANDING)
         self._disbanding_since = self._now
 
 

@@ -112,7 +112,7 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
     on_stoppable(stop)
     while True:
         run = _serve_life(request, stop)
-        if not run.is_rewound or stop.is_requested:
+        if not run.state.is_rewound or stop.is_requested:
             return run
         request = replace(request, config=None, start=None)
 

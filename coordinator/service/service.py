@@ -38,6 +38,8 @@ from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
 from dreamfleet.coordinator.dispatch.refusals import Refusal
 from dreamfleet.coordinator.run.batches import Batches
 from dreamfleet.coordinator.run.run import Run
+from dreamfleet.coordinator.run.run_state import Ended
+from dreamfleet.coordinator.run.shown_state import shown_state
 from dreamfleet.coordinator.run.worker_protocol import WorkerMessage, WorkerProtocol
 from dreamfleet.coordinator.service.batch_queries import BatchQueries
 from dreamfleet.coordinator.service.control import Control
@@ -107,7 +109,7 @@ class Service:
             declared = self._start(session, open_run())
             try:
                 self._loop(session)
-                if not self._run.is_rewound:
+                if not self._run.state.is_rewound:
                     self._shut_down(session, declared)
             except JournalError:
                 self._file_watch.check(monotonic(), at_once=True)  # what was done to the files may be rescued
@@ -156,25 +158,25 @@ class Service:
 
     def _loop(self, session: zenoh.Session) -> None:
         snapshot_at = monotonic()
-        while not self._stopping and (self._run.ended is None or self._run.stalled is not None):
+        while not (self._stopping or isinstance(self._run.state, Ended)):
             self._drain_events()
             now = monotonic()
             self._run.tick(now)
             opened = self._run.advance(now)
-            if not self._run.is_rewound:  # jobs need not wait for the disk
+            if not self._run.state.is_rewound:  # jobs need not wait for the disk
                 self._put(session, self._run.fleet.dispatch(now, durable=False))
             self._has_uncommitted = not (opened or self._is_commit_due(now))
             if self._has_uncommitted:
                 continue
             durable = self._commit()
-            if self._run.is_rewound:  # no verdict: the next life counts what workers still hold
+            if self._run.state.is_rewound:  # no verdict: the next life counts what workers still hold
                 self._run_log.write_notes()
                 self._stopping = self._stopping or durable
                 continue
             self._put(session, self._run.fleet.dispatch(now, durable=durable))
             self._run.prepare()
             # A new state is in the snapshot before it is announced: a client that hears of it and asks must see it.
-            if now - snapshot_at >= SNAPSHOT_INTERVAL or self._run.state != self._snapshot.status.state:
+            if now - snapshot_at >= SNAPSHOT_INTERVAL or shown_state(self._run).word != self._snapshot.status.state:
                 self._snapshot, snapshot_at = self._take_snapshot(), now
                 self._run_log.check(self._snapshot, now)
             closed = self._run.take_closed()
@@ -193,7 +195,7 @@ class Service:
         self._run.leave()
         self._batch_queries.send(session, (), monotonic(), durable=True)
         self._snapshot = self._take_snapshot().as_left()
-        if self._run.ended is not None:
+        if self._run.state.ended is not None:
             self._dismiss_workers(session)
         for each in declared:
             each.undeclare()
@@ -236,7 +238,7 @@ class Service:
 
     def _is_commit_due(self, now: float) -> bool:
         """Whether the turn goes on to the disk: later while workers hold jobs whose results may share the commit."""
-        goes_on = self._run.ended is None and self._run.stalled is None and not self._run.is_rewound
+        goes_on = not (self._run.state.is_over or self._run.state.stalled)
         return (
             not (goes_on and self._run.fleet.lease_count) or now >= self._commit_at or self._batch_queries.has_waiting
         )

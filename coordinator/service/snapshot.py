@@ -33,6 +33,7 @@ from dreamfleet.coordinator.jobs.generation import CandidateScores
 from dreamfleet.coordinator.jobs.history import HistoryView
 from dreamfleet.coordinator.run.report import ReportedMean
 from dreamfleet.coordinator.run.run import Run
+from dreamfleet.coordinator.run.shown_state import shown_state
 
 MOST_FAILURES, MOST_NAMED = 3, 3  # failed jobs in the status, and workers of each
 LONGEST = 200  # characters of an error
@@ -96,6 +97,7 @@ def _status(
 ) -> Status:  # fmt: skip
     present = [member for member in members if member.is_reachable]
     lost = sum(member.is_lost for member in departed)
+    shown, reached = shown_state(run), run.state.reached
     evaluations, failures, last = run.background_jobs.evaluations, run.fleet.jobs.failures, run.generations.last
     return Status(
         schema=STATUS_SCHEMA_VERSION,
@@ -103,8 +105,9 @@ def _status(
         run_uid=run.uid,
         incarnation=run.incarnation,
         package=_package(),
-        state=run.state,
-        why=run.paused or run.stalled or run.ended or (run.verification.waiting if run.state == "paused" else ""),
+        state=shown.word,
+        why=shown.why,
+        pauses=tuple(each.value for each in shown.pauses),
         settings=run.settings,
         limits=asdict(run.limits),
         uptime=round(uptime, 1),
@@ -131,12 +134,12 @@ def _status(
         refused=_refused(run),
         confirmed=run.confirmed,
         confirming=EpisodeProgress(*run.background_jobs.confirming),
-        ending=run.ending,
+        ending=reached is not None,
         failed=run.history.failed,
         equal=0 if run.settings.is_external else run.history.equal.count,
         has_risen=run.history.equal.has_risen,
         elapsed=run.elapsed,
-        closing=0 if run.ended is not None else run.background_jobs.episodes_until_end(ending=run.ending),
+        closing=0 if run.state.ended else run.background_jobs.episodes_until_end(ending=reached is not None),
         strict=run.admission.strict,
         classes=run.classes,
         checks=run.verification.summary,

@@ -140,7 +140,7 @@ def serve_request(
     gc.set_threshold(*COLLECTION)
     run = serve_run(request, _stop_on_signals)
     _restore_signals()  # its last word may wait for a reader of stdout
-    outcome = ExitReport(code=LEFT_OPEN) if run.ended is None else on_ended()
+    outcome = ExitReport(code=LEFT_OPEN) if run.state.ended is None else on_ended()
     _report(args, run, request, outcome, nothing_new=len(run.history) == before)
     return outcome.code
 
@@ -221,12 +221,12 @@ def _report(
     from dreamfleet.common.serialization.times import elapsed_seconds
     from dreamfleet.common.worlds.score_words import score_word_of_run
 
-    again = request.resume_command()
+    again, ended = request.resume_command(), run.state.ended
     path = request.folder / CONTROLLER
     controller = path if path.is_file() else None
     facts: dict[str, Any] = {
         "run": request.name,
-        "ended": run.ended,
+        "ended": ended.text if ended else None,
         "controller": controller,
         "continue": again,
     }
@@ -235,20 +235,20 @@ def _report(
     judged = run.confirmed or run.best
     word = score_word_of_run(run.settings.task, request.folder / BUNDLE)
     score = f"; {describe_score(in_values(judged, run.settings.task), word)}" if judged else ""
-    if run.ended is None:
+    if ended is None:
         with open_run(request.runs_dir, request.name) as stored:
             stored.history()  # `JournalError`: what cannot be read cannot be continued
         text = f"left run {request.name} open{score}; continue it with: {again}"
     else:
         where = f"; controller: {controller}" if controller else "; it has no controller yet"
         more = f"; to continue it, widen its limits: {again} --generations 0 --minutes 30" if nothing_new else ""
-        if run.stop_kind is StopKind.ONE_POINT:
+        if ended.kind is StopKind.ONE_POINT:
             more = f"; a run --from {request.name} with a larger --sigma0 searches on"
         failed = _describe_failures(request, run.history.failed)
         lasted = elapsed_seconds(run.created, datetime.now(UTC).isoformat())
         ago = "" if lasted is None else f" (begun {format_duration(lasted)} ago)"
-        text = f"run {request.name} ended after {run.ended}{ago}{score}{where}{failed}{outcome.text or more}"
-    if run.ended is None and not args.json:
+        text = f"run {request.name} ended after {ended.text}{ago}{score}{where}{failed}{outcome.text or more}"
+    if ended is None and not args.json:
         print(text, file=sys.stderr)
     else:
         print_answer(args, text, **facts, **outcome.facts)

@@ -36,7 +36,7 @@ class Evaluated(Bench):
     def drive(self, choose, after=lambda: None):
         """To its end; what the scored jobs name of their specification, by generation."""
         found = {}
-        while self.run.ended is None:
+        while self.run.state.ended is None:
             self.fetch()
             found.update({job.generation: job.overrides for job in self.given if job.kind == "score"})
             self.finish(choose(self))
@@ -51,9 +51,9 @@ class Evaluated(Bench):
             batch = ResultBatch(run_uid=self.run.uid, incarnation=1, fingerprint="f", results=(result,))
             self.worker_protocol.handle_results(name, batch, self.now)
             self.run.advance(self.now)
-            if fate > 0.2 or self.run.ended is not None:
+            if fate > 0.2 or self.run.state.ended is not None:
                 self.run.commit()
-            if fate < 0.4 and self.run.ended is None:
+            if fate < 0.4 and self.run.state.ended is None:
                 self.restart()
 
         self.deliver = deliver

@@ -32,7 +32,7 @@ def dies_before(self, hosts):
 
 def dies_after(self):
     done = commit(self)
-    if self.is_rewound:
+    if self.state.is_rewound:
         os.kill(os.getpid(), signal.SIGKILL)
     return done
 

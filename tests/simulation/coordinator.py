@@ -80,16 +80,16 @@ class Coordinator:
         opened = self.run.advance(now)
         if opened:
             yield OPENED
-        if not self.run.is_rewound:
+        if not self.run.state.is_rewound:
             yield from self.fleet.dispatch(now, durable=False)
         yield None
-        goes_on = self.run.ended is None and self.run.stalled is None and not self.run.is_rewound
+        goes_on = not (self.run.state.is_over or self.run.state.stalled)
         if not opened and goes_on and self.fleet.lease_count and now < self.commit_at:
             return
         self.run.commit()
         self.commit_at = now + LINGER
         yield COMMITTED
-        if self.run.is_rewound:
+        if self.run.state.is_rewound:
             return
         yield from self.fleet.dispatch(now)
         self.run.prepare()
@@ -103,6 +103,4 @@ class Coordinator:
     @property
     def over(self) -> bool:
         """Whether this life leaves by itself: the run has ended or was rewound, or a drain is done."""
-        if self.run.is_rewound:
-            return True
-        return self.run.ended is not None or (self.draining and not self.fleet.lease_count)
+        return self.run.state.is_over or (self.draining and not self.fleet.lease_count)

@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable
 
 from dreamfleet.common.protocol.messages import Result, ResultBatch
+from dreamfleet.coordinator.run.run import BY_HAND
+from dreamfleet.coordinator.service.control import DRAINING
 from tests.simulation.network import Effect, Way
 from tests.simulation.schedule import Fault
 from tests.simulation.truth import STEPS
@@ -177,7 +179,7 @@ def _leave(world: World, _fault: Fault) -> bool:
     if life is None:
         return False
     life.draining = True
-    life.run.pause("draining")
+    life.run.pause(DRAINING)
     return True
 
 
@@ -186,7 +188,7 @@ def _pause(world: World, fault: Fault) -> bool:
     life = world.coordinator
     if life is None:
         return False
-    life.run.pause("paused by hand")
+    life.run.pause(BY_HAND)
     world.later(fault.seconds, world.resume, life)
     return True
 
@@ -204,7 +206,7 @@ def _bar(world: World, fault: Fault) -> bool:
 def _resume(world: World, _fault: Fault) -> bool:
     """Somebody says `dreamfleet resume` of a run that is not paused: what failed is tried again."""
     life = world.coordinator
-    if life is None or life.draining or life.run.paused is not None:
+    if life is None or life.draining or life.run.state.paused is not None:
         return False
     life.run.resume()
     return True

@@ -13,6 +13,7 @@ from typing import Any
 
 from dreamfleet.common.protocol.messages import HelloRequest, Job, JobBatch
 from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
+from dreamfleet.coordinator.run.run import BY_HAND
 from tests.simulation import books
 from tests.simulation.coordinator import COMMITTED, LINGER, OPENED, TICK, Coordinator, simulated_surroundings
 from tests.simulation.disk import Disk
@@ -190,7 +191,7 @@ class World:
             books.check_coordinator(life.fleet)
             self._sendings.check(life.fleet)
             self._check_workers()
-        if life.run.ended is not None:
+        if life.run.state.ended is not None:
             books.check_end(life.fleet, life.run)
             self._end_run()
             return
@@ -198,7 +199,7 @@ class World:
         if life.over:
             self.end_coordinator(1.0)
             return
-        if life.run.paused and not self._final_pause and not self._operator_called:
+        if life.run.state.paused and not self._final_pause and not self._operator_called:
             self._operator_called = True
             self.later(OPERATOR, self.resume, life)
         if self._final_pause and self.now >= self._calm_at and self._at_rest(life):
@@ -240,8 +241,8 @@ class World:
         if life is not None and not self.shape.ends and len(life.run.history) >= self.shape.generations:
             self._final_pause = True
             life.draining = False
-            if life.run.paused is None:
-                life.run.pause("the play is over")
+            if life.run.state.paused is None:
+                life.run.pause(BY_HAND)
 
     def _at_rest(self, life: Coordinator) -> bool:
         quiet = all(worker is not None and not worker.undelivered for worker in self.workers)
@@ -399,7 +400,7 @@ class World:
             held = {worker.identity: worker.undelivered for worker in self.workers if worker is not None}
             raise Violation("memory", f"workers of a paused run hold {held}")
         state = (
-            "no coordinator" if life is None else f"generation {life.run.generation.number} is open, {life.run.state}"
+            "no coordinator" if life is None else f"generation {life.run.generation.number} is open, {life.run.state!r}"
         )
         raise Violation(
             "liveness", f"{state}, {self.now - self._calm_at:.0f} s after the last fault, {self.events} events"

@@ -13,6 +13,11 @@ SETTINGS = replace(TWO, population=6, episodes=2, collect_every=0, on_failure="w
 GENERATIONS = 3
 
 
+def pause_kinds(bench):
+    """What paused the run, the latest first."""
+    return [each.kind for each in bench.run.state.paused.pauses]
+
+
 class Failing(Bench):
     """A bench whose episodes fail where `fails(job)`; everything else scores by its digest."""
 
@@ -39,7 +44,7 @@ class Failing(Bench):
 
     def serve(self, turns=400, stop=lambda run: False):
         for _ in range(turns):
-            if self.run.ended or self.run.paused or stop(self.run):
+            if self.run.state.ended or self.run.state.paused or stop(self.run):
                 return
             self.now += 1.0
             self.run.tick(self.now)

@@ -18,6 +18,7 @@ from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, Sto
 from dreamfleet.common.host.processes import PATIENCE, VerbProcess, parent_death_command
 from dreamfleet.common.host.stop_signals import Stop, signals_deferred
 from dreamfleet.common.monitoring.client import Client
+from dreamfleet.common.protocol.pause_kind import PauseKind
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.experiments.local_run import (
@@ -30,7 +31,6 @@ from dreamfleet.coordinator.experiments.local_run import (
 )
 from dreamfleet.coordinator.experiments.sweep.folder import SweepFolder
 from dreamfleet.coordinator.experiments.sweep.plan import Sweep, SweepRun, staggered_share
-from dreamfleet.coordinator.run.run import BY_HAND
 from dreamfleet.coordinator.settings.environment_check import CHECKED
 
 STATUS_INTERVAL = 2.0  # seconds between two looks at all runs
@@ -200,7 +200,7 @@ class SweepRunner:
             if status is None or each.run.name not in self._coordinators:
                 continue
             each.text = _describe(status)
-            if status.get("state") != "paused" or status.get("why") == BY_HAND:
+            if status.get("state") != "paused" or status.get("pauses") == [PauseKind.BY_HAND]:
                 each.paused_since = None
             elif each.paused_since is None:
                 each.paused_since = self._looked_at

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.protocol.messages import Result
+from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.common.runs.records import StoredEvaluation
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_paths import CONTROLLER
@@ -54,7 +55,7 @@ class Judging(Bench):
         self.answer(Result(job.digest, fitness, 10, 0.1, None, None))
 
     def end(self):
-        while self.run.ended is None:
+        while self.run.state.ended is None:
             self.step()
 
     @property
@@ -117,7 +118,7 @@ def test_the_best_few_drive_on_and_half_of_them_further(make):
 
 def test_the_episodes_that_the_end_takes_are_predicted(make):
     night = make()
-    while not night.run.ending:
+    while not night.run.state.reached:
         night.step()
     predicted, before = night.run.background_jobs.episodes_until_end(ending=True), {job.digest for job in night.judged}
     night.end()
@@ -174,7 +175,7 @@ def lived(path, bundle, kills):
     """What a run reports that is killed after so many results, and how many there were."""
     Judging.judged, steps = [], 0
     bench = Judging(path, bundle.path, JUDGED, GENERATIONS)
-    while bench.run.ended is None:
+    while bench.run.state.ended is None:
         bench.step()
         steps += 1
         if steps in kills:
@@ -213,7 +214,7 @@ def test_a_run_that_ended_goes_on_and_is_confirmed_again(make):
     bench.end()
     first, *_ = bench.outcome()
     bench.restart()
-    assert bench.run.ended == "3 generations", "nothing is driven again"
+    assert bench.run.state.ended.kind is StopKind.GENERATIONS, "nothing is driven again"
     assert bench.outcome()[0] == first
     bench.limits = LimitsConfig(generations=9)
     bench.restart()

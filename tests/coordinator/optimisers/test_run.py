@@ -25,12 +25,12 @@ def drive(path, bundle, optimiser, restart_at=()):
     for generation in range(GENERATIONS):
         if generation in restart_at:
             bench.restart()
-        while bench.run.ended is None and bench.run.generation.number == generation:
+        while bench.run.state.ended is None and bench.run.generation.number == generation:
             for send in bench.run.fleet.dispatch(bench.now):
                 for work in send.content.work:
                     fitness = float(np.frombuffer(work.vector, "<f4").sum())
                     bench.answer(Result(work.job.digest, fitness, 10, 0.1, None, None))
-    assert bench.run.ended is not None
+    assert bench.run.state.ended is not None
     bench.journal.close()
     with RunFolder(path) as stored:
         mean, sigma = latest_mean_and_sigma(stored)

@@ -10,6 +10,7 @@ import pytest
 from dreamfleet.common.protocol.batches import MAX_BATCH, BatchError, BatchHeader, pack_batch
 from dreamfleet.common.protocol.messages import MAX_PART
 from dreamfleet.coordinator.run import batches as batches_module
+from dreamfleet.coordinator.run.shown_state import shown_state
 from tests.support.batch_door import SETTINGS, SIZE, Door, vectors
 
 
@@ -19,7 +20,7 @@ def door(tmp_path):
 
 
 def test_a_batch_waits_is_scored_and_is_read(door):
-    assert door.run.state == "waiting for workers"
+    assert shown_state(door.run).word == "waiting for workers"
     reply = door.submit("a")
     assert (reply.state, reply.is_new, reply.population, reply.episodes) == ("waiting", True, 2, 2)
     door.step()

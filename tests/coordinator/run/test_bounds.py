@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from dreamfleet.common.protocol.codec import encode_json
 from dreamfleet.common.protocol.messages import MAX_SLOTS, HelloRequest, Result
+from dreamfleet.common.protocol.pause_kind import PauseKind
 from dreamfleet.common.protocol.result_bounds import (
     LARGEST_FITNESS,
     MAX_COUNT,
@@ -22,6 +23,7 @@ from dreamfleet.common.protocol.result_bounds import (
     rejection_reason,
     to_finite,
 )
+from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.work import vector_bytes
 from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
@@ -68,16 +70,17 @@ def answers_of(bench):
 @pytest.mark.parametrize("numbers", EXTREME.values(), ids=EXTREME)
 @pytest.mark.parametrize("kind", ["score", "evaluate"])
 def test_an_extreme_result_fails_its_job_with_the_reason_and_the_run_can_continue(bench, numbers, kind):
-    while bench.run.paused is None and deliver_all(bench, numbers, (kind,)):
+    while bench.run.state.paused is None and deliver_all(bench, numbers, (kind,)):
         answers_of(bench)
-    assert "fitness" in bench.run.paused or "steps" in bench.run.paused
+    assert bench.run.state.paused.pauses[0].kind is PauseKind.FAILED_JOB
+    assert bench.run.fleet.jobs.failures
     assert answers_of(bench)[""]["state"] == "paused"
     bench.restart()
-    assert bench.run.paused is None
-    while bench.run.ended is None:
+    assert bench.run.state.paused is None
+    while bench.run.state.ended is None:
         assert deliver_all(bench, (1.0, 10, 0.1))
         answers_of(bench)
-    assert bench.run.ended == "2 generations"
+    assert bench.run.state.ended.kind is StopKind.GENERATIONS
 
 
 @pytest.mark.parametrize("numbers", EXTREME.values(), ids=EXTREME)
@@ -88,7 +91,7 @@ def test_excessive_results_of_an_older_coordinator_are_scored_again(bench, numbe
     bench.journal.commit()
     bench.restart()
     assert bench.run.generation.done == 0
-    while bench.run.ended is None:
+    while bench.run.state.ended is None:
         assert deliver_all(bench, (1.0, 10, 0.1))
         answers_of(bench)
 
@@ -109,7 +112,7 @@ def test_excessive_generations_and_evaluations_of_an_older_coordinator_can_be_en
     bench.now += 1
     deliver_all(bench, (1.0, 10, 0.1))
     answers_of(bench)
-    while bench.run.ended is None:
+    while bench.run.state.ended is None:
         assert deliver_all(bench, (1.0, 10, 0.1))
     bench.run.leave()
     answers_of(bench)

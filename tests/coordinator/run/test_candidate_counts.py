@@ -87,7 +87,7 @@ def test_the_sums_over_candidates_are_their_generations(tmp_path, random_bundle,
         until = chance.randint(3, 60)
         bench.serve(stop=lambda run, until=until: run.fleet.counts["accepted"] > until)
         check(bench.path)
-        if (bench.run.ended and recalls == 2) or bench.run.paused:
+        if (bench.run.state.ended and recalls == 2) or bench.run.state.paused:
             break
         if recalls < 2 and chance.random() < 0.4:
             recalls += 1

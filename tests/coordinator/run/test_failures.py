@@ -12,12 +12,14 @@ import pytest
 
 from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.messages import Result, ResultBatch
+from dreamfleet.common.protocol.pause_kind import PauseKind
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.seeds import CONFIRMING_OFFSET, training_seed
 from dreamfleet.coordinator.jobs import generation
 from dreamfleet.coordinator.run.run import BY_HAND
+from dreamfleet.coordinator.run.shown_state import shown_state
 from dreamfleet.coordinator.settings.limits import LimitsConfig
-from tests.support.failing_runs import GENERATIONS, SETTINGS, Failing, by_vector, finished
+from tests.support.failing_runs import GENERATIONS, SETTINGS, Failing, by_vector, finished, pause_kinds
 from tests.support.failures import failure
 from tests.support.run_bench import A, B
 
@@ -27,9 +29,9 @@ NEW = "new/1"
 def story_of_killed(path, bundle, results, settings, **options):
     """The story of a run whose coordinator is killed each time that so many results and errors have come."""
     bench = Failing(path / "killed" / "night", bundle.path, settings, **options)
-    while not bench.run.ended:
+    while not bench.run.state.ended:
         bench.serve(stop=lambda run: run.fleet.counts["accepted"] + run.fleet.counts["errors"] > results)
-        if not bench.run.ended:
+        if not bench.run.state.ended:
             bench.restart()
     story = bench.story()
     bench.journal.close()
@@ -52,7 +54,7 @@ def failing(tmp_path, random_bundle):
 def test_a_failed_candidate_ranks_last_and_the_run_ends(failing):
     bench = failing("one", fails=by_vector(0.15))
     rows, candidates, *_ = bench.story()
-    assert bench.run.ended
+    assert bench.run.state.ended
     assert len(rows) == GENERATIONS
     failed = [each for each in candidates if each[0] < GENERATIONS and each[2] is None]
     assert 0 < len(failed) == sum(each.failed for each in rows)
@@ -99,11 +101,11 @@ def test_a_candidate_that_is_drawn_anew_is_another_and_the_old_one_stays_in_the_
 def test_a_run_whose_every_episode_fails_pauses_and_resume_tries_again(tmp_path, random_bundle):
     bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: True)
     bench.serve()
-    assert "failed on " in bench.run.paused
+    assert pause_kinds(bench) == [PauseKind.NO_ABLE_HOST]
     bench.fails = lambda job: False
     bench.run.resume()
     bench.serve()
-    assert bench.run.ended
+    assert bench.run.state.ended
     assert sum(each.failed for each in bench.run.history.rows) == 0
     bench.journal.close()
 
@@ -111,11 +113,11 @@ def test_a_run_whose_every_episode_fails_pauses_and_resume_tries_again(tmp_path,
 def test_more_failures_than_the_limit_pause_the_run_and_resume_scores_these_candidates_again(tmp_path, random_bundle):
     bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate > 1)
     bench.serve()
-    assert bench.run.paused.startswith("4 of 6 candidates failed in generation 0")
+    assert (pause_kinds(bench), len(bench.run.generation.failed)) == ([PauseKind.FAILED_CANDIDATES], 4)
     bench.fails = lambda job: job.candidate > 3
     bench.run.resume()
     bench.serve()
-    assert bench.run.ended
+    assert bench.run.state.ended
     assert [each.failed for each in bench.run.history.rows] == [2, 2, 2]
     bench.journal.close()
 
@@ -125,17 +127,17 @@ def test_all_candidates_failing_is_a_pause_that_says_so_whatever_the_limit(tmp_p
     bench.run.failure_limit.share = 1.0
     bench.run.fleet.failure_judge.working_hosts = {"a", "b"}
     bench.serve()
-    assert bench.run.paused.startswith("all candidates failed in generation 0")
+    assert (pause_kinds(bench), bench.run.generation.all_failed) == ([PauseKind.FAILED_CANDIDATES], True)
     bench.fails = lambda job: False
     bench.run.resume()
     bench.serve()
-    assert bench.run.ended
+    assert bench.run.state.ended
     bench.journal.close()
 
 
 def test_one_generation_with_many_failures_does_not_pause_a_run_that_had_few(failing):
     bench = failing("night", fails=lambda job: job.kind == "score" and job.generation == 2 and job.candidate > 1)
-    assert bench.run.ended
+    assert bench.run.state.ended
     assert [each.failed for each in bench.run.history.rows] == [0, 0, 4]
 
 
@@ -144,10 +146,10 @@ def test_after_resume_the_same_failures_do_not_pause_the_generation_again(tmp_pa
         tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate > 1 - job.generation
     )
     bench.serve()
-    assert "failed in generation 0" in bench.run.paused
+    assert (pause_kinds(bench), bench.run.generation.number) == ([PauseKind.FAILED_CANDIDATES], 0)
     bench.run.resume()
     bench.serve()
-    assert "failed in generation 1" in bench.run.paused
+    assert (pause_kinds(bench), bench.run.generation.number) == ([PauseKind.FAILED_CANDIDATES], 1)
     assert bench.run.history.rows[0].failed == 4
     bench.journal.close()
 
@@ -164,7 +166,7 @@ def test_a_seed_on_which_all_candidates_fail_is_replaced_with_the_same_bits_thro
 
     bench = failing("whole", settings=settings, fails=fails)
     whole = bench.story()
-    assert bench.run.ended
+    assert bench.run.state.ended
     assert [each.failed for each in whole[0]] == [0, 0, 0], (
         "what fails on a seed on which all fail is not the candidate's"
     )
@@ -179,7 +181,7 @@ def test_a_seed_on_which_all_candidates_fail_is_replaced_with_the_same_bits_thro
 def test_a_bad_seed_of_the_first_generation_is_replaced_before_the_limit_counts(failing):
     bad = training_seed(SETTINGS.seed, 0, 0)
     bench = failing("first", fails=lambda job: job.seeds[0] == bad)
-    assert bench.run.ended
+    assert bench.run.state.ended
     assert [each.failed for each in bench.run.history.rows] == [0, 0, 0]
 
 
@@ -187,7 +189,7 @@ def test_seeds_on_which_the_whole_better_half_fails_are_replaced_in_a_race(faili
     settings = replace(SETTINGS, racing=True, episodes=4, population=8)
     bad = training_seed(settings.seed, 1, 2)  # of the second half
     bench = failing("race", settings=settings, fails=lambda job: job.seeds[0] == bad)
-    assert bench.run.ended
+    assert bench.run.state.ended
     assert [each.failed for each in bench.run.history.rows] == [0, 0, 0]
     with RunFolder(bench.path) as folder:
         texts = [each.text for each in folder.events()]
@@ -206,7 +208,7 @@ def test_redraws_count_each_candidate_once_and_go_on_where_all_failed(tmp_path, 
     bench.run.failure_limit.share = 1.0
     bench.run.fleet.failure_judge.working_hosts = {"a", "b"}
     bench.serve()
-    assert bench.run.ended
+    assert bench.run.state.ended
     assert bench.run.history.rows[0].failed <= 6
     bench.journal.close()
 
@@ -227,7 +229,7 @@ def test_a_host_that_never_scored_condemns_nobody(tmp_path, random_bundle):
         else bench.deliver(name, Result(job.digest, None, 0, 0.1, failure("ValueError", "sick"), None))
     )
     bench.serve()
-    assert bench.run.ended
+    assert bench.run.state.ended
     assert sum(each.failed for each in bench.run.history.rows) == 0
     bench.journal.close()
 
@@ -258,16 +260,16 @@ def replace_host(bench):
 def test_a_run_without_hosts_waits_for_them_though_every_open_job_failed(left):
     for _ in range(3):
         left.run.advance(left.now)
-        assert left.run.paused is None
+        assert left.run.state.paused is None
         left.now += 1.0
         left.run.tick(left.now)
-    assert left.run.state == "waiting for workers"
+    assert shown_state(left.run).word == "waiting for workers"
 
 
 def test_a_new_host_proves_itself_on_a_job_that_was_scored_before(left):
     """Only jobs that fail are open when it comes: nothing else would show that it can score."""
     replace_host(left)
-    assert left.run.ended
+    assert left.run.state.ended
     assert [each.failed for each in left.run.history.rows] == [2] * GENERATIONS
     assert left.run.fleet.counts["duplicate"] == 1
 
@@ -280,7 +282,7 @@ def test_a_failing_job_goes_to_the_host_where_it_failed_least(left):
     for name in left.hosts:
         left.run.admission.admit(left.request(name), left.now)
     left.serve()
-    assert left.run.ended
+    assert left.run.state.ended
     assert [each.failed for each in left.run.history.rows] == [2] * GENERATIONS
 
 
@@ -292,7 +294,7 @@ def test_a_host_that_was_never_ready_keeps_no_job_from_being_tried_again(tmp_pat
     bench.handle_heartbeat(B)
     member.capacity, member.was_ready = 0, False
     bench.serve()
-    assert bench.run.ended
+    assert bench.run.state.ended
     assert [each.failed for each in bench.run.history.rows] == [1] * GENERATIONS
     bench.journal.close()
 
@@ -300,7 +302,7 @@ def test_a_host_that_was_never_ready_keeps_no_job_from_being_tried_again(tmp_pat
 def test_a_new_host_that_fails_the_proof_pauses_the_run(left):
     left.fails = lambda job: True
     replace_host(left)
-    assert "no present host has ever scored" in left.run.paused
+    assert pause_kinds(left) == [PauseKind.NO_ABLE_HOST]
     assert left.run.generation.failed == []
 
 
@@ -308,7 +310,7 @@ def test_a_host_that_has_scored_ends_the_pause_of_a_fleet_that_cannot(left):
     sound = left.fails
     left.fails = lambda job: True
     replace_host(left)
-    assert left.run.state == "paused"
+    assert left.run.state.paused.until_host
     left.fails = sound
     answer = left.answer_one
     left.answer_one = lambda name, job: (
@@ -320,9 +322,9 @@ def test_a_host_that_has_scored_ends_the_pause_of_a_fleet_that_cannot(left):
     left.run.admission.admit(left.request(A), left.now)
     left.handle_heartbeat(A, host_class=left.host_class)
     left.run.advance(left.now)
-    assert left.run.paused is None
+    assert left.run.state.paused is None
     left.serve()
-    assert left.run.ended
+    assert left.run.state.ended
     assert [each.failed for each in left.run.history.rows] == [2] * GENERATIONS
 
 
@@ -333,7 +335,7 @@ def test_a_run_that_nobody_can_score_pauses_before_every_job_was_tried(tmp_path,
             tmp_path / str(tried) / "night", random_bundle.path, settings, fails=lambda job: True, limit=limit
         )
         bench.serve()
-        assert "no present host has ever scored" in bench.run.paused
+        assert pause_kinds(bench) == [PauseKind.NO_ABLE_HOST]
         assert (len(bench.run.fleet.jobs.failures) < 80) == (tried < 80)
         assert sum("it is tried again" in each for each in bench.run.take_notes()) == 1
         bench.journal.close()
@@ -354,10 +356,10 @@ def test_an_evaluation_counts_its_scored_episodes_and_one_without_any_ends(faili
     assert confirmed.episodes + confirmed.failed == 4
     assert confirmed.failed
     none = failing("none", settings=settings, fails=lambda job: job.kind == "evaluate", limit=1.0)
-    assert none.run.ended
+    assert none.run.state.ended
     assert none.story()[3:] == ([], None)
     late = failing("late", settings=settings, fails=lambda job: job.episode >= CONFIRMING_OFFSET)
-    assert late.run.ended
+    assert late.run.state.ended
     with RunFolder(late.path) as folder:
         assert any("no confirmed score" in each.text for each in folder.events())
 
@@ -373,7 +375,7 @@ def test_racing_goes_on_without_the_failed_ones(failing):
 def test_time_without_workers_or_paused_is_no_time_of_the_run(tmp_path, random_bundle):
     bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: False)
     bench.run.limits = LimitsConfig(minutes=1.0)
-    bench.run.pause("by a test")
+    bench.run.pause(BY_HAND)
     for _ in range(100):
         bench.now += 1.0
         bench.run.tick(bench.now)
@@ -407,17 +409,17 @@ def test_a_pause_by_hand_outlives_its_coordinator(tmp_path, random_bundle):
         other.execute("BEGIN IMMEDIATE")
         bench.run.pause(BY_HAND)
         bench.run.keep_paused()
-        assert bench.run.stalled
+        assert bench.run.state.stalled
     bench.now += 10.0
     bench.run.tick(bench.now)
     assert bench.run.commit()
     bench.restart()
-    assert bench.run.paused == BY_HAND
+    assert bench.run.state.paused.pauses == (BY_HAND,)
     bench.run.resume()
     bench.run.commit()
     bench.restart()
     bench.serve()
-    assert bench.run.ended
+    assert bench.run.state.ended
     bench.journal.close()
 
 
@@ -449,7 +451,7 @@ class Lethal(Failing):
 def test_an_episode_that_ends_its_worker_counts_as_failed_and_its_company_does_not(tmp_path, random_bundle):
     bench = Lethal(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate == 3)
     bench.serve(turns=3000)
-    assert bench.run.ended
+    assert bench.run.state.ended
     assert [each.failed for each in bench.run.history.rows] == [1] * GENERATIONS
     with RunFolder(bench.path) as folder:
         facts = folder.failures()
@@ -462,7 +464,7 @@ def test_an_episode_that_ends_workers_on_hosts_of_ever_new_names_counts_as_faile
     bench = Lethal(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate == 3)
     bench.new_names = True
     bench.serve(turns=3000)
-    assert bench.run.ended
+    assert bench.run.state.ended
     assert [each.failed for each in bench.run.history.rows] == [1] * GENERATIONS
     bench.journal.close()
 
@@ -471,7 +473,7 @@ def test_a_run_whose_every_episode_ends_its_worker_pauses(tmp_path, random_bundl
     bench = Lethal(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: True)
     bench.new_names = True
     bench.serve(turns=3000)
-    assert "no present host has ever scored" in bench.run.paused
+    assert pause_kinds(bench) == [PauseKind.NO_ABLE_HOST]
     bench.journal.close()
 
 
@@ -492,7 +494,7 @@ def test_a_cut_link_is_no_end_of_a_worker(tmp_path, random_bundle):
         bench.handle_heartbeat(A, host_class=bench.host_class)
         assert not any(each.lost_with for each in bench.run.fleet.jobs.values())
     bench.serve()
-    assert bench.run.ended
+    assert bench.run.state.ended
     assert sum(each.failed for each in bench.run.history.rows) == 0
     bench.journal.close()
 
@@ -505,7 +507,7 @@ def test_a_host_that_replaces_its_scoring_process_counts_as_here(tmp_path, rando
     bench.serve(stop=lambda run: run.generation.done >= 10 or run.fleet.jobs.failures)
     bench.run.fleet.members[A].capacity = 0
     bench.run.advance(bench.now)
-    assert bench.run.paused is None
+    assert bench.run.state.paused is None
     worked = bench.run.work_clock.seconds
     bench.now += 1.0
     bench.run.tick(bench.now)
@@ -539,7 +541,7 @@ def test_a_run_ends_though_a_suspect_failed_on_the_only_host_that_has_scored(
     bench.hosts = [A, B]
     bench.run.admission.admit(bench.request(B), bench.now)
     bench.serve()
-    assert bench.run.ended
+    assert bench.run.state.ended
     assert [each.failed for each in bench.run.history.rows] == [0] * GENERATIONS
     bench.journal.close()
 
@@ -548,7 +550,7 @@ def test_a_resume_in_the_second_half_of_a_race_wants_the_first_half_before(tmp_p
     racing = replace(SETTINGS, racing=True, population=4)
     bench = Failing(tmp_path / "night", random_bundle.path, racing, fails=lambda job: job.candidate == 0, limit=1.0)
     bench.serve(stop=lambda run: any(each.work.episode == 1 for each in run.fleet.jobs.values()))
-    bench.run.pause("by hand")
+    bench.run.pause(BY_HAND)
     bench.run.resume()  # it forgets the failures, so the better half is not known
     assert [(each.work.template.candidate, each.work.episode) for each in bench.run.fleet.jobs.values()] == [(0, 0)]
     bench.journal.close()

@@ -35,7 +35,7 @@ def settings_of(optimiser):
 def ended(path, bundle, settings, fails=lambda job: False):
     bench = Failing(path / "run", bundle, settings, fails=fails)
     bench.serve()
-    assert bench.run.ended
+    assert bench.run.state.ended
     return bench
 
 
@@ -77,7 +77,7 @@ def bar(bench, host, others):
     for name in others:
         bench.run.admission.admit(bench.request(name), bench.now)
     bench.serve()
-    assert bench.run.ended
+    assert bench.run.state.ended
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -117,7 +117,7 @@ def test_a_race_that_is_resumed_after_the_fault_of_a_host_is_one_without_it(tmp_
     bench.is_broken = False
     bench.run.resume()
     bench.serve()
-    assert bench.run.ended
+    assert bench.run.state.ended
     assert bench.story() == honest.story()
     assert sums(bench) == sums(honest)
 
@@ -173,7 +173,7 @@ def test_a_run_of_which_all_is_recalled_comes_to_the_same(tmp_path, random_bundl
     bench.restart()
     assert bench.run.generation.number < GENERATIONS
     bench.serve()
-    assert bench.run.ended
+    assert bench.run.state.ended
     assert outcome(bench) == before
 
 
@@ -185,7 +185,7 @@ def test_candidates_that_were_drawn_anew_are_drawn_anew_again(tmp_path, random_b
     bench.journal.commit()
     bench.restart()
     bench.serve()
-    assert bench.run.ended
+    assert bench.run.state.ended
     assert outcome(bench) == before
 
 
@@ -199,7 +199,7 @@ def test_what_other_hosts_scored_in_dropped_generations_is_not_scored_again(tmp_
     assert aside <= mine
     bench.restart()
     bench.serve()
-    assert bench.run.ended
+    assert bench.run.state.ended
     again = "SELECT digest FROM result WHERE worker LIKE 'b/%' AND incarnation = 1"
     assert {digest for (digest,) in bench.journal._read(again)} == mine
 
@@ -213,7 +213,7 @@ def test_what_a_host_brought_to_dropped_generations_counts_no_more_once_it_is_ba
     assert set(bench.journal._read("SELECT because FROM recalled")) == {("barred",)}
     bench.restart()
     bench.serve()
-    assert bench.run.ended
+    assert bench.run.state.ended
     assert not bench.journal._read("SELECT 1 FROM result WHERE incarnation = 1")
     assert outcome(bench) == before
 
@@ -233,7 +233,7 @@ def test_files_of_recalled_rollouts_are_removed_and_those_that_are_collected_aga
             for part in bench.parts(job):
                 bench.upload(name, part)
             bench.deliver(name, result_of(job))
-        assert bench.run.ended
+        assert bench.run.state.ended
         with RunFolder(bench.path) as run:
             return run.rollouts()
 
@@ -301,7 +301,7 @@ def test_a_reported_controller_is_withdrawn_before_its_recall_is_durable_and_a_l
             bench.run.bar("a")
     assert not path.exists()
     bench.restart()  # it was killed before the commit
-    assert bench.run.ended
+    assert bench.run.state.ended
     assert Controller.load(path).sha256 == before.sha256
     assert not bench.run.bar("a")
     bench.run.commit()
@@ -361,7 +361,7 @@ def test_a_bar_on_a_full_disk_is_refused_and_changes_nothing(tmp_path, random_bu
     with monkeypatch.context() as patched:
         patched.setattr(Journal, "commit", full)
         assert bench.run.bar("a")
-        assert bench.run.stalled is not None
+        assert bench.run.state.stalled is not None
         assert not bench.run.commit()
         assert bench.run.bar("a"), "it is not asked again while the disk is full"
     bench.now += 10.0

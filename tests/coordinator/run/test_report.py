@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.errors import ControllerError
+from dreamfleet.common.protocol.stop_kind import StopKind, StopReason
 from dreamfleet.common.runs.lookup import find_controller
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_paths import CONTROLLER
@@ -79,7 +80,7 @@ def test_a_run_that_resumes_beyond_its_limit_writes_the_controller_and_the_reaso
     (bench.path / CONTROLLER).unlink()
     bench.limits = LimitsConfig(generations=2)
     bench.restart()
-    assert bench.run.ended == "3 generations"
+    assert bench.run.state.ended == StopReason(StopKind.GENERATIONS, "3 generations")
     assert bench.run.background_jobs.report.path == bench.path / CONTROLLER
     assert bench.saved() is not None
     with RunFolder(bench.path) as stored:
@@ -104,7 +105,7 @@ def test_a_new_run_starts_from_the_mean_of_an_open_run_and_from_the_report_of_an
     assert opened.source.startswith("run ")
     bench.limits = LimitsConfig(generations=1)
     bench.restart()
-    assert bench.run.ended is not None
+    assert bench.run.state.ended is not None
     ended = find_start(bench.path.name, bench.path.parent)
     assert np.array_equal(ended.mean, bench.saved().parameters.astype(np.float64))
     assert not np.array_equal(opened.mean, ended.mean)

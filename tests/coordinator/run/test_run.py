@@ -1,6 +1,5 @@
 """A run with its worker protocol and its journal, without a transport. Tests background_jobs.py and generations.py."""
 
-import json
 from dataclasses import replace
 
 import pytest
@@ -11,6 +10,7 @@ from dreamfleet.common.protocol.messages import (
     Result,
     ResultBatch,
 )
+from dreamfleet.common.protocol.pause_kind import PauseKind
 from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.common.runs.records import StoredEvaluation
 from dreamfleet.common.runs.run_folder import STOP_KIND, RunFolder
@@ -71,11 +71,11 @@ def test_a_result_has_no_verdict_before_its_rollout_is_on_disk(bench):
 def test_the_end_waits_for_every_rollout(bench):
     jobs = bench.reach_collection()
     for name, job in jobs:
-        assert bench.run.ended is None
+        assert bench.run.state.ended is None
         for part in bench.parts(job):
             bench.upload(name, part)
         bench.deliver(name, result_of(job))
-    assert bench.run.ended == "1 generation"
+    assert bench.run.state.ended.kind is StopKind.GENERATIONS
     assert bench.kept() == [drive_of(job) for _, job in jobs]
 
 
@@ -108,7 +108,7 @@ def test_a_restart_during_an_upload_repeats_it_and_keeps_finished_rollouts(bench
     for part in bench.parts(other):
         bench.upload(B, part)
     bench.deliver(B, result_of(other))
-    assert bench.run.ended is not None
+    assert bench.run.state.ended is not None
     assert bench.kept() == [drive_of(job), drive_of(other)]
 
 
@@ -121,14 +121,13 @@ def test_a_pause_names_candidate_seed_every_worker_how_often_and_why(bench):
     work = given[A][0]
     seed, name = work.job.seeds[0], f"candidate 0/{work.job.candidate}"
     fail(bench, A, work.job.digest, "boom")
-    assert bench.run.paused is None
+    assert bench.run.state.paused is None
     bench.run.fleet.dispatch(bench.now)
     fail(bench, B, work.job.digest, "bang")
-    assert bench.run.paused.startswith(
-        f"{name}, seed {seed}, failed on two workers: {A} (once): boom; {B} (once): bang"
-    )
-    assert "dreamfleet resume" in bench.run.paused
-    assert f"paused: {bench.run.paused}" in bench.run.take_notes()
+    (pause,) = bench.run.state.paused.pauses
+    assert pause.kind is PauseKind.FAILED_JOB
+    assert all(each in pause.text for each in (name, str(seed), A, B, "boom", "bang", "dreamfleet resume"))
+    assert any(pause.text in each for each in bench.run.take_notes())
 
 
 def test_a_pause_on_the_only_worker_names_one_worker_and_three_failures(bench):
@@ -136,15 +135,15 @@ def test_a_pause_on_the_only_worker_names_one_worker_and_three_failures(bench):
     bench.now += 1
     bench.run.tick(bench.now)
     digest = None
-    while bench.run.paused is None:
+    while bench.run.state.paused is None:
         bench.now += 1
         bench.run.tick(bench.now)
         bench.handle_heartbeat(A)
         for send in bench.run.fleet.dispatch(bench.now):
             digest = digest or (send.content.work[0].job.digest if send.content.work else None)
         fail(bench, A, digest, "boom")
-    assert f"failed on one worker: {A} (3 times): boom" in bench.run.paused
-    assert "two workers" not in bench.run.paused
+    (failure,) = bench.run.fleet.jobs.failures
+    assert (bench.run.state.paused.pauses[0].kind, failure.attempts) == (PauseKind.FAILED_JOB, {A: 3})
 
 
 STEPS = st.one_of(
@@ -180,7 +179,7 @@ def test_under_loss_duplication_late_parts_and_restarts_each_rollout_is_kept_who
             bench.run.tick(bench.now)
             bench.run.advance(bench.now)
             bench.run.commit()
-        elif kind == "restart" and bench.run.ended is None:
+        elif kind == "restart" and bench.run.state.ended is None:
             bench.restart()
         accepted += [digest for _, digest, verdict in bench.verdicts() if verdict == "accepted"]
         whole = {drive_of(job) for job in jobs}
@@ -195,7 +194,7 @@ def test_under_loss_duplication_late_parts_and_restarts_each_rollout_is_kept_who
         accepted += [digest for _, digest, verdict in bench.verdicts() if verdict == "accepted"]
     assert bench.kept() == [drive_of(job) for job in jobs]
     assert len(accepted) == len(set(accepted))
-    assert bench.run.ended is not None
+    assert bench.run.state.ended is not None
     bench.journal.close()
 
 
@@ -205,23 +204,23 @@ def test_a_run_whose_population_is_one_point_ends_with_that_reason(tmp_path, ran
     settings = replace(SETTINGS, population=4, collect_every=0, sigma0=1e-30)
     bench = Bench(tmp_path / "night", random_bundle.path, settings, generations=0)
     for _ in range(2):
-        while bench.run.ended is None:
+        while bench.run.state.ended is None:
             for send in bench.run.fleet.dispatch(bench.now):
                 for work in send.content.work:
                     bench.deliver(send.identity, Result(work.job.digest, 1.0, 10, 0.1, None, None))
-        assert bench.run.stop_kind is StopKind.ONE_POINT
+        assert bench.run.state.ended.kind is StopKind.ONE_POINT
         closed = len(bench.run.history)
         bench.restart()
         assert len(bench.run.history) == closed
-        assert bench.run.ended
-        assert bench.run.stop_kind is StopKind.ONE_POINT
+        assert bench.run.state.ended
+        assert bench.run.state.ended.kind is StopKind.ONE_POINT
     with RunFolder(bench.path) as stored:
         assert stored.stop_kind is StopKind.ONE_POINT
     bench.journal.drop_fact(STOP_KIND)  # as an older version leaves it
     bench.journal.commit()
     bench.restart()
-    assert bench.run.ended
-    assert bench.run.stop_kind is None
+    assert bench.run.state.ended
+    assert bench.run.state.ended.kind is None
     with RunFolder(bench.path) as stored:
         assert stored.ended
         assert stored.stop_kind is None
@@ -231,7 +230,7 @@ def test_parted_compares_the_same_scores_before_and_after_a_restart(tmp_path, ra
     """R28: it reads them from the journal. Equal means share their results, whichever generation asked for them."""
     settings = replace(SETTINGS, collect_every=0, evaluate_every=1, evaluation_episodes=4)
     bench = Bench(tmp_path / "night", random_bundle.path, settings, generations=3)
-    while bench.run.ended is None:
+    while bench.run.state.ended is None:
         for send in bench.run.fleet.dispatch(bench.now):
             for work in send.content.work:
                 bench.deliver(send.identity, Result(work.job.digest, work.job.digest[0] / 10, 10, 0.1, None, None))
@@ -268,9 +267,8 @@ def test_a_reached_limit_stays_reached_when_the_last_evaluation_contradicts_it(t
 
     while bench.journal.fact("ending") is None:
         step()
-    (ending, _), closed = json.loads(bench.journal.fact("ending")), len(bench.run.history)
-    assert "fell behind" in ending
+    closed = len(bench.run.history)
     bench.restart()
-    while bench.run.ended is None:
+    while bench.run.state.ended is None:
         step()
-    assert (bench.run.ended, len(bench.run.history)) == (ending, closed)
+    assert (bench.run.state.ended.kind, len(bench.run.history)) == (StopKind.PARTED, closed)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.coordinator.run.run import BY_HAND
 from dreamfleet.coordinator.storage.journal import MAX_EVENTS
 from tests.support.failing_runs import SETTINGS, Failing
 from tests.support.run_bench import A
@@ -25,7 +26,7 @@ def texts(bench):
 
 
 def test_comings_failures_pauses_and_lives_are_kept_in_order(bench):
-    bench.run.pause("by hand")
+    bench.run.pause(BY_HAND)
     bench.run.resume()
     bench.run.leave()
     bench.restart()

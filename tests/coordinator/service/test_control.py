@@ -3,8 +3,12 @@
 import pytest
 
 from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.pause_kind import PauseKind
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.coordinator.service.control import DISBAND_TIMEOUT, Control
+from dreamfleet.coordinator.run.failure_limit import LIMIT_FROM
+from dreamfleet.coordinator.run.run import BY_HAND, PAUSED
+from dreamfleet.coordinator.run.run_state import Pause
+from dreamfleet.coordinator.service.control import DISBAND_TIMEOUT, DRAINING, Control
 from tests.support.run_bench import A, B, Bench
 
 AGAIN = "dreamfleet coordinator --resume night"
@@ -32,20 +36,39 @@ def bench(tmp_path, random_bundle):
 
 def test_a_known_verb_is_obeyed_and_one_that_ends_the_coordinator_names_the_command_that_continues(bench):
     assert bench.obey("pause").accepted
-    assert (bench.run.paused, bench.obey("pause").again) == ("by hand", "")
+    assert (bench.run.state.paused.pauses, bench.obey("pause").again) == ((BY_HAND,), "")
     assert bench.obey("resume").accepted
-    assert bench.run.paused is None
+    assert bench.run.state.paused is None
     assert (bench.obey("stop").again, bench.stopped) == (AGAIN, True)
 
 
 def test_a_pause_by_hand_does_not_hide_why_the_run_was_paused(bench):
-    bench.run.pause("4 of 6 candidates failed")
+    failures = Pause(PauseKind.FAILED_CANDIDATES, "by hand")  # its words do not matter
+    bench.run.pause(failures)
     for _ in range(2):
         assert bench.obey("pause").accepted
-        assert bench.run.paused == "by hand; before: 4 of 6 candidates failed"
+        assert bench.run.state.paused.pauses == (BY_HAND, failures)
+    for _ in range(2):
+        assert bench.obey("drain").accepted
+        assert bench.obey("pause").accepted
+        assert bench.run.state.paused.pauses == (BY_HAND, DRAINING, failures)
     bench.obey("resume")
     bench.obey("pause")
-    assert bench.run.paused == "by hand"
+    assert bench.run.state.paused.pauses == (BY_HAND,)
+
+
+def test_a_run_whose_results_are_being_recalled_resumes_in_its_next_life_only(bench):
+    """What this life holds is true no more, so nothing of it may reach the journal or a worker."""
+    bench.run.pause(BY_HAND)
+    bench.run.keep_paused()
+    assert bench.obey("bar", "a").accepted
+    assert not bench.obey("resume").accepted
+    assert bench.run.fleet.paused
+    assert bench.journal.fact(PAUSED) is not None
+    assert bench.journal.fact(LIMIT_FROM) is None
+    bench.restart()
+    assert bench.obey("resume").accepted
+    assert bench.run.state.paused is None
 
 
 def test_an_unknown_verb_and_one_for_several_runs_change_nothing(bench):
@@ -83,9 +106,9 @@ def test_the_operator_bars_a_host_and_lets_it_in_again_and_a_misspelt_one_change
     assert "no worker of host c scored in this run or is here: there are a, b" in bench.obey("bar", "c").why
     assert bench.obey("bar").why
     assert "host a is not barred" in bench.obey("unbar", "a").why
-    assert not bench.run.is_rewound
+    assert not bench.run.state.is_rewound
     assert bench.obey("bar", "a").accepted
-    assert bench.run.is_rewound
+    assert bench.run.state.is_rewound
     assert "results are being recalled" in bench.obey("bar", "b").why
     bench.run.commit()
     bench.restart()
@@ -98,7 +121,7 @@ def test_the_operator_bars_a_host_and_lets_it_in_again_and_a_misspelt_one_change
     assert "barred: a (by the operator)" in summary.description
     assert "host a is barred already" in bench.obey("bar", "a").why
     assert bench.obey("unbar", "a").accepted
-    assert not bench.run.is_rewound
+    assert not bench.run.state.is_rewound
     assert bench.run.admission.find_refusal(bench.request(A)) is None
     bench.run.commit()
     bench.restart()

@@ -11,6 +11,7 @@ import pytest
 from dreamfleet.common.monitoring.equal_fitness import ENOUGH
 from dreamfleet.common.monitoring.status import PARTS, Population, WorkerStatus, read_status
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, MAX_OPTIONS, Result
+from dreamfleet.common.protocol.pause_kind import PauseKind
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
 from dreamfleet.common.serialization.validation import from_plain, from_plain_lenient
 from dreamfleet.common.transport.network import Network
@@ -18,6 +19,8 @@ from dreamfleet.coordinator.dispatch.event_log import EventLog
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.generation import CandidateScores
 from dreamfleet.coordinator.jobs.history import History
+from dreamfleet.coordinator.run.run import BY_HAND
+from dreamfleet.coordinator.run.run_state import Pause
 from dreamfleet.coordinator.service.run_log import RunLog
 from dreamfleet.coordinator.service.snapshot import Snapshot
 from dreamfleet.coordinator.service.status import encode_part, encode_status
@@ -192,10 +195,20 @@ def test_the_best_answer_carries_the_controller_in_parts(bench):
 
 def test_the_last_snapshot_says_left_unless_the_run_has_ended(bench):
     assert snapshot_of(bench).as_left().status.state == "left"
-    while bench.run.ended is None:
+    while bench.run.state.ended is None:
         score(bench, 1)
     assert snapshot_of(bench).as_left().status.state == "ended"
     assert json.loads(encode_status(snapshot_of(bench).as_left()))["why"] == "3 generations"
+
+
+def test_the_status_says_what_paused_the_run_for_programs(bench):
+    assert snapshot_of(bench).status.pauses == ()
+    for pause in (Pause(PauseKind.FAILED_JOB, ""), BY_HAND):
+        bench.run.pause(pause)
+    status = read_status(answered(snapshot_of(bench)))
+    assert (status.state, status.pauses) == ("paused", (PauseKind.BY_HAND, PauseKind.FAILED_JOB))
+    bench.run.resume()
+    assert read_status(answered(snapshot_of(bench))).pauses == ()
 
 
 def test_a_workers_status_holds_its_job_seconds_round_trip_and_resent_batches(bench):

@@ -38,7 +38,7 @@ class Spending(Reporting):
         super().begin()
 
     def end(self):
-        while self.run.ended is None:
+        while self.run.state.ended is None:
             self.step()
         return Controller.load(self.path / CONTROLLER)
 

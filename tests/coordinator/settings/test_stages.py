@@ -11,6 +11,7 @@ from rich.console import Console
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.monitoring.status_panel import RunPanel
 from dreamfleet.common.protocol.messages import Result
+from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.common.runs.records import StageSettings
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.scoring_params import scoring_params_of
@@ -89,11 +90,11 @@ def test_killed_as_each_generation_opens_every_optimiser_gives_the_same_bits(sta
     settings = replace(STAGED, optimiser=optimiser)
     calm, bench = staged("calm", settings=settings), staged("night", settings=settings)
     calm.drive(lambda _: 0)
-    while bench.run.ended is None:
+    while bench.run.state.ended is None:
         before = bench.run.generation.number
         bench.fetch()
         bench.finish(0)
-        if bench.run.generation.number > before and bench.run.ended is None:
+        if bench.run.generation.number > before and bench.run.state.ended is None:
             bench.restart()
             assert bench.run.generation.number == before + 1
     assert bench.outcome() == calm.outcome()
@@ -110,7 +111,7 @@ def test_a_run_that_ended_between_two_checks_and_goes_on_comes_to_the_same_stage
 
 def test_a_generation_waits_for_the_check_that_may_end_its_stage_and_for_no_other(staged, undisturbed):
     bench, waited = staged("night"), []
-    while bench.run.ended is None:
+    while bench.run.state.ended is None:
         bench.fetch()
         scored = bench.first("score")
         if scored is None and bench.run.generation.complete:
@@ -151,7 +152,7 @@ def test_limits_count_over_the_whole_run(staged):
     bench.limits = LimitsConfig(steps=20 * 6)
     bench.restart()
     bench.drive(lambda _: 0)
-    assert bench.run.ended == f"{20 * 6} environment steps"
+    assert bench.run.state.ended.kind is StopKind.STEPS
     assert len(bench.run.history) == 2
 
 

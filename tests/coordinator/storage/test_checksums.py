@@ -40,7 +40,7 @@ def ended(tmp_path, random_bundle):
 
 def end(bench):
     bench.serve()
-    assert bench.run.ended
+    assert bench.run.state.ended
     bench.journal.end_incarnation()
     bench.journal.commit()
     bench.journal.close()

@@ -47,7 +47,7 @@ def journals(tmp_path_factory, random_bundle):
         bench = Failing(tmp_path_factory.mktemp(name) / RUN, random_bundle.path, BIG, fails=by_vector(0.05), limit=1.0)
         most = 10**9 if name == "ended" else 400
         bench.serve(stop=lambda run, most=most: run.fleet.counts["accepted"] > most)
-        assert (bench.run.ended is not None) == (name == "ended")
+        assert (bench.run.state.ended is not None) == (name == "ended")
         bench.journal.end_incarnation()
         bench.journal.commit()
         bench.journal.close()

@@ -1,0 +1,37 @@
+"""A run's state as the status and the replies about batches show it: a word, and why."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from dreamfleet.common.protocol.pause_kind import PauseKind
+from dreamfleet.coordinator.run.run import Run
+from dreamfleet.coordinator.run.run_state import Ended
+
+
+class ShownState(NamedTuple):
+    """A state in a word, and why the run is paused or has ended, in words; `why` is empty in other states.
+
+    `pauses` is what paused it, the latest first; empty where the journal or differing hosts make it wait.
+    """
+
+    word: str
+    why: str = ""
+    pauses: tuple[PauseKind, ...] = ()
+
+
+def shown_state(run: Run) -> ShownState:
+    """How the run's state is shown. An end that is not yet written is shown as a pause."""
+    if isinstance(run.state, Ended):
+        return ShownState("ended", run.state.reason.text)
+    if (paused := run.state.paused) is not None:
+        return ShownState("paused", paused.text, tuple(each.kind for each in paused.pauses))
+    if (stalled := run.state.stalled) is not None:
+        return ShownState("paused", stalled.why)
+    if not run.fleet.has_workers:
+        return ShownState("waiting for workers")
+    if (why := run.verification.waiting) and not run.fleet.takes_jobs:
+        return ShownState("paused", why)
+    if not run.generation.population:
+        return ShownState("waiting for a batch")
+    return ShownState("evaluating" if run.fleet.drain_background else "running")
