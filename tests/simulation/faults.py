@@ -196,7 +196,7 @@ def _pause(world: World, fault: Fault) -> bool:
 def _bar(world: World, fault: Fault) -> bool:
     """Somebody bars an honest host, so what it brought is recalled, and lets it in again."""
     life, host = world.coordinator, _host(world, fault)
-    if life is None or world.coordinator_stopped or life.run.bar(f"w{host}"):
+    if life is None or world.coordinator_stopped or world.is_silent or life.run.bar(f"w{host}"):
         return False
     world.wake_coordinator(0.0)
     world.later(fault.seconds, world.unbar, host)

@@ -84,7 +84,7 @@ class World:
         self._inbox: list[tuple[str, Any]] = []  # of whichever coordinator lives
         self._wakes: dict[int, float] = {}  # by host; the coordinator's is -1
         self._turns = 0
-        self._final_pause = False
+        self.is_silent = False
         self._operator_called = False
         self._done = False
         self._calm_at = max((fault.at + fault.seconds + 5.0 for fault in self.schedule.faults), default=0.0)
@@ -199,10 +199,10 @@ class World:
         if life.over:
             self.end_coordinator(1.0)
             return
-        if life.run.state.paused and not self._final_pause and not self._operator_called:
+        if life.run.state.paused and not self.is_silent and not self._operator_called:
             self._operator_called = True
             self.later(OPERATOR, self.resume, life)
-        if self._final_pause and self.now >= self._calm_at and self._at_rest(life):
+        if self.is_silent and self.now >= self._calm_at and self._at_rest(life):
             self._done = True
         self.wake_coordinator(TICK)
 
@@ -213,7 +213,7 @@ class World:
 
     def resume(self, life: Coordinator) -> None:
         """Somebody says `dreamfleet resume`."""
-        if life is self.coordinator and not self._final_pause:
+        if life is self.coordinator and not self.is_silent:
             self._operator_called = life.draining = False
             life.run.resume()
 
@@ -239,7 +239,7 @@ class World:
         """A run that shall fall silent is paused once its last generation is closed."""
         life = self.coordinator
         if life is not None and not self.shape.ends and len(life.run.history) >= self.shape.generations:
-            self._final_pause = True
+            self.is_silent = True
             life.draining = False
             if life.run.state.paused is None:
                 life.run.pause(BY_HAND)
@@ -395,7 +395,7 @@ class World:
 
     def _give_up(self) -> None:
         life = self.coordinator
-        if life is not None and self._final_pause:
+        if life is not None and self.is_silent:
             books.check_rest(life.fleet, life.run)
             held = {worker.identity: worker.undelivered for worker in self.workers if worker is not None}
             raise Violation("memory", f"workers of a paused run hold {held}")
