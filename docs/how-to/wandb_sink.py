@@ -28,7 +28,9 @@ class WandbSink:
             dir=str(run.path),
             resume="allow",
             config=json.loads(run.settings.to_json()),
-            settings=wandb.Settings(console="off", silent=True, init_timeout=30),
+            settings=wandb.Settings(
+                console="off", silent=True, disable_git=True, save_code=False, x_disable_stats=True, init_timeout=30
+            ),
         )
         self._run.define_metric("generation")
         self._run.define_metric("*", step_metric="generation")
