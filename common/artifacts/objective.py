@@ -151,7 +151,7 @@ class Objective:
 
     def value(self, fitness: float) -> float:
         """The function's value of a fitness, and the fitness of a value."""
-        return -fitness if self.minimise else fitness
+        return 0.0 - fitness if self.minimise else fitness  # no -0.0
 
 
 def describe_sign(options: str) -> str:

@@ -32,7 +32,7 @@ const fillDifferences = (page, runs, { worlds, differences, problem }) => {
   const why = problem ? `The two cannot be paired: ${problem}.` : worlds.length > 1
     ? `The evaluations are of the worlds ${worlds.join(" and ")}, so no difference is taken.`
     : "A difference is taken once both runs have evaluated means.";
-  page["paired-table"].hidden = !differences.length;
+  page["paired-note"].hidden = page["paired-table"].hidden = !differences.length;
   page["paired-why"].hidden = differences.length > 0;
   say(page["paired-why"], why);
   page.paired.replaceChildren(...differences.map(({ of, size, on, verdict, clear }) => {
