@@ -166,17 +166,17 @@ class Client(Displayed):
         try:
             document = self.document(run, "story", f"worker={worker};job={job};what={','.join(kinds)}")
         except ConnectionFailedError:
-            document = self.document(run)  # older coordinators answer for the whole status only
+            document = self.document(run)  # a worker's join file may read nothing else
         rows = document.get("story")
         if not isinstance(rows, list):
             raise MalformedError(
                 f"the coordinator of run {document.get('run')} sends no events: a worker's join file may not read "
-                "them, so use a viewer's; an older dreamfleet sends none, so install a newer one"
+                "them, so use a viewer's"
             )
         return [from_plain_lenient(Event, row) for row in rows], int(document.get("total", len(rows)))
 
     def evaluations(self, run: str) -> list[StoredEvaluation]:
-        """All finished evaluations of `run`, oldest first; `ConnectionFailedError` from older coordinators."""
+        """All finished evaluations of `run`, oldest first."""
         rows = self.fetch_rows("evaluations", run)
         return [from_plain_lenient(StoredEvaluation, row) for row in rows]
 

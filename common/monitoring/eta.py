@@ -71,11 +71,11 @@ def estimate_eta(status: Status) -> Eta:
     bounds = tuple(_counted_limits(status, pace, next_seconds))
     if next_seconds is not None:
         bounds = tuple(sorted(bounds, key=lambda each: math.inf if each.seconds is None else each.seconds))
-    known = [0.0] if _is_limit_reached(status) else [each.seconds for each in bounds if each.seconds is not None]
+    known = [0.0] if status.ending else [each.seconds for each in bounds if each.seconds is not None]
     limit = min(known) if known and status.state in ACTIVE_STATES and not _is_stalled(status, pace) else None
     closing = _closing_seconds(status)
     seconds = None if limit is None or closing is None else limit + closing
-    return Eta(bounds, tuple(_uncounted_limits(status)), pace, limit, seconds, _closing_episodes(status))
+    return Eta(bounds, tuple(_uncounted_limits(status)), pace, limit, seconds, status.closing)
 
 
 def describe_state(status: Status) -> str:
@@ -161,22 +161,15 @@ def _open_generation_seconds(status: Status, pace: float | None) -> float | None
     return max((each for each in (left, needed, *retries) if each is not None), default=None)
 
 
-def _closing_episodes(status: Status) -> int:
-    """Episodes of evaluations until the run's end; from older coordinators, those in progress."""
-    parts = (status.evaluating, status.confirming) if _is_limit_reached(status) else ()
-    return max(status.closing, sum(each.episodes - each.episodes_done for each in parts))
-
-
 def _closing_seconds(status: Status) -> float | None:
     """Seconds of the last evaluations and the confirmation; `None` if the speed of evaluations is unknown."""
     rate = status.throughput.evaluation_episodes_per_second
-    closing = _closing_episodes(status)
-    return closing / rate if rate else None if closing else 0.0
+    return status.closing / rate if rate else None if status.closing else 0.0
 
 
 def _counted_limits(status: Status, pace: float | None, next_seconds: float | None) -> Iterator[LimitProgress]:
     """Each countable limit. A run ends when a generation closes, so never before the open one does."""
-    limits, spent, reached = status.limits, status.throughput, _is_limit_reached(status)
+    limits, spent, reached = status.limits, status.throughput, status.ending
     elapsed = 0.0 if reached else status.generation.seconds
     open_seconds = 0.0 if reached else _open_generation_seconds(status, pace)
     seconds: float | None
@@ -197,7 +190,7 @@ def _counted_limits(status: Status, pace: float | None, next_seconds: float | No
             seconds = max((steps - done) / rate, open_seconds) if done < steps else open_seconds
         text = f"{format_steps(done)} of {format_steps(int(steps))} {step_unit(status.settings.task.task)}"
         yield LimitProgress("steps", done, steps, seconds, text)
-    if (minutes := _limit(limits, "minutes")) and spent.seconds is not None:
+    if minutes := _limit(limits, "minutes"):
         elapsed += spent.seconds
         text = f"{_format_minutes(elapsed / 60)} of {_format_minutes(minutes)} minute{'' if minutes == 1 else 's'}"
         yield LimitProgress("minutes", elapsed / 60, minutes, max(60 * minutes - elapsed, open_seconds or 0.0), text)
@@ -207,14 +200,6 @@ def _is_stalled(status: Status, pace: float | None) -> bool:
     """Whether the open generation is overdue and no step is made: an environment hangs, say."""
     is_overdue = pace is not None and status.generation.seconds > 2 * pace + STALL_SECONDS
     return is_overdue and status.state == "running" and not status.throughput.steps_per_second
-
-
-def _is_limit_reached(status: Status) -> bool:
-    """Whether a limit is reached: the open generation is scored only if the run is resumed with higher limits."""
-    generations, minutes = _limit(status.limits, "generations"), _limit(status.limits, "minutes")
-    by_time = bool(minutes) and (status.throughput.seconds or 0.0) >= 60 * minutes
-    by_number = 0 < generations <= status.generations
-    return status.ending or by_time or by_number or status.confirming.episodes > 0  # older versions send no `ending`
 
 
 def _closed_steps_per_second(status: Status) -> float:
@@ -251,7 +236,7 @@ def _summarise_progress(status: Status) -> str:
     """The state, and the generation that is scored in it; near the run's end none is."""
     if status.state == "evaluating":
         return _describe_evaluating(status)
-    if _is_limit_reached(status):
+    if status.ending:
         return status.state
     opened = status.generation
     if status.settings.is_external and not opened.episodes:

@@ -198,8 +198,7 @@ class WorkerCount:
 
     present: Count
     known: Count  # those that were lost, or left, in the last minutes included
-    # Lost in the last minutes and not back; `None` from older coordinators.
-    lost: Count | None = field(default=None, metadata=OPTIONAL)
+    lost: Count  # in the last minutes, and not back
     left: Count = field(default=0, metadata=OPTIONAL)  # likewise, and they said why
 
 
@@ -209,8 +208,7 @@ class Throughput:
 
     steps_per_second: float
     environment_steps: Count
-    # Of closed generations, which a limit of minutes counts; `None` from older coordinators.
-    seconds: Seconds | None = field(default=None, metadata=OPTIONAL)
+    seconds: Seconds  # of closed generations, which a limit of minutes counts
     # At the present workers' speed if they scored nothing else; `None` if unknown.
     episodes_per_second: float | None = field(default=None, metadata=OPTIONAL)  # of candidates
     evaluation_episodes_per_second: float | None = field(default=None, metadata=OPTIONAL)

@@ -193,7 +193,7 @@ def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
             "failed",
             f"{plural(failed, 'candidate')}, {status.generation.failed} of this generation; `story` lists why",
         )
-    if status.throughput.seconds is not None and status.elapsed is not None:
+    if status.elapsed is not None:
         worked = status.throughput.seconds + status.generation.seconds
         yield 6, "time", f"{format_duration(worked)} of work, {format_duration(status.elapsed)} since it began"
     if status.classes.total:

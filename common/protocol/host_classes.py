@@ -1,7 +1,7 @@
 """Host classes: hosts of one class computed the same bits on fixed inputs. No input or output.
 
 A worker computes its class by scoring these inputs (`worker/scoring/host_class_probe.py`) and sends it with its
-results. For older workers, and for tasks without such inputs, the class is derived from the host's fingerprint.
+results. For tasks without such inputs the class is derived from the host's fingerprint.
 """
 
 from __future__ import annotations
@@ -86,11 +86,8 @@ class HostClasses:
 
 
 def count_results(rows: Iterable[tuple[str, str, int]]) -> Counter[tuple[str, str]]:
-    """Sum a journal's rows of class, fingerprint and count; an empty class is derived from the fingerprint."""
-    counted: Counter[tuple[str, str]] = Counter()
-    for host_class, fingerprint, results in rows:
-        counted[host_class or class_from_fingerprint(fingerprint), fingerprint] += results
-    return counted
+    """Count results by class and fingerprint from a journal's rows of both and their count."""
+    return Counter({(host_class, fingerprint): results for host_class, fingerprint, results in rows})
 
 
 def class_from_fingerprint(fingerprint: str) -> str:
@@ -98,15 +95,13 @@ def class_from_fingerprint(fingerprint: str) -> str:
     return BY_FINGERPRINT + hashlib.sha256(fingerprint.encode()).hexdigest()[:12]
 
 
-def effective_class(reported: str | None, fingerprint: str, run: str | None) -> str:
+def effective_class(reported: str, fingerprint: str, run: str | None) -> str:
     """The class under which a host counts in a run; empty if it is not known yet.
 
-    `reported` is the class that the host reported: `None` from older workers, empty if not known yet. `run` is the
-    class of the run's first result. If that was derived from a fingerprint, all classes of the run are.
+    `reported` is the class that the host reported, empty if not known yet. `run` is the class of the run's first
+    result. If that was derived from a fingerprint, all classes of the run are.
     """
-    if reported is None or (run or "").startswith(BY_FINGERPRINT):
-        return class_from_fingerprint(fingerprint)
-    return reported
+    return class_from_fingerprint(fingerprint) if (run or "").startswith(BY_FINGERPRINT) else reported
 
 
 def _fingerprints(counted: ResultCounts, host_class: str) -> tuple[str, ...]:

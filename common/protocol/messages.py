@@ -33,7 +33,7 @@ MAX_BATCHES = 2**53  # never reached
 MAX_SLOTS = 4096  # of one worker
 TAG_BYTES = 8
 MIN_TEMPERATURE, MAX_TEMPERATURE = 1e-3, 1e3  # of a dream
-OWN_END_VERSION = 10  # added to the world's version by runs with an end rule of their own: older workers refuse them
+OWN_END_VERSION = 10  # added to the world's version by runs with an end rule of their own
 
 
 Tag = Annotated[bytes, Length(TAG_BYTES, TAG_BYTES)]  # the first bytes of a digest, unique among one worker's jobs
@@ -189,9 +189,8 @@ class JobBatch(Message):
     cancels: tuple[Digest, ...]
     verdicts: tuple[Verdict, ...]
     leave: bool = field(default=False, metadata=OPTIONAL)  # the run is over: the worker exits
-    # The run has ended. Only workers whose hello said `leaves_with_run` or `reads_end` get it.
-    ended: bool = field(default=False, metadata=OPTIONAL)
-    why: Reason = field(default="", metadata=OPTIONAL)  # it ended, for workers whose hello said `reads_end`
+    ended: bool = field(default=False, metadata=OPTIONAL)  # the run has ended: the worker leaves it
+    why: Reason = field(default="", metadata=OPTIONAL)  # it ended
 
 
 @dataclass(frozen=True)
@@ -215,8 +214,7 @@ class ResultBatch(Message):
 
     fingerprint: Text
     results: tuple[Result, ...]
-    # Of the worker's host; `None` from older workers, here and below.
-    host_class: HostClass | None = field(default=None, metadata=OPTIONAL)
+    host_class: HostClass = field(default="", metadata=OPTIONAL)  # of the worker's host
 
 
 @dataclass(frozen=True)
@@ -244,7 +242,7 @@ class Heartbeat(Message):
     load: Annotated[float, Between(0.0, 1e6)]  # the host's load average over one minute
     steps_per_second: Annotated[float, Between(0.0, 1e9)]
     drawn_by: Word  # renderer of the slots' pictures: native, gymnasium, or - if the task does not say
-    host_class: HostClass | None = field(default=None, metadata=OPTIONAL)
+    host_class: HostClass = field(default="", metadata=OPTIONAL)
     reason: Reason = field(default="", metadata=OPTIONAL)  # the worker leaves, and this is its last heartbeat
     # Of `capacity`, what the worker's other runs use now: jobs given to it would wait.
     taken: Annotated[int, Between(0, MAX_LEASES)] = field(default=0, metadata=OPTIONAL)
@@ -319,9 +317,7 @@ class HelloRequest:
     fingerprint: Text
     slots: Count
     packages: Packages = field(default=NUMERIC_PACKAGES, metadata=OPTIONAL)  # whose versions the fingerprint names
-    host_class: HostClass | None = field(default=None, metadata=OPTIONAL)
-    leaves_with_run: bool = field(default=False, metadata=OPTIONAL)  # it reads `JobBatch.ended`, and then exits
-    reads_end: bool = field(default=False, metadata=OPTIONAL)  # it reads `JobBatch.ended` and `why`, and may stay
+    host_class: HostClass = field(default="", metadata=OPTIONAL)
     # Shows that it runs on the coordinator's own host, as its user (`common/security/anchor_key.py`); empty if not.
     anchor: Annotated[str, Length(0, 64)] = field(default="", metadata=OPTIONAL)
 
@@ -346,11 +342,7 @@ class HelloReply:
     intervals: dict[str, Any]
     packages: Packages = field(default=NUMERIC_PACKAGES, metadata=OPTIONAL)  # whose versions the fingerprint names
     numbering: Count = field(default=0, metadata=OPTIONAL)  # of the following batches; it increases
-    classes: bool = field(default=False, metadata=OPTIONAL)  # whether this coordinator reads `host_class`
-    reasons: bool = field(default=False, metadata=OPTIONAL)  # whether it reads `Heartbeat.reason`
     share: FleetShare = field(default=1.0, metadata=OPTIONAL)  # of a worker's slots, relative to its other runs
-    taken: bool = field(default=False, metadata=OPTIONAL)  # whether it reads `Heartbeat.taken`
-    together: bool = field(default=False, metadata=OPTIONAL)  # whether it reads `Heartbeat.together`
     # Refused, as the worker did not announce this task of no package: its user may start it with that.
     unannounced_task: Annotated[str, Length(0, 128)] = field(default="", metadata=OPTIONAL)
 

@@ -282,10 +282,7 @@ class _FollowedRun:
         if last is not None and last.generation > latest and len(self.evaluations) + 1 == status.evaluations:
             self.evaluations.append(last)
             return
-        try:
-            found = list(_fetch_rows(client, "evaluations", StoredEvaluation, self.name))
-        except ConnectionFailedError:  # older coordinators have no list: collect those seen
-            found = [*self.evaluations, *(each for each in (status.best, last) if each is not None)]
+        found = _fetch_rows(client, "evaluations", StoredEvaluation, self.name)
         self.evaluations = sorted({each.generation: each for each in found}.values(), key=lambda each: each.generation)
 
     def _render_curves(self) -> None:

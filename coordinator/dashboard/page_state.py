@@ -181,7 +181,7 @@ def reported_caption(reported: StoredEvaluation | StoredConfirmation, word: str)
 
 def _worked(status: Status) -> str:
     """The time that was worked, and the time that passed; empty if unknown."""
-    if status.throughput.seconds is None or status.elapsed is None:
+    if status.elapsed is None:
         return ""
     worked = format_duration(status.throughput.seconds + status.generation.seconds)
     return f"{worked} of work in {format_duration(status.elapsed)}"
@@ -266,9 +266,8 @@ def _problems(status: Status) -> list[str]:
 def _fleet(status: Status, link: str) -> str:
     """What no tile says of the fleet: who is missing, and the classes of hosts."""
     counts = status.workers
-    lost = counts.lost or 0
-    silent = counts.known - counts.present - lost - counts.left
-    parts = [f"{count} {state}" for count, state in ((silent, "silent"), (lost, "lost"), (counts.left, "left"))
+    silent = counts.known - counts.present - counts.lost - counts.left
+    parts = [f"{count} {state}" for count, state in ((silent, "silent"), (counts.lost, "lost"), (counts.left, "left"))
              if count > 0]  # fmt: skip
     missing = f"{'' if link == LIVE else 'at the last: '}{', '.join(parts)}" if parts else ""
     classes = status.classes.description if status.classes.total else ""

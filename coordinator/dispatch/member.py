@@ -94,8 +94,6 @@ class Member:
     taken: int = 0  # of its capacity, what its other runs use now
     together: int = 1  # candidates' drives that one of its slots does side by side
     drives_a_slot: int = MOST_TOGETHER  # of these, as many as leave work for all slots; set before each dispatch
-    leaves_with_run: bool = False  # it reads that the run has ended, and then exits
-    reads_end: bool = False  # it reads why the run has ended, and leaves it
     gone_since: float | None = None  # when its token vanished, or its first heartbeat was its last
     farewell: str = ""  # why it leaves, by its last heartbeat
     silent: bool = False
@@ -365,7 +363,7 @@ class DepartedWorkers(dict[str, Member]):
     """Workers that were lost, or said why they leave, by identity, the latest last: in the status, but no members."""
 
     def add(self, member: Member) -> None:
-        """List a worker that is gone, unless it had drained and gave no reason, as older ones do."""
+        """List a worker that is gone, unless it had drained and gave no reason."""
         if not member.is_guest and (member.capacity or member.farewell):
             self[member.identity] = member
             if len(self) > MAX_DEPARTED:  # R26: the list is bounded

@@ -55,17 +55,16 @@ class WorkerAdmission:
         if (member := self._fleet.members[request.worker]) is not known:
             member.host_class = self.class_of(request.host_class, request.fingerprint)
             member.is_anchor = is_proof(self._anchor_key, request.worker, request.anchor)
-            member.leaves_with_run, member.reads_end = request.leaves_with_run, request.reads_end
         return numbering
 
-    def update_class(self, worker: str, host_class: str | None) -> None:
+    def update_class(self, worker: str, host_class: str) -> None:
         """Note the class that a heartbeat names, and remove a worker whose class is foreign."""
         member = self._fleet.members.get(worker)
         if member is not None and host_class:
             member.host_class = self.class_of(host_class, member.fingerprint)
             self._enforce_class(member)
 
-    def class_of(self, host_class: str | None, fingerprint: str) -> str:
+    def class_of(self, host_class: str, fingerprint: str) -> str:
         """The class under which this run counts a host; empty if it is not known yet."""
         return effective_class(host_class, fingerprint, self.host_class)
 

@@ -12,6 +12,7 @@ from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.printable import plural, truncate
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.failures import Failure
+from dreamfleet.common.protocol.host_classes import class_from_fingerprint
 from dreamfleet.common.protocol.messages import (
     MAX_REASON,
     Heartbeat,
@@ -78,11 +79,7 @@ class WorkerProtocol:
             intervals={} if why else asdict(self._intervals),
             packages=self._run.settings.packages,
             numbering=numbering,
-            classes=True,
-            reasons=True,
             share=self._run.fleet_share,
-            taken=True,
-            together=True,
         )
 
     def handle(self, worker: str, message: WorkerMessage, now: float) -> None:
@@ -113,7 +110,8 @@ class WorkerProtocol:
 
         A result that raises does not keep the others from being counted; then the first such error is raised.
         """
-        host_class = self._admission.class_of(batch.host_class or None, batch.fingerprint)
+        named = batch.host_class or class_from_fingerprint(batch.fingerprint)  # a job that no slot took has no class
+        host_class = self._admission.class_of(named, batch.fingerprint)
         if (why := self._admission.distrust_reason(worker, host_class, batch.fingerprint)) is not None:
             self._fleet.dropped[why] += len(batch.results)
             return
@@ -141,8 +139,8 @@ class WorkerProtocol:
 
     def job_batch(self, batch: OutgoingBatch, *, leave: bool = False, ended: bool = False) -> JobBatch:
         """The message for a batch; with `leave` it asks the worker to leave the run, with `ended` it says why."""
-        content, member = batch.content, self._fleet.members.get(batch.identity)
-        reason = self._run.state.ended if ended and member is not None and member.reads_end else None
+        content = batch.content
+        reason = self._run.state.ended if ended else None
         return JobBatch(
             run_uid=self._run.uid,
             incarnation=self._run.incarnation,

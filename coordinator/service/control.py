@@ -84,9 +84,8 @@ class Control:
         return []
 
     def last_batches(self) -> list[OutgoingBatch]:
-        """Empty batches that say that the run has ended, for those present that then leave it."""
-        return _empty_batches(each for each in self._run.fleet.members.values()
-                              if (each.leaves_with_run or each.reads_end) and each.gone_since is None)  # fmt: skip
+        """Empty batches that say that the run has ended, for those present, which leave it."""
+        return _empty_batches(each for each in self._run.fleet.members.values() if each.gone_since is None)
 
     def _pause_by_hand(self) -> str:
         self._run.pause(BY_HAND)

@@ -202,7 +202,7 @@ class Service:
         session.put(keys.event_status(self._name), encode_status(self._snapshot), encoding="application/json")
 
     def _dismiss_workers(self, session: zenoh.Session) -> None:
-        """Tell the workers that leave with the run that it has ended, and wait briefly until they are gone.
+        """Say to the workers that the run has ended, and wait briefly until they are gone.
 
         R24: without this word such a worker would wait for another life of the coordinator.
         """

@@ -14,6 +14,7 @@ from typing import Any
 
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.protocol.failures import Failure
+from dreamfleet.common.protocol.host_classes import class_from_fingerprint
 from dreamfleet.common.protocol.keys import PROTOCOL_VERSION
 from dreamfleet.common.protocol.messages import (
     MAX_LEASES,
@@ -95,7 +96,7 @@ class Worker:
         self.left = False
         self.slowness = 1.0
         self.lie: Callable[[Job, float], float] = lambda _, fitness: fitness  # what it says of a job
-        self.host_class: str | None = None  # `None`: it says none, as older workers
+        self.host_class = class_from_fingerprint("f")
         self.is_anchor = False  # whether it is on the coordinator's own host
         self.failures = 0  # turns that are still to fail
         self.nonce: str | None = None  # of the life that it has joined; `None` before the first

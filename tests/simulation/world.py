@@ -267,7 +267,7 @@ class World:
             self.scored,
         )
         worker.lie, worker.is_anchor = self.lies.get(host, worker.lie), host in self.anchors
-        worker.host_class = self.classes.get(host)
+        worker.host_class = self.classes.get(host, worker.host_class)
         self.workers[host] = worker
         self.links[host].sees = None
         self._turn_worker(host, worker)

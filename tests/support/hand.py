@@ -46,8 +46,6 @@ class Hand:
         self.refusal = None
         self.package = package_version("dreamfleet") or "unknown"  # its own version
         self.packages = NUMERIC_PACKAGES  # in the run's fingerprint
-        self.classes = True  # whether it supports host classes
-        self.reasons = True  # whether it reads why a worker leaves
         self.worker = None
         self.slots = 0  # in its status
         self.answers = False  # whether it answers each heartbeat by an empty batch, as a coordinator does
@@ -173,7 +171,7 @@ class Hand:
                 package=self.package, run=self.run, run_uid=self.run_uid, incarnation=self.incarnation,
                 nonce=self.nonce, why=why, remedy=remedy,
                 spec={} if why else asdict(self.spec), intervals={} if why else asdict(self.intervals),
-                packages=self.packages, numbering=self.numbering, classes=self.classes, reasons=self.reasons,
+                packages=self.packages, numbering=self.numbering,
             )  # fmt: skip
             query.reply(keys.hello(self.run), encode_json(reply), encoding="application/json")
         self._said.put(request)

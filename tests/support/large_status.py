@@ -16,6 +16,6 @@ FLEET = tuple(
 RECENT = tuple(dataclasses.replace(STATUS.recent[0], number=number, mean=float(number)) for number in range(60))
 
 LARGE = dataclasses.replace(
-    STATUS, worker_list=FLEET, workers=WorkerCount(40, 40), recent=RECENT,
+    STATUS, worker_list=FLEET, workers=WorkerCount(40, 40, 0), recent=RECENT,
     population=Population(7, 0, 64, (16,) * 30 + (4,) * 10 + (0,) * 24, (16,) * 64, (5.0,) * 40 + (None,) * 24),
 )  # fmt: skip

@@ -121,11 +121,6 @@ JSON = {
     "hello-request-classed": HelloRequest(
         2, 2, "0.1.0", "host-a/0a1b2c3d", ("car-racing", "dream"), "x86_64 avx2", 8, host_class="0123456789abcdef"
     ),
-    "hello-reply-classed": HelloReply(
-        True, 2, 2, "0.1.0", "night", UID, 3, "c0ffee00c0ffee00", "", "",
-        {"task": "car-racing", "bundle": "ab" * 32, "horizon": 1000, "patience": 100}, {"beat": 1.0, "repeat": 1.0},
-        numbering=4, classes=True,
-    ),
     "generation-event": GenerationEvent(
         v=1, run="night", run_uid=UID, incarnation=3, generation=7, mean=100.5, std=20.25, best=150.0, worst=-10.0,
         sigma=0.09, seconds=12.5, environment_steps=64000,
@@ -146,9 +141,9 @@ STATUS = Status(
     population=Population(7, 0, 4, (2, 1, 0, 0), (2, 2, 2, 2), (101.5, -3.25, None, None)),
     last_population=Population(6, 0, 4, (2, 2, 2, 2), (2, 2, 2, 2), (140.0, 112.0, 122.5, -12.5)),
     evaluation=BEST, best=BEST, evaluations=1, evaluating=EpisodeProgress(0, 0), collecting=EpisodeProgress(8, 8),
-    workers=WorkerCount(1, 1),
+    workers=WorkerCount(1, 1, 0),
     worker_list=(WorkerStatus("host-a/0a1b2c3d", "present", 8, 12, 400, 987.5, 1.5, "native", 0.3, "x86_64 avx2"),),
-    slots=8, fingerprint="x86_64 avx2", throughput=Throughput(987.5, 448000),
+    slots=8, fingerprint="x86_64 avx2", throughput=Throughput(987.5, 448000, 0.0),
     waste=Waste(100, 0.01, 1, 2, 3, 4, 5, 6, 7, 8), failing=1,
     failures=(FailureStatus("7/1", "score", (1048576,), {"host-a/0a1b2c3d": "boom"}, {"host-a/0a1b2c3d": 2}),),
     dropped={"not msgpack": 2},

@@ -36,7 +36,7 @@ def snapshot(generations=8, workers=1, population=16, name="night", **changes):
     )  # fmt: skip
     status = dataclasses.replace(
         STATUS, run=name, generation=dataclasses.replace(STATUS.generation, number=generations),
-        generations=generations, last=history.last, recent=(), worker_list=(), workers=WorkerCount(workers, workers),
+        generations=generations, last=history.last, recent=(), worker_list=(), workers=WorkerCount(workers, workers, 0),
         population=dataclasses.replace(STATUS.population, generation=generations, total=population),
         evaluation=looks[-1] if looks else None, best=looks[-1] if looks else None, evaluations=len(looks),
         **{"failures": (), "failing": 0, "dropped": {}, **changes},

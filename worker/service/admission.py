@@ -39,11 +39,7 @@ class Admission:
     intervals: Intervals
     packages: tuple[str, ...] = NUMERIC_PACKAGES  # the run's fingerprint consists of their versions
     numbering: int = 0  # R12: of the batches that follow; older ones cannot pass for current ones
-    classes: bool = False  # whether the coordinator supports host classes
-    reasons: bool = False  # whether the coordinator reads why a worker leaves
     share: float = 1.0  # of the worker's slots, relative to its other runs' shares
-    taken: bool = False  # whether the coordinator reads what other runs use
-    together: bool = False  # whether the coordinator reads how many drives a slot does side by side
     package: str = ""  # the coordinator's version
 
 
@@ -147,9 +143,7 @@ def _live_statuses(session: zenoh.Session) -> Iterator[Any]:
             yield json.loads(payload)
 
 
-def make_request(
-    worker: str, tasks: tuple[str, ...], slots: int, *, leaves_with_run: bool = False, torch_device: str = ""
-) -> HelloRequest:
+def make_request(worker: str, tasks: tuple[str, ...], slots: int, *, torch_device: str = "") -> HelloRequest:
     """The hello request of a worker."""
     return HelloRequest(
         protocol_min=keys.PROTOCOL_VERSION,
@@ -159,8 +153,6 @@ def make_request(
         tasks=tasks,
         fingerprint=fingerprint(torch_device=torch_device),
         slots=slots,
-        leaves_with_run=leaves_with_run,
-        reads_end=True,
     )
 
 
@@ -179,5 +171,5 @@ def _read_admission(reply: HelloReply) -> Admission:
         ) from error
     return Admission(
         keys.check_run_name(reply.run), reply.run_uid, reply.incarnation, reply.nonce, spec, intervals, reply.packages,
-        reply.numbering, reply.classes, reply.reasons, reply.share, reply.taken, reply.together, reply.package,
+        reply.numbering, reply.share, reply.package,
     )  # fmt: skip

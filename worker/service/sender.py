@@ -58,7 +58,7 @@ class CoordinatorSender:
             incarnation=self._admission.incarnation,
             fingerprint=fingerprint(self._admission.packages, slots.torch_device),
             results=results,
-            host_class=self._host_class(slots),
+            host_class=slots.host_class,
         )
         self._publish(keys.result(self._admission.run, self._identity), batch)
 
@@ -100,17 +100,15 @@ class CoordinatorSender:
             load=os.getloadavg()[0],
             steps_per_second=min(rate, MAX_STEPS_PER_SECOND),
             drawn_by=slots.drawn_by,
-            host_class=self._host_class(slots),
-            reason=reason if self._admission.reasons else "",
-            taken=min(slots.taken, capacity) if self._admission.taken else 0,
-            together=slots.together if self._admission.together else 1,
+            host_class=slots.host_class,
+            reason=reason,
+            taken=min(slots.taken, capacity),
+            together=slots.together,
         )
         self._publish(keys.heartbeat(self._admission.run, self._identity), beat)
 
     def send_farewell(self, slots: int, reason: str) -> None:
         """Send the first and last heartbeat of a worker that fails before it can score (R24)."""
-        if not self._admission.reasons:
-            return
         beat = Heartbeat(
             run_uid=self._admission.run_uid,
             incarnation=self._admission.incarnation,
@@ -128,10 +126,6 @@ class CoordinatorSender:
             reason=reason,
         )
         self._publish(keys.heartbeat(self._admission.run, self._identity), beat)
-
-    def _host_class(self, slots: SlotPool) -> str | None:
-        """The host class, if it is known and the coordinator supports host classes."""
-        return slots.host_class or None if self._admission.classes else None
 
     def _publish(self, key: str, message: Message) -> None:
         self._session.put(key, encode(message), encoding=encoding(type(message)))

@@ -96,7 +96,7 @@ class Worker:
         self._slot_count = config.slots or (1 if config.torch_device else usable_cores())
         self._hello = make_request(
             self.identity, (*known_tasks(), *tasks), self._slot_count,
-            leaves_with_run=config.exit_when_done or config.any, torch_device=config.torch_device,
+            torch_device=config.torch_device,
         )  # fmt: skip
         lifetime = min(config.lifetime or math.inf, self._seconds_until_expiry)
         self._conditions = LeaveConditions(

@@ -17,7 +17,7 @@ from tests.support.samples import BEST, CLOSED, STATUS
 WORKER = STATUS.worker_list[0]
 
 
-def status(limits=(), seconds=None, gone=0.0, **changes):
+def status(limits=(), seconds=0.0, gone=0.0, **changes):
     recent = tuple(dataclasses.replace(CLOSED, seconds=each) for each in changes.pop("paces", (4.5, 4.6, 900.0)))
     return dataclasses.replace(
         STATUS, limits={"generations": 0, "steps": 0, "minutes": 0.0, "target": None, "parted": 0, **dict(limits)},
@@ -107,12 +107,6 @@ def test_a_limit_that_an_evaluation_reached_is_over_too():
     assert eta.seconds == 10.0
 
 
-def test_an_older_coordinators_evaluations_in_progress_count():
-    eta = estimate_eta(status({"minutes": 1.0}, seconds=66.0, state="evaluating", confirming=EpisodeProgress(3, 16)))
-    assert eta.description.endswith("then 13 episodes of evaluation")
-    assert estimate_eta(status({"minutes": 1.0}, seconds=66.0)).description.endswith("about to end")
-
-
 def test_a_run_whose_limit_is_not_reached_is_not_about_to_end():
     quick = estimate_eta(status({"generations": 12}, paces=(0.1,)))
     assert quick.description.endswith("0.1 s a generation, less than a second to go")
@@ -138,7 +132,6 @@ def test_a_target_score_has_no_estimate():
 def test_without_limits_or_generations_there_is_no_estimate():
     assert estimate_eta(status(paces=())).description == "no limit: it runs until it is stopped"
     assert estimate_eta(status({"generations": 9}, paces=())).seconds is None
-    assert estimate_eta(status({"minutes": 30.0})).bounds == ()  # an earlier coordinator does not say how long
 
 
 @pytest.mark.parametrize("state", ["paused", "waiting for workers", "ended", "left"])
@@ -170,10 +163,10 @@ def test_unknown_limits_are_ignored(strange):
         ),
         ({"state": "waiting for workers"}, "waiting for workers: none is present"),
         (
-            {"state": "waiting for workers", "workers": WorkerCount(0, 0), "steps": 0},
+            {"state": "waiting for workers", "workers": WorkerCount(0, 0, 0), "steps": 0},
             "waiting for workers: none has joined yet",
         ),
-        ({"state": "waiting for workers", "workers": WorkerCount(0, 0)}, "waiting for workers: none is present"),
+        ({"state": "waiting for workers", "workers": WorkerCount(0, 0, 0)}, "waiting for workers: none is present"),
         (
             {
                 "state": "waiting for workers",

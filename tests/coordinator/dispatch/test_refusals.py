@@ -47,7 +47,6 @@ def test_a_fingerprint_of_other_packages_is_asked_for_again_before_it_is_judged(
         ("a" * 16, "a" * 16, True),
         ("a" * 16, "b" * 16, False),
         ("", "b" * 16, True),  # it does not know yet
-        (None, "b" * 16, False),  # it knows nothing of classes
         ("a" * 16, class_from_fingerprint("here"), True),  # the run goes by fingerprints
         ("", class_from_fingerprint("elsewhere"), False),
     ],

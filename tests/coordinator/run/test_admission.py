@@ -1,7 +1,6 @@
 """The first accepted result fixes a run's class; in a strict run all accepted results are of that class.
 Tests common/protocol/host_classes.py."""
 
-import sqlite3
 from dataclasses import replace
 
 import pytest
@@ -17,6 +16,7 @@ from tests.support.run_bench import SETTINGS, A, B, Bench
 from tests.support.samples import SPEC
 
 PLAIN = replace(SETTINGS, collect_every=0, population=4)
+HERE, ELSEWHERE = class_from_fingerprint("here"), class_from_fingerprint("elsewhere")
 
 
 class Classed(Bench):
@@ -36,7 +36,7 @@ class Classed(Bench):
         self.handle_heartbeat(name, host_class=self.classes[name])
 
     def request(self, name):
-        known = self.classes[name] and self.announced[name]  # a worker finds out its class after it has joined
+        known = self.announced[name]  # a worker finds out its class after it has joined
         return HelloRequest(2, 2, "0", name, (SPEC.task,), self.fingerprints[name], 1, host_class=known)
 
     def hello(self, name):
@@ -76,10 +76,10 @@ def done(job):
     return Result(job.digest, 1.0, 10, 0.1, None, None)
 
 
-class FromBefore(Classed):
-    """Workers of a version without classes."""
+class ByFingerprint(Classed):
+    """Workers of a task without a probe episode."""
 
-    classes = {A: None, B: None}  # noqa: RUF012
+    classes = {A: HERE, B: ELSEWHERE}  # noqa: RUF012
 
 
 def test_a_hello_alone_does_not_fix_the_class(bench):
@@ -88,10 +88,10 @@ def test_a_hello_alone_does_not_fix_the_class(bench):
     assert bench.hello(A) is bench.hello(B) is None
 
 
-@pytest.mark.parametrize("kind", [Classed, FromBefore])
+@pytest.mark.parametrize("kind", [Classed, ByFingerprint])
 def test_the_first_accepted_result_fixes_the_class_and_the_other_host_is_removed(tmp_path, random_bundle, kind):
     bench = kind(tmp_path / "night", random_bundle.path, PLAIN)
-    own = kind.classes[B] or class_from_fingerprint("elsewhere")
+    own = kind.classes[B]
     jobs = bench.given()
     bench.deliver(B, done(jobs[B][0]))
     assert (bench.run.admission.host_class, bench.run.admission.fingerprint) == (own, "elsewhere")
@@ -120,10 +120,11 @@ def test_a_worker_of_another_class_is_removed_before_it_gets_work(bench):
     assert "classes differ" in bench.hello(A)[0]
 
 
-def test_a_worker_without_a_class_cannot_join_a_strict_run_with_one(bench):
+def test_a_worker_with_the_class_of_its_fingerprint_cannot_join_a_strict_run_of_another(bench):
     jobs = bench.given()
     bench.deliver(B, done(jobs[B][0]))
-    bench.classes = {A: None, B: "b" * 16}
+    bench.classes = {A: HERE, B: "b" * 16}
+    bench.announced[A] = HERE
     assert "install the same dreamfleet" in bench.hello(A)[1]
 
 
@@ -160,7 +161,7 @@ def test_a_result_of_another_life_is_judged_before_its_worker_says_hello(bench):
     assert bench.run.generation.done == 1
 
 
-@pytest.mark.parametrize("classes", [{A: "a" * 16, B: "b" * 16}, {A: None, B: "b" * 16}, {A: "a" * 16, B: None}])
+@pytest.mark.parametrize("classes", [{A: "a" * 16, B: "b" * 16}, {A: HERE, B: "b" * 16}, {A: "a" * 16, B: ELSEWHERE}])
 def test_a_run_that_is_not_strict_accepts_all_classes_and_records_each_results_class(tmp_path, random_bundle, classes):
     kind = type("Open", (Classed,), {"strict": False, "classes": classes})
     bench = kind(tmp_path / "night", random_bundle.path, PLAIN)
@@ -169,51 +170,12 @@ def test_a_run_that_is_not_strict_accepts_all_classes_and_records_each_results_c
         bench.deliver(name, done(jobs[name][0]))
     assert bench.run.generation.done == 2
     assert bench.hello(A) is bench.hello(B) is None
-    # If the first accepted result had no class, the whole run uses fingerprints, as older journals do.
-    counted = classes if classes[A] else {A: None, B: None}
-    assert bench.stored() == {
-        counted[A] or class_from_fingerprint("here"),
-        counted[B] or class_from_fingerprint("elsewhere"),
-    }
+    # If the class of the first accepted result is that of its fingerprint, so are all.
+    assert bench.stored() == ({HERE, ELSEWHERE} if classes[A] == HERE else {*classes.values()})
     assert bench.run.classes.description == "mixed: 2 classes with 50.0%, 50.0% of the results"
     bench.journal.close()
     with RunFolder(bench.path) as folder:
         assert folder.classes == bench.run.classes
-
-
-def test_a_journal_without_classes_continues_with_fingerprints(bench):
-    jobs = bench.given()
-    bench.deliver(A, done(jobs[A][0]))
-    bench.journal.close()
-    before = sqlite3.connect(bench.path / "journal.sqlite")
-    before.executescript(
-        "DROP TABLE verification; DROP TABLE barred; DROP TABLE recalled; "
-        "DROP TABLE batch; DROP TABLE failure; DROP TABLE redraw; DROP TABLE event; "
-        "ALTER TABLE generation DROP COLUMN checksum; ALTER TABLE evaluation DROP COLUMN checksum; "
-        "ALTER TABLE strategy DROP COLUMN checksum; DELETE FROM run WHERE key = 'checksum'; "
-        "ALTER TABLE generation DROP COLUMN failed; "
-        "ALTER TABLE evaluation DROP COLUMN failed; "
-        "ALTER TABLE result DROP COLUMN measures; ALTER TABLE candidate DROP COLUMN measures; "
-        "ALTER TABLE result DROP COLUMN host_class; DELETE FROM run WHERE key = 'host_class'; PRAGMA user_version = 2"
-    )
-    before.close()
-    with RunFolder(bench.path) as folder:
-        assert bench.stored() == {class_from_fingerprint("here")}
-        assert folder.classes.description == "one class (by fingerprint): all results are bit-identical"
-    bench.journal = Journal(bench.path / "journal.sqlite")
-    bench.begin()
-    assert bench.run.admission.host_class == class_from_fingerprint("here")
-    assert "classes differ" in bench.hello(B)[0]
-    bench.deliver(A, done(bench.given()[A][0]))
-    assert bench.run.generation.done == 2
-    assert bench.stored() == {class_from_fingerprint("here")}
-
-
-def test_an_old_journal_with_the_class_of_a_hello_has_no_class_again(bench):
-    bench.journal.set_fact("fingerprint", "a host that never scored")
-    bench.journal.commit()
-    bench.restart()
-    assert bench.run.admission.host_class is None
 
 
 @pytest.mark.slow

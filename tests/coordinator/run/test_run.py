@@ -216,14 +216,6 @@ def test_a_run_whose_population_is_one_point_ends_with_that_reason(tmp_path, ran
         assert bench.run.state.ended.kind is StopKind.ONE_POINT
     with RunFolder(bench.path) as stored:
         assert stored.stop_kind is StopKind.ONE_POINT
-    bench.journal.drop_fact(STOP_KIND)  # as an older version leaves it
-    bench.journal.commit()
-    bench.restart()
-    assert bench.run.state.ended
-    assert bench.run.state.ended.kind is None
-    with RunFolder(bench.path) as stored:
-        assert stored.ended
-        assert stored.stop_kind is None
 
 
 def test_parted_compares_the_same_scores_before_and_after_a_restart(tmp_path, random_bundle):

@@ -115,7 +115,7 @@ def test_what_the_world_does_not_have_is_refused(bundle, flags, says):
         settings_of(bundle, **flags)
 
 
-def test_an_end_rule_of_the_runs_own_is_another_version_which_older_workers_refuse(bundle):
+def test_an_end_rule_of_the_runs_own_is_another_version(bundle):
     assert bundle.manifest.world.end == DRAWN
     plain, own = settings_of(bundle, task="dream"), settings_of(bundle, task="dream", end="0.250")
     assert (own.task.end, own.task.version, own.task.world_version) == ("0.25", 3 + OWN_END_VERSION, 3)

@@ -222,12 +222,3 @@ def test_it_sends_its_host_class_once_a_child_has_determined_it(stage, cached):
     hand.nonce = SECOND
     hand.appear()
     assert hand.hello().host_class == beat.host_class
-
-
-def test_a_coordinator_without_host_classes_gets_none(stage, cached):
-    hand = stage.hand()
-    hand.classes = False
-    stage.worker()
-    assert hand.ready().host_class is None
-    hand.send(1, hand.job())
-    assert hand.next(ResultBatch).host_class is None

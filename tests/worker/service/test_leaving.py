@@ -19,7 +19,6 @@ from tests.support.stage import drained, wait_for
 def test_with_exit_when_done_it_leaves_when_its_coordinator_says_that_the_run_has_ended(stage, cached):
     hand = stage.hand(tasks.SLOW_TOY)
     _, served = stage.worker(exit_when_done=True)
-    assert hand.hello().leaves_with_run
     hand.beat(lambda beat: beat.capacity > 0)
     hand.send(1, hand.job())
     hand.beat(lambda beat: beat.running)
@@ -109,16 +108,6 @@ def test_it_says_why_it_fails_before_it_can_score(stage):
     assert (said.capacity, said.reason) == (0, str(error))
 
 
-def test_it_sends_an_older_coordinator_no_reason(stage, cached):
-    hand = stage.hand()
-    hand.reasons = False
-    made, served = stage.worker()
-    hand.ready()
-    made.stop()
-    assert hand.beat(lambda beat: beat.capacity == 0).reason == ""
-    assert served.result(DEADLINE) is None
-
-
 def test_stopped_once_it_finishes_running_jobs_and_delivers(stage, cached):
     hand = stage.hand(tasks.SLOW_TOY)
     made, served = stage.worker()
@@ -195,7 +184,6 @@ def test_late_events_of_the_last_runs_slots_do_not_reach_the_next_run(stage, sai
 def test_without_a_flag_it_says_why_its_run_ended_and_waits_for_it(stage, said, cached):
     hand = stage.hand(tasks.SLOW_TOY)
     _, served = stage.worker()
-    assert hand.hello().reads_end
     hand.beat(lambda beat: beat.capacity > 0)
     hand.answer_no_hello()  # as a run that has ended
     hand.send(0, vectors=(), ended=True, why="2 generations")
