@@ -1,7 +1,7 @@
 """Variants of CarRacing: a controller's actions and features, and penalties on time and on leaving the road.
 
 A variant is the task's options. A run's specification names only options that differ from their defaults, so the
-default variant has the same specification as runs from before there were variants.
+default variant has the specification of a run that names none.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from dreamfleet.common.host.packages import package_version
 
-# The packages of CarRacing and its dream, and of older runs, whose tasks do not name theirs.
+# The packages of CarRacing and its dream; a run whose task names no others has these.
 NUMERIC_PACKAGES = ("numpy", "onnxruntime", "gymnasium", "pygame-ce", "box2d", "box2d-py")
 # Instruction sets between which the inference kernels choose at run time.
 CPU_FEATURES = ("sse4_1", "avx", "avx2", "fma", "f16c", "avx512f", "avx512bw", "avx512vl", "avx512_vnni", "avx512_bf16",

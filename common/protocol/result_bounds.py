@@ -47,7 +47,7 @@ def clamp_count(number: int) -> int:
 
 
 def to_finite(value: float | None) -> float:
-    """Convert a stored number to a finite one: older journals hold infinity, and `NULL` for NaN."""
+    """Convert a stored number to a finite one; `NULL`, which SQLite stores for NaN, is 0."""
     if value is None or math.isnan(value):
         return 0.0
     return min(max(value, -sys.float_info.max), sys.float_info.max)

@@ -20,13 +20,13 @@ class StopKind(StrEnum):
 
     @classmethod
     def parse(cls, text: str | None) -> StopKind | None:
-        """The kind that a journal holds; `None` if its version wrote none, or one that this version does not know."""
+        """The kind that a journal holds; `None` if it holds none that this version knows."""
         return next((each for each in cls if each == text), None)
 
 
 @dataclass(frozen=True)
 class StopReason:
-    """Why a run ended; `kind` is `None` if it was something else, or if an older version did not write it."""
+    """Why a run ended; `kind` is `None` if it was something else."""
 
     kind: StopKind | None
     text: str

@@ -31,9 +31,8 @@ class JournalReader:
 
     def __init__(self, path: Path) -> None:
         self._run, self._path = path.parent.name, path
-        self._connections = ThreadConnections(lambda: _connect_read_only(path)[0])
-        connection, self.version = _connect_read_only(path)
-        self._connections.add_own(connection)
+        self._connections = ThreadConnections(lambda: _connect_read_only(path))
+        self._connections.add_own(_connect_read_only(path))
 
     def close(self) -> None:
         """Release the journal, for all threads."""
@@ -106,23 +105,19 @@ class JournalReader:
         return JournalError(f"run {self._run} was closed here: open it again")
 
 
-def class_counts_query(class_column: str = "host_class") -> str:
-    """Count results by host class, which may be empty, and fingerprint."""
-    return f"SELECT {class_column}, fingerprint, count(*) FROM result GROUP BY 1, 2"  # noqa: S608
-
-
-def results_query(class_column: str) -> str:
-    """The results of one kind, generation and candidate, by episode."""
-    return (
-        "SELECT kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, fingerprint, "  # noqa: S608
-        f"{class_column}, hex(digest) FROM result WHERE kind = ? AND generation = ? AND candidate = ? ORDER BY episode"
-    )
+# Numbers of results by host class and fingerprint.
+CLASS_COUNTS_QUERY = "SELECT host_class, fingerprint, count(*) FROM result GROUP BY 1, 2"
+# The results of one kind, generation and candidate, by episode.
+RESULTS_QUERY = (
+    "SELECT kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, fingerprint, host_class, "
+    "hex(digest) FROM result WHERE kind = ? AND generation = ? AND candidate = ? ORDER BY episode"
+)
 
 
 def efforts_query(begun: Sequence[BegunStage]) -> str:
     """Sum steps and time by kind, generation, and whether results confirm the report or were driven in reality.
 
-    Columns: kind, generation, confirming, driven, steps, microseconds. Sums are floats: old journals hold huge numbers.
+    Columns: kind, generation, confirming, driven, steps, microseconds. Sums are floats, which cannot overflow.
     """
     whens = " ".join(f"WHEN generation >= {each.since} THEN {each.stage.driven_episodes}" for each in reversed(begun))
     return (
@@ -138,8 +133,8 @@ WORK_QUERY = (
 )
 
 
-def _connect_read_only(path: Path, *, rolled_back: bool = False) -> tuple[sqlite3.Connection, int]:
-    """An open journal and its schema version."""
+def _connect_read_only(path: Path, *, rolled_back: bool = False) -> sqlite3.Connection:
+    """An open journal."""
     # In a read-only folder SQLite cannot create the shared-memory file. It needs none where no write-ahead log is left.
     immutable = "" if os.access(path.parent, os.W_OK) or _has_log(path) else "&immutable=1"
     try:
@@ -149,7 +144,8 @@ def _connect_read_only(path: Path, *, rolled_back: bool = False) -> tuple[sqlite
     except (sqlite3.Error, OSError) as error:
         raise JournalError(f"{path} cannot be read: {error}") from error
     try:
-        return connection, schema.check_schema(connection, path)
+        schema.check_schema(connection, path)
+        return connection
     except (sqlite3.Error, UnicodeError) as error:
         connection.close()
         if getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_READONLY_ROLLBACK and not rolled_back:

@@ -75,8 +75,8 @@ def load_controller_of(run: RunFolder) -> Controller:
 
 def _no_controller_yet(run: Path) -> ControllerError:
     return ControllerError(
-        f"run {run.name} has no controller yet: it is written when the first generation closes; an older run's is "
-        f"written when it is resumed: {resume_command(run)}; a run of submitted batches has none"
+        f"run {run.name} has no controller yet: it is written when the first generation closes, and again when "
+        f"the run is resumed: {resume_command(run)}; a run of submitted batches has none"
     )
 
 

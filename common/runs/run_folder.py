@@ -16,21 +16,20 @@ from dreamfleet.common.errors import JournalError
 from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.printable import join_some, plural
 from dreamfleet.common.protocol.check_counts import MAX_BARRED, CheckCounts
-from dreamfleet.common.protocol.host_classes import HostClasses, class_from_fingerprint, count_results
+from dreamfleet.common.protocol.host_classes import HostClasses, count_results
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite
 from dreamfleet.common.protocol.stop_kind import StopKind
-from dreamfleet.common.runs import schema
 from dreamfleet.common.runs.effort import START_EFFORT, Effort, GenerationEffort, parse_start_effort
 from dreamfleet.common.runs.journal.candidate_counts import CandidateCounts
 from dreamfleet.common.runs.journal.journal_check import JournalCheck
 from dreamfleet.common.runs.journal_reader import (
+    CLASS_COUNTS_QUERY,
+    RESULTS_QUERY,
     WORK_QUERY,
     JournalReader,
-    class_counts_query,
     efforts_query,
-    results_query,
 )
 from dreamfleet.common.runs.records import (
     RunSettings,
@@ -59,7 +58,7 @@ CONFIRMED = "confirmed"  # the confirmed score
 ENDED_AT = "ended_at"  # the time when the run ended
 EPISODE_LIMIT = "episode_limit"  # steps after which the environment itself ends an episode
 ENDING = "ending"  # the limit that ended the run; set while the last evaluations still run, and kept
-STOP_KIND = "stop_kind"  # of that limit, a `StopKind`; journals of older versions lack it
+STOP_KIND = "stop_kind"  # of that limit, a `StopKind`
 
 
 def open_run(runs_dir: Path, name: str) -> RunFolder:
@@ -82,9 +81,6 @@ class RunFolder(Displayed):
         self.name = path.name
         self._journal = JournalReader(path / JOURNAL)
         self._check = JournalCheck(self._journal)
-        self._class_column = "host_class" if self._journal.version >= schema.HOST_CLASS_VERSION else "''"
-        self._has_failures = self._journal.version >= schema.FAILURE_VERSION
-        self._failed_column = "failed" if self._has_failures else "0"
 
     def _display(self) -> tuple[str, dict[str, object]]:
         facts: dict[str, object] = {"folder": str(self.path)}
@@ -175,12 +171,12 @@ class RunFolder(Displayed):
 
     @property
     def stop_kind(self) -> StopKind | None:
-        """What ended the run; `None` if it did not end, or if its version did not write it."""
+        """What ended the run; `None` if it did not end."""
         return StopKind.parse(self.fact(STOP_KIND)) if self.ended else None
 
     @property
     def ended_at(self) -> str | None:
-        """When the run ended, ISO 8601, UTC; `None` if it did not, or if its version did not record the time."""
+        """When the run ended, ISO 8601, UTC; `None` if it did not."""
         return self.fact(ENDED_AT) if self.ended else None
 
     @property
@@ -191,16 +187,13 @@ class RunFolder(Displayed):
     @property
     def classes(self) -> HostClasses:
         """The host classes of the accepted results."""
-        return HostClasses.of(count_results(self._journal.rows("ssi", class_counts_query(self._class_column))))
+        return HostClasses.of(count_results(self._journal.rows("ssi", CLASS_COUNTS_QUERY)))
 
     @property
     def checks(self) -> CheckCounts | None:
         """What came of checking results on other hosts; `None` if nothing was checked and nobody is barred."""
-        if self._journal.version < schema.VERIFICATION_VERSION:
-            return None
         counts = dict(self._journal.rows("si", "SELECT outcome, count(*) FROM verification GROUP BY 1"))
-        column = "by_operator" if self._journal.version >= schema.OPERATOR_VERSION else "0"
-        rows = self._journal.rows("si", f"SELECT host, {column} FROM barred ORDER BY happened")  # noqa: S608
+        rows = self._journal.rows("si", "SELECT host, by_operator FROM barred ORDER BY happened")
         barred = rows[-MAX_BARRED:]
         (recalled,) = self._journal.row("SELECT count(*) FROM recalled WHERE because = 'barred'")
         if not (counts or barred or recalled):
@@ -247,8 +240,8 @@ class RunFolder(Displayed):
 
     def results(self, generation: int, number: int, kind: str = "score") -> list[StoredResult]:
         """A candidate's accepted results, by episode; also those of a vector that was discarded and drawn anew."""
-        rows = self._journal.rows("siiiififssss", results_query(self._class_column), kind, generation, number)
-        return [StoredResult(*(*row[:-2], row[-2] or class_from_fingerprint(row[-3]), row[-1])) for row in rows]
+        rows = self._journal.rows("siiiififssss", RESULTS_QUERY, kind, generation, number)
+        return [StoredResult(*row) for row in rows]
 
     def candidates(self) -> list[StoredCandidate]:
         """Every candidate by generation and number."""
@@ -268,8 +261,6 @@ class RunFolder(Displayed):
 
         They are those of the closed generations from `since` on.
         """
-        if self._journal.version < schema.MEASURES_VERSION:
-            return []
         query = (
             "SELECT generation, number, fitness, measures FROM candidate WHERE generation >= ? "
             "AND measures IS NOT NULL AND fitness IS NOT NULL ORDER BY generation, number"
@@ -318,20 +309,20 @@ class RunFolder(Displayed):
     def history(self, since: int = 0) -> list[StoredGeneration]:
         """Every closed generation from number `since` on, oldest first."""
         query = (
-            f"SELECT number, mean, std, best, worst, sigma, steps, seconds, {self._failed_column} FROM generation "  # noqa: S608
+            "SELECT number, mean, std, best, worst, sigma, steps, seconds, failed FROM generation "
             "WHERE closed IS NOT NULL AND number >= ? ORDER BY number"
         )
         found = []
         self._check.check_generations(since)
         rows = self._journal.rows("iFFFFfiFi", query, since)
         for number, mean, std, best, worst, sigma, steps, seconds, failed in rows:
-            fitness = to_finite(mean), to_finite(std), to_finite(best), to_finite(worst)  # not finite in old journals
+            fitness = to_finite(mean), to_finite(std), to_finite(best), to_finite(worst)
             effort = clamp_count(steps), to_finite(seconds)
             found.append(StoredGeneration(number, *fitness, to_finite(sigma), *effort, clamp_count(failed)))
         return found
 
     def unscored_generations(self) -> set[int]:
-        """The closed generations without a mean fitness, which `history` gives as 0: journals had them once."""
+        """The closed generations without a mean fitness, which `history` gives as 0."""
         rows = self._journal.rows("i", "SELECT number FROM generation WHERE closed IS NOT NULL AND mean IS NULL")
         return {number for (number,) in rows}
 
@@ -349,8 +340,7 @@ class RunFolder(Displayed):
     def evaluations(self) -> list[StoredEvaluation]:
         """Every finished evaluation of a mean, oldest first."""
         query = (
-            f"SELECT generation, episodes, mean, std, {self._failed_column} FROM evaluation WHERE mean IS NOT NULL "  # noqa: S608
-            "ORDER BY generation"
+            "SELECT generation, episodes, mean, std, failed FROM evaluation WHERE mean IS NOT NULL ORDER BY generation"
         )
         self._check.check_evaluations()
         rows = self._journal.rows("iiFFi", query)
@@ -361,8 +351,6 @@ class RunFolder(Displayed):
 
     def events(self) -> list[StoredEvent]:
         """What happened to the run, oldest first: workers that came and went, pauses, failures, lives."""
-        if self._journal.version < schema.KINDS_VERSION:
-            return []
         query = (
             "SELECT happened, incarnation, substr(text, 1, 1000), substr(what, 1, 100), substr(worker, 1, 100) "
             "FROM event ORDER BY number"
@@ -371,8 +359,6 @@ class RunFolder(Displayed):
 
     def failures(self) -> list[StoredFailure]:
         """Every episode that has no score because it failed everywhere, oldest first."""
-        if self._journal.version < schema.KINDS_VERSION:
-            return []
         query = (
             "SELECT kind, generation, candidate, episode, seed, substr(error, 1, 1000), substr(cause, 1, 1000), "
             "substr(fault, 1, 10), substr(workers, 1, 1000), attempts, happened, hex(digest) FROM failure "

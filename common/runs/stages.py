@@ -170,11 +170,6 @@ def join_distinct(values: Iterable[str]) -> str:
     return ", then ".join(value for value, _ in groupby(values))
 
 
-def longest_horizon(settings: RunSettings) -> int:
-    """The longest horizon of all stages."""
-    return max(each.horizon for each in stages_of(settings))
-
-
 def latest_usable_evaluation(every: int, generation: int) -> int:
     """The generation of the last evaluation on which the parameters of `generation` may depend; negative: none.
 

@@ -242,8 +242,7 @@ class Generation:
         counting = self._counting
         scored = counting & np.isfinite(self._scores)
         done = scored.sum(axis=1)
-        with np.errstate(over="ignore"):  # of a generation that an older version closed
-            totals = np.where(scored, self._scores, 0.0).sum(axis=1)
+        totals = np.where(scored, self._scores, 0.0).sum(axis=1)
         means = [
             to_finite(total / count) if count else None
             for total, count in zip(totals.tolist(), done.tolist(), strict=True)

@@ -14,7 +14,6 @@ from datetime import UTC, datetime
 from math import nan
 
 from dreamfleet.common.errors import NotWritableNowError
-from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.messages import Job, Result
 from dreamfleet.common.protocol.pause_kind import PauseKind
@@ -23,7 +22,6 @@ from dreamfleet.common.protocol.stop_kind import StopKind, StopReason
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_folder import ENDING, EPISODE_LIMIT, STOP_KIND
 from dreamfleet.common.runs.scoring_params import ScheduleState
-from dreamfleet.common.runs.stages import longest_horizon
 from dreamfleet.common.serialization.times import elapsed_seconds
 from dreamfleet.coordinator.dispatch.failures import JobFailure, host_of, shorten
 from dreamfleet.coordinator.dispatch.fleet import Fleet
@@ -71,8 +69,6 @@ class Run:
         self._notes: list[str] = []  # that are in the journal and not in the log
         self._journal = journal
         self._unpublished: list[StoredGeneration] = []
-        if dropped := journal.drop_excessive(longest_horizon(settings)):
-            self.fleet.note(f"{plural(dropped, 'result')} of an older version too large to count: scored again")
         self.admission = WorkerAdmission(journal, settings, self.fleet, strict=network.strict, anchor_key=anchor_key)
         self.verification = Verification(journal, self.fleet, self.admission, network.verify, self.incarnation)
         reached = self._stored_end_reason()
@@ -504,8 +500,7 @@ class Run:
     def _stored_end_reason(self) -> StopReason | None:
         """The limit that an earlier incarnation reached; `None` if this one has other limits."""
         reason, limits = json.loads(self._journal.fact(ENDING) or "[null, null]")
-        known = None if limits is None else {**asdict(LimitsConfig()), **limits}  # an older version knew fewer
-        if known != asdict(self.limits):
+        if limits != asdict(self.limits):
             return None
         return StopReason(StopKind.parse(self._journal.fact(STOP_KIND)), reason)
 

@@ -7,7 +7,6 @@ when a run is continued is stronger, and is kept from then on.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
 from dataclasses import fields, replace
 from typing import Any
 
@@ -24,8 +23,8 @@ LIMITS, NETWORK = "limits", "network"  # the facts' names
 
 
 def serving_facts(limits: LimitsConfig, network: NetworkConfig) -> dict[str, str]:
-    """The facts to keep, by name. Whether a run is strict is always written: one that does not say so is older."""
-    kept = {LIMITS: _non_defaults(limits), NETWORK: {**_non_defaults(network), "strict": network.strict}}
+    """The facts to keep, by name."""
+    kept = {LIMITS: _non_defaults(limits), NETWORK: _non_defaults(network)}
     return {name: json.dumps(each, allow_nan=False) for name, each in kept.items()}
 
 
@@ -35,12 +34,8 @@ def stored_limits(stored: RunFolder) -> Table:
 
 
 def stored_network(stored: RunFolder) -> Table:
-    """Where a run was last reached, and how it treated its workers.
-
-    Older runs did not store `strict`: they were strict unless they had stored `mixed`.
-    """
-    kept = _read(stored, NETWORK, NetworkConfig, removed=("mixed",))
-    return {"strict": not kept.pop("mixed", False), **kept}
+    """Where a run was last reached, and how it treated its workers."""
+    return _read(stored, NETWORK, NetworkConfig)
 
 
 def choose_addresses(
@@ -60,12 +55,10 @@ def choose_addresses(
     return replace(own, listen=listen or (() if connect else (default,)), connect=connect)
 
 
-def _read(stored: RunFolder, name: str, section: type[Any], removed: Iterable[str] = ()) -> dict[str, Any]:
-    """The values of a section that the run stored; those of settings `removed` since then are not checked."""
+def _read(stored: RunFolder, name: str, section: type[Any]) -> Table:
+    """The values of a section that the run stored."""
     try:
-        table = json.loads(stored.fact(name) or "{}")
-        old = {key: table.pop(key) for key in removed if key in table}
-        return old | read_table(section, f"the {name} kept with run {stored.name}", table)
+        return read_table(section, f"the {name} kept with run {stored.name}", json.loads(stored.fact(name) or "{}"))
     except (ValueError, AttributeError) as error:
         raise JournalError(f"the {name} kept with run {stored.name} are damaged: {error}") from error
     except UsageError as error:

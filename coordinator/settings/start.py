@@ -146,10 +146,7 @@ def latest_mean_and_sigma(stored: RunFolder) -> tuple[NDArray[np.float64], float
 
 
 def stored_start_mean(journal: Journal) -> NDArray[np.float64] | None:
-    """The mean `(size,)` that the journal says its run begins at; `None`: at zero.
-
-    A journal from before it was kept has a first generation wherever it names a start, and goes on from that.
-    """
+    """The mean `(size,)` that the journal says its run begins at; `None`: at zero."""
     kept = journal.fact(START_MEAN)
     if kept is None:
         return None

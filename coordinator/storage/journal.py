@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from dreamfleet.common.errors import DamagedJournalError, JournalError
 from dreamfleet.common.files.atomic_write import atomic_write, fsync_path, reporting_unwritable_folder
 from dreamfleet.common.protocol.failures import Failure
-from dreamfleet.common.protocol.host_classes import HostClasses, class_from_fingerprint, count_results
+from dreamfleet.common.protocol.host_classes import HostClasses, count_results
 from dreamfleet.common.protocol.messages import Job, Kind, Result
-from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS, LONGEST_EPISODE, max_steps, to_finite
+from dreamfleet.common.protocol.result_bounds import to_finite
 from dreamfleet.common.runs import schema
 from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.journal.checksums import RECORD, REST, record_checksum, state_checksum
-from dreamfleet.common.runs.journal_reader import class_counts_query, efforts_query
+from dreamfleet.common.runs.journal_reader import CLASS_COUNTS_QUERY, efforts_query
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_folder import ENDED_AT, RunFolder
 from dreamfleet.common.runs.run_paths import BUNDLE, JOURNAL
@@ -97,7 +97,7 @@ class Journal(RecallRecords):
                     shutil.copyfileobj(source, copy)
             aside.touch(mode=0o600)  # its log has the same mode
             with journal_errors(path), closing(sqlite3.connect(aside)) as connection:
-                schema.migrate(connection, 0)
+                schema.create_tables(connection)
                 connection.executemany("INSERT INTO run (key, value) VALUES (?, ?)", own.items())
                 connection.commit()
             aside.replace(path)
@@ -124,26 +124,19 @@ class Journal(RecallRecords):
             )
 
     def fingerprint(self) -> str | None:
-        """The fingerprint of the host of the first accepted result; `None` before it.
-
-        Older journals store their first worker's instead, which means nothing without a result.
-        """
+        """The fingerprint of the host of the first accepted result; `None` before it."""
         scored = self._read_row("SELECT 1 FROM result LIMIT 1") is not None
         return self.fact(FINGERPRINT) if scored else None
 
     def host_class(self) -> str | None:
-        """The class of the host of the first accepted result; `None` before it.
-
-        Older journals do not store classes; there it follows from the fingerprint.
-        """
-        fingerprint = self.fingerprint()
-        return None if fingerprint is None else self.fact(HOST_CLASS) or class_from_fingerprint(fingerprint)
+        """The class of the host of the first accepted result; `None` before it."""
+        return None if self.fingerprint() is None else self.fact(HOST_CLASS)
 
     @property
     def classes(self) -> HostClasses:
         """The host classes of all results: read once, then counted with each."""
         if self._counted is None:
-            self._counted = count_results(self._read(class_counts_query()))
+            self._counted = count_results(self._read(CLASS_COUNTS_QUERY))
         return HostClasses.of(self._counted)
 
     def end(self, why: str) -> None:
@@ -256,9 +249,9 @@ class Journal(RecallRecords):
         self._write("DELETE FROM failure WHERE kind = 'score' AND generation = ?", generation)
 
     def add_result(
-        self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int, host_class: str = ""
+        self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int, host_class: str
     ) -> None:
-        """Write an accepted result; without a class, the class follows from the fingerprint."""
+        """Write an accepted result."""
         self._write(
             "INSERT INTO result (digest, kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, "
             "fingerprint, incarnation, host_class, measures) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -267,7 +260,7 @@ class Journal(RecallRecords):
             json.dumps(result.measures) if result.measures else None,
         )  # fmt: skip
         if self._counted is not None:
-            self._counted[host_class or class_from_fingerprint(fingerprint), fingerprint] += 1
+            self._counted[host_class, fingerprint] += 1
         if self._effort is not None:
             made = self._made.setdefault((job.task, job.kind, bool(job.driven)), [0, 0])
             made[0] += result.steps
@@ -287,20 +280,6 @@ class Journal(RecallRecords):
             (task, kind, driven), made = self._made.popitem()
             self._effort += Effort.of(task, kind, *made, driven=driven)
         return self._effort
-
-    def drop_excessive(self, horizon: int) -> int:
-        """Delete results beyond today's bounds, which older versions accepted; returns how many.
-
-        Results of closed generations have already updated the strategy, and stay.
-        """
-        within = "abs(fitness) <= ? AND steps BETWEEN 0 AND CASE kind WHEN 'evaluate' THEN ? ELSE ? END"
-        still = "kind != 'score' OR generation IN (SELECT number FROM generation WHERE closed IS NULL)"
-        query = f"DELETE FROM result WHERE NOT ({within}) AND ({still}) RETURNING digest"  # noqa: S608
-        bounds = LARGEST_FITNESS, max_steps(LONGEST_EPISODE), max_steps(horizon)
-        dropped = len(self._read(query, *bounds))
-        self._effort = self._counted = None
-        self.commit()
-        return dropped
 
     def schedule_evaluation(self, evaluation: Evaluation) -> None:
         """Write that the mean of a generation is to be evaluated."""

@@ -13,7 +13,6 @@ from dreamfleet.common.files.atomic_write import fsync_path
 from dreamfleet.common.runs import schema
 from dreamfleet.coordinator.storage.journal_file import (
     check_database,
-    check_room,
     copy_database,
     file_stamp,
     journal_errors,
@@ -41,10 +40,7 @@ class JournalConnection:
             self._connection = sqlite3.connect(path, timeout=5)
             try:
                 self._prepare(self._connection)
-                version = schema.check_schema(self._connection, path)
-                if version < schema.PLACED_VERSION:
-                    check_room(path)
-                schema.migrate(self._connection, version)
+                schema.check_schema(self._connection, path)
                 self._connection.execute("PRAGMA journal_mode = WAL")
                 self._connection.execute("PRAGMA synchronous = FULL")
                 self._connection.execute(f"PRAGMA wal_autocheckpoint = {LOG_PAGES}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -47,15 +46,6 @@ def file_stamp(path: Path) -> tuple[int, int] | None:
 def sqlite_side_files(path: Path) -> tuple[Path, ...]:
     """The files that SQLite may write beside a database: write-ahead log, that log's index, rollback journal."""
     return tuple(path.with_name(path.name + end) for end in ("-wal", "-shm", "-journal"))
-
-
-def check_room(path: Path) -> None:
-    """`JournalError` unless the disk has room for a journal that is rewritten: a log of its size, and a copy."""
-    missing = 2 * path.stat().st_size - shutil.disk_usage(path.parent).free
-    if missing > 0:
-        raise JournalError(
-            f"{path} is of an earlier version and is rewritten once: make room for {missing / 1e6:.0f} MB more"
-        )
 
 
 @contextmanager

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from time import time
 from typing import Any, Literal
 
-from dreamfleet.common.protocol.host_classes import class_from_fingerprint
 from dreamfleet.common.protocol.messages import Job, Kind
 from dreamfleet.common.protocol.result_bounds import to_finite
 from dreamfleet.coordinator.jobs.checks import Answer
@@ -91,7 +90,7 @@ class VerificationRecords(BatchRecords):
         """The accepted results of those of a generation's jobs that have one, and no outcome of a check; by digest."""
         if not jobs:
             return {}
-        columns, kind = "digest, worker, host_class, fingerprint, fitness, steps, measures, seconds", jobs[0].kind
+        columns, kind = "digest, worker, host_class, fitness, steps, measures, seconds", jobs[0].kind
         wanted = {job.digest for job in jobs}
         if kind in self._digest_indices:
             rows: Iterable[tuple[Any, ...]] = self._with_digests(kind, columns, [*wanted], UNCHECKED)
@@ -99,11 +98,11 @@ class VerificationRecords(BatchRecords):
             query = f"SELECT {columns} FROM result WHERE kind = ? AND generation = ? {UNCHECKED}"  # noqa: S608
             rows = self._read(query, kind, jobs[0].generation)
         found: dict[bytes, StoredAnswer] = {}
-        for digest, worker, host_class, fingerprint, fitness, steps, measures, seconds in rows:
+        for digest, worker, host_class, fitness, steps, measures, seconds in rows:
             if digest in wanted:
                 measured = tuple(json.loads(measures or "[]"))
                 answer = Answer(worker.partition("/")[0], to_finite(fitness), steps, measured, seconds)
-                found[digest] = StoredAnswer(worker, host_class or class_from_fingerprint(fingerprint), answer)
+                found[digest] = StoredAnswer(worker, host_class, answer)
         return found
 
     def barred(self) -> dict[str, StoredBar]:

@@ -60,7 +60,7 @@ def test_what_is_given_as_a_run_goes_on_is_stronger_and_is_kept(processes, setti
     assert again.finish()[0] == 0
     with open_run(processes.runs, "test") as run:
         assert json.loads(run.fact("limits")) == {"generations": 3, "minutes": 30}
-        assert json.loads(run.fact("network")) == {"listen": [elsewhere], "beat": 0.2, "strict": False}
+        assert json.loads(run.fact("network")) == {"listen": [elsewhere], "beat": 0.2}
     code, out, _ = processes.call("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--json")
     assert code == 0
     assert json.loads(out)["ended"] == "3 generations"

@@ -141,10 +141,6 @@ class MemoryJournal:
         rows = [*self._tables["result"].values(), *(row for _, row in self._tables["recalled"].values() if recalled)]
         return sorted({worker for _, _, worker, _ in rows})
 
-    def drop_excessive(self, horizon: int) -> int:
-        """No older version wrote here."""
-        return 0
-
     def begin_incarnation(self) -> int:
         number = int(self.fact("incarnation") or 0) + 1
         self.set_fact("incarnation", str(number))
@@ -168,7 +164,7 @@ class MemoryJournal:
         self._put("generation", closed.number, {**row, "closed": closed, "fitness": found})
 
     def add_result(
-        self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int, host_class: str = ""
+        self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int, host_class: str
     ) -> None:
         self._witness.counted(job, result)
         self._insert("result", result.digest, (job, result, worker, host_class))

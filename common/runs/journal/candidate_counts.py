@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite
-from dreamfleet.common.runs import schema
 from dreamfleet.common.runs.journal_reader import JournalReader
 from dreamfleet.common.runs.records import RunSettings, StoredCandidate, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.scoring_params import ScheduleState
 
 SOME = 500  # variables of a query
 RESULTS = "SELECT digest, steps, seconds FROM result WHERE kind = 'score' AND generation = ?"
-RECALLED = "SELECT digest, steps, seconds FROM recalled WHERE kind = 'score' AND generation = ? AND {}"
-BY_TIME = "happened > (SELECT closed FROM generation WHERE number = recalled.generation)"  # in older journals
+RECALLED = "SELECT digest, steps, seconds FROM recalled WHERE kind = 'score' AND generation = ? AND was_closed"
 
 
 class CandidateCounts:
@@ -31,8 +29,6 @@ class CandidateCounts:
         self._journal, self._history = journal, history
         self._schedule = ScheduleState(settings)
         self._finished = {each.generation: each for each in evaluations}
-        has_mark = journal.version >= schema.CHECKSUM_VERSION
-        self._was_closed = f"ifnull(was_closed, {BY_TIME})" if has_mark else BY_TIME
         self._shares_results = settings.is_external  # among generations: batches of others repeat jobs
 
     def rows(self, number: int, seeds: Sequence[int], *, is_open: bool) -> Iterator[StoredCandidate]:
@@ -57,14 +53,12 @@ class CandidateCounts:
         What was handed out of a complete batch stays, so its candidates keep what they were scored by.
         """
         results = self._journal.rows("bif", RESULTS, number)
-        if self._shares_results and self._journal.version >= schema.VERIFICATION_VERSION:
-            results = self._journal.rows("bif", RECALLED.format(self._was_closed), number) + results
+        if self._shares_results:
+            results = self._journal.rows("bif", RECALLED, number) + results
         return {digest: (steps, seconds) for digest, steps, seconds in results}
 
     def _failed_jobs(self, number: int) -> set[bytes]:
         """The jobs of an open generation that failed for good."""
-        if self._journal.version < schema.FAILURE_VERSION:
-            return set()
         query = "SELECT digest FROM failure WHERE kind = 'score' AND generation = ?"
         return {digest for (digest,) in self._journal.rows("b", query, number)}
 

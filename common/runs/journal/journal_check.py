@@ -8,7 +8,6 @@ from statistics import fmean
 from typing import Any
 
 from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite
-from dreamfleet.common.runs import schema
 from dreamfleet.common.runs.journal import checksums
 from dreamfleet.common.runs.journal.candidate_counts import CandidateCounts
 from dreamfleet.common.runs.journal_reader import JournalReader
@@ -24,17 +23,16 @@ STRAY = (
 class JournalCheck:
     """Compares what is read from a journal with its checksums; `DamagedJournalError` where it differs.
 
-    What has no checksum, because it is open or of an older version, is not compared.
+    What has no checksum, because it is open, is not compared.
     """
 
     def __init__(self, journal: JournalReader) -> None:
         self._journal = journal
-        self._has_checksums = journal.version >= schema.CHECKSUM_VERSION
         self._is_record_checked = False
 
     def check_record(self) -> None:
         """Compare the run's facts, once."""
-        if self._is_record_checked or not self._has_checksums:
+        if self._is_record_checked:
             return
         facts: list[tuple[str, str]] = self._journal.rows("ss", "SELECT key, value FROM run")
         written = dict(facts).get(checksums.RECORD)
@@ -51,8 +49,6 @@ class JournalCheck:
         return self._check_rows("evaluation", f"{checksums.EVALUATION_ROW} ORDER BY generation")
 
     def _check_rows(self, what: str, query: str, *values: int) -> list[tuple[Any, ...]]:
-        if not self._has_checksums:
-            return []
         rows = self._journal.read(query, *values)
         for row in rows:
             if not checksums.is_row_sound(row):
@@ -62,7 +58,7 @@ class JournalCheck:
     def check_state(self) -> None:
         """Compare the strategy's states."""
         query = "SELECT generation, state, checksum FROM strategy"
-        for number, state, written in self._journal.rows("ibn", query) if self._has_checksums else ():
+        for number, state, written in self._journal.rows("ibn", query):
             if written not in (None, checksums.state_checksum(number, state)):
                 raise self._journal.damage_error(f"the optimiser's state of {number} differs from its checksum")
 
@@ -94,8 +90,6 @@ class JournalCheck:
 
     def _check_ends(self) -> None:
         """Compare what belongs to no generation, and that the last generation has the strategy's state before it."""
-        if not self._has_checksums:
-            return
         sealed = self._journal.fact(checksums.SEALED)
         if sealed is not None and sealed != checksums.sealed_text(self._journal.read):
             raise self._journal.damage_error("generations or evaluations are missing")

@@ -47,9 +47,8 @@ def format_score(score: Mapping[str, Any] | None) -> str:
     if score is None:
         return "not evaluated"
     provisional = "" if score["confirmed"] else ", provisional"
-    error = score["error"] if score["episodes"] > 1 else None  # older ledgers have 0 for one track
     episodes = plural(score["episodes"], score.get("word", "track"))
-    return f"{format_with_error(score['mean'], error)} on {episodes}{provisional}"
+    return f"{format_with_error(score['mean'], score['error'])} on {episodes}{provisional}"
 
 
 def describe_rounds(layout: IterationFolder, ledger: IterationLedger) -> list[dict[str, Any]]:

@@ -6,7 +6,7 @@ import pytest
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.runs.records import RunSettings, StageSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.scoring_params import ScheduleState, scoring_params_at
-from dreamfleet.common.runs.stages import begun_stages, describe_stages, longest_horizon, stages_of
+from dreamfleet.common.runs.stages import begun_stages, describe_stages, stages_of
 from tests.support.samples import SPEC
 
 EVERY = 2
@@ -170,7 +170,6 @@ def test_candidates_are_scored_with_their_stage_and_temperature():
     cooled = evaluated({1: 100.0, 3: 10.0})
     spec = scoring_params_at(6, settings, history(*[10] * 6), cooled).spec
     assert spec == replace(SPEC, horizon=50, patience=0, temperature=1.5)
-    assert longest_horizon(settings) == 1000
 
 
 def test_settings_and_digests_without_a_schedule_are_unchanged():

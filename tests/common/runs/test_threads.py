@@ -144,7 +144,7 @@ def test_pages_that_sqlite_cannot_read_are_damage(folder):
     path = folder / "journal.sqlite"
     whole = path.read_bytes()
     path.write_bytes(whole[:4096] + b"\xff" * (len(whole) - 4096))
-    with RunFolder(folder) as run, pytest.raises(DamagedJournalError):
+    with pytest.raises(DamagedJournalError), RunFolder(folder) as run:
         look(run)
     with pytest.raises(DamagedJournalError), closing(Journal(path)) as journal:
         journal.generation(0)

@@ -28,7 +28,8 @@ def confirm(runs, name, scores):
                 VALIDATION.start + CONFIRMING_OFFSET + number,
                 score,
             )
-            journal.execute("INSERT INTO result VALUES (?, 'evaluate', ?, 0, ?, ?, ?, 10, 0.1, 'w', 'f', 1)", row)
+            query = "INSERT INTO result VALUES (?, 'evaluate', ?, 0, ?, ?, ?, 10, 0.1, 'w', 'f', 1, 'c', NULL)"
+            journal.execute(query, row)
         found = StoredConfirmation(last, len(scores), sum(scores) / len(scores), 1.0, closed)
         journal.execute("INSERT INTO run VALUES (?, ?)", (CONFIRMED, found.to_json()))
         journal.commit()

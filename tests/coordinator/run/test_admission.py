@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from dreamfleet.common.protocol.host_classes import class_from_fingerprint
 from dreamfleet.common.protocol.messages import HelloRequest, Result, ResultBatch
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.coordinator.storage.journal import Journal
 from tests.support.failures import failure
 from tests.support.run_bench import SETTINGS, A, B, Bench
 from tests.support.samples import SPEC

@@ -1,4 +1,4 @@
-"""Extreme numbers fail their job, and never end a run; nor do those in older journals.
+"""Extreme numbers fail their job, and never end a run.
 Tests common/protocol/result_bounds.py."""
 
 import json
@@ -24,8 +24,6 @@ from dreamfleet.common.protocol.result_bounds import (
     to_finite,
 )
 from dreamfleet.common.protocol.stop_kind import StopKind
-from dreamfleet.coordinator.jobs.evaluation import Evaluation
-from dreamfleet.coordinator.jobs.work import vector_bytes
 from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
 from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.service.status import encode_part
@@ -83,20 +81,7 @@ def test_an_extreme_result_fails_its_job_with_the_reason_and_the_run_can_continu
     assert bench.run.state.ended.kind is StopKind.GENERATIONS
 
 
-@pytest.mark.parametrize("numbers", EXTREME.values(), ids=EXTREME)
-def test_excessive_results_of_an_older_coordinator_are_scored_again(bench, numbers):
-    given = [(send.identity, work.job) for send in bench.run.fleet.dispatch(bench.now) for work in send.content.work]
-    for name, job in given:
-        bench.journal.add_result(job, Result(job.digest, *numbers, None, None), name, "f", 1)
-    bench.journal.commit()
-    bench.restart()
-    assert bench.run.generation.done == 0
-    while bench.run.state.ended is None:
-        assert deliver_all(bench, (1.0, 10, 0.1))
-        answers_of(bench)
-
-
-def test_excessive_generations_and_evaluations_of_an_older_coordinator_can_be_encoded(bench):
+def test_generations_and_evaluations_without_finite_numbers_can_be_encoded(bench):
     deliver_all(bench, (1.0, 10, 0.1))
     while len(bench.run.history) < 1:
         deliver_all(bench, (1.0, 10, 0.1))
@@ -116,16 +101,6 @@ def test_excessive_generations_and_evaluations_of_an_older_coordinator_can_be_en
         assert deliver_all(bench, (1.0, 10, 0.1))
     bench.run.leave()
     answers_of(bench)
-
-
-def test_a_pending_excessive_evaluation_of_an_older_coordinator_is_driven_again(bench):
-    evaluation = Evaluation(0, vector_bytes(np.zeros(SETTINGS.controller.size)), 2)
-    for work in evaluation.work(SPEC):
-        bench.journal.add_result(work.job, Result(work.job.digest, 1.7e308, 10, 0.1, None, None), A, "f", 1)
-    bench.journal.schedule_evaluation(evaluation)
-    bench.journal.commit()
-    bench.restart()
-    assert bench.run.background_jobs.evaluations.progress == (0, 2)
 
 
 def test_huge_counts_of_slots_and_steps_can_be_encoded(bench):

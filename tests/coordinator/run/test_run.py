@@ -13,7 +13,7 @@ from dreamfleet.common.protocol.messages import (
 from dreamfleet.common.protocol.pause_kind import PauseKind
 from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.common.runs.records import StoredEvaluation
-from dreamfleet.common.runs.run_folder import STOP_KIND, RunFolder
+from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from tests.support.failures import failure

@@ -44,17 +44,8 @@ def test_limits_and_network_come_back_as_they_were(folder):
         assert NetworkConfig(**stored_network(run)) == network
 
 
-@pytest.mark.parametrize(("kept", "strict"), [("{}", True), ('{"mixed": true}', False), ('{"strict": false}', False)])
-def test_an_older_run_without_strict_resumes_strict_unless_it_stored_mixed(folder, kept, strict):
-    with RunFolder(folder) as run:
-        assert (stored_limits(run), stored_network(run)) == ({}, {"strict": True})
-    keep(folder, {"network": kept})
-    with RunFolder(folder) as run:
-        assert stored_network(run) == {"strict": strict}
-
-
-def test_defaults_are_not_written_but_whether_a_run_is_strict():
-    assert serving_facts(LimitsConfig(), NetworkConfig()) == {"limits": "{}", "network": '{"strict": false}'}
+def test_defaults_are_not_written():
+    assert serving_facts(LimitsConfig(), NetworkConfig()) == {"limits": "{}", "network": "{}"}
 
 
 @pytest.mark.parametrize("text", ["not JSON", "[]", '{"minutes": "many"}', json.dumps({"patience": 3})])

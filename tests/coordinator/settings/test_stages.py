@@ -224,8 +224,7 @@ def test_a_result_is_bounded_by_the_horizon_of_its_own_stage(staged):
     bench.fetch()
     job = bench.given[bench.first("score")]
     bench.answer(Result(job.digest, 1.0, 1500 * 1024, 0.1, None, None))
-    bench.restart()
-    assert bench.run.generation.done == 1, "no older version took it in"
+    assert bench.run.generation.done == 1
 
 
 def forked(bench, given=frozenset()):

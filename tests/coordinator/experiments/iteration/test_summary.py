@@ -44,7 +44,7 @@ def test_a_round_says_whose_model_it_evolved_in():
 
 
 def test_a_score_of_one_track_has_no_standard_error():
-    single = {**SCORE, "mean": -80.0, "error": 0.0, "episodes": 1, "confirmed": False}
+    single = {**SCORE, "mean": -80.0, "error": None, "episodes": 1, "confirmed": False}
     assert summary.format_score(single) == "-80.0 on 1 track, provisional"
 
 
