@@ -9,7 +9,7 @@ SOURCES := pyproject.toml constraints.txt $(wildcard worker/car_racing/native/*)
 # Every process of every test would compile our modules again where an environment forbids the cache.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-doom test-newest short slow setup check wheel long box2d-py simulate chaos weekend fuzz sanitize bundle worker-size \
+.PHONY: demo test test-doom test-newest short slow setup check long box2d-py simulate chaos weekend fuzz sanitize bundle worker-size \
   stranger reproduce reproduce-evolution lock audit sbom structure words site reference clean
 
 demo: $(VENV)/.demo $(if $(filter takecover,$(WORLD)),$(VENV)/.demo-doom)  ## evolve a controller here (WORLD=takecover: there), judge it, plot it, record it
