@@ -121,7 +121,7 @@ def work(session: zenoh.Session, seconds: float) -> None:
 
 def score(job: Job, seconds: float, inbox: SimpleQueue[bytes]) -> None:
     """A slot: play an episode of `seconds`. Its fitness is minus the squared distance from (1, 1, ...)."""
-    print(f"scores candidate {job.candidate} of generation {job.generation}", flush=True)
+    print(f"scores candidate {job.candidate} of generation {job.generation}\n", end="", flush=True)  # a line as a whole
     time.sleep(seconds)
     inbox.put(msgpack.packb({"scored": {job.digest: -sum((x - 1) ** 2 for x in job.vector)}}))
 
