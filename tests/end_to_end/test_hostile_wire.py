@@ -132,7 +132,7 @@ def test_no_hello_and_no_control_verb_is_too_long_to_be_answered(processes, rand
         processes.worker("--task", tasks.SLOW_TOY)
         coordinator.wait_for("generation 0: mean")
         for strange in ("y" * 2000, "\x1b" * 2000):
-            assert not (reply := hello(session, fingerprint=strange)).accepted
+            assert not (reply := hello(session, fingerprint=strange, host_class="0" * 16)).accepted
             assert "classes differ" in reply.why
         reply = decode_json(ControlReply, say(session, keys.control("test", "z" * 3000)))
         assert not reply.accepted
