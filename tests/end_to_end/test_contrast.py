@@ -25,7 +25,7 @@ def data(tmp_path):
     return write_encoded_drives(tmp_path / "data")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_stopped_contrast_continues_and_compares_the_kinds(processes, data, tmp_path):
     words = ("lab", "contrast", "--data", data, "--out", tmp_path / "out", "--seeds", 1, *SMALL)
     first = processes.start(*words)

@@ -199,7 +199,7 @@ def call(words, capfd):
     return code, capfd.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_verb_imports_what_a_file_names(folder, mark, capfd):
     refused = set()
     with socket.create_server(("127.0.0.1", 0)) as busy:

@@ -105,7 +105,7 @@ def test_hostile_frames_are_dropped_and_counted(processes, run):
         assert len(sights(view, 3)) == 3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_fifty_views_one_of_which_never_looks_leave_the_run_as_it_is(processes, settings, tmp_path):
     plain = processes.coordinator(*settings, "--generations", 1, "--seed", 3, name="plain")
     processes.worker("--task", tasks.PAINTED, "--run", "plain")

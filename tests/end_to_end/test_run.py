@@ -265,7 +265,7 @@ def test_several_runs_on_one_router_never_see_each_other_and_a_worker_serves_the
         assert one.results(0, 0)[0].worker != other.results(0, 0)[0].worker
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_on_a_small_busy_fleet_an_evaluation_is_finished_within_two_generations(processes, random_bundle):
     """Two slots, 32 episodes a generation, and an evaluation of 6 tracks after generation 1."""
     coordinator = processes.coordinator(

@@ -46,7 +46,7 @@ def test_what_once_broke_a_rule_does_so_no_more(schedule):
     assert play(schedule).violation is None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", MUTANTS)
 def test_a_rule_that_is_forgotten_is_missed(name):
     found = MUTANTS[name].find(seed=1, most=300)

@@ -30,7 +30,7 @@ def made():
     return networks, Learner(networks, optimiser, CONFIG, 0), replay
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_choices_become_worth_their_rewards_and_the_best_that_follows(made):
     networks, learner, replay = made
     losses = [learner.learn(replay.sample(RANDOM)) for _ in range(400)]
