@@ -20,8 +20,8 @@ RETRY_PAUSES = (0.01, 0.05)  # seconds; `is_run_locked` holds the lock for an in
 def run_lock(path: Path) -> Iterator[None]:
     """Hold the lock of the run in the folder `path`; `UsageError` while another process holds it.
 
-    Earlier versions lock the lock file alone. The folder is locked too, for somebody may remove that file by hand. The
-    journal is not locked: closing a second descriptor of it would release SQLite's own locks.
+    The folder is locked too, for somebody may remove the lock file by hand. The journal is not locked: closing
+    a second descriptor of it would release SQLite's own locks.
     """
     with ExitStack() as stack:
         with reporting_unwritable_folder(path, "choose another --runs-dir", JournalError):

@@ -82,11 +82,10 @@ def describe_card(contents: CardContents, files: Sequence[str]) -> Iterator[str]
 
 def _describe_known_score(contents: CardContents) -> str:
     """What is known without a report: of a run's controller its confirmation."""
-    command = "`dreamfleet evaluate --out REPORT.json` and `dreamfleet card CONTROLLER REPORT.json` show each score."
     if (known := find_known_score(contents.controller)) is None:
-        return f"Not evaluated. {command}"
+        return "Not evaluated."
     mean, word = format_with_error(known.mean, known.error), score_word(contents.world)
-    return _plain(f"{mean}, the mean of {plural(known.episodes, word)}.") + f" {command}"
+    return _plain(f"{mean} (standard error), the mean of {plural(known.episodes, word)}.")
 
 
 def _metadata(contents: CardContents, files: Sequence[str]) -> Iterator[str]:
