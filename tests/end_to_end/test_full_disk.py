@@ -122,7 +122,7 @@ def test_a_disk_that_fills_while_a_drive_is_written_keeps_every_drive_whole(proc
                 assert len(drive["picture"]) == len(drive["action"])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_on_a_disk_without_inodes_waits_and_goes_on_by_itself(processes, random_bundle, small_disk):
     flags = ("--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 1, "--evaluate-every", 0, "--generations", 12)
     processes.runs = small_disk

@@ -87,16 +87,8 @@ def until(true, process=None):
         Event().wait(0.01)  # it works on this core too
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Bits are promised on equally many threads; and two of a process of updates this small wait for each other."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("OMP_NUM_THREADS", "1")
-        yield
-
-
 @pytest.fixture(scope="module")
-def undisturbed(one_thread, tmp_path_factory):
+def undisturbed(tmp_path_factory):
     """The folder of an iteration that nobody disturbed, and what it answered; read only."""
     with processes_in(tmp_path_factory.mktemp("iterate")) as processes:
         layout = IterationFolder(processes.folder / "data")

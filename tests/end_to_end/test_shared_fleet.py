@@ -90,7 +90,7 @@ def test_two_runs_have_the_bits_of_each_alone_though_a_worker_and_a_slot_are_kil
         assert bits(processes, name) == alone[name]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_paused_run_and_one_whose_coordinator_was_killed_hold_up_no_other(processes, router, settings):
     endless = (*settings, "--generations", 10**6)
     one, two = (run_beside(processes, name, *endless) for name in ("one", "two"))

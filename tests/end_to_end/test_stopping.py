@@ -12,7 +12,7 @@ from tests.support import tasks
 from tests.support.drives import write_drives
 
 
-@pytest.fixture(params=[signal.SIGINT, signal.SIGTERM])
+@pytest.fixture(params=[signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
 def number(request):
     return request.param
 
@@ -40,7 +40,7 @@ def test_training_keeps_all_updates(processes, tmp_path, number):
     assert f"after update {update} of 100000: {tmp_path}/vae.safetensors keeps them; the same command continues" in said
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_training_that_was_killed_goes_on_to_the_same_bits(processes, tmp_path):
     weights = []
     for name, killed in ("whole", False), ("killed", True):

@@ -80,7 +80,9 @@ def query(processes, text):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("set_there", [{LIES: 0.5}, {FLIPS: 16}], ids=["a liar", "bad memory"])
+@pytest.mark.parametrize(
+    "set_there", [{LIES: 0.5}, pytest.param({FLIPS: 16}, marks=pytest.mark.long)], ids=["a liar", "bad memory"]
+)
 def test_a_host_whose_results_differ_is_barred_and_the_run_has_the_bits_of_an_honest_one(
     processes, settings, honest, set_there
 ):
@@ -108,7 +110,7 @@ def test_the_coordinators_own_host_decides_against_a_single_other_one(processes,
     assert outcome(processes, "test") == honest
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_strangers_that_differ_are_held_until_a_third_host_decides(processes, settings, honest, tmp_path):
     elsewhere = {"DREAMFLEET_CACHE": tmp_path / "elsewhere"}
     coordinator = processes.coordinator(*settings, "--verify", 1)
@@ -124,7 +126,7 @@ def test_two_strangers_that_differ_are_held_until_a_third_host_decides(processes
         assert run.checks.barred == ("bad",)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_honest_fleet_is_checked_and_nobody_is_accused(processes, settings, honest):
     coordinator = processes.coordinator(*settings, "--verify", 1)
     gathered(processes, coordinator, own={}, other={})
@@ -136,7 +138,7 @@ def test_an_honest_fleet_is_checked_and_nobody_is_accused(processes, settings, h
     assert (checks.differing, checks.recalled, checks.barred) == (0, 0, ())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_host_alone_in_its_class_is_said_to_be_unchecked_and_the_run_ends(processes, settings, honest):
     coordinator = processes.coordinator(*settings, "--verify", 1)
     worker(processes, "own")
@@ -147,7 +149,7 @@ def test_a_host_alone_in_its_class_is_said_to_be_unchecked_and_the_run_ends(proc
         assert "unchecked for want of another host" in run.checks.description
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("moment", ["before", "after"])
 def test_a_coordinator_that_is_killed_amid_a_recall_goes_on_as_if_it_had_not_been(
     processes, settings, honest, moment, tmp_path

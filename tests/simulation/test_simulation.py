@@ -26,13 +26,13 @@ def assert_no_violation(tally, report):
 
 @pytest.mark.slow
 def test_no_schedule_of_faults_breaks_a_rule():
-    assert_no_violation(*run(schedules=300, seed=1, jobs=1))
+    assert_no_violation(*run(schedules=200, seed=1, jobs=1))
 
 
 @pytest.mark.slow
 def test_no_schedule_breaks_a_rule_where_generations_are_made_in_parts(monkeypatch):
     monkeypatch.setattr(generation, "PART_JOBS", 3)
-    assert_no_violation(*run(schedules=300, seed=2, jobs=1))
+    assert_no_violation(*run(schedules=200, seed=2, jobs=1))
 
 
 @pytest.mark.long

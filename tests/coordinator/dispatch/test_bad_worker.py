@@ -34,7 +34,7 @@ def seconds_of_a_good_one(fast, size):
     return mean_seconds(made("good", FAST[fast]), size=size)
 
 
-@pytest.mark.parametrize("size", [64, 900])
+@pytest.mark.parametrize("size", [pytest.param(64, marks=pytest.mark.long), 900])
 @pytest.mark.parametrize("bad", BAD)
 @pytest.mark.parametrize("fast", FAST)
 def test_a_bad_worker_makes_no_run_slower(fast, bad, size):

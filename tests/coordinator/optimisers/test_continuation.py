@@ -14,7 +14,7 @@ OWN = "tests.support.optimisers:ParentsAndChildren"
 OPTIMISERS = [(name, "diagonal") for name in (*known_optimisers(), OWN)] + [("cma", "full"), ("cma-me", "full")]
 ARCHIVE = ("first=-2:3:10", "second=-2:3:10")
 FILLS_AN_ARCHIVE = ("cma-me", "map-elites")
-SIZES = [(2, 4), (3, 64), (12, 5), (31, 7), pytest.param(50, 16, marks=pytest.mark.slow)]
+SIZES = [(2, 4), (31, 7), *(pytest.param(*each, marks=pytest.mark.long) for each in [(3, 64), (12, 5), (50, 16)])]
 EVERY_OPTIMISER = pytest.mark.parametrize(("optimiser", "covariance"), OPTIMISERS)
 
 
@@ -93,7 +93,9 @@ def test_it_continues_up_to_convergence_and_beyond(optimiser, dimension, populat
 
 
 @pytest.mark.parametrize("optimiser", ["cma", "cmaes-sep", "cma-me", "map-elites", OWN])
-@pytest.mark.parametrize(("dimension", "population"), [(299, 4), (300, 4), (867, 16), (900, 64)])
+@pytest.mark.parametrize(
+    ("dimension", "population"), [(299, 4), (300, 4), (867, 16), pytest.param(900, 64, marks=pytest.mark.long)]
+)
 def test_it_continues_at_the_real_size(optimiser, dimension, population):
     assert_continues(config(optimiser, "diagonal", dimension, population), (0, 1, 5), 8)
 

@@ -24,8 +24,6 @@ def controller(tmp_path_factory):
 def call(tmp_path, capsys, monkeypatch):
     """Run `inspect` with short probes; what it prints."""
     monkeypatch.setattr(probe, "UPDATES", 30)
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"):
-        monkeypatch.setenv(name, "1")
 
     def run(*arguments):
         parser = argparse.ArgumentParser()
