@@ -136,7 +136,7 @@ def test_a_stranger_to_the_fleet_is_refused_with_the_reason(access, endpoint, tm
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("days", [-91, 3])
+@pytest.mark.parametrize("days", [-91, pytest.param(3, marks=pytest.mark.long)])
 def test_a_listener_whose_certificate_is_out_of_its_time_is_a_matter_of_clocks(access, endpoint, tmp_path, days):
     now = datetime.now(UTC) + timedelta(days=days)
     out_of_time = access.authority.issue("coordinator", "other", tmp_path / "other", now=now)

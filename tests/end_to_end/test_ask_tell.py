@@ -203,7 +203,7 @@ def test_a_caller_that_was_killed_goes_on_and_nothing_is_scored_twice(processes,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("victim", ["coordinator", "worker"])
+@pytest.mark.parametrize("victim", ["coordinator", pytest.param("worker", marks=pytest.mark.long)])
 def test_a_batch_outlives_the_kill_of_a_process(processes, random_bundle, victim):
     coordinator = begin(processes, random_bundle, task=tasks.SLOW_TOY)
     worker = processes.worker("--task", tasks.SLOW_TOY)

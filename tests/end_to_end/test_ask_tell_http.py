@@ -23,7 +23,7 @@ from dreamfleet.coordinator.bridge.app import MOST_STREAMS
 from tests.support import tasks
 from tests.support.access import begin as begin_secured
 from tests.support.batches import begin, count_results, resume, vectors
-from tests.support.processes import DEADLINE, free_port
+from tests.support.processes import DEADLINE, ROOT, free_port
 
 TOKEN = "0123456789abcdef0123456789abcdef"
 
@@ -31,8 +31,8 @@ TOKEN = "0123456789abcdef0123456789abcdef"
 class Bridge:
     """A bridge in a process of its own, and requests to it."""
 
-    def __init__(self, processes, *more, token=None):
-        self.process = processes.start("serve", "--connect", processes.endpoint, "--port", 0, *more)
+    def __init__(self, processes, *more, token=None, inside=()):
+        self.process = processes.start("serve", "--connect", processes.endpoint, "--port", 0, *more, inside=inside)
         self.process.wait_for("the bridge is at")
         self.address = "".join(self.process.lines).split("the bridge is at ")[1].split()[0]
         self.port = int(self.address.rpartition(":")[2])
@@ -160,8 +160,21 @@ def test_bad_requests_are_refused_with_a_reason_and_lose_nothing(bridge):
     assert bridge.submit(good)[0] == 201  # none of these took its id
 
 
-@pytest.mark.slow  # a silent connection is kept for a minute
-def test_garbage_and_half_open_connections_hold_nobody_up(bridge):
+IMPATIENT = """
+from dreamfleet.coordinator.bridge import app, server
+from dreamfleet.coordinator.dashboard import server as page
+
+app.BODY_TIMEOUT, page.IDLE_TIMEOUT, server.KEEP_ALIVE, server.BridgeConnection.keep_alive = 3.0, 1.0, 4, 4
+"""  # Python imports it as `sitecustomize` before the verb begins
+
+
+@pytest.mark.slow
+def test_garbage_and_half_open_connections_hold_nobody_up(processes, random_bundle, tmp_path):
+    begin(processes, random_bundle)
+    processes.worker("--task", tasks.TOY)
+    (tmp_path / "sitecustomize.py").write_text(IMPATIENT)
+    bridge = Bridge(processes, inside=("env", f"PYTHONPATH={ROOT}:{tmp_path}"))
+
     def connect(data):
         made = socket.create_connection(("127.0.0.1", bridge.port), timeout=DEADLINE)
         made.sendall(data)

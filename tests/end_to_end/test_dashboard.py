@@ -286,13 +286,16 @@ def test_past_runs_are_searched_sorted_opened_and_compared_by_keyboard(browser, 
         without_absence(page)  # a browser logs each 404
 
 
+@pytest.mark.slow
 def test_an_empty_runs_folder_says_how_a_run_is_started(page):
     page.goto(f"{page.address}#/runs")
     page.wait_for_selector("text=No runs here yet")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("width", "scheme"), [(390, "light"), (390, "dark"), (1280, "dark")])
+@pytest.mark.parametrize(
+    ("width", "scheme"), [(390, "light"), pytest.param(390, "dark", marks=pytest.mark.long), (1280, "dark")]
+)
 def test_it_fits_a_phone_and_follows_the_systems_colours(browser, processes, width, scheme):
     names = tuple(dataclasses.replace(WORKER, worker=f"{'a-rather-long-host-name-' * 2}{n}/0a1b2c3d") for n in range(3))
     with serving(processes.endpoint, dataclasses.replace(snapshot(40), workers=names)), \
@@ -420,6 +423,7 @@ def test_without_its_packages_it_names_the_extra():
     assert command("dashboard")[-1] == "dashboard"
 
 
+@pytest.mark.slow
 def test_it_leaves_at_once_although_pages_are_open(processes):
     with dashboard(processes, "--port", 0) as started:
         stream = urllib.request.urlopen(f"{started.address}live", timeout=DEADLINE)

@@ -12,13 +12,13 @@ from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, write_bundle
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support.bundles import states, write_random_bundle
 
-GENERATIONS, POPULATION, EPISODES = 4, 8, 3
+GENERATIONS, POPULATION, EPISODES = 4, 4, 3
 
 
 def begin(processes, bundle, name, *flags):
     return processes.coordinator(
         "--preset", "dream", "--bundle", bundle.path, "--population", POPULATION, "--episodes", EPISODES,
-        "--horizon", 300, "--generations", GENERATIONS, "--evaluate-every", 2, "--evaluation-episodes", 2,
+        "--horizon", 100, "--generations", GENERATIONS, "--evaluate-every", 2, "--evaluation-episodes", 2,
         "--confirm-episodes", 2, *flags, name=name,
     )  # fmt: skip
 
@@ -156,8 +156,8 @@ def test_a_run_that_dreams_then_mixes_then_drives_gives_the_same_bits_through_ki
     coordinator = staged(processes, random_bundle, "calm")
     coordinator.wait_for("generation 0 is in stage 1 of 3")
     worker = processes.worker("--run", "calm", "--slots", 2)
-    coordinator.wait_for("stage 2 of 3 (60 steps, 8 x 4 episodes, 50% of them driven, a new search with step size 0.2)")
-    coordinator.wait_for("stage 3 of 3 (60 steps, 8 x 2 episodes, all driven, the search continues)")
+    coordinator.wait_for("stage 2 of 3 (60 steps, 4 x 4 episodes, 50% of them driven, a new search with step size 0.2)")
+    coordinator.wait_for("stage 3 of 3 (60 steps, 4 x 2 episodes, all driven, the search continues)")
     assert coordinator.finish()[0] == 0
     worker.end()
     coordinator = staged(processes, random_bundle, "night")

@@ -28,7 +28,7 @@ def outcome(processes, name):
         return calls, [run.candidate(*place).tobytes() for place in places], run.controller_path.read_bytes()[-64:]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_worker_and_three_of_which_one_is_killed_give_the_same_bits(processes):
     alone = coordinator(processes, "alone")
     worker = processes.worker("--run", "alone", "--task", TASK)

@@ -188,6 +188,7 @@ def test_the_failures_of_a_fresh_childs_first_large_group_are_reported_at_once(h
     assert slot.slot.pid == pid
 
 
+@pytest.mark.slow
 def test_the_jobs_of_a_small_group_that_failed_are_tried_one_by_one(harness):
     slot = harness(tasks.EXPLODING)
     slot.wait_ready()
@@ -208,6 +209,7 @@ def test_a_job_that_crashes_its_process_takes_no_other_with_it(harness):
     assert found == {each.digest: each.seeds[0] != rough_tasks.DEADLY for each in jobs}
 
 
+@pytest.mark.slow
 def test_a_group_that_is_sent_again_without_its_unwanted_jobs_can_still_be_abandoned(harness):
     slot = harness(tasks.SLOW_TOY)
     assert slot.score(99).fitness is not None
@@ -225,6 +227,7 @@ def test_a_group_that_is_sent_again_without_its_unwanted_jobs_can_still_be_aband
         assert slot.take() == ()
 
 
+@pytest.mark.slow
 def test_the_episodes_of_a_group_may_begin_one_after_the_other_without_counting_as_hung(harness):
     slot = harness(rough_tasks.SlowToBegin)
     slot.wait_ready()
@@ -275,7 +278,7 @@ def test_a_child_that_cannot_end_is_left_behind(harness, monkeypatch):
     slot.wait_ready()
 
 
-@pytest.mark.parametrize("place", ["reset", "step"])
+@pytest.mark.parametrize("place", [pytest.param("reset", marks=pytest.mark.long), "step"])
 @pytest.mark.parametrize(
     ("error", "text"),
     [
@@ -302,7 +305,7 @@ def test_whatever_an_environment_raises_is_the_jobs_error(harness, monkeypatch, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("place", ["make", "policy"])
+@pytest.mark.parametrize("place", [pytest.param("make", marks=pytest.mark.long), "policy"])
 @pytest.mark.parametrize("error", ["SystemExit", "KeyboardInterrupt", "Mute"])
 def test_whatever_is_raised_as_a_slot_starts_is_one_clear_error(harness, monkeypatch, place, error):
     monkeypatch.setenv(rough_tasks.PLACE, place)

@@ -174,7 +174,8 @@ def made(folder, preset):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name == "tiny" else pytest.mark.slow) for name in SHARES]
+    "name",
+    [pytest.param(each, marks={"tiny": (), "paper": pytest.mark.long}.get(each, pytest.mark.slow)) for each in SHARES],
 )
 def test_a_share_of_a_preset_becomes_a_bundle_of_its_own_layers(name, tmp_path, capsys):
     assert call("--data", tmp_path, "--preset", name, "--scale", SHARES[name], *FEW, "--json") == 0
