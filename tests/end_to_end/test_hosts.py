@@ -31,13 +31,13 @@ def slots(processes):
 @pytest.mark.slow
 def test_a_host_that_is_cut_off_costs_no_bit_and_comes_back(processes, hosts, random_bundle):
     settings = (
-        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", POPULATION, "--episodes", 1,
-        "--generations", GENERATIONS, "--evaluate-every", 0,
+        "--bundle", random_bundle.path, "--population", POPULATION, "--episodes", 1, "--generations", GENERATIONS,
+        "--evaluate-every", 0,
     )  # fmt: skip
     near = [f"tcp/{host.address}:{processes.port}" for host in hosts]
     coordinator = processes.start(
         "coordinator", "--run", "two", "--runs-dir", processes.runs, "--beat", 0.2,
-        "--listen", processes.endpoint, *near, "--insecure", *settings,
+        "--listen", processes.endpoint, *near, "--insecure", *settings, "--task", tasks.SLOW_TOY,
     )  # fmt: skip
     coordinator.wait_for("incarnation")
     for number, host in enumerate(hosts):
@@ -54,8 +54,8 @@ def test_a_host_that_is_cut_off_costs_no_bit_and_comes_back(processes, hosts, ra
     code, _ = coordinator.finish()
     assert code == 0
 
-    alone = processes.coordinator(*settings, name="alone")
-    processes.worker("--run", "alone", "--task", tasks.SLOW_TOY, "--slots", 4)
+    alone = processes.coordinator(*settings, "--task", tasks.TOY, name="alone")
+    processes.worker("--run", "alone", "--task", tasks.TOY)
     code, _ = alone.finish()
     assert code == 0
     assert fitness(processes, "two") == fitness(processes, "alone")

@@ -24,12 +24,12 @@ def candidates(processes, name):
 
 @pytest.mark.slow
 def test_a_run_of_another_optimiser_is_continued_and_forked_to_one_of_ones_own(processes, settings):
-    flags = (*settings, "--task", tasks.SLOW_TOY, "--optimiser", "cmaes-sep", "--generations", 4)
-    whole = processes.coordinator(*flags, name="whole")
-    processes.worker("--task", tasks.SLOW_TOY, "--run", "whole")
+    flags = (*settings, "--optimiser", "cmaes-sep", "--generations", 4)
+    whole = processes.coordinator(*flags, "--task", tasks.TOY, name="whole")
+    processes.worker("--task", tasks.TOY, "--run", "whole")
     assert whole.finish()[0] == 0
 
-    parts = processes.coordinator(*flags, name="parts")
+    parts = processes.coordinator(*flags, "--task", tasks.SLOW_TOY, name="parts")
     processes.worker("--task", tasks.SLOW_TOY, "--run", "parts")
     parts.wait_for("generation 1: mean")
     parts.popen.send_signal(signal.SIGTERM)
@@ -41,7 +41,7 @@ def test_a_run_of_another_optimiser_is_continued_and_forked_to_one_of_ones_own(p
 
     own = ("--optimiser", OWN, "--optimiser-options", "parents=1")
     fork = processes.start("coordinator", "--from", "whole", *own, "--generations", 1, *common)
-    processes.worker("--task", tasks.SLOW_TOY, "--run", "whole-fork")
+    processes.worker("--task", tasks.TOY, "--run", "whole-fork")
     assert fork.finish()[0] == 0
     with open_run(processes.runs, "whole") as one, open_run(processes.runs, "whole-fork") as other:
         before, sigma = latest_mean_and_sigma(one)

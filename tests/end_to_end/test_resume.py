@@ -14,7 +14,7 @@ from tests.support.processes import DEADLINE, environment, free_port
 
 @pytest.fixture
 def settings(random_bundle):
-    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
+    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 1, "--evaluate-every", 0,
             "--task", tasks.SLOW_TOY)  # fmt: skip
 
 
@@ -81,8 +81,8 @@ def test_a_limit_that_has_passed_ends_at_once_and_names_no_controller_that_is_no
 @pytest.mark.slow
 def test_a_run_moves_to_another_place_and_its_worker_follows(processes, settings):
     """The worker is given both addresses; the folder is all that moves."""
-    whole = processes.coordinator(*settings, "--generations", 5, name="whole")
-    with_it = processes.worker("--task", tasks.SLOW_TOY, "--run", "whole")
+    whole = processes.coordinator(*settings[:-1], tasks.TOY, "--generations", 5, name="whole")
+    with_it = processes.worker("--task", tasks.TOY, "--run", "whole")
     assert whole.finish()[0] == 0
     with_it.end()
 
@@ -125,7 +125,7 @@ def test_one_file_serves_coordinator_worker_and_status(processes, random_bundle)
 def test_a_file_that_speaks_of_another_run_does_not_keep_this_one_from_going_on(processes, settings):
     stopped(processes, settings, "--generations", 3)
     path = processes.folder / "fleet.toml"
-    path.write_text("[run]\npopulation = 64\nepisodes = 2\n")
+    path.write_text("[run]\npopulation = 64\nepisodes = 1\n")
     again = processes.start("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--config", path)
     again.wait_for("population is 4 in run test, which keeps it; the settings say 64")
     assert again.finish()[0] == 0

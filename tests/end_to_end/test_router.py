@@ -17,8 +17,8 @@ from tests.support.processes import free_port, processes_in
 
 RECIPES = Path(__file__).parents[2] / "deploy" / "zenoh"
 GENERATIONS, POPULATION = 5, 4
-SETTINGS = ("--task", tasks.SLOW_TOY, "--population", POPULATION, "--episodes", 1, "--generations", GENERATIONS,
-            "--evaluate-every", 0, "--beat", 0.2)  # fmt: skip
+SETTINGS = ("--population", POPULATION, "--episodes", 1, "--generations", GENERATIONS, "--evaluate-every", 0,
+            "--beat", 0.2, "--task")  # fmt: skip
 
 
 @pytest.fixture
@@ -45,8 +45,8 @@ def fitness(processes, name):
 def alone(tmp_path_factory, random_bundle):
     """What the run comes to where nothing stands between."""
     with processes_in(tmp_path_factory.mktemp("alone")) as processes:
-        coordinator = processes.coordinator("--bundle", random_bundle.path, *SETTINGS, name="alone")
-        processes.worker("--run", "alone", "--task", tasks.SLOW_TOY, "--slots", 4)
+        coordinator = processes.coordinator("--bundle", random_bundle.path, *SETTINGS, tasks.TOY, name="alone")
+        processes.worker("--run", "alone", "--task", tasks.TOY)
         assert coordinator.finish()[0] == 0
         return fitness(processes, "alone")
 
@@ -64,7 +64,7 @@ def test_two_linked_routers_one_of_which_is_killed_cost_no_bit(processes, recipe
     router = processes.start("router", "--config", first)
     router.wait_for("listening on")
     coordinator = processes.start("coordinator", "--config", first, "--run", "far", "--runs-dir", processes.runs,
-                                  "--bundle", random_bundle.path, *SETTINGS)  # fmt: skip
+                                  "--bundle", random_bundle.path, *SETTINGS, tasks.SLOW_TOY)  # fmt: skip
     worker = processes.start("worker", "--config", second, "--run", "far", "--task", tasks.SLOW_TOY, "--slots", 1)
     worker.wait_for("joined")
     coordinator.wait_for("generation 1: mean")
@@ -91,7 +91,8 @@ def test_a_coordinator_that_nobody_reaches_meets_workers_of_another_network_at_a
         listen = [f"tcp/{host.address}:{processes.port}" for host in (inside, elsewhere)]
         processes.start("router", "--insecure", "--listen", *listen).wait_for("listening on")
         coordinator = processes.start("coordinator", "--config", near[0], "--run", "nat", "--runs-dir", processes.runs,
-                                      "--bundle", random_bundle.path, *SETTINGS, inside=inside.inside)  # fmt: skip
+                                      "--bundle", random_bundle.path, *SETTINGS, tasks.SLOW_TOY,
+                                      inside=inside.inside)  # fmt: skip
         worker = processes.start("worker", "--config", near[1], "--run", "nat", "--task", tasks.SLOW_TOY, "--slots", 2,
                                  inside=elsewhere.inside)  # fmt: skip
         worker.wait_for("joined")

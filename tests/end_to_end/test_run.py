@@ -61,8 +61,8 @@ def test_the_mean_is_evaluated_on_schedule_and_at_the_end_and_the_target_ends_th
 
 @pytest.mark.slow
 def test_stopped_with_a_signal_and_continued_equals_never_stopped(processes, settings):
-    whole = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 6, name="whole")
-    processes.worker("--task", tasks.SLOW_TOY, "--run", "whole", "--slots", 2)
+    whole = processes.coordinator(*settings, "--task", tasks.TOY, "--generations", 6, name="whole")
+    processes.worker("--task", tasks.TOY, "--run", "whole")
     assert whole.finish()[0] == 0
 
     parts = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 6, name="parts")
@@ -221,11 +221,11 @@ def test_parameters_of_another_world_model_are_no_beginning(processes, settings)
 
 @pytest.mark.slow
 def test_a_race_that_is_stopped_between_its_stages_equals_one_that_is_not(processes, settings):
-    flags = (*settings[:4], "--episodes", 4, "--evaluate-every", 0, "--racing", "--task", tasks.SLOW_TOY)
-    whole = processes.coordinator(*flags, "--generations", 2, name="whole")
-    processes.worker("--task", tasks.SLOW_TOY, "--run", "whole", "--slots", 2)
+    flags = (*settings[:4], "--episodes", 4, "--evaluate-every", 0, "--racing", "--generations", 2)
+    whole = processes.coordinator(*flags, "--task", tasks.TOY, name="whole")
+    processes.worker("--task", tasks.TOY, "--run", "whole")
     assert whole.finish()[0] == 0
-    parts = processes.coordinator(*flags, "--generations", 2, name="parts")
+    parts = processes.coordinator(*flags, "--task", tasks.SLOW_TOY, name="parts")
     processes.worker("--task", tasks.SLOW_TOY, "--run", "parts", "--slots", 2)
     with open_run(processes.runs, "parts") as run:
         while run.result_count() < 9:

@@ -18,7 +18,7 @@ FLAGS = ("--task", tasks.SLOW_TOY)
 @pytest.fixture
 def settings(random_bundle):
     return (
-        "--bundle", random_bundle.path, *FLAGS, "--population", POPULATION, "--episodes", 2, "--evaluate-every", 0,
+        "--bundle", random_bundle.path, "--population", POPULATION, "--episodes", 2, "--evaluate-every", 0,
     )  # fmt: skip
 
 
@@ -74,12 +74,12 @@ def test_two_runs_have_the_bits_of_each_alone_though_a_worker_and_a_slot_are_kil
     settings = (*settings, "--generations", GENERATIONS)
     seeds, alone = {"one": 5, "two": 9}, {}
     for name, seed in seeds.items():
-        coordinator = run_beside(processes, f"{name}-alone", *settings, "--seed", seed)
-        worker = processes.worker(*FLAGS, "--run", f"{name}-alone", "--slots", 2)
+        coordinator = run_beside(processes, f"{name}-alone", *settings, "--seed", seed, "--task", tasks.TOY)
+        worker = processes.worker("--task", tasks.TOY, "--run", f"{name}-alone")
         assert coordinator.finish()[0] == 0
         worker.end()
         alone[name] = bits(processes, f"{name}-alone")
-    shared = {name: run_beside(processes, name, *settings, "--seed", seed) for name, seed in seeds.items()}
+    shared = {name: run_beside(processes, name, *settings, *FLAGS, "--seed", seed) for name, seed in seeds.items()}
     stays, dies = (any_worker(processes, "--name", name) for name in ("stays", "dies"))
     shared["one"].wait_for("generation 0: mean")
     os.kill(children(stays)[0], signal.SIGKILL)
@@ -92,7 +92,7 @@ def test_two_runs_have_the_bits_of_each_alone_though_a_worker_and_a_slot_are_kil
 
 @pytest.mark.long
 def test_a_paused_run_and_one_whose_coordinator_was_killed_hold_up_no_other(processes, router, settings):
-    endless = (*settings, "--generations", 10**6)
+    endless = (*settings, *FLAGS, "--generations", 10**6)
     one, two = (run_beside(processes, name, *endless) for name in ("one", "two"))
     worker = any_worker(processes)
     assert processes.call("pause", "one", "--connect", processes.endpoint)[0] == 0

@@ -9,10 +9,10 @@ import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support.lying_tasks import FLIPS, LIES, WATCHED
-from tests.support.processes import DEADLINE, ROOT
+from tests.support.processes import DEADLINE, ROOT, processes_in
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def settings(random_bundle):
     return ("--bundle", random_bundle.path, "--task", WATCHED, "--population", 8, "--episodes", 2,
             "--evaluate-every", 2, "--evaluation-episodes", 4, "--generations", 5)  # fmt: skip
@@ -64,14 +64,14 @@ def outcome(processes, name):
         return history, run.evaluations(), run.confirmation()
 
 
-@pytest.fixture
-def honest(processes, settings):
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory, settings):
     """What the run comes to on one honest host."""
-    coordinator = processes.coordinator(*settings, name="honest")
-    with_it = worker(processes, "alone")
-    assert coordinator.finish()[0] == 0
-    with_it.end()
-    return outcome(processes, "honest")
+    with processes_in(tmp_path_factory.mktemp("honest")) as processes:
+        coordinator = processes.coordinator(*settings, name="honest")
+        worker(processes, "alone")
+        assert coordinator.finish()[0] == 0
+        return outcome(processes, "honest")
 
 
 def query(processes, text):
