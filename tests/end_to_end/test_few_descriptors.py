@@ -16,7 +16,7 @@ def at_most(files):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("files", [12, 40])
+@pytest.mark.parametrize("files", [pytest.param(12, marks=pytest.mark.long), 40])
 def test_a_worker_without_descriptors_for_its_slots_ends_and_says_so(processes, random_bundle, files):
     processes.coordinator("--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4)
     worker = processes.worker("--task", tasks.SLOW_TOY, "--slots", 8, inside=at_most(files))
@@ -29,8 +29,9 @@ def test_a_worker_without_descriptors_for_its_slots_ends_and_says_so(processes, 
 def test_strangers_cannot_take_a_coordinators_last_descriptor(processes, random_bundle):
     coordinator = processes.start(
         "coordinator", "--run", "test", "--runs-dir", processes.runs, "--listen", processes.endpoint, "--beat", "0.2",
-        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 1,
-        "--evaluation-episodes", 1, "--generations", 4, inside=at_most(120),
+        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 1,
+        "--evaluate-every", 1, "--evaluation-episodes", 1, "--confirm-episodes", 2, "--generations", 4,
+        inside=at_most(120),
     )  # fmt: skip
     coordinator.wait_for("incarnation")
     processes.worker("--task", tasks.SLOW_TOY).wait_for("joined")

@@ -20,7 +20,7 @@ from tests.support.processes import DEADLINE, environment, free_port
 
 @pytest.fixture
 def settings(random_bundle):
-    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
+    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 1, "--evaluate-every", 0,
             "--task", tasks.SLOW_TOY, "--generations", 100_000)  # fmt: skip
 
 
@@ -65,8 +65,14 @@ def goes_on(processes, coordinator, said, name="test"):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("lost", [("journal.sqlite",), ("journal.sqlite-wal",), ("journal.sqlite", "journal.sqlite-wal",
-                                  "journal.sqlite-shm")], ids=["journal", "log", "all"])  # fmt: skip
+@pytest.mark.parametrize(
+    "lost",
+    [
+        ("journal.sqlite",), pytest.param(("journal.sqlite-wal",), marks=pytest.mark.long),
+        ("journal.sqlite", "journal.sqlite-wal", "journal.sqlite-shm"),
+    ],
+    ids=["journal", "log", "all"],
+)  # fmt: skip
 def test_a_journal_that_is_removed_is_rescued_under_its_own_name(processes, live, lost):
     coordinator, folder = live
     for name in lost:

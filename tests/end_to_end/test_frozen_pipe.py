@@ -75,7 +75,7 @@ def test_a_task_that_prints_without_end_scores_although_nobody_reads_it(processe
 
 @pytest.mark.slow
 def test_who_is_not_read_still_hears_that_it_shall_leave(processes, random_bundle, frozen):
-    run = frozen(*coordinator(processes, random_bundle, tasks.SLOW_TOY, 1000))
+    run = frozen(*coordinator(processes, random_bundle, tasks.SLOW_TOY, 1000, "--episodes", 1))
     worker = frozen(*WORKER, tasks.SLOW_TOY, "--connect", processes.endpoint)
     while not (status := processes.status()) or status["generations"] < 1:
         pass

@@ -8,7 +8,7 @@ import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support.environments import ODD
-from tests.support.processes import DEADLINE
+from tests.support.processes import DEADLINE, call_here
 from tests.support.tables import cells
 
 NORMAL = ("--normalise", "--population", 32, "--episodes", 4, "--evaluation-episodes", 16)
@@ -95,7 +95,6 @@ def test_what_can_be_scored_in_is_listed(processes):
     assert "gym:ENVIRONMENT" in processes.call("tasks")[1]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
@@ -109,12 +108,12 @@ def test_what_can_be_scored_in_is_listed(processes):
         (("--normalise",), "without a world model"),
     ],
 )
-def test_settings_that_make_no_run_are_refused(processes, settings, says):
-    code, _, err = processes.call("coordinator", "--run", "bad", "--runs-dir", processes.runs, *settings)
+def test_settings_that_make_no_run_are_refused(tmp_path, settings, says):
+    code, _, err = call_here("coordinator", "--run", "bad", "--runs-dir", tmp_path, *settings)
     assert code in (1, 2)
     assert says in err
     assert "Traceback" not in err
-    assert not (processes.runs / "bad" / "journal.sqlite").exists()
+    assert not (tmp_path / "bad" / "journal.sqlite").exists()
 
 
 @pytest.mark.long

@@ -24,8 +24,8 @@ KEYS = {"result": keys.result, "beat": keys.heartbeat, "upload": keys.upload}
 @pytest.mark.slow
 def test_a_coordinator_drops_and_counts_what_is_malformed_or_foreign(processes, random_bundle):
     coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0,
-        "--generations", 5,
+        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 1,
+        "--evaluate-every", 0, "--generations", 2,
     )  # fmt: skip
     with open_session(Network(connect=(processes.endpoint,))) as session:
         for kind in ("result", "beat", "upload"):
@@ -47,8 +47,8 @@ def test_a_coordinator_drops_and_counts_what_is_malformed_or_foreign(processes, 
 @pytest.mark.slow
 def test_a_worker_drops_what_is_malformed_or_of_another_coordinator(processes, random_bundle):
     coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0,
-        "--generations", 5,
+        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 1,
+        "--evaluate-every", 0, "--generations", 5,
     )  # fmt: skip
     worker = processes.worker("--task", tasks.SLOW_TOY, "--exit-when-done")
     while not (workers := processes.status()["worker_list"]):
@@ -64,7 +64,8 @@ def test_a_worker_drops_what_is_malformed_or_of_another_coordinator(processes, r
 def flood(processes, random_bundle, *counts):
     """Damaged messages at a coordinator that has work; after each flood what it dropped and the bytes that it holds."""
     coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0,
+        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 1,
+        "--evaluate-every", 0,
     )  # fmt: skip
     processes.worker("--task", tasks.SLOW_TOY)
     coordinator.wait_for("generation 1: mean")
@@ -119,8 +120,8 @@ def hello(session, **changes):
 @pytest.mark.slow
 def test_no_hello_and_no_control_verb_is_too_long_to_be_answered(processes, random_bundle):
     coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0,
-        "--generations", 2, "--strict",
+        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 2,
+        "--evaluate-every", 0, "--generations", 2, "--strict",
     )  # fmt: skip
     with open_session(Network(connect=(processes.endpoint,))) as session:
         names = [f"task-{number}-{'x' * 100}" for number in range(80)]
@@ -159,7 +160,8 @@ def test_every_query_is_answered_whatever_it_asks_for(processes, random_bundle):
 @pytest.mark.slow
 def test_large_messages_fill_no_memory_and_the_run_goes_on(processes, random_bundle):
     coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0,
+        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 1,
+        "--evaluate-every", 0,
     )  # fmt: skip
     processes.worker("--task", tasks.SLOW_TOY)
     coordinator.wait_for("generation 0: mean")
@@ -176,7 +178,8 @@ def test_large_messages_fill_no_memory_and_the_run_goes_on(processes, random_bun
 @pytest.mark.slow
 def test_a_flood_of_hellos_leaves_few_guests_and_the_run_goes_on(processes, random_bundle):
     coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--evaluate-every", 0,
+        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 1,
+        "--evaluate-every", 0,
     )  # fmt: skip
     processes.worker("--task", tasks.SLOW_TOY)
     coordinator.wait_for("generation 0: mean")

@@ -22,7 +22,7 @@ def test_a_json_log_is_json_and_says_how_to_start_a_worker(processes, random_bun
     assert record["event"] == "no worker"
     program, *words = shlex.split(record["command"])
     assert program == "dreamfleet"
-    worker = processes.start(*words, "--slots", "1", "--task", tasks.TOY)
+    worker = processes.start(*words, "--slots", "1", "--task", tasks.TOY, "--drain-timeout", 1)
     closed = json.loads(coordinator.wait_for("generation 0: mean"))
     assert (closed["event"], closed["number"], closed["level"]) == ("generation", 0, "info")
     coordinator.popen.kill()
@@ -59,7 +59,7 @@ def test_an_orderly_end_is_not_logged_as_a_loss(processes, random_bundle):
 @pytest.mark.slow
 def test_the_events_of_a_killed_workers_jobs_are_printed_while_the_run_lives(processes, random_bundle):
     coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
+        "--bundle", random_bundle.path, "--population", 4, "--episodes", 1, "--evaluate-every", 0,
         "--task", tasks.SLOW_TOY, "--generations", 100000,
     )  # fmt: skip
     worker = processes.worker("--task", tasks.SLOW_TOY, "--name", "host-a")

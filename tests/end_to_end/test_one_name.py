@@ -16,7 +16,7 @@ from tests.support.relay import Relay
 
 @pytest.fixture
 def settings(random_bundle):
-    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
+    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 1, "--evaluate-every", 0,
             "--task", tasks.SLOW_TOY, "--beat", "0.2")  # fmt: skip
 
 

@@ -56,7 +56,7 @@ def test_a_crash_behind_a_forked_process_pauses_the_run_with_its_reason(processe
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
 def test_two_signals_end_it_and_what_its_environment_left(processes, random_bundle, left, number):
     _, worker = serve(processes, random_bundle, rough_tasks.ForkingAndHanging)
     pidfd = wait_for_one(left)

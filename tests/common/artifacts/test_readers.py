@@ -21,7 +21,7 @@ from dreamfleet.common.files.archives import ArchiveLimits, DamagedArchiveError,
 from tests.support.bundles import npy
 from tests.support.mutations import archives, mutate, packed, reworded
 
-COUNT = 2000
+COUNT = 1000
 LIMITS = ArchiveLimits(1 << 20)
 KINDS = ["<f4", ">f8", "<i8", "|u1", "|b1", "<f2", "<U7"]
 

@@ -6,7 +6,7 @@ from dreamfleet.common.errors import JournalError
 from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
 from tests.support.mutations import Watched, archives
 
-COUNT = 100
+COUNT = 50
 
 
 @pytest.mark.parametrize("covariance", ["diagonal", "full"])

@@ -10,7 +10,7 @@ from dreamfleet.worker.training.data.rollouts import load_rollouts
 from tests.support.drives import write_drive
 from tests.support.mutations import Watched, archives
 
-COUNT = 2000
+COUNT = 1000
 
 
 @pytest.fixture
