@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import MISSING, Field, fields
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
@@ -71,6 +72,7 @@ SECTIONS: Mapping[str, tuple[type | tuple[type, ...], str]] = {
         "`dreamfleet baseline train`, over its preset; each key may be given as `--set KEY=VALUE`.",
     ),
 }
+OFTEN = 8  # words from which on a row that several verbs have stands once, before the verbs
 ALL_VERBS = ("config", "log_level", "log_format", "trust", "help", "help_all")  # names of flags that each verb has
 OF_ONE_VERB = ("dashboard", "serve", "demo", "iterate", "router")  # tables that only the verb of that name reads
 LARGE = 1e9  # a bound from here on only guards the wire
@@ -108,6 +110,9 @@ overrides the variable, and the variable overrides the file. [How to configure a
 example.
 
 - The flag of `evaluate_every` is `--evaluate-every`. A setting that is true or false has `--no-NAME` too.
+- The variable of `population` in the table `[run]` is `DREAMFLEET_RUN_POPULATION`, that of the shared `connect`
+  `DREAMFLEET_CONNECT`.
+- A setting without a default is unset.
 - A variable holds a list as texts between commas. An empty variable counts as unset, but it empties a text or a list.
 - `DREAMFLEET_CONFIG` names the configuration file, and `DREAMFLEET_CACHE` the folder of downloaded world models.
 - With `DREAMFLEET_PICTURES=gymnasium`, gymnasium draws CarRacing's pictures, which takes 15 times as long. Scores are
@@ -121,8 +126,9 @@ VERBS_HEAD = f"""{NOTE}
 `dreamfleet VERB --help` shows a verb's first flags, and `--help-all` all of them.
 [Exit codes](exit-codes.md) says how a verb ends.
 
-A flag in capitals takes a value: `--run RUN`. *Settings* names the tables of [settings](settings.md) whose keys are
-flags of that verb too; they are described there. Each verb also has these:
+A word in capitals stands for a value: `--run RUN`. *Settings* names the tables of [settings](settings.md) whose keys
+are flags of that verb too, or those of their keys that are. *Flags of several verbs* are described below. `--json`,
+where a verb has it beside these, prints the answer as JSON. Each verb also has these:
 
 """
 
@@ -178,12 +184,22 @@ def settings_page() -> str:
 
 def _settings_table(table: str, section: type | tuple[type, ...]) -> Iterator[str]:
     hints = {name: hint for each in _types(section) for name, hint in get_type_hints(each, include_extras=True).items()}
-    prefix = f"DREAMFLEET_{table.upper()}_" if table else "DREAMFLEET_"
-    yield f"Variables begin with `{prefix}`: `{prefix}{next(_settings(section)).name.upper()}`.\n"
+    known = _known_before(table, section)
+    if known:
+        yield f"As above: {', '.join(f'`{each}`' for each in known)}.\n"
     yield "| key | default | values | meaning |\n|---|---|---|---|"
     for each in _settings(section):
+        if each.name in known:
+            continue
         values = ", ".join(filter(None, (_values(hints[each.name]), UNITS.get(f"{table}.{each.name}"))))
         yield f"| `{each.name}` | {_default(each)} | {values} | {_cell(_plain_help(each.metadata['help']))} |"
+
+
+def _known_before(table: str, section: type | tuple[type, ...]) -> list[str]:
+    """The settings of a table whose dataclass an earlier table has, too."""
+    tables = list(SECTIONS)
+    before = {each for one in tables[: tables.index(table)] for each in _types(SECTIONS[one][0])}
+    return [each.name for one in _types(section) if one in before for each in _settings(one)]
 
 
 def verbs_page() -> str:
@@ -191,57 +207,75 @@ def verbs_page() -> str:
     points = {each.name: each for each in entry_points(group=GROUP) if each.value.startswith("dreamfleet.")}
     parsers = {name: build_parser(name, load_verb(point)) for name, point in points.items()}
     common = [each for each in parsers["status"]._actions if each.dest in ALL_VERBS]
-    parts = [VERBS_HEAD + "\n".join(_flags_table(common))]
+    often = _rows_of_several(parsers)
+    parts = [VERBS_HEAD + _flags_table([_row(each) for each in common])]
+    parts += ["\n## Flags of several verbs\n", _flags_table(sorted(often))]
     for heading, names in _groups(points).items():
         parts.append(f"\n## {heading}")
         for name in names:
-            parts += ["", *_verb(name, load_verb(points[name]).SUMMARY, parsers[name])]
+            parts += ["", *_verb(name, load_verb(points[name]).SUMMARY, parsers[name], often)]
     return "\n".join(parts) + "\n"
 
 
-def _verb(name: str, summary: str, parser: argparse.ArgumentParser) -> Iterator[str]:
+def _rows_of_several(parsers: Mapping[str, argparse.ArgumentParser]) -> set[str]:
+    """Of each flag the row of `OFTEN` words or more that most verbs have, two at least."""
+    rows = Counter(
+        _row(each) for name, parser in parsers.items() for each in _own(name, parser)[0] if each.option_strings
+    )
+    several = [row for row, count in rows.most_common() if count > 1 and len(row.replace("|", "").split()) >= OFTEN]
+    return {*{_flag_of(row): row for row in reversed(several)}.values()}
+
+
+def _verb(name: str, summary: str, parser: argparse.ArgumentParser, often: Set[str]) -> Iterator[str]:
     yield f"### {name.replace('.', ' ')}\n"
     yield f"{_sentence(summary)}\n"
-    of_tables: list[str] = []
-    own: list[argparse.Action] = []
+    own, of_tables = _own(name, parser)
+    rows = [_row(each) for each in own]
+    shared = ", ".join(_flag_of(row) for row in rows if row in often)
+    lines = [f"*Settings:* {', '.join(_keys_of(parser, each) for each in of_tables)}." if of_tables else ""]
+    lines += [f"*Flags of several verbs:* {shared}." if shared else ""]
+    lines += ["`--json`." if any(_help(each) == JSON for each in parser._actions) else ""]
+    if any(lines):
+        yield " ".join(filter(None, lines)) + "\n"
+    if rest := [row for row in rows if row not in often]:
+        yield _flags_table(rest)
+
+
+def _own(name: str, parser: argparse.ArgumentParser) -> tuple[list[argparse.Action], list[str]]:
+    """The flags that a verb alone describes, and the tables of settings that it reads."""
     titles = {id(each): group.title or "" for group in parser._action_groups for each in group._group_actions}
-    for each in parser._actions:
-        if each.dest in ALL_VERBS or _help(each) == JSON:
-            continue
-        table = _table_of(name, each, titles.get(id(each), ""))
-        if table is None:
-            own.append(each)
-        elif table not in of_tables:
-            of_tables.append(table)
-    if of_tables:
-        links = ", ".join(f"[{_title(each)}](settings.md#{_anchor(_title(each))})" for each in of_tables)
-        yield f"*Settings:* {links}{_part_of(parser, of_tables)}.\n"
-    if any(_help(each) == JSON for each in parser._actions):
-        yield "`--json` prints the answer as JSON.\n"
-    if own:
-        yield from _flags_table(own)
+    flags = [each for each in parser._actions if each.dest not in ALL_VERBS and _help(each) != JSON]
+    tables = [_table_of(name, each, titles.get(id(each), "")) for each in flags]
+    own = [each for each, table in zip(flags, tables, strict=True) if table is None]
+    return own, [each for each in dict.fromkeys(tables) if each is not None]
 
 
-def _part_of(parser: argparse.ArgumentParser, tables: Sequence[str]) -> str:
-    """Of which keys, where a verb takes a part of these tables: the flags by name."""
-    taken = {each.dest for each in parser._actions}
-    flagged = {
-        each: {one.name for one in _settings(SECTIONS[each][0]) if one.metadata.get("flag", True)} for each in tables
-    }
-    partial = [each for each in tables if flagged[each] - taken]
-    names = [one.name for each in partial for one in _settings(SECTIONS[each][0]) if one.name in taken - {*ALL_VERBS}]
-    flags = ", ".join(f"`--{name.replace('_', '-')}`" for name in dict.fromkeys(names))
-    return (
-        f" ({'of the ' + ' and '.join(map(_title, partial)) + ': ' if len(tables) > len(partial) else ''}{flags})"
-        if flags
-        else ""
-    )
+def _keys_of(parser: argparse.ArgumentParser, table: str) -> str:
+    """A table's link where a verb takes all of its keys, else the flags that it takes of it."""
+    taken = {each.dest for each in parser._actions} - {*ALL_VERBS}
+    flagged = [
+        one.name
+        for one in _settings(SECTIONS[table][0])
+        if one.metadata.get("flag", True) and one.name not in ALL_VERBS
+    ]
+    link = f"[{_title(table).removesuffix(' settings')}](settings.md#{_anchor(_title(table))})"
+    if taken.issuperset(flagged):
+        return link
+    names = [each.replace("_", "-") for each in flagged if each in taken]
+    return f"{link} ({', '.join(f'`--{each}`' for each in names)})"
 
 
-def _flags_table(actions: Sequence[argparse.Action]) -> Iterator[str]:
-    yield "| flag | default | meaning |\n|---|---|---|"
-    for each in actions:
-        yield f"| {_flag(each)} | {_own_default(each)} | {_cell(_plain_help(_help(each)))} |"
+def _flags_table(rows: Sequence[str]) -> str:
+    return "\n".join(("| flag | default | meaning |\n|---|---|---|", *rows))
+
+
+def _row(action: argparse.Action) -> str:
+    return f"| {_flag(action)} | {_own_default(action)} | {_cell(_plain_help(_help(action)))} |"
+
+
+def _flag_of(row: str) -> str:
+    """The first cell of a row, without its value: `--task` of `--task TASK`."""
+    return re.sub(r"(--[\w-]+)[^`]*`.*", r"\1`", row.partition(" | ")[0].removeprefix("| ")).removesuffix(" ...")
 
 
 def _flag(action: argparse.Action) -> str:
@@ -321,7 +355,7 @@ def _default(each: Field[Any]) -> str:
     if found := re.search(r"\(default:? ([^()]*)\)$", each.metadata["help"]):
         return _cell(found[1])
     if each.default in (MISSING, None, (), ""):
-        return "none"
+        return ""
     return f"`{str(each.default).lower() if isinstance(each.default, bool) else each.default}`"
 
 
@@ -337,7 +371,7 @@ def _values(hint: Any) -> str:
         return ", ".join(f"`{each}`" for each in get_args(hint))
     if get_origin(hint) is tuple:
         return "texts" if get_args(hint)[0] is str else "numbers"
-    return {int: "whole number", float: "number", bool: "true, false", str: "text", Path: "path"}[hint]
+    return {int: "integer", float: "number", bool: "boolean", str: "text", Path: "path"}[hint]
 
 
 def _bounds(low: float, high: float) -> str:

@@ -11,7 +11,7 @@ PARTS = ("README.md", "CONTRIBUTING.md", "docs/tutorials/*.md", "docs/how-to/*.m
 PAGES = sorted(path for part in PARTS for path in ROOT.glob(part))
 GROUPS = ("access", "baseline", "lab", "runs", "verify")
 VERBS, SETTINGS = ((ROOT / "docs" / "reference" / name).read_text() for name in ("verbs.md", "settings.md"))
-EVERY, *_ = VERBS.partition("\n## ")  # flags of every verb
+EVERY = "\n".join(re.findall(r"^\| .*", VERBS.partition("\n## ")[0], re.MULTILINE))  # flags of every verb
 FLAGS = dict(re.findall(r"^### (.+?)\n(.*?)(?=^##|\Z)", VERBS, re.MULTILINE | re.DOTALL))
 
 
