@@ -40,15 +40,14 @@ FORMAT = 1
 TO_BUNDLE = "--out world.zip"  # of `import`, for another program's world model
 MANIFEST = "manifest.json"
 ENCODER, DECODER, POLICY, INITIAL_LATENTS_PART = "encoder.onnx", "decoder.onnx", "policy.onnx", "initial_latents.npy"
-DREAM_GRAPH = "dream.onnx"  # one step of the dream; older bundles have none
+DREAM_GRAPH = "dream.onnx"  # one step of the dream
 RECORDED_STATES = "recorded_states.npy"  # states of recorded drives; only in bundles whose dreams may begin there
 # Graphs for controllers of any size; their input holds a controller in each row.
 LINEAR_CONTROLLER, LAYERED_CONTROLLER = "controller-linear.onnx", "controller-hidden.onnx"
 WEIGHTS = "weights.safetensors"  # only in bundles from which training can continue
 EIGHT_BITS = "eight_bits"  # among a manifest's models: the ranges of eight-bit products
 SINGLE_PRECISION = "single_precision"  # in the provenance of a bundle of eight bits: SHA-256 of what was rounded
-REQUIRED = (ENCODER, DECODER, POLICY, INITIAL_LATENTS_PART)  # of a bundle that does not describe its world
-REQUIRED_WITH_WORLD = (ENCODER, DECODER, DREAM_GRAPH, INITIAL_LATENTS_PART)
+REQUIRED = (ENCODER, DECODER, DREAM_GRAPH, INITIAL_LATENTS_PART)  # parts without which it is no bundle
 MAX_BUNDLE = 256 << 20  # bytes, of the file and of its members together; the largest known bundle has 16 MB
 LIMITS = ArchiveLimits(MAX_BUNDLE)
 _MAX_MANIFEST = 1_000_000
@@ -73,11 +72,6 @@ class BundleManifest:
     # The configurations of `vae` and `mdnrnn`; empty in older bundles, which have the paper's.
     models: dict[str, Any] = field(default_factory=dict, metadata=OPTIONAL)
     world: WorldFacts | None = field(default=None, metadata=OPTIONAL)  # `None`: CarRacing, as all bundles once were
-
-    @property
-    def required_parts(self) -> tuple[str, ...]:
-        """Names of the parts without which it is no bundle."""
-        return REQUIRED if self.world is None else REQUIRED_WITH_WORLD
 
 
 class Bundle(Displayed):
@@ -144,7 +138,7 @@ class Bundle(Displayed):
         try:
             with open_archive(io.BytesIO(data), LIMITS) as archive:
                 manifest = _read_manifest(archive, path)
-                for name in {*manifest.required_parts, *manifest.parts}:
+                for name in {*REQUIRED, *manifest.parts}:
                     _check_part(path, manifest, name, _read_part(archive, path, manifest, name))
         except DamagedArchiveError as error:
             if path.suffix in ("", ".zip"):
@@ -198,8 +192,7 @@ class Bundle(Displayed):
     def with_controllers(self, shape: ControllerShape | None, driving: Driving | None = None) -> Bundle:
         """This bundle for controllers of another shape, or that drive otherwise; `None`: linear ones on all features.
 
-        `ControllerError` if they do not fit it; `BundleError` if it is too old for them, or its world has no such
-        options.
+        `ControllerError` if they do not fit it; `BundleError` if its world has no such options.
         """
         try:
             driving = self.driving_of(driving.options if driving else "")
@@ -214,11 +207,6 @@ class Bundle(Displayed):
                 f"a controller of {plural(shape.size, 'parameter')} does not fit {self.path.name}, which needs "
                 f"{fitting.size}, or other inputs: latent {self.manifest.latent}, hidden "
                 f"{self.manifest.hidden}, {fitting.actions} actions"
-            )
-        needed = {DREAM_GRAPH, LINEAR_CONTROLLER, LAYERED_CONTROLLER} if self.manifest.world is None else {DREAM_GRAPH}
-        if not needed <= self.manifest.parts.keys():
-            raise BundleError(
-                f"{self.path.name} is too old for controllers other than linear ones on z and h: build it again"
             )
         return Bundle(self.path, self.sha256, self.manifest, shape, driving)
 

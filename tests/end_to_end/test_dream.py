@@ -3,12 +3,10 @@
 import json
 import os
 import signal
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, write_bundle
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support.bundles import states, write_random_bundle
 
@@ -114,17 +112,6 @@ def test_recorded_states_that_a_bundle_lacks_are_refused_as_the_run_begins(proce
     assert "random.zip holds no recorded states" in err
     assert "Traceback" not in err
     assert not (processes.runs / "run").exists()
-
-
-@pytest.mark.slow
-def test_a_world_model_without_a_dream_is_refused_by_its_worker(processes, random_bundle, tmp_path):
-    parts = {name: random_bundle.read(name) for name in random_bundle.manifest.parts if name != DREAM_GRAPH}
-    old = write_bundle(tmp_path / "old.zip", replace(random_bundle.manifest, parts={}), parts)
-    begin(processes, old, "old")
-    worker = processes.worker("--run", "old")
-    code, _ = worker.finish()
-    assert code == 1
-    assert any("is too old to dream" in line for line in worker.lines)
 
 
 STAGES = """

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, Bundle
+from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.worker.dream.ends import DreamEnds
 from dreamfleet.worker.dream.noise import EpisodeNoise
 from dreamfleet.worker.dream.world import check_temperature
@@ -87,8 +87,3 @@ class DreamContinuation:
             if self._ends.are_reached(dream.done, draw.bar)[0]:
                 return
             yield latent
-
-
-def can_dream(bundle: Bundle) -> bool:
-    """Whether the bundle has the graph of a dream step; bundles of early versions do not."""
-    return DREAM_GRAPH in bundle.manifest.parts

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import Continuous
-from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, Bundle
+from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.world_facts import RewardFacts, WorldFacts
 from dreamfleet.common.errors import BundleError, UsageError
 from dreamfleet.worker.dream.ends import DreamEnds
@@ -41,11 +41,9 @@ class DreamWorld:
         """`recorded` is the share of `StartStates`, `end` a rule in place of the bundle's, as in `EndRule.parse`.
 
         `world` is the bundle's; by default it is looked up where the bundle does not describe it. `BundleError` if the
-        bundle cannot dream, or if the rewards of its dream are unknown.
+        rewards of its dream are unknown.
         """
         check_temperature(temperature)
-        if DREAM_GRAPH not in bundle.manifest.parts:
-            raise BundleError(f"{bundle.path.name} is too old to dream: build it again with `dreamfleet bundle`")
         model: dict[str, Any] = bundle.manifest.models.get("mdnrnn", {})
         self._reward_kind = str(model.get("reward", "none"))
         self._reward_scale = float(model.get("reward_scale", 1.0))  # of a value: what its labels were divided by

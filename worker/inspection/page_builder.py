@@ -17,7 +17,6 @@ from dreamfleet.common.files.regular_files import is_file
 from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.stages import begun_stages, join_distinct
-from dreamfleet.worker.dream.parallel_dream import can_dream
 from dreamfleet.worker.inspection import curve_sections, mdnrnn_sections, vae_sections
 from dreamfleet.worker.inspection.encoded_rollout import DriveConfig, EncodedRollout, record_drive
 from dreamfleet.worker.inspection.page import Page, Section
@@ -193,10 +192,6 @@ def _fitness_section(subject: InspectionSubject) -> Iterator[Section]:
 
 
 def _dream_sections(bundle: Bundle, driven: EncodedRollout, vae_view: VAEView) -> Iterator[Section]:
-    if not can_dream(bundle):
-        text = "This bundle is too old to dream; build it again with `dreamfleet bundle` to see one."
-        yield Section("dream", "A dream beside the drive", text)
-        return
     yield mdnrnn_sections.dream_section(bundle, driven, vae_view)
     if bundle.manifest.models.get("mdnrnn", {}).get("reward", "none") != "none":
         yield mdnrnn_sections.reward_section(bundle, driven)

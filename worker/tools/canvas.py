@@ -37,8 +37,7 @@ class FrameLayout:
         return self.track[0] + (SIDE + 32 if self.column else 2 * MARGIN), self.track[1] + 80
 
 
-AWAKE = FrameLayout((600, 400))  # with two small pictures
-DREAMING = FrameLayout((900, 600))  # with three
+DREAMING = FrameLayout((900, 600))  # with three small pictures
 
 
 def plain_layout(picture: Frame) -> FrameLayout:
@@ -62,7 +61,7 @@ class ModelPictures:
 
     seen: Frame
     decoded: Frame
-    dreamt: DreamPicture | None = None
+    dreamt: DreamPicture
 
 
 @dataclass(frozen=True)
@@ -146,7 +145,7 @@ class Canvas(Board):
     """Draws frames of a recorded drive."""
 
     def __init__(
-        self, seed: int, profile: WorldProfile, layout: FrameLayout = AWAKE, names: tuple[str, ...] = (),
+        self, seed: int, profile: WorldProfile, layout: FrameLayout = DREAMING, names: tuple[str, ...] = (),
         actions: Actions | None = None,
     ) -> None:  # fmt: skip
         super().__init__(layout.size, names, actions)
@@ -177,9 +176,11 @@ class Canvas(Board):
         self._surface.blit(band, (MARGIN, MARGIN))
 
     def _draw_model(self, pictures: ModelPictures) -> None:
-        column = [("what the model sees", pictures.seen), ("what it decodes", pictures.decoded)]
-        if pictures.dreamt is not None:
-            column.append((f"dreaming since step {pictures.dreamt.since}", pictures.dreamt.picture))
+        column = (
+            ("what the model sees", pictures.seen),
+            ("what it decodes", pictures.decoded),
+            (f"dreaming since step {pictures.dreamt.since}", pictures.dreamt.picture),
+        )
         for row, (label, picture) in enumerate(column):
             left, top = self._layout.track[0] + 20, MARGIN + row * (LABEL + SIDE + GAP)
             self._text(label, (left, top), self._small, FAINT)

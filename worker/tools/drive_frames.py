@@ -15,19 +15,17 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.worlds.profile import End
 from dreamfleet.common.worlds.score_words import profile_of
-from dreamfleet.worker.dream.parallel_dream import ParallelDream, ParallelDreamConfig, can_dream
+from dreamfleet.worker.dream.parallel_dream import ParallelDream, ParallelDreamConfig
 from dreamfleet.worker.scoring.agents import Agent
 from dreamfleet.worker.scoring.episode import Transition
 from dreamfleet.worker.scoring.failure_cause import failure_of
 from dreamfleet.worker.tasks.pictures import drawn_pixels
 from dreamfleet.worker.tools.canvas import (
-    AWAKE,
     DREAMING,
     Canvas,
     DreamPicture,
     DriveFrame,
     Frame,
-    FrameLayout,
     ModelPictures,
     plain_layout,
 )
@@ -41,20 +39,16 @@ class WorldModelView:
         self, bundle: Bundle, policy: Any, parameters: NDArray[np.float32], dreaming: ParallelDreamConfig
     ) -> None:
         self._policy, self._decoder = policy, Decoder(bundle)
-        self._parallel_dream = ParallelDream(bundle, parameters, dreaming) if can_dream(bundle) else None
-        self.layout = DREAMING if self._parallel_dream else AWAKE
+        self._parallel_dream = ParallelDream(bundle, parameters, dreaming)
 
     def follow(self, step: int, state: Any) -> None:
         """Dream this step; `state` is the policy's before it acted."""
-        if self._parallel_dream is not None:
-            self._imagined = self._parallel_dream.follow(step, self._policy.latent, state)
+        self._imagined = self._parallel_dream.follow(step, self._policy.latent, state)
 
     def pictures(self, seen: NDArray[np.uint8]) -> ModelPictures:
         """The pictures of the step that was followed last; `seen` is its observation."""
-        decoded, dreamt = self._decoder.decode(self._policy.latent)[0], None
-        if self._parallel_dream is not None:
-            dreamt = DreamPicture(self._decoder.decode(self._imagined)[0], self._parallel_dream.since)
-        return ModelPictures(seen, decoded, dreamt)
+        dreamt = DreamPicture(self._decoder.decode(self._imagined)[0], self._parallel_dream.since)
+        return ModelPictures(seen, self._decoder.decode(self._policy.latent)[0], dreamt)
 
 
 class FilmedPolicy:
@@ -75,10 +69,8 @@ class FilmedPolicy:
         if self._model_view is not None:
             self._model_view.follow(self._step, state)
         if self._step % self._painter.every == 0:
-            pictures, layout = None, None
-            if self._model_view is not None:
-                pictures, layout = self._model_view.pictures(observation), self._model_view.layout
-            self._painter.add(action, self._step, self._score, pictures, layout)
+            pictures = None if self._model_view is None else self._model_view.pictures(observation)
+            self._painter.add(action, self._step, self._score, pictures)
         self._step += 1
         return action
 
@@ -109,16 +101,12 @@ class FramePainter:
         self._canvas: Canvas | None = None
         self._last: DriveFrame | None = None
 
-    def add(
-        self, action: Any, step: int, score: float, pictures: ModelPictures | None, layout: FrameLayout | None
-    ) -> None:
+    def add(self, action: Any, step: int, score: float, pictures: ModelPictures | None) -> None:
         """Draw the frame of a step."""
         picture = self._picture()
         if self._canvas is None:
-            self._canvas = Canvas(
-                self._seed, self._profile, layout or plain_layout(picture), self._world.action_names,
-                self._world.actions,
-            )  # fmt: skip
+            layout = DREAMING if pictures is not None else plain_layout(picture)
+            self._canvas = Canvas(self._seed, self._profile, layout, self._world.action_names, self._world.actions)
         self._last = DriveFrame(picture, np.atleast_1d(np.asarray(action)), step, score, pictures)
         self._on_frame(self._canvas.draw(self._last))
 

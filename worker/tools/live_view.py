@@ -13,7 +13,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.monitoring.live import LiveFrame
 from dreamfleet.common.printable import plural, truncate
 from dreamfleet.common.worlds.score_words import profile_of
-from dreamfleet.worker.dream.parallel_dream import DreamContinuation, can_dream
+from dreamfleet.worker.dream.parallel_dream import DreamContinuation
 from dreamfleet.worker.tasks.api import Actions
 from dreamfleet.worker.tools.canvas import BACKGROUND, FAINT, Board, Frame, pixels
 from dreamfleet.worker.worldmodel.inference import Decoder
@@ -49,7 +49,7 @@ class LiveDreamer:
 
     def __init__(self, bundle: Bundle, temperature: float) -> None:
         self._decoder, self._latent = Decoder(bundle), bundle.manifest.latent
-        self._continuation = DreamContinuation(bundle, temperature) if can_dream(bundle) else None
+        self._continuation = DreamContinuation(bundle, temperature)
 
     def decode_and_dream(self, live: LiveFrame) -> DecodedDream | None:
         """The decoded dream of a frame; `None` if the frame has no latent of this world model."""
@@ -62,7 +62,7 @@ class LiveDreamer:
 
     def _dream(self, live: LiveFrame) -> dict[int, NDArray[np.float32]]:
         """The dreamt latents by steps ahead."""
-        if self._continuation is None or live.latent is None or live.state is None or live.parameters is None:
+        if live.latent is None or live.state is None or live.parameters is None:
             return {}
         moment = live.latent, live.state, live.parameters
         if not self._continuation.fits(*moment):

@@ -9,7 +9,7 @@ from onnx import TensorProto
 
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, ENCODER, Bundle
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.errors import BundleError, UsageError
+from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.worldmodel.choice_memory import ChoiceMemory
 from dreamfleet.worker.worldmodel.export import squash
 from dreamfleet.worker.worldmodel.inference import PolicyStep, open_graph
@@ -23,14 +23,11 @@ def export_driver(bundle: Bundle, controller: Controller) -> bytes:
     """Export one step of a controller on its world model: `picture` and `state` to `action` and `next_state`.
 
     `picture` is (N, side, side, 3) uint8, and `action` (N, actions) what the world takes. `state` (N, state) is zero as
-    an episode begins. `BundleError` for a bundle that is too old; `UsageError` for a world model that sees rewards,
-    which no picture shows.
+    an episode begins. `UsageError` for a world model that sees rewards, which no picture shows.
     """
     own, kind = bundle.for_controller(controller), TensorProto.FLOAT
     if bundle.manifest.models.get("mdnrnn", {}).get("previous_reward"):
         raise UsageError(f"{bundle.path.name} also sees the last reward: pictures alone do not drive it")
-    if DREAM_GRAPH not in bundle.manifest.parts:
-        raise BundleError(f"{bundle.path.name} is too old for one graph with a controller: build it again")
     encoder, memory = (onnx.load_from_string(bundle.read(part)) for part in (ENCODER, DREAM_GRAPH))
     size = next(each for each in memory.graph.input if each.name == "state").type.tensor_type.shape.dim[1].dim_value
     columns = ChoiceMemory(own.driving).columns

@@ -16,12 +16,14 @@ from dreamfleet.common.artifacts.bundle import (
     LINEAR_CONTROLLER,
     MANIFEST,
     POLICY,
+    REQUIRED,
     Bundle,
     hash_file,
     write_bundle,
 )
 from dreamfleet.common.artifacts.bundle_store import BundleStore, describe_bundle, find_bundle, shipped_bundles
 from dreamfleet.common.errors import BundleError
+from dreamfleet.worker.worldmodel.inference import PolicyStep
 from tests.support.bundles import states, write_random_bundle
 
 LARGEST_SHIPPED = 16_000_000
@@ -130,6 +132,28 @@ def test_an_empty_graph_is_refused_with_its_name(random_bundle, tmp_path, name, 
     parts = parts_of(random_bundle)
     with pytest.raises(BundleError, match=rf"b\.zip: {name} is an empty graph; .*build it again"):
         write_bundle(tmp_path / "b.zip", random_bundle.manifest, {**parts, name: change(parts[name])})
+
+
+@pytest.mark.parametrize("name", REQUIRED)
+def test_a_bundle_of_any_world_needs_its_dream_and_both_ends_of_its_vae(random_bundle, tmp_path, name):
+    parts = parts_of(random_bundle)
+    del parts[name]
+    with pytest.raises(BundleError):
+        write_bundle(tmp_path / "less.zip", random_bundle.manifest, parts)
+
+
+def test_without_graphs_of_its_controllers_a_bundle_drives_by_its_dreams_graph(random_bundle, tmp_path):
+    needed = {name: random_bundle.read(name) for name in REQUIRED}
+    bare = write_bundle(tmp_path / "bare.zip", random_bundle.manifest, needed)
+    random = np.random.default_rng(3)
+    parameters = random.normal(0, 0.3, (2, bare.controller_shape.size)).astype(np.float32)
+    pictures = random.integers(0, 256, (2, 64, 64, 3), dtype=np.uint8)
+    whole, split = (
+        step.step(pictures, parameters, step.zero_state(2)).action
+        for step in (PolicyStep(random_bundle), PolicyStep(bare))
+    )
+    np.testing.assert_allclose(split, whole, atol=1e-5)
+    assert bare.with_controllers(bare.shape_of("z", 4)).controller_shape.hidden == 4
 
 
 def test_recorded_states_are_counted(random_bundle, tmp_path):

@@ -38,7 +38,7 @@ def controller(tmp_path):
 @pytest.fixture
 def bundle(tmp_path):
     graph = b"\x3a\x10\x0a\x0e" + b"\x0a\x01x" * 4 + b"\x12\x00"
-    parts = dict.fromkeys(("encoder.onnx", "decoder.onnx", "policy.onnx"), graph)
+    parts = dict.fromkeys(("encoder.onnx", "decoder.onnx", "dream.onnx"), graph)
     parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
     manifest = BundleManifest(
         "small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3, models={"vae": {"a": 1}}

@@ -116,9 +116,3 @@ def test_a_bundle_without_a_description_says_nothing_of_it(random_bundle):
     with zipfile.ZipFile(random_bundle.path) as archive:
         assert b'"world"' not in archive.read(MANIFEST)
     assert random_bundle.manifest.world is None
-    assert POLICY in random_bundle.manifest.required_parts
-    with pytest.raises(BundleError, match="not a whole bundle"):
-        write_bundle(
-            random_bundle.path.with_name("less.zip"), random_bundle.manifest,
-            {name: part for name, part in parts_of(random_bundle).items() if name != POLICY},
-        )  # fmt: skip

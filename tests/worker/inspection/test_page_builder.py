@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, write_bundle
+from dreamfleet.common.artifacts.bundle import write_bundle
 from dreamfleet.common.errors import BundleError, DatasetError, UsageError
 from dreamfleet.worker.inspection import mdnrnn_sections
 from dreamfleet.worker.inspection.encoded_rollout import DriveConfig, record_drive
@@ -98,16 +98,11 @@ def test_a_page_has_every_section_and_needs_nothing_else(attentive, tmp_path):
 
 
 @pytest.mark.slow
-def test_what_a_bundle_cannot_do_is_left_out_or_explained(attentive, tmp_path):
+def test_what_a_bundle_cannot_do_is_left_out(tmp_path):
     rnn = MDNRNNConfig(latent=5, hidden=8, reward="none")
     plain = write_random_bundle(tmp_path / "plain.zip", vae=VAE, rnn=rnn)
     page = write_page(InspectionSubject(plain), tmp_path / "plain", SHORT)
     assert Links(page.read_text()).sections == [*LOOKS, "dream"]
-    parts = {name: attentive.read(name) for name in attentive.manifest.parts if name != DREAM_GRAPH}
-    awake = write_bundle(tmp_path / "awake.zip", attentive.manifest, parts)
-    page = write_page(InspectionSubject(awake), tmp_path / "awake", SHORT)
-    assert Links(page.read_text()).sections == [*LOOKS, "dream"]
-    assert "is too old to dream" in page.read_text()
 
 
 def test_the_table_has_sizes_and_quality(tmp_path, attentive):

@@ -17,7 +17,7 @@ def small_bundle(tmp_path_factory):
     parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
     manifest = BundleManifest("small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3)
     path = tmp_path_factory.mktemp("bundle") / "small.zip"
-    return write_bundle(path, manifest, {**parts, "policy.onnx": bytes((PARTS - 1) * MAX_PART)})
+    return write_bundle(path, manifest, {**parts, "dream.onnx": bytes((PARTS - 1) * MAX_PART)})
 
 
 @pytest.fixture

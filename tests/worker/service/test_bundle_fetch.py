@@ -30,7 +30,7 @@ def bundle(tmp_path_factory):
     parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
     manifest = BundleManifest("small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3)
     content = hashlib.sha256(b"a").digest() * ((PARTS - 1) * MAX_PART // 32)
-    return write_bundle(tmp_path_factory.mktemp("bundle") / "small.zip", manifest, {**parts, "policy.onnx": content})
+    return write_bundle(tmp_path_factory.mktemp("bundle") / "small.zip", manifest, {**parts, "dream.onnx": content})
 
 
 @pytest.fixture(scope="module")

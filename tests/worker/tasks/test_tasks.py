@@ -84,7 +84,7 @@ def test_only_a_missing_module_is_to_be_installed():
 def test_a_bundle_of_another_task_or_of_pictures_that_it_does_not_give_is_refused(
     tmp_path, task, of, preprocessing, shape
 ):
-    parts = dict.fromkeys(("encoder.onnx", "decoder.onnx", "policy.onnx"), b"x")
+    parts = dict.fromkeys(("encoder.onnx", "decoder.onnx", "dream.onnx"), b"x")
     parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
     manifest = BundleManifest("moon", of, preprocessing, shape, latent=4, hidden=4, actions=3)
     bundle, found = write_bundle(tmp_path / "moon.zip", manifest, parts), find_task(task)

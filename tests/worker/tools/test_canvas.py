@@ -6,9 +6,9 @@ import pytest
 from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, Continuous, Discrete, one_hot
 from dreamfleet.common.worlds.score_words import profile_of
 from dreamfleet.worker.tools.canvas import (
-    AWAKE,
     BACKGROUND,
     DREAMING,
+    LABEL,
     MARGIN,
     SIDE,
     Canvas,
@@ -28,32 +28,35 @@ def plain(colour):
     return np.full((64, 64, 3), colour, np.uint8)
 
 
+MODELS = ModelPictures(plain(GREEN), plain(BLUE), DreamPicture(plain(WHITE), 0))
+
+
 def test_a_frame_shows_the_track_the_observation_and_the_decoded_latent():
     green = plain(GREEN)
     green[:, ::2] = 0  # an edge a pixel: enlarging must not blur it
-    frame = Canvas(SEED, WORLD).draw(DriveFrame(plain(RED), ACTION, 7, 12.5, ModelPictures(green, plain(BLUE))))
-    assert frame.shape[1::-1] == AWAKE.size
-    assert (frame[200, 300] == RED).all()
-    assert {tuple(pixel) for pixel in frame[100, 620:812].tolist()} == {GREEN, (0, 0, 0)}
-    assert (frame[400, 700] == BLUE).all()
-    assert not (frame[420:, :240] == BACKGROUND).all(), "score, step and track are written there"
+    frame = Canvas(SEED, WORLD).draw(DriveFrame(plain(RED), ACTION, 7, 12.5, replace(MODELS, seen=green)))
+    width, height = DREAMING.track
+    column = slice(width + 20, width + 20 + SIDE)
+    assert frame.shape[1::-1] == DREAMING.size
+    assert (frame[height // 2, width // 2] == RED).all()
+    assert {tuple(pixel) for pixel in frame[MARGIN + LABEL + SIDE // 2, column].tolist()} == {GREEN, (0, 0, 0)}
+    assert (frame[400, column] == BLUE).all()
+    assert not (frame[height + 20 :, :240] == BACKGROUND).all(), "score, step and track are written there"
 
 
 def test_the_end_stands_on_the_top_of_the_worlds_picture_and_leaves_the_rest():
-    moment = DriveFrame(plain(RED), ACTION, 7, 12.5, ModelPictures(plain(GREEN), plain(BLUE)))
+    moment = DriveFrame(plain(RED), ACTION, 7, 12.5, MODELS)
     before, after = (Canvas(SEED, WORLD).draw(replace(moment, end=end)) for end in ("", "lap finished"))
     rows = np.flatnonzero((before != after).any(axis=(1, 2)))
     columns = np.flatnonzero((before != after).any(axis=(0, 2)))
-    assert MARGIN <= rows[0] <= rows[-1] < MARGIN + AWAKE.track[1] / 6
-    assert MARGIN <= columns[0] <= columns[-1] < MARGIN + AWAKE.track[0]
+    assert MARGIN <= rows[0] <= rows[-1] < MARGIN + DREAMING.track[1] / 6
+    assert MARGIN <= columns[0] <= columns[-1] < MARGIN + DREAMING.track[0]
 
 
 @pytest.mark.parametrize("since", [0, 9900])
 def test_a_dreamt_picture_and_its_label_fit_into_the_frame(since):
-    moment = DriveFrame(
-        plain(RED), ACTION, 7, 12.5, ModelPictures(plain(GREEN), plain(BLUE), DreamPicture(plain(WHITE), since))
-    )
-    frame = Canvas(SEED, WORLD, DREAMING).draw(moment)
+    models = replace(MODELS, dreamt=DreamPicture(plain(WHITE), since))
+    frame = Canvas(SEED, WORLD).draw(DriveFrame(plain(RED), ACTION, 7, 12.5, models))
     assert frame.shape[1::-1] == DREAMING.size
     column = frame[:, DREAMING.track[0] + 20 :][:, :SIDE]
     heights = [int((column == colour).all(axis=(1, 2)).sum()) for colour in (GREEN, BLUE, WHITE)]
@@ -64,10 +67,10 @@ def test_a_dreamt_picture_and_its_label_fit_into_the_frame(since):
 
 def bar(action, actions, names=("push",)):
     """The columns of the first bar that are filled, of its 106."""
-    frame = Canvas(SEED, WORLD, AWAKE, names, actions).draw(
+    frame = Canvas(SEED, WORLD, names=names, actions=actions).draw(
         DriveFrame(plain(RED), np.array(action, np.float32), 0, 0.0)
     )
-    width, height = AWAKE.track
+    width, height = DREAMING.track
     left = width + 16 - len(action) * 122
     row = frame[height + 26 + 22 + 7, left : left + 106]
     return np.flatnonzero((row == (120, 170, 255)).all(axis=1)).tolist()
@@ -103,7 +106,7 @@ def test_the_cars_bars_need_no_names_of_pedals():
 def test_a_choice_is_shown_by_its_name(action, names, actions, name):
     assert choice_name(action, names, actions) == name
     frames = [
-        Canvas(SEED, WORLD, AWAKE, names, actions).draw(DriveFrame(plain(RED), each, 0, 0.0))
+        Canvas(SEED, WORLD, names=names, actions=actions).draw(DriveFrame(plain(RED), each, 0, 0.0))
         for each in (action, action * 0)
     ]
     assert (name is None) or not np.array_equal(*frames)
@@ -112,8 +115,7 @@ def test_a_choice_is_shown_by_its_name(action, names, actions, name):
 @pytest.mark.parametrize(("height", "width"), [(48, 40), (120, 160), (20, 200)])
 def test_a_world_keeps_its_shape_beside_the_small_pictures(height, width):
     picture = np.full((height, width, 3), RED, np.uint8)
-    models = ModelPictures(plain(GREEN), plain(BLUE))
-    for layout, more in ((AWAKE, models), (plain_layout(picture), None)):
+    for layout, more in ((DREAMING, MODELS), (plain_layout(picture), None)):
         red = (Canvas(SEED, WORLD, layout).draw(DriveFrame(picture, ACTION, 0, 0.0, more)) == RED).all(axis=2)
         rows, columns = np.flatnonzero(red.any(axis=1)), np.flatnonzero(red.any(axis=0))
         assert len(columns) / len(rows) == pytest.approx(width / height, rel=0.02)

@@ -1,14 +1,12 @@
 """Tests recording.py and drive_frames.py."""
 
 import json
-from dataclasses import replace
 from functools import partial
 
 import av
 import numpy as np
 import pytest
 
-from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, write_bundle
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host.stop_signals import never_stop
@@ -17,7 +15,7 @@ from dreamfleet.worker.scoring.agents import make_agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task
-from dreamfleet.worker.tools.canvas import AWAKE, DREAMING, Canvas
+from dreamfleet.worker.tools.canvas import DREAMING, Canvas
 from dreamfleet.worker.tools.recording import record, record_in_process
 
 SEED, STEPS = 10_003, 8
@@ -82,17 +80,6 @@ def test_a_controller_that_was_evolved_in_the_dream_is_recorded_in_reality(contr
         record(make_agent(each, random_bundle), SEED, 3, tmp_path / "drive.mp4") for each in (controller, dreamer)
     ]
     assert scores[0] == scores[1]
-
-
-def test_a_bundle_without_a_dream_is_recorded_with_two_pictures(controller, random_bundle, tmp_path):
-    manifest = random_bundle.manifest
-    parts = {name: random_bundle.read(name) for name in manifest.parts if name != DREAM_GRAPH}
-    awake = write_bundle(tmp_path / "awake.zip", replace(manifest, parts={}), parts)
-    own = replace(controller, bundle=awake.sha256)
-    record(make_agent(own, awake), SEED, 2, tmp_path / "drive.mp4")
-    with av.open(str(tmp_path / "drive.mp4")) as container:
-        stream = container.streams.video[0]
-        assert (stream.width, stream.height) == AWAKE.size
 
 
 def test_floats_with_opacity_are_filmed_in_their_colours(tmp_path, monkeypatch):

@@ -7,10 +7,7 @@ import pytest
 import torch
 
 from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
-from dreamfleet.common.artifacts.bundle import DREAM_GRAPH
-from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.controller import act
-from dreamfleet.common.errors import BundleError
 from dreamfleet.worker.worldmodel.inference import DreamStep, PolicyStep
 from dreamfleet.worker.worldmodel.mdnrnn_config import ARTICLE, ATTENTIVE, NOTEBOOK, PAPER, REWARDED, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -133,12 +130,3 @@ def test_reality_remembers_its_reward_in_the_heads_form(tmp_path, kind, scale, l
     policy.write_rewards(state, np.array([3.2, -0.1]))
     assert np.flatnonzero(state.any(axis=0)).tolist() == [2 * config.hidden]
     np.testing.assert_allclose(state[:, 2 * config.hidden], labels, rtol=1e-6)
-
-
-def test_a_bundle_from_before_the_dream_says_so():
-    shipped = find_bundle("tiny")
-    if DREAM_GRAPH not in shipped.manifest.parts:
-        with pytest.raises(BundleError, match=r"holds no dream\.onnx"):
-            DreamStep(shipped)
-        with pytest.raises(BundleError, match="build it again"):
-            shipped.with_controllers(shipped.shape_of("z"))
