@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import MAX_OUTPUTS
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape, import_hint
-from dreamfleet.common.artifacts.driving import Driving, Variant, parse_driving
+from dreamfleet.common.artifacts.driving import Driving, Variant, facts_left_out, parse_driving
 from dreamfleet.common.artifacts.onnx_checks import (
     UnsafeModelError,
     check_model,
@@ -71,7 +71,12 @@ class BundleManifest:
     format: int = FORMAT
     # The configurations of `vae` and `mdnrnn`; empty in older bundles, which have the paper's.
     models: dict[str, Any] = field(default_factory=dict, metadata=OPTIONAL)
-    world: WorldFacts | None = field(default=None, metadata=OPTIONAL)  # `None`: CarRacing, as all bundles once were
+    world: WorldFacts | None = field(default=None, metadata=OPTIONAL)  # CarRacing's bundles leave it out; read `facts`
+
+    @property
+    def facts(self) -> WorldFacts:
+        """The facts of its world; `MalformedError` if they are left out, and the world is not CarRacing."""
+        return self.world or facts_left_out(self.task, self.models.get("mdnrnn", {}).get("reward"))
 
 
 class Bundle(Displayed):
@@ -168,7 +173,7 @@ class Bundle(Displayed):
 
     def driving_of(self, options: str) -> Driving:
         """How controllers drive under a run's options, JSON or empty; `UsageError` for options that do not exist."""
-        return parse_driving(self.manifest.task, self.manifest.world, options)
+        return parse_driving(self.manifest.task, self.manifest.facts, options)
 
     def shape_of(self, features: str, hidden: int = 0, driving: Driving | None = None) -> ControllerShape:
         """The shape of controllers on `features`, with `hidden` units between (0: linear).
@@ -178,9 +183,7 @@ class Bundle(Displayed):
         """
         driving = driving or self.driving_of("")
         width = self.manifest.latent + (self.manifest.hidden if features == "zh" else 0)
-        is_plain = driving.is_default and self.manifest.world is None
-        outputs = self.manifest.actions if is_plain else driving.controls.outputs
-        return ControllerShape(width + driving.extra_features, outputs, hidden)
+        return ControllerShape(width + driving.extra_features, driving.controls.outputs, hidden)
 
     def with_options(self, shape: ControllerShape | None, options: str) -> Bundle:
         """This bundle for controllers of a run with these options, JSON or empty; errors as in `with_controllers`.
@@ -362,7 +365,7 @@ def _read_manifest(archive: Archive, path: Path) -> BundleManifest:
                 raise MalformedError(f"{name} is not a finite number")
         if not all(map(str.isprintable, (manifest.name, manifest.task, manifest.preprocessing))):
             raise MalformedError("a name holds control characters")
-        if manifest.world is not None and manifest.world.actions.actions != manifest.actions:
+        if manifest.facts.actions.actions != manifest.actions:
             raise MalformedError("its world has another number of actions")
     except DamagedArchiveError:
         raise

@@ -1,4 +1,4 @@
-"""Variants of CarRacing: a controller's actions and features, and penalties on time and on leaving the road.
+"""CarRacing's facts, and its variants: a controller's actions and features, penalties on time and on leaving the road.
 
 A variant is the task's options. A run's specification names only options that differ from their defaults, so the
 default variant has the specification of a run that names none.
@@ -19,9 +19,21 @@ from dreamfleet.common.artifacts.actions import (
     Continuous,
 )
 from dreamfleet.common.artifacts.task_options import check_options, read_options, write_options
+from dreamfleet.common.artifacts.world_facts import RewardFacts, WorldFacts
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 
 CAR_RACING = "car-racing"  # the task; its dream has the same options
+FACTS = WorldFacts.of(
+    STEERING_GAS_BRAKE,
+    packages=NUMERIC_PACKAGES,
+    horizon=1000,  # as gymnasium has it
+    frames_per_second=50,
+    reward=RewardFacts("label", gain=3.5, cost=0.1),  # a tile gives 1000 / N, of a track's N tiles: 3.5 on average
+    score_word="track",
+    marks=(800.0, 900.0),
+    action_names=("steer", "gas", "brake"),
+)
 OPTION_HELP = {
     "actions": "continuous, or linear or discrete with pedals=two",
     "pedals": "two, half or one",

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Any, Literal, Protocol
 
 from dreamfleet.common.artifacts.actions import Continuous
-from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, Variant
+from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, FACTS, Variant
 from dreamfleet.common.artifacts.task_options import read_options, write_options
-from dreamfleet.common.artifacts.world_facts import WorldFacts
+from dreamfleet.common.artifacts.world_facts import RewardFacts, WorldFacts
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.serialization.validation import MalformedError
 
 __all__ = [
     "FIRST_WORLD",
     "Driving",
     "Variant",
     "WorldDriving",
+    "facts_left_out",
     "parse_driving",
 ]  # every world's options are among a variant's
 
@@ -27,7 +29,8 @@ OPTION_HELP = {"decide_every": "a whole number from 1 to 50", "feedback": "none 
 class Driving(Protocol):
     """How controllers drive: their actions, how long they hold one, and what they see beside the world model's state.
 
-    >>> driving: Driving = parse_driving("car-racing", None, '{"feedback": "last"}')
+    >>> from dreamfleet.common.artifacts.car_racing_variants import FACTS
+    >>> driving: Driving = parse_driving("car-racing", FACTS, '{"feedback": "last"}')
     >>> driving.controls.outputs, driving.extra_features, driving.option_texts
     (3, 6, ('feedback=last',))
     """
@@ -131,21 +134,29 @@ class WorldDriving:
         return {name: value for name, (value, default) in values.items() if value != default}
 
 
-def parse_driving(task: str, facts: WorldFacts | None, options: str) -> Driving:
+def facts_left_out(task: str, predicted: object) -> WorldFacts:
+    """The facts of CarRacing, whose manifests leave them out; `MalformedError` for another task.
+
+    Its dreams pay what the model has `predicted` if that is the value, or else by the label of a reward.
+    """
+    if task != CAR_RACING:
+        raise MalformedError(f"it does not describe the world of {task}")
+    return replace(FACTS, reward=RewardFacts()) if predicted == "value" else FACTS
+
+
+def parse_driving(task: str, facts: WorldFacts, options: str) -> Driving:
     """How controllers of a world model drive under a run's options, a JSON object or an empty text.
 
-    `task` and `facts` are of the world model's manifest. Without facts its world is CarRacing, or one without options.
-    `UsageError` for options that the world does not have.
+    `task` and `facts` are of the world model's manifest; CarRacing has more options than other worlds. `UsageError` for
+    options that the world does not have.
 
-    >>> parse_driving("car-racing", None, "").controls.outputs
-    3
+    >>> from dreamfleet.common.artifacts.car_racing_variants import FACTS
+    >>> parse_driving("car-racing", FACTS, '{"pedals": "one"}').controls.outputs
+    2
     """
-    if facts is not None:
-        return _parse_options(task, facts, options)
-    variant = Variant.from_json(options)
-    if task != FIRST_WORLD and not variant.is_default:
-        raise UsageError(f"{variant.options} are options of {FIRST_WORLD}")
-    return variant
+    if task == CAR_RACING:
+        return Variant.from_json(options)
+    return _parse_options(task, facts, options)
 
 
 @lru_cache

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING
+from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, FACTS
 from dreamfleet.common.runs.records import StageSettings
 from dreamfleet.common.worlds.profile import DemoPlan, PublishedScore, PublishedScores, ShippedScore, WorldProfile
 
@@ -96,7 +96,7 @@ FRUGAL: dict[str, Any] = {
 }  # fmt: skip
 PROFILE = WorldProfile(
     task=CAR_RACING,
-    score_word="track",
+    score_word=FACTS.score_word,
     score_unit="points",
     end_texts={"finished": "lap finished", "terminated": "left the track", "truncated": "time's up"},
     shipped_scores=(

@@ -6,7 +6,6 @@ from contextlib import suppress
 from pathlib import Path
 
 from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.artifacts.world_facts import WorldFacts
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.worlds.profile import WorldProfile
@@ -22,14 +21,12 @@ def profile_of(task: str) -> WorldProfile:
     return WORLDS.get(task) or WorldProfile(task=task)
 
 
-def score_word(task: str, facts: WorldFacts | None = None) -> str:
-    """What a scored seed is called in the world of `task`, of which its bundle says `facts`, if anything.
+def score_word(task: str) -> str:
+    """What a scored seed is called in the world of `task`, where no bundle describes it.
 
     >>> score_word("car-racing"), score_word("gym:CartPole-v1")
     ('track', 'seed')
     """
-    if facts is not None:
-        return facts.score_word
     return WORLDS[task].score_word if task in WORLDS else WorldProfile.score_word
 
 
@@ -37,6 +34,5 @@ def score_word_of_run(spec: TaskSpec, bundle: Path) -> str:
     """What a scored seed of a run's evaluations is called; `bundle` is the run's copy of its world model, if any."""
     if spec.bundle:
         with suppress(DreamfleetError, OSError):  # it may be gone
-            manifest = Bundle.open(bundle, spec.bundle).manifest
-            return score_word(manifest.task, manifest.world)
+            return Bundle.open(bundle, spec.bundle).manifest.facts.score_word
     return score_word(spec.task)

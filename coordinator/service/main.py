@@ -18,7 +18,6 @@ from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
 from dreamfleet.common.files.file_system import file_system_type, is_network, lock_problem
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.protocol.messages import Intervals
-from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.own_runs import remember_run
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_folder import EPISODE_LIMIT, open_run
@@ -175,8 +174,7 @@ def _check_file_system(folder: Path) -> None:
 
 
 def _score_word(settings: RunSettings, bundle: Bundle | None) -> str:
-    task = settings.task.task
-    return score_word(task) if bundle is None else score_word(bundle.manifest.task, bundle.manifest.world)
+    return score_word(settings.task.task) if bundle is None else bundle.manifest.facts.score_word
 
 
 def _watch_revocations(request: RunRequest, journal: Journal | None) -> RevocationWatcher:
@@ -255,5 +253,4 @@ def _episode_limit(config: RunConfig, bundle: Bundle | None) -> int:
     """Steps after which a scored episode's environment ends it; 0 if it has no limit, none is known, or it dreams."""
     if bundle is None:
         return config.description.steps if config.description else 0
-    world = bundle.manifest.world
-    return world.horizon if world is not None and config.task != DREAM else 0
+    return bundle.manifest.facts.horizon if config.task in (None, bundle.manifest.task) else 0

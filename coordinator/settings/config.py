@@ -23,7 +23,6 @@ from dreamfleet.common.cli.config import option
 from dreamfleet.common.cli.key_values import parse_arguments
 from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.measures import NO_ARCHIVE, check_dreamt, parse_axes
 from dreamfleet.common.protocol.messages import (
@@ -283,8 +282,7 @@ class RunConfig:
         if self.task is not None and is_function_task(self.task) and self.horizon != 1:
             return replace(self, horizon=1).settings(bundle)
         if self.horizon is None:
-            world = None if bundle is None else bundle.manifest.world
-            limit = DEFAULT_HORIZON if world is None else world.horizon
+            limit = DEFAULT_HORIZON if bundle is None else bundle.manifest.facts.horizon
             return replace(self, horizon=min(limit, DEFAULT_HORIZON)).settings(bundle)
         spec, shape, packages = self._resolve_without_bundle() if bundle is None else self._resolve_with_bundle(bundle)
         if names := self.measures:
@@ -340,24 +338,24 @@ class RunConfig:
             )
         if self.recorded:
             bundle.check_recorded()
-        driving, facts = self._driving(bundle), bundle.manifest.world
+        driving, facts = self._driving(bundle), bundle.manifest.facts
         shape = bundle.with_controllers(
             bundle.shape_of(self.features, self._hidden, driving), driving
         ).controller_shape  # fmt: skip
         own_shape = None if shape == bundle.default_shape else shape
-        end, own_end = self.end and EndRule.parse(self.end).text, (facts.end if facts else EndRule()).text
-        end = "" if end == own_end else end  # so that it scores as a run that names none
+        end = self.end and EndRule.parse(self.end).text
+        end = "" if end == facts.end.text else end  # so that it scores as a run that names none
         version = driving.version + (OWN_END_VERSION if end else 0)
         spec = replace(self._spec(bundle.sha256, own_shape, driving.options, version), end=end)
-        return spec, shape, NUMERIC_PACKAGES if facts is None else facts.packages
+        return spec, shape, facts.packages
 
     def _check_world(self, bundle: Bundle) -> None:
-        """`UsageError` for a world model that the task surely cannot use; others may be of several tasks."""
+        """`UsageError` for a world model that the task surely cannot use; other packages' tasks may use CarRacing's."""
         task, world = str(self.task), bundle.manifest.task
         check_preset_fits(self.preset, world, bundle.path.name)
         if task in (DREAM, world):
             return
-        if bundle.manifest.world is not None or is_shipped(task):
+        if world != FIRST_WORLD or is_shipped(task):
             without = "; or without a world model: --bundle none" if task.partition(":")[0] == GYM else ""
             raise UsageError(
                 f"{bundle.path.name} is a world model of {world}, and not of {task}: name one of that with --bundle"

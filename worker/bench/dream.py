@@ -48,7 +48,7 @@ def bench_dream(bundle: Bundle) -> dict[str, Any]:
 
         cases["torch"] = make_torch_dream(bundle, TILE)
         if has_cuda() and EIGHT_BITS not in bundle.manifest.models:
-            cases["cuda"] = dream(TORCH_ROWS, TorchDreamBatch(bundle, spec, None, "cuda"))
+            cases["cuda"] = dream(TORCH_ROWS, TorchDreamBatch(bundle, spec, "cuda"))
     except ModuleNotFoundError as error:
         note = f"torch_naive_ratio needs {error.name}: pip install 'dreamfleet[train]'"
     seconds = time_alternately(cases)

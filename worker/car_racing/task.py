@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, Mirror
 from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
+from dreamfleet.common.artifacts.car_racing_variants import FACTS
 from dreamfleet.worker.car_racing.drivers import DRIVERS, PushedDriver, UniformDriver
 from dreamfleet.worker.car_racing.native_check import CHECK_INTERVAL, make_car_racing, native_is_exact
 from dreamfleet.worker.car_racing.preprocessing import PREPROCESSINGS
@@ -34,17 +34,17 @@ if TYPE_CHECKING:
 ENVIRONMENT = "CarRacing-v3"
 WORLD = World(
     actions=STEERING_GAS_BRAKE,
-    packages=NUMERIC_PACKAGES,
+    packages=FACTS.packages,
     idle_cost=0.1,
-    frames_per_second=50,
-    action_names=("steer", "gas", "brake"),
-    dream_reward=DreamReward(gain=3.5, cost=0.1),  # a tile gives 1000 / N, of a track's N tiles: 3.5 on average
+    frames_per_second=FACTS.frames_per_second,
+    action_names=FACTS.action_names,
+    dream_reward=DreamReward(gain=FACTS.reward.gain, cost=FACTS.reward.cost),
     off_course="off_road",  # `OffRoadInfo` says so
     threshold=gymnasium.spec(ENVIRONMENT).reward_threshold,
     finish="lap_finished",  # gymnasium says so as an episode ends; one that runs out of time says nothing
     judge="gymnasium",
-    score_word="track",
-    marks=(800, 900),
+    score_word=FACTS.score_word,
+    marks=FACTS.marks,
     mirror=Mirror(order=(0, 1, 2), signs=(-1, 1, 1)),  # steering
     lost_after=40,
     opening=50,  # the camera zooms in

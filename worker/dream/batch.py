@@ -14,7 +14,7 @@ from dreamfleet.common.protocol.measures import check_dreamt
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.dream.noise import SharedNoise
 from dreamfleet.worker.dream.world import DreamWorld
-from dreamfleet.worker.tasks.api import Episode, Score, StepObserver, StepSnapshot, World
+from dreamfleet.worker.tasks.api import Episode, Score, StepObserver, StepSnapshot
 from dreamfleet.worker.tasks.measures import Measurer
 
 DEFAULT_TEMPERATURE = 1.0
@@ -27,15 +27,13 @@ class DreamBatch:
 
     most_rows = MAX_ROWS
 
-    def __init__(self, bundle: Bundle, spec: TaskSpec, world: World | None = None) -> None:
-        """`world` is the bundle's world; by default it is looked up by the name of the bundle's task."""
+    def __init__(self, bundle: Bundle, spec: TaskSpec) -> None:
         self._size = bundle.controller_shape.size
         self._horizon = spec.horizon
         self._observer: StepObserver | None = None
-        self._world = DreamWorld(bundle, spec.temperature or DEFAULT_TEMPERATURE, world, spec.recorded, spec.end)
+        self._world = DreamWorld(bundle, spec.temperature or DEFAULT_TEMPERATURE, spec.recorded, spec.end)
         check_dreamt(spec.measures)
-        names = (world or self._world).action_names
-        self._measurer = Measurer(spec.measures, self._world.actions, names)
+        self._measurer = Measurer(spec.measures, self._world.actions, self._world.action_names)
 
     def watched(self, observer: StepObserver) -> DreamBatch:
         """A copy that passes steps to `observer`: those of the first episode that has not ended."""

@@ -23,8 +23,7 @@ class DreamEnds:
 
     def __init__(self, bundle: Bundle, temperature: float, text: str = "") -> None:
         """`text` is a rule in place of the bundle's, as in `EndRule.parse`; empty: the bundle's own."""
-        facts = bundle.manifest.world
-        self.rule = EndRule() if facts is None else facts.end
+        self.rule = bundle.manifest.facts.end
         if text:
             self.rule = replace(EndRule.parse(text), odds_weight=self.rule.odds_weight)
         self.bars: Bars | None = None  # for the dreams' noise; thresholds need none

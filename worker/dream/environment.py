@@ -22,7 +22,6 @@ from dreamfleet.worker.worldmodel.observation import Observation, open_bundle
 
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
-DEFAULT_HORIZON = 1000  # steps, as gymnasium's CarRacing has them
 
 
 def action_space(actions: Continuous) -> Any:
@@ -30,11 +29,6 @@ def action_space(actions: Continuous) -> Any:
     if sizes := actions.sizes:
         return spaces.Discrete(sizes[0]) if len(sizes) == 1 else spaces.MultiDiscrete(list(sizes))
     return spaces.Box(np.array(actions.low, np.float32), np.array(actions.high, np.float32))
-
-
-def horizon_of(bundle: Bundle) -> int:
-    """The steps of a whole episode in the bundle's world."""
-    return DEFAULT_HORIZON if bundle.manifest.world is None else bundle.manifest.world.horizon
 
 
 def to_rows(actions: Continuous, given: Any, count: int) -> Floats:
@@ -83,7 +77,7 @@ class Dream(gymnasium.Env[Floats, Any]):
         self._bundle = open_bundle(bundle)
         self._world = DreamWorld(self._bundle, temperature, recorded=recorded, end=end)
         self.metadata = {**self.metadata, "render_fps": self._world.frames_per_second}
-        self._horizon = horizon or horizon_of(self._bundle)
+        self._horizon = horizon or self._bundle.manifest.facts.horizon
         self.render_mode = render_mode
         self._decoder = Decoder(self._bundle) if render_mode else None
         self._observation = Observation(self._bundle, features)
@@ -134,7 +128,7 @@ class VectorDream(gymnasium.vector.VectorEnv[Floats, Any, Any]):
         self._bundle = open_bundle(bundle)
         self._world = DreamWorld(self._bundle, temperature, recorded=recorded, end=end)
         self.metadata = {**self.metadata, "render_fps": self._world.frames_per_second}
-        self._horizon = horizon or horizon_of(self._bundle)
+        self._horizon = horizon or self._bundle.manifest.facts.horizon
         self.num_envs = num_envs
         self.render_mode = render_mode
         self._decoder = Decoder(self._bundle) if render_mode else None

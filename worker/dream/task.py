@@ -40,14 +40,14 @@ class DreamTask(Task):
     def make_batch(self, assignment: Assignment) -> DreamBatch:
         """The batch that dreams; `UsageError` for a torch device that this host lacks."""
         self.make_policy(assignment)  # raises `BundleError` if the bundle does not fit its world
-        model, spec, world = assignment.world_model, assignment.spec, self.world_of(assignment)
+        model, spec = assignment.world_model, assignment.spec
         if not assignment.torch_device:
-            return DreamBatch(model, spec, world)
+            return DreamBatch(model, spec)
         try:
             from dreamfleet.worker.dream.torch_batch import TorchDreamBatch
         except ModuleNotFoundError as error:
             raise UsageError(f"torch_device needs {error.name}: pip install 'dreamfleet[train]'") from error
-        return TorchDreamBatch(model, spec, world, assignment.torch_device)
+        return TorchDreamBatch(model, spec, assignment.torch_device)
 
     def reality(self, assignment: Assignment) -> Task:
         """The task that the bundle was trained on; `UsageError` if no package registers it."""

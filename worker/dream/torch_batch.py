@@ -21,7 +21,7 @@ from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.dream.batch import TORCH_ROWS as ROWS
 from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.dream.noise import BLOCK_STEPS, Draw, SharedNoise
-from dreamfleet.worker.tasks.api import Episode, Score, StepSnapshot, World
+from dreamfleet.worker.tasks.api import Episode, Score, StepSnapshot
 from dreamfleet.worker.worldmodel.inference import NoiseSize
 from dreamfleet.worker.worldmodel.torch_dream_step import StepNoise, TorchDreamStep
 
@@ -34,9 +34,9 @@ class TorchDreamBatch(DreamBatch):
 
     most_rows = ROWS
 
-    def __init__(self, bundle: Bundle, spec: TaskSpec, world: World | None, device: str) -> None:
+    def __init__(self, bundle: Bundle, spec: TaskSpec, device: str) -> None:
         """`UsageError` for a device that torch does not have here."""
-        super().__init__(bundle, spec, world)
+        super().__init__(bundle, spec)
         found = find_device(device)
         step = TorchDreamStep(bundle, found, self._world.temperature)
         self._rows = _DreamRows(step, self._world.begin(ROWS), self._world.chance, self._size, found)

@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.actions import Continuous
 from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.artifacts.world_facts import RewardFacts, WorldFacts
+from dreamfleet.common.artifacts.world_facts import RewardFacts
 from dreamfleet.common.errors import BundleError, UsageError
 from dreamfleet.worker.dream.ends import DreamEnds
 from dreamfleet.worker.dream.noise import Draw
@@ -35,24 +34,19 @@ class DreamtStep(NamedTuple):
 class DreamWorld:
     """The frozen MDN-RNN as a world, at one temperature (Ha and Schmidhuber 2018, section 4)."""
 
-    def __init__(
-        self, bundle: Bundle, temperature: float, world: World | None = None, recorded: float = 0.0, end: str = ""
-    ) -> None:  # fmt: skip
+    def __init__(self, bundle: Bundle, temperature: float, recorded: float = 0.0, end: str = "") -> None:
         """`recorded` is the share of `StartStates`, `end` a rule in place of the bundle's, as in `EndRule.parse`.
 
-        `world` is the bundle's; by default it is looked up where the bundle does not describe it. `BundleError` if the
-        rewards of its dream are unknown.
+        `BundleError` if its model does not predict the reward of a dream.
         """
         check_temperature(temperature)
         model: dict[str, Any] = bundle.manifest.models.get("mdnrnn", {})
         self._reward_kind = str(model.get("reward", "none"))
         self._reward_scale = float(model.get("reward_scale", 1.0))  # of a value: what its labels were divided by
-        described = bundle.manifest.world or world or world_of(bundle)
-        if not isinstance(described.actions, Continuous):
-            raise BundleError(f"the actions of {bundle.manifest.task} are numbers: a dream needs vectors (`one_hot`)")
-        self.actions, self.frames_per_second = described.actions, described.frames_per_second
-        self.action_names = described.action_names
-        self._reward = _reward_of(bundle, described, self._reward_kind)
+        facts = bundle.manifest.facts
+        self.actions, self.action_names = bundle.driving.controls, facts.action_names
+        self.frames_per_second = facts.frames_per_second
+        self._reward = _predicted_reward(bundle, self._reward_kind)
         self._step = DreamStep(bundle)
         self._ends = DreamEnds(bundle, temperature, end)
         self.temperature = temperature
@@ -104,20 +98,12 @@ class DreamWorld:
         return 1 - predicted if self._reward_kind == "notebook" else predicted  # its head: steps without a reward
 
 
-def _reward_of(bundle: Bundle, world: World | WorldFacts, kind: str) -> RewardFacts:
-    """The reward of a dreamt step, of a model whose reward head predicts `kind`; `BundleError` if it is unknown."""
-    found = world.reward if isinstance(world, WorldFacts) else None
-    if isinstance(world, World):
-        terms = world.dream_reward
-        if kind == "value":
-            found = RewardFacts()
-        elif terms is not None:
-            found = RewardFacts(terms.source, terms.gain, terms.cost)
-    survives = found is not None and found.source == "survival"
+def _predicted_reward(bundle: Bundle, kind: str) -> RewardFacts:
+    """The reward of a dreamt step; `BundleError` if it is no survival, and no reward head of `kind` predicts it."""
+    found = bundle.manifest.facts.reward
+    survives = found.source == "survival"
     if kind == "none" and not survives:
         raise BundleError(f"{bundle.path.name} predicts no reward: its dreams cannot be scored")
-    if found is None:
-        raise BundleError(f"task {bundle.manifest.task} defines no reward for a dreamt step of {bundle.path.name}")
     if not survives and (found.source == "value") != (kind == "value"):
         raise BundleError(
             f"the reward in dreams of {bundle.path.name} is a {found.source}, which its reward head {kind!r} does not "

@@ -231,9 +231,9 @@ def manifest_facts(bundle: Bundle) -> list[tuple[str, str]]:
         ("attention window", str(model.get("window", 0) or "none")),
         ("recorded states", str(bundle.recorded_count or "none")),
     ]
-    if (world := manifest.world) is not None:
-        rows += [("options", world.options or "none"), ("reward of a dream", _reward_text(world.reward))]
-        rows += [("a dream ends", _end_text(world.end))]
+    facts = manifest.facts
+    rows += [("options", facts.options or "none"), ("reward of a dream", _reward_text(facts.reward))]
+    rows += [("a dream ends", _end_text(facts.end))]
     rows += [(name, str(provenance[name])) for name in DRIVEN if name in provenance]
     if isinstance(quality, dict):
         rows += [(f"quality: {name}", _with_unit(name, value)) for name, value in quality.items()]

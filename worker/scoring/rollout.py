@@ -31,8 +31,7 @@ class DataWorld(NamedTuple):
     @classmethod
     def of(cls, bundle: Bundle) -> DataWorld:
         """The world of the data that a bundle was trained on."""
-        facts = bundle.manifest.world
-        return cls(bundle.manifest.task, "" if facts is None else facts.options)
+        return cls(bundle.manifest.task, bundle.manifest.facts.options)
 
     @classmethod
     def parse(cls, text: str) -> DataWorld:

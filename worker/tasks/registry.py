@@ -71,8 +71,7 @@ def task_of(bundle: Bundle) -> Task:
     'car-racing'
     """
     manifest = bundle.manifest
-    task = find_task(manifest.task)
-    return task if manifest.world is None else _bind(task, manifest.world.options)
+    return _bind(find_task(manifest.task), manifest.facts.options)
 
 
 def find_scored_task(name: str, bundle: Bundle | None) -> Task:

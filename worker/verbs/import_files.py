@@ -123,6 +123,7 @@ def _import_controller(args: argparse.Namespace) -> int:
 def _read_controller(args: argparse.Namespace) -> Controller:
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.common.artifacts.controller import IMPORTED, Controller
+    from dreamfleet.common.artifacts.driving import FIRST_WORLD
     from dreamfleet.worker.importing.sources import checkpoint_of
     from dreamfleet.worker.importing.vectors import to_parameters
 
@@ -146,7 +147,7 @@ def _read_controller(args: argparse.Namespace) -> Controller:
             f"(which the controller sees; {world_command} makes it of another project's) or --like CONTROLLER_OR_RUN"
         )
     bundle = find_bundle(args.bundle)
-    options = OPTIONS.get(layout, "") if bundle.manifest.world is None else ""
+    options = OPTIONS.get(layout, "") if bundle.manifest.task == FIRST_WORLD else ""
     driving = bundle.driving_of(options)
     shape = bundle.shape_of("zh", driving=driving)
     return Controller(

@@ -18,11 +18,7 @@ from dreamfleet.common.runs.seeds import TEST
 from dreamfleet.worker.verbs.evaluate import add_random_flags, named_agent
 
 if TYPE_CHECKING:
-    from dreamfleet.common.artifacts.bundle import Bundle
-    from dreamfleet.common.artifacts.world_facts import WorldFacts
     from dreamfleet.common.monitoring.client import Client
-    from dreamfleet.common.protocol.messages import TaskSpec
-    from dreamfleet.worker.tasks.api import World
     from dreamfleet.worker.tools.frame_sinks import SendFrame
     from dreamfleet.worker.tools.live_sources import Driver
     from dreamfleet.worker.tools.live_view import CaptionedFrame
@@ -142,6 +138,7 @@ def _worker_pictures(args: argparse.Namespace, client: Client) -> Iterator[Itera
     from dreamfleet.common.artifacts.bundle_store import BundleStore, default_cache
     from dreamfleet.common.monitoring.live import LiveView
     from dreamfleet.common.protocol.codec import CountingDecoder
+    from dreamfleet.common.protocol.tasks import DREAM
     from dreamfleet.worker.service.bundle_fetch import fetch_bundle
     from dreamfleet.worker.tools.live_sources import worker_frames
     from dreamfleet.worker.tools.live_view import LiveCanvas, LiveDreamer
@@ -155,26 +152,15 @@ def _worker_pictures(args: argparse.Namespace, client: Client) -> Iterator[Itera
             )
             assert bundle is not None  # it is never stopped
             fitting = bundle.with_options(spec.controller, spec.options)
-            dreamer, world = LiveDreamer(fitting, args.temperature), _find_world(spec, fitting)
-            task = bundle.manifest.task
-            glass = LiveCanvas(view.run, dreamer=dreamer, task=task)
-            if world is not None:
-                glass = LiveCanvas(view.run, world.action_names, dreamer, world.actions, task)
+            manifest, dreamer = bundle.manifest, LiveDreamer(fitting, args.temperature)
+            glass = LiveCanvas(view.run, dreamer=dreamer, task=manifest.task)
+            if spec.task in (DREAM, manifest.task):  # actions of another task are not the world model's
+                names, actions = manifest.facts.action_names, fitting.driving.controls
+                glass = LiveCanvas(view.run, names, dreamer, actions, manifest.task)
         print(f"watching run {view.run}; its workers: {view.status.workers.present}", file=sys.stderr)
         yield worker_frames(view, glass, args.fps)
         if view.is_over:
             print(f"run {view.run} {view.status.state}: {one_line(view.status.why)}", file=sys.stderr)
-
-
-def _find_world(spec: TaskSpec, bundle: Bundle) -> World | WorldFacts | None:
-    """The world, as its bundle describes it; else of a registered task, as other names could load any code."""
-    if bundle.manifest.world is not None:
-        return bundle.manifest.world
-    from dreamfleet.worker.tasks.api import Assignment
-    from dreamfleet.worker.tasks.registry import find_task, known_tasks
-
-    known = {spec.task, bundle.manifest.task} <= set(known_tasks())
-    return find_task(spec.task).world_of(Assignment(spec, bundle)) if known else None
 
 
 def _drive_pictures(args: argparse.Namespace, driver: Callable[[], Driver]) -> Iterator[CaptionedFrame]:

@@ -283,10 +283,9 @@ def _score(run: RunFolder) -> dict[str, Any] | None:
     judged = confirmed or best_evaluation(run.evaluations())
     if judged is None:
         return None
-    world = Bundle.open(run.bundle_path, run.spec.bundle).manifest.world
-    facts: dict[str, Any] = {} if world is None else {"word": world.score_word}
-    facts |= {"generation": judged.generation, "episodes": judged.episodes, "confirmed": confirmed is not None}
-    return {"mean": judged.mean, "error": judged.error, **facts}
+    word = Bundle.open(run.bundle_path, run.spec.bundle).manifest.facts.score_word
+    facts = {"generation": judged.generation, "episodes": judged.episodes, "confirmed": confirmed is not None}
+    return {"mean": judged.mean, "error": judged.error, "word": word, **facts}
 
 
 def _copy(before: Path, path: Path) -> None:

@@ -2,6 +2,7 @@ import json
 
 import pytest
 
+from dreamfleet.common.artifacts import car_racing_variants
 from dreamfleet.common.artifacts.actions import Continuous, one_hot
 from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, Variant
 from dreamfleet.common.artifacts.driving import WorldDriving, parse_driving
@@ -11,11 +12,11 @@ from dreamfleet.common.errors import UsageError
 FACTS = WorldFacts.of(one_hot(3), packages=("numpy",), horizon=525, frames_per_second=9, version=4)
 
 
-def test_without_facts_the_options_are_a_variant():
-    assert parse_driving(CAR_RACING, None, '{"pedals": "one"}') == Variant(pedals="one")
-    assert parse_driving("moon", None, "").is_default
-    with pytest.raises(UsageError, match=r'{"pedals": "one"} are options of car-racing'):
-        parse_driving("moon", None, '{"pedals": "one"}')
+def test_the_options_of_car_racing_are_a_variant_whatever_its_facts():
+    for facts in (car_racing_variants.FACTS, FACTS):
+        assert parse_driving(CAR_RACING, facts, '{"pedals": "one"}') == Variant(pedals="one")
+    with pytest.raises(UsageError):
+        parse_driving("moon", car_racing_variants.FACTS, '{"pedals": "one"}')
 
 
 @pytest.mark.parametrize("options", ["", '{"decide_every": 4}', '{"feedback": "last"}'])

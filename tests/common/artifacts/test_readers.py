@@ -14,6 +14,7 @@ import pytest
 
 from dreamfleet.common.artifacts.bundle import Bundle, BundleManifest, write_bundle
 from dreamfleet.common.artifacts.bundle_store import BundleStore, default_cache, find_bundle
+from dreamfleet.common.artifacts.car_racing_variants import FACTS
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.cli.config import load, read_toml
 from dreamfleet.common.errors import BundleError, ControllerError, DreamfleetError, UsageError
@@ -41,7 +42,7 @@ def bundle(tmp_path):
     parts = dict.fromkeys(("encoder.onnx", "decoder.onnx", "dream.onnx"), graph)
     parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
     manifest = BundleManifest(
-        "small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3, models={"vae": {"a": 1}}
+        "small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3, models={"vae": {"a": 1}}, world=FACTS
     )
     return write_bundle(tmp_path / "small.zip", manifest, parts).path
 

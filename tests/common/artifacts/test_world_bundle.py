@@ -13,11 +13,12 @@ from dreamfleet.common.artifacts.bundle import (
     Bundle,
     write_bundle,
 )
-from dreamfleet.common.artifacts.car_racing_variants import Variant
+from dreamfleet.common.artifacts.car_racing_variants import FACTS, Variant
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.driving import WorldDriving
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts, WorldFacts
 from dreamfleet.common.errors import BundleError, ControllerError, UsageError
+from dreamfleet.worker.car_racing.task import WORLD
 from dreamfleet.worker.worldmodel.inference import PolicyStep
 from tests.support.bundles import write_world_bundle
 
@@ -112,7 +113,20 @@ def test_what_cannot_be_is_refused(bundle, tmp_path):
         Bundle.open(rewritten)
 
 
-def test_a_bundle_without_a_description_says_nothing_of_it(random_bundle):
+def test_a_bundle_of_car_racing_leaves_its_facts_out_and_has_them(random_bundle):
     with zipfile.ZipFile(random_bundle.path) as archive:
         assert b'"world"' not in archive.read(MANIFEST)
-    assert random_bundle.manifest.world is None
+    manifest = random_bundle.manifest
+    assert manifest.facts == FACTS
+    assert FACTS.actions == Variant().controls == WORLD.actions
+    by_value = replace(manifest, models={"mdnrnn": {"reward": "value"}}).facts
+    assert by_value == replace(FACTS, reward=RewardFacts("value"))
+
+
+def test_facts_that_are_left_out_are_no_other_worlds(random_bundle, tmp_path):
+    parts = parts_of(random_bundle)
+    for manifest in (replace(random_bundle.manifest, task="moon"), replace(random_bundle.manifest, actions=2)):
+        with pytest.raises(BundleError):
+            write_bundle(tmp_path / "moon.zip", manifest, parts)
+    moon = replace(random_bundle.manifest, task="moon", world=FACTS)
+    assert write_bundle(tmp_path / "moon.zip", moon, parts).driving == WorldDriving(FACTS)

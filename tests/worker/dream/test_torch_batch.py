@@ -44,7 +44,7 @@ def dreams(bundle, candidates=3, seeds=3):
 def check(bundle, **changes):
     """The torch dream of a bundle is that of ONNX Runtime but for its last bits, and the same bits alone."""
     asked = spec(bundle, **changes)
-    batch, episodes = TorchDreamBatch(bundle, asked, None, DEVICE), dreams(bundle)
+    batch, episodes = TorchDreamBatch(bundle, asked, DEVICE), dreams(bundle)
     found, wanted = batch.score(episodes), DreamBatch(bundle, asked).score(episodes)
     assert [score.steps for score in found] == [score.steps for score in wanted]
     np.testing.assert_allclose([s.fitness for s in found], [s.fitness for s in wanted], rtol=1e-3, atol=1e-3)
@@ -75,7 +75,7 @@ def test_measures_are_those_of_the_dream(random_bundle):
 
 
 def test_more_dreams_than_rows_are_dreamt_in_turn(random_bundle):
-    batch = TorchDreamBatch(random_bundle, spec(random_bundle, horizon=2), None, DEVICE)
+    batch = TorchDreamBatch(random_bundle, spec(random_bundle, horizon=2), DEVICE)
     few, done = dreams(random_bundle, candidates=4, seeds=2), []
     assert batch.score(few * (ROWS // 8 + 1), done.append) == batch.score(few) * (ROWS // 8 + 1)
     assert done == [2 * ROWS, 2 * ROWS + 16]
@@ -90,7 +90,7 @@ def test_a_watched_dream_has_the_same_score_and_shows_each_step_that_is_due(rand
             self.append((episode, look()))
 
     seen, episodes = Seen(), dreams(random_bundle)
-    batch = TorchDreamBatch(random_bundle, spec(random_bundle), None, DEVICE)
+    batch = TorchDreamBatch(random_bundle, spec(random_bundle), DEVICE)
     assert batch.watched(seen).score(episodes) == batch.score(episodes)
     assert [(episode, snapshot.step) for episode, snapshot in seen] == [(0, step) for step in range(HORIZON)]
     plain = Seen()
@@ -108,9 +108,7 @@ def test_a_scorer_on_a_torch_device_is_of_a_class_of_its_own(random_bundle):
     own, plain = Scorer(asked, random_bundle, DEVICE), Scorer(asked, random_bundle)
     assert own.host_class != plain.host_class
     assert Scorer(asked, random_bundle, DEVICE).host_class == own.host_class
-    assert [own.score("score", vector, seed)] == TorchDreamBatch(random_bundle, asked, None, DEVICE).score(
-        [(vector, seed)]
-    )
+    assert [own.score("score", vector, seed)] == TorchDreamBatch(random_bundle, asked, DEVICE).score([(vector, seed)])
     driven = asked.with_overrides(driven=True, horizon=5)
     assert own.score("score", vector, seed, spec=driven) == plain.score("score", vector, seed, spec=driven)
 
@@ -144,7 +142,7 @@ def test_a_world_model_of_eight_bits_does_not_dream_in_torch():
     with pytest.raises(
         UsageError, match=rf"eight bits, and torch dreams in single .* with the world model tiny .{whole}"
     ):
-        TorchDreamBatch(bundle, spec(bundle), None, DEVICE)
+        TorchDreamBatch(bundle, spec(bundle), DEVICE)
 
 
 def test_a_host_without_torch_says_what_is_missing(random_bundle, monkeypatch):
@@ -155,7 +153,7 @@ def test_a_host_without_torch_says_what_is_missing(random_bundle, monkeypatch):
 
 
 def test_an_invalid_vector_is_refused(random_bundle):
-    batch = TorchDreamBatch(random_bundle, spec(random_bundle), None, DEVICE)
+    batch = TorchDreamBatch(random_bundle, spec(random_bundle), DEVICE)
     for vector in (np.zeros(3, np.float32), np.full(random_bundle.controller_shape.size, np.nan, np.float32)):
         with pytest.raises(UsageError, match="finite parameters"):
             batch.score([(vector, 1)])

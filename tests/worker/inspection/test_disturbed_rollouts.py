@@ -23,6 +23,7 @@ from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
+from tests.support.tasks import TOY
 
 
 def drive(bundle, actors, **config):
@@ -124,6 +125,6 @@ def test_a_world_without_true_state_is_reported(tmp_path):
     small = VAEConfig(latent=5, channels=(4, 4, 4, 8))
     ours = write_random_bundle(tmp_path / "ours.zip", vae=small, rnn=MDNRNNConfig(latent=5, hidden=8))
     parts = {name: ours.read(name) for name in ours.manifest.parts}
-    poles = write_bundle(tmp_path / "poles.zip", replace(ours.manifest, task="gym:CartPole-v1"), parts)
-    with pytest.raises(UsageError, match=r"gym:CartPole-v1 gives no true state .*docs/reference/tasks.md"):
-        next(record_disturbed_drives(poles, RecurrentState(poles), lambda _seed: None, DisturbedDriveConfig()))
+    toy = write_bundle(tmp_path / "toy.zip", replace(ours.manifest, task=TOY, world=ours.manifest.facts), parts)
+    with pytest.raises(UsageError, match=r"docs/reference/tasks\.md"):
+        next(record_disturbed_drives(toy, RecurrentState(toy), lambda _seed: None, DisturbedDriveConfig()))

@@ -3,6 +3,7 @@ import pytest
 
 from dreamfleet.common.artifacts.bundle import BundleManifest, write_bundle
 from dreamfleet.common.artifacts.bundle_store import BundleStore, default_cache
+from dreamfleet.common.artifacts.car_racing_variants import FACTS
 from dreamfleet.common.protocol.messages import MAX_PART
 from tests.support.bundles import npy
 from tests.support.stage import Stage, listening
@@ -15,7 +16,7 @@ def small_bundle(tmp_path_factory):
     """A bundle with placeholder bytes as its world model, which the toy tasks do not read."""
     parts = dict.fromkeys(("encoder.onnx", "decoder.onnx"), b"x")
     parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
-    manifest = BundleManifest("small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3)
+    manifest = BundleManifest("small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3, world=FACTS)
     path = tmp_path_factory.mktemp("bundle") / "small.zip"
     return write_bundle(path, manifest, {**parts, "dream.onnx": bytes((PARTS - 1) * MAX_PART)})
 

@@ -10,6 +10,7 @@ import pytest
 
 from dreamfleet.common.artifacts.bundle import BundleManifest, write_bundle
 from dreamfleet.common.artifacts.bundle_store import BundleStore
+from dreamfleet.common.artifacts.car_racing_variants import FACTS
 from dreamfleet.common.errors import BundleError
 from dreamfleet.common.protocol.codec import CountingDecoder
 from dreamfleet.common.protocol.messages import MAX_PART
@@ -28,7 +29,7 @@ PARTS = 5
 def bundle(tmp_path_factory):
     parts = dict.fromkeys(("encoder.onnx", "decoder.onnx"), b"x")
     parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
-    manifest = BundleManifest("small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3)
+    manifest = BundleManifest("small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3, world=FACTS)
     content = hashlib.sha256(b"a").digest() * ((PARTS - 1) * MAX_PART // 32)
     return write_bundle(tmp_path_factory.mktemp("bundle") / "small.zip", manifest, {**parts, "dream.onnx": content})
 

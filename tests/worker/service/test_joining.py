@@ -202,7 +202,7 @@ def test_a_child_imports_no_task_that_its_worker_did_not_announce(tmp_path, monk
 def test_a_world_model_of_an_unannounced_task_imports_nothing(stage, tmp_path, monkeypatch):
     mark, small = foreign(tmp_path, monkeypatch), stage.bundle
     parts = {name: small.read(name) for name in small.manifest.parts}
-    world = replace(small.manifest, task="foreign_world:World")
+    world = replace(small.manifest, task="foreign_world:World", world=small.manifest.facts)
     stage.bundle = write_bundle(tmp_path / "foreign.zip", world, parts)
     stage.hand("dream")
     _, served = stage.worker(exit_when_done=True)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.bundle import BundleManifest, write_bundle
-from dreamfleet.common.artifacts.car_racing_variants import Variant
+from dreamfleet.common.artifacts.car_racing_variants import FACTS, Variant
 from dreamfleet.common.errors import BundleError, ControllerError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import check_task, describe_task, is_self_describing
@@ -86,7 +86,7 @@ def test_a_bundle_of_another_task_or_of_pictures_that_it_does_not_give_is_refuse
 ):
     parts = dict.fromkeys(("encoder.onnx", "decoder.onnx", "dream.onnx"), b"x")
     parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
-    manifest = BundleManifest("moon", of, preprocessing, shape, latent=4, hidden=4, actions=3)
+    manifest = BundleManifest("moon", of, preprocessing, shape, latent=4, hidden=4, actions=3, world=FACTS)
     bundle, found = write_bundle(tmp_path / "moon.zip", manifest, parts), find_task(task)
     for make in (found.make_environment, found.make_evaluation_environment, found.make_policy):
         asked = task == "dream" and of == "moon"  # the dream asks the bundle's own world
