@@ -24,7 +24,7 @@ FIGURES: dict[str, dict[str, Any]] = {  # of a finished phase, which later phase
     GATE: {"kept": bool, "why": str, "new": dict},
     EVOLVE: {"generations": int, "ended": str, "score": (dict, type(None))},
 }
-SCORE = {"mean": (int, float), "error": (int, float, type(None)), "episodes": int, "confirmed": bool}
+SCORE = {"mean": (int, float), "error": (int, float, type(None)), "episodes": int, "word": str, "confirmed": bool}
 
 
 @dataclass(frozen=True)

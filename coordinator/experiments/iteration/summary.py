@@ -47,7 +47,7 @@ def format_score(score: Mapping[str, Any] | None) -> str:
     if score is None:
         return "not evaluated"
     provisional = "" if score["confirmed"] else ", provisional"
-    episodes = plural(score["episodes"], score.get("word", "track"))
+    episodes = plural(score["episodes"], score["word"])
     return f"{format_with_error(score['mean'], score['error'])} on {episodes}{provisional}"
 
 

@@ -9,7 +9,7 @@ from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
 from tests.support.ledgers import entry, ledger
 
 QUALITY = {"nats_per_dimension": 0.96, "reward_auc": 0.93}
-SCORE = {"mean": 812.4, "error": 15.2, "episodes": 32, "generation": 9, "confirmed": True}
+SCORE = {"mean": 812.4, "error": 15.2, "episodes": 32, "word": "track", "generation": 9, "confirmed": True}
 FIGURES = {"knows": {"value": 0.8, "error": 0.01}, "loses": None}
 LAYOUT = IterationFolder(Path("data"))
 
