@@ -5,6 +5,7 @@ import os
 import re
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,8 @@ from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.coordinator.experiments.demo import Demo, DemoConfig, median_drive, plan_runs
+from dreamfleet.coordinator.experiments.demo_plans import PLANS
+from tests.support.processes import call_here
 from tests.support.tables import cells
 
 
@@ -46,11 +49,13 @@ def test_both_stages_search_in_the_features_that_ship_for_its_world_model(config
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle):
-    code, out, err = processes.call(
+def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle, monkeypatch):
+    few = replace(PLANS["car-racing"], dream_evaluations=(2, 2, 2), real_evaluations=(3, 2, 3), video_steps=40)
+    monkeypatch.setitem(PLANS, "car-racing", few)
+    monkeypatch.setenv("COLUMNS", "120")
+    code, out, err = call_here(
         "demo", "--run", "demo", "--runs-dir", processes.runs, "--port", processes.port, "--bundle", random_bundle.path,
         "--dream-minutes", 0.02, "--minutes", 0.02, "--horizon", 30, "--tracks", 1, "--population", 4,
-        timeout=900,
     )  # fmt: skip
     assert code == 0, err
     with open_run(processes.runs, "demo-dream") as dream, open_run(processes.runs, "demo") as real:

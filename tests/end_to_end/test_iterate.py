@@ -31,7 +31,7 @@ from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
 from tests.support.drives import write_drives
-from tests.support.processes import DEADLINE, processes_in
+from tests.support.processes import DEADLINE, call_here, processes_in
 from tests.support.tables import cells
 from tests.support.variants import controller_of
 
@@ -116,6 +116,7 @@ def test_each_round_makes_a_model_from_all_drives_and_evolves_in_its_dream(undis
     assert [tuple(line.split()[1:3]) for line in lines] == [(str(number), name) for number, name in PHASES]
 
 
+@pytest.mark.long
 def test_a_rounds_dreams_may_begin_where_its_drives_were(processes):
     layout = IterationFolder(processes.folder / "data")
     flags = ("--rounds", 1, "--drive-steps", 24, "--run-flags", f"{RUN} --recorded 0.5")
@@ -209,10 +210,10 @@ def test_the_same_model_loses_the_road_as_often_on_the_same_drives(tmp_path):
     assert abs(figures["old"]["loses"]["value"]) <= 1
 
 
-def test_what_is_finished_is_not_done_again_and_other_settings_are_refused(undisturbed, processes):
+def test_what_is_finished_is_not_done_again_and_other_settings_are_refused(undisturbed):
     layout, answer, _ = undisturbed
     before = layout.ledger.read_bytes()
-    code, out, err = processes.call("iterate", "--data", layout.root)
+    code, out, err = call_here("iterate", "--data", layout.root)
     assert code == 0, err
     assert "finished: 14 phases" in err
     assert cells(out.splitlines()[0])[:3] == ["round", "drives", "frames"]
@@ -223,7 +224,7 @@ def test_what_is_finished_is_not_done_again_and_other_settings_are_refused(undis
         (("--run-flags", "--generations 3"), "generations 2, not 3"),
         (("--redo", "3/vae"), "3/vae is not finished"),
     ):
-        code, _, err = processes.call("iterate", "--data", layout.root, *flags)
+        code, _, err = call_here("iterate", "--data", layout.root, *flags)
         assert code == 2
         assert said in err
     assert layout.ledger.read_bytes() == before
@@ -284,27 +285,27 @@ def test_an_iteration_goes_on_from_a_controller_and_its_world_model(processes, p
     assert hashes(layout)["rounds/01/round-1.zip"] == made.sha256
 
 
-def test_until_it_has_what_it_goes_on_from_flags_may_be_mended(processes, pilot):
-    root = processes.folder / "data"
+def test_until_it_has_what_it_goes_on_from_flags_may_be_mended(pilot, tmp_path):
+    root = tmp_path / "data"
     wrong = ("--mdnrnn-flags", "--latent 4 --hidden 5", "--vae-flags", "--latent 4 --channels 2 2 2 2")
-    code, _, err = processes.call("iterate", "--data", root, "--init", pilot, *wrong)
+    code, _, err = call_here("iterate", "--data", root, "--init", pilot, *wrong)
     assert (code, "to another model: hidden 4, not 5" in err) == (1, True), err
-    code, _, err = processes.call("iterate", "--data", root, "--mdnrnn-flags", "--latent 4 --hidden 4 --nonsense 3")
+    code, _, err = call_here("iterate", "--data", root, "--mdnrnn-flags", "--latent 4 --hidden 4 --nonsense 3")
     assert "begun with" not in err
     assert "nonsense" in err
     inside = root / "pilot.npz"
     for name in ("pilot.npz", "bundle.zip"):
         shutil.copyfile(pilot.with_name(name), root / name)
-    code, _, err = processes.call("iterate", "--data", root, "--init", inside)
+    code, _, err = call_here("iterate", "--data", root, "--init", inside)
     assert (code, "lies in the iteration's own folder" in err) == (2, True), err
 
 
-def test_a_controller_that_cannot_be_fitted_is_refused_at_once(processes, pilot):
+def test_a_controller_that_cannot_be_fitted_is_refused_at_once(pilot, tmp_path):
     bundle = Bundle.open(pilot.with_name("bundle.zip")).with_controllers(None, Variant(feedback="last"))
-    (processes.folder / "bundle.zip").write_bytes(pilot.with_name("bundle.zip").read_bytes())
-    controller_of(bundle).save(processes.folder / "seeing.npz")
-    flags = ("--init", processes.folder / "seeing.npz", "--go-on")
-    code, _, err = processes.call("iterate", "--data", processes.folder / "data", *flags)
+    (tmp_path / "bundle.zip").write_bytes(pilot.with_name("bundle.zip").read_bytes())
+    controller_of(bundle).save(tmp_path / "seeing.npz")
+    flags = ("--init", tmp_path / "seeing.npz", "--go-on")
+    code, _, err = call_here("iterate", "--data", tmp_path / "data", *flags)
     assert (code, "--go-on fits a controller" in err) == (2, True), err
 
 
@@ -317,11 +318,11 @@ def test_a_controller_that_cannot_be_fitted_is_refused_at_once(processes, pilot)
         (("--init", "tiny", "--preset", "article", "--vae", "whole"), "0/init: .*to another model: channels"),
     ],
 )
-def test_what_cannot_be_gone_on_from_is_refused_before_anything_is_driven(processes, flags, said):
-    code, _, err = processes.call("iterate", "--data", processes.folder / "data", *flags)
+def test_what_cannot_be_gone_on_from_is_refused_before_anything_is_driven(tmp_path, flags, said):
+    code, _, err = call_here("iterate", "--data", tmp_path / "data", *flags)
     assert code in (1, 2), err
     assert re.search(said, err.replace("\n", " ")), err
-    assert not list((processes.folder / "data").glob("episodes/*.npz"))
+    assert not list((tmp_path / "data").glob("episodes/*.npz"))
 
 
 @pytest.mark.parametrize(
@@ -347,11 +348,11 @@ def test_what_cannot_be_gone_on_from_is_refused_before_anything_is_driven(proces
         ),
     ],
 )
-def test_what_could_not_work_is_refused_before_anything_is_driven(processes, flags, said):
-    code, _, err = processes.call("iterate", "--data", processes.folder / "data", *flags)
+def test_what_could_not_work_is_refused_before_anything_is_driven(tmp_path, flags, said):
+    code, _, err = call_here("iterate", "--data", tmp_path / "data", *flags)
     assert code == 2
     assert said in err
-    assert not (processes.folder / "data" / "episodes").exists()
+    assert not (tmp_path / "data" / "episodes").exists()
 
 
 def kill(process, layout):

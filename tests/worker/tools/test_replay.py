@@ -11,6 +11,7 @@ from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.worker.scoring.failure_cause import crash
 from dreamfleet.worker.tools.replay import replay
 from tests.support import rough_tasks, tasks
+from tests.support.processes import call_here
 
 
 @pytest.fixture
@@ -27,14 +28,14 @@ def finished_run(processes, random_bundle):
 @pytest.mark.slow
 def test_a_fitness_that_differs_from_the_stored_one_is_reported_and_exits_1(processes, finished_run):
     replay = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
-    code, out, _ = processes.call(*replay)
+    code, out, _ = call_here(*replay)
     assert (code, out.count("same bits")) == (0, 2)
     with closing(sqlite3.connect(finished_run / JOURNAL)) as connection, connection:
         connection.execute("UPDATE result SET fitness = fitness + 1e-9 WHERE candidate = 1 AND episode = 1")
     connection.close()
-    code, out, _ = processes.call(*replay)
+    code, out, _ = call_here(*replay)
     assert (code, out.count("same bits"), out.count("DIFFERS")) == (1, 1, 1)
-    code, _, err = processes.call("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", "5/0")
+    code, _, err = call_here("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", "5/0")
     assert code == 1
     assert "candidate 5/0" in err
 
@@ -45,14 +46,14 @@ def test_results_of_another_host_class_are_counted_and_optionally_compared(proce
         connection.execute("UPDATE result SET fitness = fitness + 0.5, host_class = 'there' WHERE episode = 1")
     connection.close()
     replay = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
-    code, out, err = processes.call(*replay)
+    code, out, err = call_here(*replay)
     assert (code, out.count("same bits"), out.count("not checkable here: of class there")) == (0, 1, 1)
     assert "1 of 2 episodes was scored by hosts of another class" in err
-    found = json.loads(processes.call(*replay, "--json")[1])
+    found = json.loads(call_here(*replay, "--json")[1])
     assert (found["identical"], found["unchecked"]) == (False, 1)
-    code, out, err = processes.call(*replay, "--tolerance", 1)
+    code, out, err = call_here(*replay, "--tolerance", 1)
     assert (code, out.count("within 1, of class there"), err) == (0, 1, "")
-    assert processes.call(*replay, "--tolerance", 0.25)[0] == 1
+    assert call_here(*replay, "--tolerance", 0.25)[0] == 1
 
 
 def score_generation(processes, bundle, task, episodes):
@@ -85,12 +86,12 @@ def test_an_episode_fails_only_in_a_fresh_process(processes, random_bundle, monk
     monkeypatch.setenv("DREAMFLEET_TRUST", rough_tasks.MODULE)
     task = rough_tasks.name_of(rough_tasks.Poisoned)
     score_generation(processes, random_bundle, task, 2)
-    code, out, err = processes.call("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
+    code, out, err = call_here("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
     assert (code, out.count("same bits")) == (0, 2), (out, err)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("place", ["make", "step"])
+@pytest.mark.parametrize("place", [pytest.param("make", marks=pytest.mark.long), "step"])
 def test_what_only_python_itself_should_raise_is_an_episodes_failure(processes, random_bundle, monkeypatch, place):
     task = rough_tasks.name_of(rough_tasks.Raising)
     score_generation(processes, random_bundle, task, 2)
@@ -107,15 +108,15 @@ def test_what_only_python_itself_should_raise_is_an_episodes_failure(processes, 
         "--trust",
         rough_tasks.MODULE,
     )
-    code, out, err = processes.call(*replay)
+    code, out, err = call_here(*replay)
     assert (code, out.count("(KeyboardInterrupt"), "Traceback" in err) == (1, 2, False), (out, err)
 
 
 @pytest.fixture
 def brittle_run(processes, random_bundle):
-    def run(on_failure, seed=7):
+    def run(on_failure, seed=7, population=12):
         coordinator = processes.coordinator(
-            "--bundle", random_bundle.path, "--task", tasks.BRITTLE, "--population", 12, "--episodes", 3,
+            "--bundle", random_bundle.path, "--task", tasks.BRITTLE, "--population", population, "--episodes", 3,
             "--generations", 1, "--evaluate-every", 0, "--seed", seed, "--on-failure", on_failure, "--failure-limit", 1,
         )  # fmt: skip
         processes.worker("--task", tasks.BRITTLE, "--exit-when-done")
@@ -138,17 +139,17 @@ def test_a_candidate_that_failed_is_driven_again_and_its_cause_compared(processe
         place = run.failures()[0]
         failed = sum((each.generation, each.candidate) == (0, place.candidate) for each in run.failures())
     replay = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", f"0/{place.candidate}")
-    code, out, err = processes.call(*replay)
+    code, out, err = call_here(*replay)
     assert (code, out.count("same cause"), "DIFFERS" in out) == (0, failed, False), err
     assert "failed then (ArithmeticError: the world of" in out
     assert "fails now (ArithmeticError: the world of" in out
-    found = json.loads(processes.call(*replay, "--json")[1])
+    found = json.loads(call_here(*replay, "--json")[1])
     assert (found["identical"], found["fitness"], found["stored_fitness"]) == (True, None, None)
     change_failures(folder, "ValueError")
-    code, out, err = processes.call(*replay)
+    code, out, err = call_here(*replay)
     assert (code, out.count("DIFFERS")) == (1, failed), err
     change_failures(folder, "killed by SIGSEGV", "crash")
-    code, out, err = processes.call(*replay)
+    code, out, err = call_here(*replay)
     assert (out.count("not driven again"), "DIFFERS" in out, "Traceback" in err) == (failed, False, False)
     assert "crashed or hung the process" in err
 
@@ -168,7 +169,7 @@ def test_a_candidate_that_scored_and_now_fails_differs(processes, brittle_run):
         )
         connection.execute("DELETE FROM failure")
     connection.close()
-    code, out, err = processes.call(
+    code, out, err = call_here(
         "verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", f"0/{place.candidate}"
     )
     assert (code, "stored -1.0  fails now (ArithmeticError" in out, "DIFFERS" in out) == (1, True, True), err
@@ -183,22 +184,22 @@ def test_a_candidate_that_was_drawn_anew_is_compared_with_its_final_vector_alone
     number = max(stored, key=stored.__getitem__)
     assert stored[number] > 3, "choose another seed"
     replay = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", f"0/{number}")
-    code, out, err = processes.call(*replay)
+    code, out, err = call_here(*replay)
     assert (code, out.count("same bits"), len(out.splitlines())) == (0, 3, 3), (out, err)
 
 
 @pytest.mark.slow
 def test_a_candidate_whose_generation_got_other_seeds_is_compared_on_these_alone(processes, brittle_run):
-    folder = brittle_run("worst", seed=5)  # everybody fails on the second of its first three seeds
+    folder = brittle_run("worst", seed=5, population=4)  # everybody fails on the second of its first three seeds
     with RunFolder(folder) as run:
         seeds = run.training_seeds(0)
         assert run.failures()[0].seed not in seeds
-        number = next(number for number in range(12) if run.fitness(0, number) is not None)
+        number = next(number for number in range(4) if run.fitness(0, number) is not None)
     replay = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", f"0/{number}")
-    code, out, err = processes.call(*replay)
+    code, out, err = call_here(*replay)
     assert (code, out.count("same bits"), len(out.splitlines())) == (0, 3, 3), (out, err)
     with closing(sqlite3.connect(folder / JOURNAL)) as connection, connection:
         connection.execute("UPDATE generation SET seeds = '7', checksum = NULL")
     connection.close()
-    code, _, err = processes.call(*replay)
+    code, _, err = call_here(*replay)
     assert (code, "damaged: generation 0 has no seeds" in err, "Traceback" in err) == (1, True, False), err
