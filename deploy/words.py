@@ -19,6 +19,7 @@ ROOT = Path(__file__).parents[1]
 BANNED = Path(__file__).with_name("banned-words.txt")
 SIDES = ("common", "coordinator", "worker")
 LONG_SENTENCE = 30  # words
+USER = ("tutorials", "how-to", "reference", "explanation")  # folders of docs/ whose words have one limit together
 PRINTED = "printed"  # the name under which texts of the code are counted
 
 FENCE = re.compile(r"^( *)(```+|~~~+).*?^\1\2\s*$", re.MULTILINE | re.DOTALL)
@@ -117,6 +118,20 @@ def banned_in_code() -> list[str]:
     return found
 
 
+def sizes() -> dict[str, int]:
+    """The words of two kinds of pages that have a limit.
+
+    "user": tutorials, how-to, reference (generated pages too) and explanation, without the code blocks that tests run.
+    "lab": lab notes, all of it.
+    """
+    texts = {page: (ROOT / page).read_text() for page in pages() if page.parts[0] == "docs"}
+    user = [prose(text) for page, text in texts.items() if page.parts[1] in USER]
+    return {
+        "user": sum(len(words(text)) for text in user),
+        "lab": sum(len(words(text)) for page, text in texts.items() if page.parts[1] == "lab"),
+    }
+
+
 def measure() -> dict[str, dict[str, int]]:
     """For each page and for printed texts: words, long sentences where they count, banned words."""
     figures = {
@@ -178,6 +193,7 @@ def main() -> None:
     print(f"{'words':>7} {'> 30':>5} {'banned':>7}")
     for name, each in (*figures.items(), ("together", total)):
         print(f"{each['words']:>7} {each['long']:>5} {each['banned']:>7}  {name}")
+    print(*(f"{count:>7} words of {kind} pages" for kind, count in sizes().items()), sep="\n")
 
 
 if __name__ == "__main__":

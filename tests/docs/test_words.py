@@ -2,10 +2,11 @@
 
 import pytest
 
-from deploy.words import PRINTED, banned_in, long_sentences, measure, sentences, words
+from deploy.words import PRINTED, banned_in, long_sentences, measure, sentences, sizes, words
 from tests.support.processes import ROOT
 
 README_WORDS = 900  # code blocks included
+LARGEST = {"user": 45_000, "lab": 20_000}
 # What still stands in pages and printed texts. These numbers may only shrink.
 ALLOWED = {"long": 4, "banned": 3, PRINTED: 0}
 CLEAN = ("README.md", "CONTRIBUTING.md", "docs/index.md", "docs/tutorials/")
@@ -18,6 +19,12 @@ def figures():
 
 def test_readme_is_read_in_five_minutes(figures):
     assert len((ROOT / "README.md").read_text().split()) <= README_WORDS
+
+
+def test_documents_keep_to_their_size():
+    found = sizes()
+    assert found.keys() == LARGEST.keys()
+    assert {kind: count for kind, count in found.items() if count > LARGEST[kind]} == {}, "`make words` lists the pages"
 
 
 def test_pages_that_are_read_first_have_no_long_sentence_and_no_banned_word(figures):
