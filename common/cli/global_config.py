@@ -91,7 +91,14 @@ def read_config_file(path: Path | None) -> dict[str, Any]:
 
 
 def complete_arguments(args: argparse.Namespace, environment: Mapping[str, str] = os.environ) -> None:
-    """Complete parsed arguments from the file and the environment, and configure logging.
+    """Complete a command's arguments as in `read_arguments`, and configure logging."""
+    read_arguments(args, environment)
+    logging.getLogger("dreamfleet").setLevel(args.log_level.upper())
+    set_log_format(args.global_config.log_format)
+
+
+def read_arguments(args: argparse.Namespace, environment: Mapping[str, str] = os.environ) -> None:
+    """Complete parsed arguments from the file and the environment, and trust the modules that they name.
 
     Sets `args.global_config` (`resolve_network` adds default addresses), `args.sources` for `config.load` of the verb's
     own sections, and `args.given`, the names of the flags on the command line.
@@ -105,8 +112,6 @@ def complete_arguments(args: argparse.Namespace, environment: Mapping[str, str] 
     args.given, args.global_config = given, global_config
     args.listen, args.runs_dir, args.log_level = global_config.listen, global_config.runs_dir, global_config.log_level
     trust((*global_config.trust, *_named_modules(args, environment, file)))
-    logging.getLogger("dreamfleet").setLevel(global_config.log_level.upper())
-    set_log_format(global_config.log_format)
 
 
 def _named_modules(args: argparse.Namespace, environment: Mapping[str, str], file: Mapping[str, Any]) -> list[str]:

@@ -31,11 +31,8 @@ def print_answer(args: argparse.Namespace, text: str, **facts: object) -> None:
 
 
 def print_next(args: argparse.Namespace, *commands: Sequence[object]) -> None:
-    """Print on stderr the verbs to type next, each given as its words; nothing beside JSON, if quiet, or within a verb.
-
-    `args.within_verb` is true where another verb runs this one and goes on by itself.
-    """
-    if getattr(args, "json", False) or getattr(args, "within_verb", False):
+    """Print on stderr the verbs to type next, each given as its words; nothing beside JSON or if quiet."""
+    if getattr(args, "json", False):
         return
     if logging.getLogger("dreamfleet").level <= logging.INFO:
         trusted = ("--trust", *args.global_config.trust) if "trust" in getattr(args, "given", ()) else ()

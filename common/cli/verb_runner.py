@@ -1,20 +1,16 @@
-"""Run verbs from other verbs: in this process, or each in a process of its own."""
+"""Run verbs from other verbs, each in a process of its own."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import subprocess
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import redirect_stdout
+from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points
-from io import StringIO
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from dreamfleet.common.cli.command_line import GROUP, Verb, build_parser, load_verb
-from dreamfleet.common.cli.global_config import complete_arguments
+from dreamfleet.common.cli.command_line import GROUP, Verb, load_verb
 from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
 from dreamfleet.common.host.processes import VerbProcess, parent_death_command
 from dreamfleet.common.host.stop_signals import Stop
@@ -30,39 +26,6 @@ def find_verb(words: Sequence[str]) -> tuple[str, Verb, Sequence[str]]:
         if points := entry_points(group=GROUP, name=name):
             return name, load_verb(next(iter(points))), words[length:]
     raise DreamfleetError(f"no verb {' '.join(words[:1])!r} is installed")
-
-
-class InProcessRunner:
-    """Runs verbs one after the other in this process. All commands are parsed before the first one runs."""
-
-    def __init__(self, commands: Mapping[str, Sequence[str]]) -> None:
-        """`commands` by the names that their answers get; `UsageError` for a wrong one."""
-        self._parsed = {name: _parse(words) for name, words in commands.items()}
-
-    def run_all(self, on_end: Callable[[str], None] = lambda _name: None) -> None:
-        """Run the verbs, each of which prints its answer, and call `on_end` with the name of each that has ended."""
-        for name, (verb, args) in self._parsed.items():
-            args.json, args.within_verb = False, True
-            verb.run(args)
-            on_end(name)
-
-    def run_all_for_json(self, on_end: Callable[[str], None] = lambda _name: None) -> dict[str, Any]:
-        """As `run_all`, but return the answers, which are not printed."""
-        answers = {}
-        for name, (verb, args) in self._parsed.items():
-            args.json = True
-            with redirect_stdout(StringIO()) as printed:
-                verb.run(args)
-            answers[name] = json.loads(printed.getvalue())
-            on_end(name)
-        return answers
-
-
-def _parse(words: Sequence[str]) -> tuple[Verb, argparse.Namespace]:
-    name, verb, flags = find_verb(words)
-    args = build_parser(name, verb).parse_all(flags)
-    complete_arguments(args)
-    return verb, args
 
 
 class ProcessRunner:

@@ -13,6 +13,8 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
+from dreamfleet.common.errors import StoppedError
+
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 END_LIMIT = 4.0  # seconds that an orderly end may take after the second signal
 RETRY = 0.01  # seconds until a Ctrl-C that nobody could catch is sent again
@@ -23,6 +25,17 @@ Stop = Callable[[], bool]
 def never_stop() -> bool:
     """A `Stop` that is always False."""
     return False
+
+
+def stopping(report: Callable[[int], None], stop: Stop) -> Callable[[int], None]:
+    """As `report`, which gets a count; but `StoppedError` once `stop` is true."""
+
+    def check(count: int) -> None:
+        if stop():
+            raise StoppedError("stopped")
+        report(count)
+
+    return check
 
 
 class Interrupts:

@@ -1,6 +1,5 @@
 """A baseline's training as a process that is interrupted and killed."""
 
-import argparse
 import os
 import signal
 
@@ -9,7 +8,7 @@ import pytest
 from dreamfleet.worker.baselines.presets import find_preset
 from dreamfleet.worker.baselines.train import CHECKPOINT, CURVE, train_drqn
 from dreamfleet.worker.training.checkpoint import load_progress, load_weights
-from dreamfleet.worker.training.config_flags import apply_flags
+from dreamfleet.worker.training.config_flags import override
 
 EPISODES, TUPLES = 12, ("channels", "kernels", "strides")
 SETTINGS = {
@@ -21,9 +20,9 @@ FLAGS = ("steps", "episodes")
 
 def finish(folder):
     """Train to the end, here."""
-    args = argparse.Namespace(**{name: [value] if name in TUPLES else value for name, value in SETTINGS.items()})
+    values = {name: (value,) if name in TUPLES else value for name, value in SETTINGS.items()}
     preset = find_preset("learning")
-    train_drqn(folder, apply_flags(preset.agent, args), apply_flags(preset.learning, args))
+    train_drqn(folder, override(preset.agent, values), override(preset.learning, values))
 
 
 def state(folder):

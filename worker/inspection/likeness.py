@@ -39,6 +39,16 @@ class RareFrequency:
     found: dict[str, Estimate]
 
 
+@dataclass(frozen=True)
+class LikenessReport:
+    """Each quantity's shares, and of how many drives, dreams of each, and dreams of which temperature they are."""
+
+    drives: int
+    dreams: int
+    temperature: float
+    quantities: tuple[RareFrequency, ...]
+
+
 def compare_frequencies(
     drives: Sequence[DisturbedDrive], bundle: Bundle, controller: Controller, opening: int, dreams: int,
     temperature: float,

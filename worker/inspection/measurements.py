@@ -15,9 +15,9 @@ from dreamfleet.worker.inspection.disturbed_rollouts import (
     record_disturbed_drives,
 )
 from dreamfleet.worker.inspection.knowledge import Knowledge, cross_validate_probes
-from dreamfleet.worker.inspection.likeness import RareFrequency, compare_frequencies
+from dreamfleet.worker.inspection.likeness import LikenessReport, compare_frequencies
 from dreamfleet.worker.inspection.road_losses import (
-    RoadLossComparison,
+    LossReport,
     RoadLossConfig,
     collect_losing_drives,
     compare_losses,
@@ -67,24 +67,26 @@ def likeness(
     dreams: RoadLossConfig,
     episodes: int,
     on_drive: OnCount,
-) -> list[RareFrequency]:
+) -> LikenessReport:
     """Measure how often rare values occur in dreams, on `episodes` drives; errors as in `measure_dream_losses`."""
     controller = _dream_controller(bundle, driving)
     drives = _first_drives(bundle, driving, config, episodes, on_drive)
-    return compare_frequencies(drives, bundle, controller, config.opening, dreams.dreams, dreams.temperature)
+    found = compare_frequencies(drives, bundle, controller, config.opening, dreams.dreams, dreams.temperature)
+    return LikenessReport(episodes, dreams.dreams, dreams.temperature, tuple(found))
 
 
 def measure_dream_losses(
     bundle: Bundle, driving: DriverChoice, config: DisturbedDriveConfig, losses: RoadLossConfig, on_loss: OnCount
-) -> tuple[list[RoadLossComparison], int]:
-    """Compare real losses of the road with dreams begun before them; also return how many drives that took.
+) -> LossReport:
+    """Compare real losses of the road with dreams begun before them.
 
     `UsageError` unless the driver is a controller that was evolved with this world model, because it also drives the
     dreams.
     """
     controller = _dream_controller(bundle, driving)
     drives = collect_losing_drives(_drives(bundle, driving, config), losses, config, on_loss)
-    return compare_losses(drives, bundle, controller, losses, config), len(drives)
+    found = compare_losses(drives, bundle, controller, losses, config)
+    return LossReport(len(drives), losses.dreams, losses.temperature, config.lasting, tuple(found))
 
 
 def _dream_controller(bundle: Bundle, driving: DriverChoice) -> Controller:

@@ -63,6 +63,17 @@ class RoadLossComparison:
 
 
 @dataclass(frozen=True)
+class LossReport:
+    """Each kind of beginning, and of how many drives, dreams of each, and which temperature; `lasting` as of drives."""
+
+    drives: int
+    dreams: int
+    temperature: float
+    lasting: int
+    begun: tuple[RoadLossComparison, ...]
+
+
+@dataclass(frozen=True)
 class RoadOutcome:
     """What happened from a beginning on, for each dream `(dreams, steps)`; reality has one row.
 

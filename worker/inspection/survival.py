@@ -90,22 +90,25 @@ class Survival:
     """Each policy's survival, and how well dreams agree with reality over all of them.
 
     `agreement` is minus the mean of the ratios' logarithms without sign: 0 where each policy lives equally long in
-    both, -0.69 where it lives twice or half as long in dreams. `limit` is the length at which episodes are cut.
+    both, -0.69 where it lives twice or half as long in dreams. `limit` is the length at which episodes are cut. It is
+    of so many `episodes` of each policy, in dreams of this `temperature`.
     """
 
+    episodes: int
+    temperature: float
     limit: int
     end: str
     policies: tuple[PolicySurvival, ...]
     agreement: Estimate
 
     @classmethod
-    def of(cls, limit: int, end: str, policies: tuple[PolicySurvival, ...]) -> Survival:
+    def of(cls, config: SurvivalConfig, limit: int, end: str, policies: tuple[PolicySurvival, ...]) -> Survival:
         """From the policies, whose errors are independent."""
         value = -float(np.mean([abs(math.log(each.ratio.value)) for each in policies]))
         errors = [None if each.ratio.error is None else each.ratio.error / each.ratio.value for each in policies]
         known = [each for each in errors if each is not None]
         error = math.hypot(*known) / len(policies) if len(known) == len(errors) else None
-        return cls(limit, end, policies, Estimate(value, error))
+        return cls(config.episodes, config.temperature, limit, end, policies, Estimate(value, error))
 
 
 def measure_survival(
@@ -138,7 +141,7 @@ def measure_survival(
         dreamt = _dream_lengths(world, make, controller, config.seeds, reality.limit)
         found.append(PolicySurvival.of(name, np.array(reality.lengths[name]), dreamt, reality.limit))
         on_episode((len(drivers) + len(found)) * len(config.seeds))
-    return Survival.of(reality.limit, rule, tuple(found))
+    return Survival.of(config, reality.limit, rule, tuple(found))
 
 
 def fixed_drivers(task: Task, world: World) -> dict[str, DriverMaker]:

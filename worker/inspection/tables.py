@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
 from dreamfleet.common.printable import plural
 from dreamfleet.worker.inspection.knowledge import Knowledge
-from dreamfleet.worker.inspection.likeness import RareFrequency
+from dreamfleet.worker.inspection.likeness import LikenessReport, RareFrequency
+from dreamfleet.worker.inspection.measure import FigureReport
 from dreamfleet.worker.inspection.probe import Estimate
-from dreamfleet.worker.inspection.road_losses import CALM, RoadLossComparison
+from dreamfleet.worker.inspection.road_losses import CALM, LossReport, RoadLossComparison
 from dreamfleet.worker.inspection.survival import Survival
 
+Rows = Sequence[Mapping[str, object]]
 BEGUN = {"0 steps before": "at the loss", CALM: "where nothing is lost"}  # clearer words for some beginnings
 HELD = {"z": "z", "zh": "[z, h]"}
 WHERE = {
@@ -75,12 +77,12 @@ def survival_rows(found: Survival) -> list[dict[str, str]]:
     ]
 
 
-def survival_text(found: Survival, episodes: int, temperature: float) -> str:
+def survival_text(found: Survival) -> str:
     """Describe the rows of `survival_rows`."""
     return (
-        f"mean steps ± standard error of {episodes} real and {episodes} dreamt episodes each, cut at {found.limit}; "
-        f"temperature {temperature:g}, end {found.end}; agreement {found.agreement} (0: equally long everywhere, "
-        "-0.69: twice or half as long)"
+        f"mean steps ± standard error of {found.episodes} real and {found.episodes} dreamt episodes each, cut at "
+        f"{found.limit}; temperature {found.temperature:g}, end {found.end}; agreement {found.agreement} (0: equally "
+        "long everywhere, -0.69: twice or half as long)"
     )
 
 
@@ -90,13 +92,27 @@ LIKENESS = (
 )
 
 
-def loss_text(drives: int, dreams: int, lasting: int) -> str:
+def loss_text(found: LossReport) -> str:
     """Describe the rows of `loss_rows`."""
     return (
-        f"means ± standard errors over n beginnings in {plural(drives, 'drive')}, {plural(dreams, 'dream')} of "
-        "each. The road is lost "
-        f"after {plural(lasting, 'step')} in a row off it, and the end is as long"
+        f"means ± standard errors over n beginnings in {plural(found.drives, 'drive')}, "
+        f"{plural(found.dreams, 'dream')} of each. The road is lost "
+        f"after {plural(found.lasting, 'step')} in a row off it, and the end is as long"
     )
+
+
+def table_of(found: FigureReport) -> tuple[Rows, tuple[str, ...], str]:
+    """A figure as rows, the columns of them that are right-aligned, and a text that describes them."""
+    if isinstance(found, LossReport):
+        rows: Rows = loss_rows(found.begun)
+        return rows, ("n", *tuple(rows[0])[3:]), loss_text(found)
+    if isinstance(found, Survival):
+        rows, text = survival_rows(found), survival_text(found)
+    elif isinstance(found, LikenessReport):
+        rows, text = likeness_rows(found.quantities), LIKENESS
+    else:
+        rows, text = knowledge_rows(found), knowledge_text(found)
+    return rows, tuple(rows[0])[1:], text
 
 
 def measured_rows(measured: Any) -> Iterator[tuple[str, str]]:

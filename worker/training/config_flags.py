@@ -78,14 +78,27 @@ class _Set(argparse.Action):
 
 
 def apply_settings(configs: tuple[Any, ...], table: str, args: argparse.Namespace) -> tuple[Any, ...]:
-    """Presets' configurations with what `--set`, the environment, [`table`] of the file and flags say instead."""
-    sections = [type(each) for each in configs]
-    values = read_settings(sections, table, getattr(args, "sources", {}), args.settings)
-    names = [{each.name for each in configurable_fields(section)} for section in sections]
-    return tuple(
-        replace(each, **{**{key: value for key, value in values.items() if key in known}, **_given(each, args)})
-        for each, known in zip(configs, names, strict=True)
-    )
+    """Presets' configurations with what `given_settings` finds for them instead."""
+    values = given_settings([type(each) for each in configs], table, args)
+    return tuple(override(each, values) for each in configs)
+
+
+def given_settings(kinds: Sequence[type[Any]], table: str, args: argparse.Namespace) -> dict[str, Any]:
+    """The fields of these configurations that `--set`, the environment, [`table`] of the file, or flags give."""
+    values = read_settings(kinds, table, getattr(args, "sources", {}), args.settings)
+    return values | {name: value for kind in kinds for name, value in given_values(kind, args).items()}
+
+
+def given_values(kind: type[Any], args: argparse.Namespace) -> dict[str, Any]:
+    """The fields of a configuration for which flags were given."""
+    given = {each.name: getattr(args, each.name) for each in fields(kind) if hasattr(args, each.name)}
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
+
+
+def override(config: T, values: Mapping[str, Any]) -> T:
+    """The configuration with those of the values that are its fields."""
+    own = {each.name: values[each.name] for each in fields(config) if each.name in values}  # type: ignore[arg-type]
+    return replace(config, **own)  # type: ignore[type-var]
 
 
 def _describe(value: Any) -> str:
@@ -107,17 +120,6 @@ def _describe_defaults(values: Mapping[str, Any]) -> str:
     (first, _), *others = names.items()
     default = [f"default {first}"] if first else []
     return "; ".join((*default, *(f"{', '.join(each)} {said}" for said, each in others)))
-
-
-def apply_flags(config: T, args: argparse.Namespace) -> T:
-    """Return a preset's configuration with the given flags applied."""
-    return replace(config, **_given(config, args))  # type: ignore[type-var]
-
-
-def _given(config: Any, args: argparse.Namespace) -> dict[str, Any]:
-    """The values of a configuration's fields for which flags were given."""
-    given = {each.name: getattr(args, each.name) for each in fields(config) if hasattr(args, each.name)}
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
 
 
 def _options(hint: Any) -> dict[str, Any]:

@@ -59,7 +59,7 @@ def train_baseline(args: argparse.Namespace) -> int:
     from dreamfleet.common.host.stop_signals import stop_on_signals
     from dreamfleet.worker.baselines.presets import CHECKPOINT
     from dreamfleet.worker.baselines.train import train_drqn
-    from dreamfleet.worker.training.training_cli import explain_interrupt
+    from dreamfleet.worker.training.stages.train import explain_interrupt
     from dreamfleet.worker.training.training_state import select_device
 
     def report_progress(episodes: int, report: TrainingReport | None) -> None:

@@ -5,20 +5,25 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from dreamfleet.common.artifacts.bundle import MAX_RECORDED_STATES, Bundle
 from dreamfleet.common.artifacts.world_facts import EndRule
 from dreamfleet.common.cli.model_commands import use_bundle
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path
-from dreamfleet.common.printable import plural
+from dreamfleet.worker.training.stages.bundle import (
+    RECORDED,
+    BundleReport,
+    BundleRequest,
+    ExtractRequest,
+    build_bundle,
+    extract_models,
+)
 
 SUMMARY = (
     "freeze a trained world model into one file that workers fetch by its hash; --extract takes one apart, "
     "--from rounds one to eight bits"
 )
 EXTRAS = ("train",)
-RECORDED = 512  # states of the default layers are 0.6 MB
 OF_DATA = ("recorded", "reward", "end", "measured", "with_weights")  # arguments of a bundle that is built from --data
 
 
@@ -64,60 +69,36 @@ def _end_rule(text: str) -> str:
     return text
 
 
+def make_request(args: argparse.Namespace) -> BundleRequest:
+    """The bundle of a data folder that the flags ask for."""
+    recorded = RECORDED if args.recorded is None else args.recorded
+    return BundleRequest(
+        args.data, args.out, bool(args.with_weights), recorded, tuple(args.measured), args.reward, args.end
+    )
+
+
 def run(args: argparse.Namespace) -> int:
     """Write the bundle and print its SHA-256, or write checkpoints and print their paths."""
-    if args.extract is None and args.eight_bits is None:
-        return _write_bundle(args)
+    building = args.extract is None and args.eight_bits is None
     given = [f"--{name.replace('_', '-')}" for name in OF_DATA if getattr(args, name) not in (None, [])]
-    if given:
+    if given and not building:
         source = "--extract" if args.eight_bits is None else "--from"
         raise UsageError(f"{given[0]} is of a bundle to build from --data: omit it or {source}")
-    return _write_checkpoints(args) if args.eight_bits is None else _write_eight_bits(args)
+    if args.eight_bits is not None and args.out is None:
+        raise UsageError("--from writes a bundle: give --out FILE")
+    if args.extract is not None and args.eight_bits is None:
+        extracted = extract_models(ExtractRequest(args.extract, args.data))
+        print_answer(args, str(extracted), **extracted.facts)
+        return 0
+    report = build_bundle(make_request(args)) if building else _round_to_eight_bits(args.eight_bits, args.out)
+    print_answer(args, str(report), **report.facts)
+    print_next(args, *use_bundle(report.bundle))
+    return 0
 
 
-def _write_bundle(args: argparse.Namespace) -> int:
-    from dreamfleet.worker.training.assemble import assemble
-
-    recorded = RECORDED if args.recorded is None else args.recorded
-    if not 0 <= recorded <= MAX_RECORDED_STATES:
-        raise UsageError(f"--recorded must be from 0 to {MAX_RECORDED_STATES}, not {recorded}")
-    check_output_path(args.out)
-    bundle = assemble(
-        args.data, args.out, args.out.stem, with_weights=bool(args.with_weights), recorded=recorded,
-        measured=args.measured, reward=args.reward, end=args.end,
-    )  # fmt: skip
-    return _answer(args, bundle)
-
-
-def _write_eight_bits(args: argparse.Namespace) -> int:
+def _round_to_eight_bits(name: str, out: Path) -> BundleReport:
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.worker.training.eight_bits import write_eight_bit_bundle
 
-    if args.out is None:
-        raise UsageError("--from writes a bundle: give --out FILE")
-    check_output_path(args.out)
-    return _answer(args, write_eight_bit_bundle(find_bundle(args.eight_bits), args.out))
-
-
-def _answer(args: argparse.Namespace, bundle: Bundle) -> int:
-    size = bundle.path.stat().st_size / 1e6
-    parameters = bundle.controller_shape.size
-    states = bundle.recorded_count
-    text = (
-        f"{bundle.path}: {size:.1f} MB, sha256 {bundle.sha256}, controllers of {plural(parameters, 'parameter')}, "
-        f"{states} recorded states"
-    )
-    print_answer(args, text, bundle=bundle.path, bytes=bundle.path.stat().st_size, sha256=bundle.sha256,
-           controller_parameters=parameters, recorded=states)  # fmt: skip
-    print_next(args, *use_bundle(bundle.path))
-    return 0
-
-
-def _write_checkpoints(args: argparse.Namespace) -> int:
-    from dreamfleet.common.artifacts.bundle_store import find_bundle
-    from dreamfleet.worker.training.unbundle import unbundle
-
-    bundle = find_bundle(args.extract)
-    vae, mdnrnn = unbundle(bundle, args.data)
-    print_answer(args, f"{vae} and {mdnrnn}, of {bundle.sha256[:12]}", vae=vae, mdnrnn=mdnrnn, bundle=bundle.sha256)
-    return 0
+    check_output_path(out)
+    return BundleReport.of(write_eight_bit_bundle(find_bundle(name), out))

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
 from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.cli.world_flags import add_world_flags, world_arguments
-from dreamfleet.common.errors import StoppedError, UsageError
+from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import is_file
 from dreamfleet.common.host.resource_limits import usable_cores
-from dreamfleet.common.printable import plural
-
-if TYPE_CHECKING:
-    from dreamfleet.worker.scoring.rollout import DataWorld
-    from dreamfleet.worker.training.data.collect_config import CollectConfig
-    from dreamfleet.worker.training.data.pilot import Pilot
+from dreamfleet.common.host.stop_signals import stop_on_signals
+from dreamfleet.worker.training.stages import StageReport
+from dreamfleet.worker.training.stages.collect import (
+    CollectRequest,
+    ImportReport,
+    ImportRequest,
+    collect_drives,
+    import_kept,
+)
 
 SUMMARY = "collect training data for a world model: random drives, drives of controllers, or rollouts that a run kept"
 EXTRAS = ("worker",)
@@ -47,101 +47,34 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_json_flag(parser)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Collect the missing drives."""
-    if args.from_run is not None:
-        return _import_run(args)
-    for flag in ("noise", "spells"):
-        if hasattr(args, flag) and not args.controller:
-            raise UsageError(f"--{flag} is on a controller's actions: give --controller too")
-    if hasattr(args, "driver") and args.controller:
-        raise UsageError("--driver is who drives at random: omit it or --controller")
-    from dreamfleet.common.cli.progress import progress_bar
-    from dreamfleet.common.host.stop_signals import stop_on_signals
-    from dreamfleet.worker.training.config_flags import apply_flags
-    from dreamfleet.worker.training.data.collect import collect, missing_numbers
-    from dreamfleet.worker.training.data.data_folder import resolve_preset, resolve_world, store_preset
-    from dreamfleet.worker.training.data.dataset import check_no_foreign_files, existing_episodes
-    from dreamfleet.worker.training.presets import find_preset
+def make_request(args: argparse.Namespace) -> CollectRequest:
+    """The drives that the flags ask for; `UsageError` for flags that do not go together."""
+    from dreamfleet.worker.training.config_flags import given_values
+    from dreamfleet.worker.training.data.collect_config import CollectConfig
 
-    check_no_foreign_files(args.data)
-    world = resolve_world(args.data, args.task, world_arguments(args))
-    preset = find_preset(resolve_preset(args.data, args.preset, world))
-    config, pilots = apply_flags(_fit_pictures(preset.collect, world), args), _load_pilots(args)
-    config.check_for(world)  # a refused command begins no data set
-    frames = done = 0
-    before = len(existing_episodes(args.data))
-    total = before + len(missing_numbers(args.data, config))
-    with progress_bar("collect", total, "episodes") as bar, stop_on_signals() as stop:
-        bar.update(before)
-        store_preset(args.data, preset.name, config.seed, world)
-        with closing(collect(args.data, config, max(1, args.jobs), pilots, world)) as counts:
-            for count in counts:
-                frames, done = frames + count, done + 1
-                bar.update(before + done)
-                if stop():
-                    break
-    there = len(existing_episodes(args.data))  # with those that were written while the others stopped
-    if there < total:
-        raise StoppedError(
-            f"stopped: {args.data} keeps {plural(there - before, 'new episode')}, {there} of {total} in all; the same "
-            "command continues"
-        )
-    text = (
-        f"{args.data}: {plural(done, 'new episode')} with {plural(frames, 'frame')}; {plural(there, 'episode')} in all"
-    )
-    print_answer(args, text, data=args.data, new_episodes=done, new_frames=frames, episodes=there)
-    _print_next(args)
+    return CollectRequest(
+        args.data, args.preset, args.task, world_arguments(args), given_values(CollectConfig, args), args.jobs,
+        tuple(args.controller), args.runs_dir,
+    )  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> int:
+    """Collect the missing drives, or import those of a run."""
+    if args.from_run is not None:
+        report: StageReport = _import(args)
+    else:
+        with stop_on_signals() as stop:
+            report = collect_drives(make_request(args), stop)
+    print_answer(args, str(report), **report.facts)
+    trained = is_file(args.data / "vae.safetensors")  # `train_vae.CHECKPOINT`, whose module loads torch
+    # Drives that are added to a trained VAE's are encoded by it.
+    print_next(args, ("encode", "--data", args.data) if trained else ("train", "vae", "--data", args.data))
     return 0
 
 
-def _print_next(args: argparse.Namespace) -> None:
-    """Train on the drives; those that are added to a trained VAE's are encoded by it."""
-    trained = is_file(args.data / "vae.safetensors")  # `train_vae.CHECKPOINT`, whose module loads torch
-    print_next(args, ("encode", "--data", args.data) if trained else ("train", "vae", "--data", args.data))
-
-
-def _fit_pictures(config: CollectConfig, world: DataWorld) -> CollectConfig:
-    """The configuration with the pictures of a world that has only one size of them."""
-    from dreamfleet.worker.training.data.dataset import find_world
-
-    sizes = {each.size for each in find_world(*world).preprocessings.values()}
-    return replace(config, picture=sizes.pop()) if len(sizes) == 1 else config
-
-
-def _load_pilots(args: argparse.Namespace) -> tuple[Pilot, ...]:
-    if not args.controller:
-        return ()
-    from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
-    from dreamfleet.worker.training.data.pilot import Pilot
-
-    found = []
-    for name in args.controller:
-        controller, beside = find_controller(name, args.runs_dir)
-        bundle = find_bundle_of(controller, None, beside)
-        if bundle is None:
-            raise UsageError(f"controller {name} sees no world model: give one that was evolved with one")
-        found.append(Pilot(controller, bundle))
-    return tuple(found)
-
-
-def _import_run(args: argparse.Namespace) -> int:
-    from dreamfleet.common.runs.run_folder import open_run
-    from dreamfleet.worker.training.data.collect import import_rollouts
-    from dreamfleet.worker.training.data.dataset import existing_episodes
-
+def _import(args: argparse.Namespace) -> ImportReport:
     if args.controller:
         raise UsageError("--from-run drives nothing: omit --controller")
     if args.task or world_arguments(args):
         raise UsageError("the drives of --from-run say their world: omit --task and its flags")
-    with open_run(args.runs_dir, args.from_run) as stored:
-        drives = stored.rollouts()
-        if not drives:
-            raise UsageError(f"run {args.from_run} has collected nothing: start a run with --collect-every")
-    new = list(import_rollouts(args.data, drives))
-    added = f"{plural(len(new), 'new episode')} with {plural(sum(new), 'frame')}"
-    text = f"{args.data}: {added}, of {len(drives)} that {args.from_run} collected"
-    print_answer(args, text, data=args.data, new_episodes=len(new), new_frames=sum(new), collected=len(drives),
-           episodes=len(existing_episodes(args.data)))  # fmt: skip
-    _print_next(args)
-    return 0
+    return import_kept(ImportRequest(args.data, args.from_run, args.runs_dir))

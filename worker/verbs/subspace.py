@@ -6,14 +6,10 @@ import argparse
 from pathlib import Path
 
 from dreamfleet.common.cli.output import add_json_flag, print_answer
-from dreamfleet.common.errors import UsageError
-from dreamfleet.common.files.atomic_write import check_output_path, reporting_write_errors
-from dreamfleet.common.host.resource_limits import pin_thread_pools
-from dreamfleet.common.printable import plural
+from dreamfleet.worker.training.stages.subspace import DRIVES, SubspaceRequest, fit_subspace
 
 SUMMARY = "find a few features that predict a driver's actions and rewards, for a search among them (--subspace)"
 EXTRAS = ("worker",)
-DRIVES = 300
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -33,31 +29,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Find the features, and print how well each is predicted."""
-    pin_thread_pools()  # of NumPy, which is not loaded yet
-    if args.episodes < 5:
-        raise UsageError(f"--episodes must be at least 5, not {args.episodes}: every fifth is held out")
-    if args.views < 0:
-        raise UsageError(f"--views must not be negative, not {args.views}")
-    check_output_path(args.out)
-    from dreamfleet.common.artifacts.bundle_store import find_bundle
-    from dreamfleet.common.cli.progress import progress_bar
-    from dreamfleet.worker.training.drive_regression import last_drives
-    from dreamfleet.worker.training.fit_subspace import find_subspace
-
-    bundle, paths = find_bundle(args.bundle), last_drives(args.data, args.episodes)
-    with progress_bar("subspace", len(paths), "drives") as bar:
-        found = find_subspace(bundle, paths, bar.update, args.views)
-    subspace, r_squared = found.subspace, [round(each, 4) for each in found.r_squared]
-    with reporting_write_errors(args.out):
-        subspace.save(args.out, {"drives": found.drives, "steps": found.steps, "r_squared": r_squared})
-    width = max(map(len, subspace.names))
-    rows = [f"{name:<{width}}  {each:z.2f}" for name, each in zip(subspace.names, r_squared, strict=True)]
-    heading = "what is predicted, how many steps ahead, and its R² on held-out drives:"
-    last = (
-        f"{args.out}: {plural(len(rows), 'feature')}, by {plural(found.steps, 'step')} of "
-        f"{plural(found.drives, 'drive')}"
-    )
-    text = "\n".join([heading, *rows, last])
-    print_answer(args, text, subspace=args.out, sha256=subspace.sha256, bundle=bundle.sha256, features=subspace.names,
-           r_squared=r_squared, drives=found.drives, steps=found.steps)  # fmt: skip
+    report = fit_subspace(SubspaceRequest(args.bundle, args.data, args.out, args.episodes, args.views))
+    print_answer(args, str(report), **report.facts)
     return 0

@@ -5,23 +5,16 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from dreamfleet.common.cli.model_commands import MODELS
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
 from dreamfleet.common.cli.presets import preset_help_text
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.stop_signals import stop_on_signals
 from dreamfleet.common.printable import plural
-
-if TYPE_CHECKING:
-    from torch import nn
-
-    from dreamfleet.common.host.stop_signals import Stop
-    from dreamfleet.worker.training.train_vae import ReportProgress
+from dreamfleet.worker.training.stages.train import MDNRNN, MODELS, VAE, TrainRequest, summarise, train_model
 
 SUMMARY = "train a world model's VAE or MDN-RNN on a data set, or continue its training"
 EXTRAS = ("train",)
-VAE, MDNRNN = MODELS
 TRAINING_FLAGS = ("updates", "batch", "rate", "seed")  # other settings are keys of --set
 
 
@@ -60,74 +53,45 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_settings_flag(parser, tables, TRAINING_FLAGS)
 
 
+def make_request(args: argparse.Namespace) -> TrainRequest:
+    """The training that the flags, the file and the environment ask for."""
+    from dreamfleet.worker.training.config_flags import given_settings
+    from dreamfleet.worker.training.presets import PRESETS
+
+    parts = (args.model, f"{args.model}_layers")
+    kinds = [type(getattr(next(iter(PRESETS.values())), part)) for part in parts]
+    return TrainRequest(
+        args.model, args.data, args.preset, given_settings(kinds, args.model, args), args.device, args.continue_from,
+        args.new, args.decoder_only, args.tensorboard,
+    )  # fmt: skip
+
+
 def run(args: argparse.Namespace) -> int:
     """Train the model, and print its quality on held-out episodes."""
+    from dreamfleet.worker.training.data.data_folder import resolve_preset
+
+    request = make_request(args)
+    if args.summary:
+        summary = summarise(request)
+        print_answer(args, str(summary), **summary.facts)
+        return 0
+    if args.model == MDNRNN:
+        _note_unencoded(args.data)
+    with stop_on_signals() as stop:
+        report = train_model(request, stop)
+    print_answer(args, str(report), **report.facts)
+    bundle = ("bundle", "--data", args.data, "--out", args.data / f"{resolve_preset(args.data, args.preset)}.zip")
+    print_next(args, ("encode", "--data", args.data) if args.model == VAE else bundle)
+    return 0
+
+
+def _note_unencoded(data: Path) -> None:
+    """Say on stderr which drives are not learnt from."""
     from dreamfleet.worker.training.torch_setup import configure_process
 
     configure_process()  # before torch is loaded
-    if args.model == VAE:
-        return _train_vae(args)
-    if args.decoder_only:
-        raise UsageError("--decoder-only is of the VAE: omit it")
-    return _train_mdnrnn(args)
-
-
-def _train_vae(args: argparse.Namespace) -> int:
-    from dreamfleet.worker.training import train_vae as training
-    from dreamfleet.worker.training.config_flags import apply_settings
-    from dreamfleet.worker.training.data.data_folder import resolve_preset
-    from dreamfleet.worker.training.presets import find_preset
-    from dreamfleet.worker.training.training_cli import run_training
-    from dreamfleet.worker.training.training_state import select_device
-    from dreamfleet.worker.worldmodel import vae
-
-    preset = find_preset(resolve_preset(args.data, args.preset))
-    config, layers = apply_settings((preset.vae, preset.vae_layers), VAE, args)
-    if args.summary:
-        return _print_summary(args, vae.VAE(layers))
-
-    def train(report: ReportProgress, stop: Stop) -> dict[str, float]:
-        device, other = select_device(args.device), args.continue_from
-        return training.train_vae(args.data, config, report, layers, device, other, args.decoder_only, stop, args.new,
-                                  args.tensorboard)  # fmt: skip
-
-    code = run_training(args, "VAE", config.updates, args.data / training.CHECKPOINT, train)
-    print_next(args, ("encode", "--data", args.data))
-    return code
-
-
-def _train_mdnrnn(args: argparse.Namespace) -> int:
-    from dreamfleet.worker.training import train_mdnrnn as training
-    from dreamfleet.worker.training.config_flags import apply_settings
-    from dreamfleet.worker.training.data.data_folder import resolve_preset
     from dreamfleet.worker.training.encode import count_unencoded
-    from dreamfleet.worker.training.presets import find_preset
-    from dreamfleet.worker.training.training_cli import run_training
-    from dreamfleet.worker.training.training_state import select_device
-    from dreamfleet.worker.worldmodel import mdnrnn
-    from dreamfleet.worker.worldmodel.mdnrnn_config import ADDABLE_HEADS
 
-    preset = find_preset(resolve_preset(args.data, args.preset))
-    config, layers = apply_settings((preset.mdnrnn, preset.mdnrnn_layers), MDNRNN, args)
-    if args.summary:
-        layers = training.fit_layers(layers, args.data, args.continue_from, args.new)
-        return _print_summary(args, mdnrnn.MDNRNN(layers), ADDABLE_HEADS)
-
-    def train(report: ReportProgress, stop: Stop) -> dict[str, float]:
-        device, other = select_device(args.device), args.continue_from
-        return training.train_mdnrnn(args.data, config, report, layers, device, other, stop, args.new, args.tensorboard)
-
-    if waiting := count_unencoded(args.data):
-        note = f"note: not encoded or learnt from: {plural(waiting, 'drive')}; `dreamfleet encode --data {args.data}`"
+    if waiting := count_unencoded(data):
+        note = f"note: not encoded or learnt from: {plural(waiting, 'drive')}; `dreamfleet encode --data {data}`"
         print(note, file=sys.stderr)
-    code = run_training(args, "MDN-RNN", config.updates, args.data / training.CHECKPOINT, train)
-    print_next(args, ("bundle", "--data", args.data, "--out", args.data / f"{preset.name}.zip"))
-    return code
-
-
-def _print_summary(args: argparse.Namespace, model: nn.Module, addable: frozenset[str] = frozenset()) -> int:
-    from dreamfleet.worker.training.training_state import count_parameters, summarise_model
-
-    text = summarise_model(model, args.continue_from, addable)
-    print_answer(args, text, summary=text.splitlines(), parameters=count_parameters(model))
-    return 0

@@ -11,8 +11,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from dreamfleet.common.cli.command_line import parse_flags
 from dreamfleet.common.cli.model_commands import MODELS, Model, Words
-from dreamfleet.common.cli.verb_runner import InProcessRunner, ProcessRunner
+from dreamfleet.common.cli.verb_runner import ProcessRunner, find_verb
 from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
 from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.host.stop_signals import Stop
@@ -22,7 +23,7 @@ from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
 from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
 from dreamfleet.coordinator.experiments.iteration.ledger import FinishedPhase, IterationLedger
 from dreamfleet.coordinator.experiments.iteration.phases import PhaseRunner
-from dreamfleet.coordinator.experiments.iteration.plan import BUNDLE, Phase, PhasePlan
+from dreamfleet.coordinator.experiments.iteration.plan import Phase, PhasePlan
 from dreamfleet.coordinator.experiments.local_run import LocalFleet
 
 log = logging.getLogger("dreamfleet.coordinator.iterate")
@@ -60,7 +61,7 @@ class Iteration:
         world than the first are checked once there are data of it, which presets must fit.
         """
         commands = Commands(self._config, self._layout, self.ledger)
-        InProcessRunner({BUNDLE: commands.bundle(1)})  # parses them
+        parse_flags(*find_verb(commands.bundle(1)))
         artefacts.check(self._layout, self.ledger)
         if self.ledger.entries or self._config.init or self._config.task:
             return

@@ -79,7 +79,6 @@ def test_the_next_command_is_said_where_a_person_reads(capsys, caplog):
     assert shlex.split(first)[-2:] == ["inspect", "a b.zip"]
     assert shlex.split(second)[-2:] == ["runs", "list"]
     print_next(Namespace(json=True), words)
-    print_next(Namespace(json=False, within_verb=True), words)
     with caplog.at_level(logging.WARNING, "dreamfleet"):
         print_next(Namespace(), words)
     assert capsys.readouterr() == ("", "")

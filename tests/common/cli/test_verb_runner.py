@@ -1,4 +1,4 @@
-"""Verbs that other verbs run, in this process and in their own, and the command lines that spell them.
+"""Verbs that other verbs run in processes of their own, and the command lines that spell them.
 Tests model_commands.py."""
 
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from dreamfleet.common.cli import model_commands
-from dreamfleet.common.cli.verb_runner import InProcessRunner, ProcessRunner, find_verb
+from dreamfleet.common.cli.verb_runner import ProcessRunner, find_verb
 from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
 from dreamfleet.common.host.stop_signals import never_stop
 
@@ -18,19 +18,6 @@ def test_a_command_line_begins_with_a_verb_of_one_or_two_words():
     assert find_verb(("evaluate", "--json"))[::2] == ("evaluate", ("--json",))
     with pytest.raises(DreamfleetError, match="no verb 'xyzzy' is installed"):
         find_verb(("xyzzy",))
-
-
-def test_verbs_in_this_process_answer_or_print(tmp_path, capsys):
-    runner = InProcessRunner({"first": (*LIST, tmp_path.as_posix())})
-    assert runner.run_all_for_json() == {"first": []}
-    assert capsys.readouterr().out == ""
-    runner.run_all()
-    assert f"no runs in {tmp_path}" in capsys.readouterr().err
-
-
-def test_a_wrong_command_is_refused_before_the_first_verb_runs():
-    with pytest.raises(UsageError, match="unrecognized arguments: --xyzzy"):
-        InProcessRunner({"right": ("runs", "list"), "wrong": ("runs", "list", "--xyzzy")})
 
 
 def test_a_verb_in_its_own_process_answers_and_logs(tmp_path):

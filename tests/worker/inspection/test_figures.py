@@ -1,5 +1,5 @@
 """`inspect --probe` and `inspect --losses`: what they print, and the allowed drivers.
-Tests measurements.py and worker/verbs/inspect.py."""
+Tests measure.py, measurements.py and worker/verbs/inspect.py."""
 
 import json
 from dataclasses import replace

@@ -18,7 +18,7 @@ from dreamfleet.worker.inspection import measurements
 from dreamfleet.worker.inspection.encoded_rollout import DriveConfig, record_drive
 from dreamfleet.worker.inspection.page_builder import find_subject, write_page
 from dreamfleet.worker.inspection.probe import Estimate
-from dreamfleet.worker.inspection.road_losses import RoadLossComparison
+from dreamfleet.worker.inspection.road_losses import LossReport, RoadLossComparison
 from dreamfleet.worker.verbs import inspect as verb
 from tests.support.samples import SPEC
 
@@ -75,7 +75,11 @@ def test_a_bundle_is_shown_a_drive_of_another_ones_controller(random_bundle, tmp
 
 def test_a_runs_own_controller_is_measured_at_the_runs_temperature(runs_dir, random_bundle, tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(measurements, "measure_dream_losses", lambda *given: asked.append(given) or ([COMPARED], 1))
+    monkeypatch.setattr(
+        measurements,
+        "measure_dream_losses",
+        lambda *given: asked.append(given) or LossReport(1, 8, 1.0, 10, (COMPARED,)),
+    )
     shape = random_bundle.controller_shape
     Controller(shape, np.zeros(shape.size, np.float32), "dream", random_bundle.sha256).save(
         next(run_paths(runs_dir)) / CONTROLLER

@@ -79,11 +79,11 @@ def test_figures_of_known_lengths():
     assert (one.real, one.dreamt) == (Estimate(20.0, 10.0), Estimate(40.0, 0.0))
     assert (one.ratio, one.real_cut, one.dreamt_cut) == (Estimate(2.0, 1.0), 0.0, 1.0)
     other = PolicySurvival.of("other", lengths[1], lengths[0], limit=40)
-    both = Survival.of(40, "0.5", (one, other)).agreement
+    both = Survival.of(SurvivalConfig(), 40, "0.5", (one, other)).agreement
     assert both.value == pytest.approx(-np.log(2)), "too long and too short do not make up for each other"
     assert both.error == pytest.approx(np.hypot(0.5, 0.5) / 2)
     single = PolicySurvival.of("one", lengths[0][:1], lengths[1][:1], limit=40)
-    assert (single.ratio.error, Survival.of(40, "0.5", (single,)).agreement.error) == (None, None)
+    assert (single.ratio.error, Survival.of(SurvivalConfig(), 40, "0.5", (single,)).agreement.error) == (None, None)
 
 
 def test_numbers_are_held_at_their_bounds():

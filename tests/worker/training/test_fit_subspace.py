@@ -1,4 +1,5 @@
-"""A subspace of features that predict a driver's actions and rewards. Tests worker/verbs/subspace.py."""
+"""A subspace of features that predict a driver's actions and rewards.
+Tests worker/training/stages/subspace.py and worker/verbs/subspace.py."""
 
 import argparse
 import json

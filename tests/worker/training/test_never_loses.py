@@ -1,5 +1,5 @@
 """A training that is interrupted, killed, or out of disk space resumes to the same bits.
-Tests loss_curve.py and training_cli.py."""
+Tests loss_curve.py and worker/training/stages/train.py."""
 
 import argparse
 import json
@@ -19,7 +19,7 @@ from dreamfleet.worker.training.checkpoint import load_progress, load_weights
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.loss_curve import append_point
 from dreamfleet.worker.training.presets import TrainConfig
-from dreamfleet.worker.training.training_cli import run_training
+from dreamfleet.worker.training.stages.train import explain_interrupt
 from dreamfleet.worker.training.training_state import numbered_path
 from dreamfleet.worker.verbs import train as verb
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
@@ -182,9 +182,12 @@ def test_a_second_signal_says_what_is_kept(data, new, command):
             signal.raise_signal(signal.SIGINT)
             signal.raise_signal(signal.SIGTERM)
 
-    args = argparse.Namespace(data=data, new=new, json=False)
-    with pytest.raises(StoppedError, match=rf"vae\.safetensors keeps what was made up to update 2; .*{command}"):
-        run_training(args, "VAE", 6, data / train_vae.CHECKPOINT, lambda _, stop: train(data, SHORT, twice, stop=stop))
+    with (
+        pytest.raises(StoppedError, match=rf"vae\.safetensors keeps what was made up to update 2; .*{command}"),
+        explain_interrupt(data / train_vae.CHECKPOINT, new),
+        stop_on_signals() as stop,
+    ):
+        train(data, SHORT, twice, stop=stop)
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[1]", b"\xff", b'{"done_auc": "high"}', b"[" * 9000])

@@ -1,6 +1,6 @@
 """From drives to a bundle: each stage by itself, and the pipeline of all of them.
-Tests assemble.py, encode.py, prediction_quality.py, train_mdnrnn.py, train_vae.py, worker/verbs/encode.py and
-worker/verbs/pipeline.py."""
+Tests assemble.py, encode.py, prediction_quality.py, train_mdnrnn.py, train_vae.py, worker/training/stages/encode.py,
+worker/verbs/encode.py and worker/verbs/pipeline.py."""
 
 import argparse
 import json
@@ -12,15 +12,15 @@ import pytest
 
 from dreamfleet.common.artifacts.bundle import WEIGHTS, Bundle
 from dreamfleet.common.errors import DatasetError, DreamfleetError, StoppedError, UsageError
+from dreamfleet.worker.training import pipeline as stages
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble, load_quality, record_quality
 from dreamfleet.worker.training.checkpoint import load_weights
 from dreamfleet.worker.training.data.dataset import load_arrays
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.pipeline import STAGES, Pipeline
+from dreamfleet.worker.training.pipeline import STAGES, check_vae
 from dreamfleet.worker.training.prediction_quality import area_under_curve
 from dreamfleet.worker.training.presets import PRESETS, TrainConfig, find_preset
-from dreamfleet.worker.verbs import encode as encode_verb
 from dreamfleet.worker.verbs import pipeline
 from dreamfleet.worker.worldmodel.inference import Encoder, PolicyStep
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
@@ -195,11 +195,11 @@ def test_it_goes_on_where_it_stopped_to_the_same_bundle(tmp_path, monkeypatch, c
     assert call("--data", tmp_path / "whole", *flags) == 0
     assert "controllers of 867 parameters" in capsys.readouterr().out
 
-    def stop(_args):
+    def stop(_request, _stop):
         raise StoppedError("stopped")
 
     with monkeypatch.context() as patched:
-        patched.setattr(encode_verb, "run", stop)
+        patched.setattr(stages, "encode_drives", stop)
         with pytest.raises(StoppedError):
             call("--data", tmp_path / "stopped", *flags)
     assert not (tmp_path / "stopped" / "encoded").exists()
@@ -220,35 +220,40 @@ def test_nothing_is_made_on_a_vae_that_is_no_better_than_the_mean_picture(tmp_pa
     assert not (tmp_path / "encoded").exists()
     assert not (tmp_path / train_mdnrnn.CHECKPOINT).exists()
     record_quality(tmp_path, {"reconstruction_error": figures["mean_picture_error"] - 0.01})
-    Pipeline(PRESETS["tiny"], tmp_path).check_vae()
+    check_vae(tmp_path)
 
 
-def test_the_world_is_passed_to_collect_alone():
-    world = ("--task", "takecover", "--skip", "1")
-    stages = Pipeline(PRESETS["takecover"], Path("data"), world_flags=world).stages(2, "cpu")
-    assert "--preset takecover" in " ".join(stages["collect"])
-    assert "--task takecover --skip 1" in " ".join(stages["collect"])
-    assert not any("--task" in words for name, words in stages.items() if name != "collect")
+def asked(*arguments):
+    parser = argparse.ArgumentParser()
+    pipeline.configure(parser)
+    return pipeline.make_request(parser.parse_args(["--data", "data", *arguments]))
+
+
+def test_the_world_is_of_collecting():
+    found = asked("--task", "takecover", "--skip", "1", "--jobs", "2").collect
+    assert (found.preset, found.task, found.world, found.jobs) == ("takecover", "takecover", {"skip": 1}, 2)
 
 
 def test_each_stage_has_its_flags():
-    flags = {f"{name}_flags": f"--set of={name}" for name in ("collect", "vae", "mdnrnn", "bundle")}
-    stages = Pipeline(PRESETS["pixels"], Path("data"), **flags).stages(2, "cpu")
-    said = {name: " ".join(words) for name, words in stages.items()}
-    assert said["bundle"] == "bundle --data data --out data/pixels.zip --json --set of=bundle"
-    assert {name: text.partition("--set of=")[2].split(" ")[0] for name, text in said.items()} == {
-        "collect": "collect", "train.vae": "vae", "encode": "", "train.mdnrnn": "mdnrnn", "bundle": "bundle",
-    }  # fmt: skip
+    found = asked(
+        "--preset", "pixels", "--collect-flags", "--steps 7", "--vae-flags", "--set latent=5", "--mdnrnn-flags",
+        "--set hidden=6 --tensorboard events", "--bundle-flags", "--reward value",
+    )  # fmt: skip
+    assert found.collect.settings["steps"] == 7
+    assert found.vae.settings["latent"] == 5
+    assert (found.mdnrnn.settings["hidden"], found.mdnrnn.tensorboard) == (6, Path("events"))
+    assert (found.bundle.reward, found.bundle.out) == ("value", Path("data/pixels.zip"))
+    assert "latent" not in found.mdnrnn.settings
 
 
 def test_a_share_of_every_amount_is_rounded_up():
-    stages = Pipeline(PRESETS["notebook"], Path("data"), scale=0.02).stages(2, "cpu")
-    assert "--episodes 20" in " ".join(stages["collect"])
-    assert "--updates 600 --set validate_every=4" in " ".join(stages["train.vae"])
-    assert "--updates 200 --set validate_every=4" in " ".join(stages["train.mdnrnn"])
-    least = Pipeline(PRESETS["tiny"], Path("data"), scale=1e-6).stages(2, "cpu")
-    assert "--episodes 2" in " ".join(least["collect"])
-    assert "--updates 1" in " ".join(least["train.vae"])
+    found = asked("--preset", "notebook", "--scale", "0.02", "--seed", "3")
+    assert found.collect.settings == {"episodes": 20, "seed": 3}
+    assert found.vae.settings == {"updates": 600, "validate_every": 4, "seed": 3}
+    assert found.mdnrnn.settings == {"updates": 200, "validate_every": 4, "seed": 3}
+    least = asked("--preset", "tiny", "--scale", "1e-6")
+    assert least.collect.settings["episodes"] == 2
+    assert least.vae.settings["updates"] == 1
 
 
 @pytest.mark.parametrize(
@@ -270,7 +275,7 @@ def test_what_cannot_be_is_refused_before_anything_is_driven(tmp_path, flags, sa
 
 
 def test_an_unknown_flag_of_a_stage_is_refused_before_anything_is_driven(tmp_path):
-    with pytest.raises(UsageError, match="unknown key 'ghost'"):
+    with pytest.raises(UsageError, match="--ghost"):
         call("--data", tmp_path / "data", "--mdnrnn-flags", "--ghost 1")
     assert not (tmp_path / "data").exists()
 

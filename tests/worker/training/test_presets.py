@@ -3,6 +3,7 @@
 import argparse
 import json
 from dataclasses import fields
+from pathlib import Path
 
 import pytest
 import torch
@@ -37,6 +38,7 @@ def ignore(_done, _note):
 def parsed(verb, *arguments):
     parser = argparse.ArgumentParser()
     verb.configure(parser)
+    parser.set_defaults(runs_dir=Path("runs"))
     return parser.parse_args(arguments)
 
 

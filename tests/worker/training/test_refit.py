@@ -1,4 +1,5 @@
-"""A controller fitted to another world model. Tests drive_regression.py and worker/verbs/refit.py."""
+"""A controller fitted to another world model.
+Tests drive_regression.py, worker/training/stages/refit.py and worker/verbs/refit.py."""
 
 import argparse
 import json

@@ -1,7 +1,8 @@
-"""Tests config_flags.py, worker/verbs/collect.py and worker/verbs/train.py."""
+"""Tests config_flags.py, worker/training/stages/collect.py, worker/verbs/collect.py and worker/verbs/train.py."""
 
 import argparse
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from tests.support.events import scalars
 def call(verb, *arguments):
     parser = argparse.ArgumentParser()
     verb.configure(parser)
+    parser.set_defaults(runs_dir=Path("runs"))
     return verb.run(parser.parse_args(arguments))
 
 

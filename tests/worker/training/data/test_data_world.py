@@ -3,6 +3,7 @@ Tests data_folder.py and common/cli/world_flags.py."""
 
 import argparse
 import json
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -62,6 +63,7 @@ def no_display(monkeypatch):
 def call(*words):
     parser = argparse.ArgumentParser()
     verb.configure(parser)
+    parser.set_defaults(runs_dir=Path("runs"))
     return verb.run(parser.parse_args([*words, "--jobs", "1"]))
 
 

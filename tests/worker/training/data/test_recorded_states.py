@@ -1,4 +1,4 @@
-"""Tests recorded_states.py and worker/verbs/bundle.py."""
+"""Tests recorded_states.py, worker/training/stages/bundle.py and worker/verbs/bundle.py."""
 
 import argparse
 import json
