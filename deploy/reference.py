@@ -363,7 +363,7 @@ def _values(hint: Any) -> str:
     """What a setting may be, in words: its type, its bounds, its choices."""
     if get_origin(hint) is Annotated:
         base, *bounds = get_args(hint)
-        limits = [_bounds(each.low, each.high) for each in bounds if hasattr(each, "low")]
+        limits = [_bounds(each.ge, each.le) for each in bounds if each.ge is not None]
         return " ".join((_values(base), *limits))
     if get_origin(hint) is Union or type(hint).__name__ == "UnionType":
         return next(_values(each) for each in get_args(hint) if each is not type(None))

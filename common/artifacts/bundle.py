@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import MAX_OUTPUTS
@@ -33,8 +34,7 @@ from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import is_folder, open_regular, read_regular
 from dreamfleet.common.printable import plural
 from dreamfleet.common.serialization.display import Displayed
-from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
-from dreamfleet.common.serialization.validation import Between, MalformedError, Word, from_plain
+from dreamfleet.common.serialization.validation import OPTIONAL, MalformedError, Word, from_plain, to_plain
 
 FORMAT = 1
 TO_BUNDLE = "--out world.zip"  # of `import`, for another program's world model
@@ -63,9 +63,9 @@ class BundleManifest:
     task: Word
     preprocessing: Word
     picture: tuple[int, ...]  # height, width, channels of the encoder's 8-bit input
-    latent: Annotated[int, Between(1, 10_000)]
-    hidden: Annotated[int, Between(1, 100_000)]
-    actions: Annotated[int, Between(1, MAX_OUTPUTS)]
+    latent: Annotated[int, Meta(ge=1, le=10_000)]
+    hidden: Annotated[int, Meta(ge=1, le=100_000)]
+    actions: Annotated[int, Meta(ge=1, le=MAX_OUTPUTS)]
     parts: dict[str, Any] = field(default_factory=dict)  # name -> SHA-256; `write_bundle` fills it in
     provenance: dict[str, Any] = field(default_factory=dict)
     format: int = FORMAT
@@ -267,7 +267,7 @@ class Bundle(Displayed):
 def write_bundle(path: Path, manifest: BundleManifest, parts: Mapping[str, bytes]) -> Bundle:
     """Write a bundle atomically, and open it."""
     hashes = {name: hashlib.sha256(data).hexdigest() for name, data in sorted(parts.items())}
-    text = json.dumps({**to_dict(manifest), "parts": hashes}, indent=1, sort_keys=True)
+    text = json.dumps({**to_plain(manifest), "parts": hashes}, indent=1, sort_keys=True)
     if len(text) > _MAX_MANIFEST:
         raise BundleError(f"the manifest of {path} would have {len(text)} bytes; at most {_MAX_MANIFEST} are read")
     with atomic_write(path) as file:

@@ -25,7 +25,7 @@ from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.host.packages import install_command_for
 from dreamfleet.common.printable import plural
 from dreamfleet.common.serialization.display import Displayed
-from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
+from dreamfleet.common.serialization.validation import OPTIONAL, to_plain
 
 if TYPE_CHECKING:
     from dreamfleet.common.artifacts.bundle import Bundle
@@ -203,7 +203,7 @@ class Controller(Displayed):
 
     def save(self, path: Path | str) -> None:
         """Write an `.npz` that `load` reads, atomically."""
-        about = {"format": FORMAT, "shape": to_dict(self.shape), "task": self.task, "bundle": self.bundle}
+        about = {"format": FORMAT, "shape": to_plain(self.shape), "task": self.task, "bundle": self.bundle}
         about |= {name: value for name, value in self._task_details.items() if value != _TASK_DEFAULTS[name]}
         text = json.dumps({**about, "provenance": self.provenance}, sort_keys=True)
         with atomic_write(Path(path)) as file:

@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+from msgspec import Meta
+
 from dreamfleet.common.artifacts.onnx_checks import UnsafeModelError, check_model, has_finite_weights, is_empty_graph
 from dreamfleet.common.errors import ControllerError
 from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive, write_archive
@@ -16,7 +18,7 @@ from dreamfleet.common.files.atomic_write import open_output
 from dreamfleet.common.files.regular_files import open_regular, read_regular
 from dreamfleet.common.printable import plural
 from dreamfleet.common.serialization.display import Displayed
-from dreamfleet.common.serialization.validation import Between, Length, MalformedError, Word, from_plain
+from dreamfleet.common.serialization.validation import MalformedError, Word, from_plain
 
 FORMAT = 1
 MANIFEST, NETWORK = "agent.json", "network.onnx"
@@ -25,7 +27,7 @@ _LIMITS = ArchiveLimits(MAX_BYTES, members=8)
 _MAX_MANIFEST = 1_000_000
 MAX_FRAME_SKIP, MAX_STATE_SIZE = 10**6, 10**6
 
-Choice = Annotated[tuple[float, ...], Length(1, 1000)]
+Choice = Annotated[tuple[float, ...], Meta(min_length=1, max_length=1000)]
 
 
 @dataclass(frozen=True)
@@ -35,9 +37,9 @@ class AgentManifest:
     name: Word  # of its baseline
     task: Word
     preprocessing: Word  # of its input pictures
-    choices: Annotated[tuple[Choice, ...], Length(1, 1000)]  # the actions to choose from
-    frame_skip: Annotated[int, Between(1, MAX_FRAME_SKIP)]  # steps for which an action is repeated
-    state: Annotated[int, Between(1, MAX_STATE_SIZE)]  # length of its recurrent state
+    choices: Annotated[tuple[Choice, ...], Meta(min_length=1, max_length=1000)]  # the actions to choose from
+    frame_skip: Annotated[int, Meta(ge=1, le=MAX_FRAME_SKIP)]  # steps for which an action is repeated
+    state: Annotated[int, Meta(ge=1, le=MAX_STATE_SIZE)]  # length of its recurrent state
     provenance: dict[str, Any] = field(default_factory=dict)
 
 

@@ -7,17 +7,18 @@ from functools import cached_property
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import MAX_OUTPUTS, Continuous
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.serialization.optional_fields import OPTIONAL
-from dreamfleet.common.serialization.validation import Between, Length, MalformedError, Word
+from dreamfleet.common.serialization.validation import OPTIONAL, MalformedError, Word
 
 DRAWN: Final = "drawn"  # the text of the rule that draws its ends
 ODDS_WEIGHTS: Final = (1e-6, 1e6)  # the least and the most
 MAX_OPTIONS = 20_000  # characters of a task's options
-Components = Annotated[tuple[float, ...], Length(1, MAX_OUTPUTS)]  # one number for each component of an action
+# One number for each component of an action
+Components = Annotated[tuple[float, ...], Meta(min_length=1, max_length=MAX_OUTPUTS)]
 
 
 @dataclass(frozen=True)
@@ -49,8 +50,8 @@ class EndRule:
     """
 
     kind: Literal["threshold", "drawn"] = "threshold"
-    at: Annotated[float, Between(0, 1)] = 0.5
-    odds_weight: Annotated[float, Between(*ODDS_WEIGHTS)] = field(default=1.0, metadata=OPTIONAL)
+    at: Annotated[float, Meta(ge=0, le=1)] = 0.5
+    odds_weight: Annotated[float, Meta(ge=ODDS_WEIGHTS[0], le=ODDS_WEIGHTS[1])] = field(default=1.0, metadata=OPTIONAL)
 
     def __post_init__(self) -> None:
         if not 0 <= self.at <= 1:
@@ -114,17 +115,18 @@ class WorldFacts:
     high: Components
     output_indices: tuple[int, ...] = field(default=(), metadata=OPTIONAL)
     choices: tuple[tuple[float, ...], ...] = field(default=(), metadata=OPTIONAL)
-    groups: Annotated[tuple[tuple[int, int], ...], Length(0, MAX_OUTPUTS)] = field(default=(), metadata=OPTIONAL)
-    packages: Annotated[tuple[Word, ...], Length(0, 64)]  # distributions on whose versions a fitness may depend
-    horizon: Annotated[int, Between(1, 10**6)]  # most steps of an evaluation episode
-    frames_per_second: Annotated[int, Between(1, 1000)]  # of videos
+    groups: Annotated[tuple[tuple[int, int], ...], Meta(max_length=MAX_OUTPUTS)] = field(default=(), metadata=OPTIONAL)
+    packages: Annotated[tuple[Word, ...], Meta(max_length=64)]  # distributions on whose versions a fitness may depend
+    horizon: Annotated[int, Meta(ge=1, le=10**6)]  # most steps of an evaluation episode
+    frames_per_second: Annotated[int, Meta(ge=1, le=1000)]  # of videos
     reward: RewardFacts = field(default=RewardFacts(), metadata=OPTIONAL)
     end: EndRule = field(default=EndRule(), metadata=OPTIONAL)
-    options: Annotated[str, Length(0, MAX_OPTIONS)] = field(default="", metadata=OPTIONAL)  # of the task, frozen
-    version: Annotated[int, Between(1, 2**31 - 1)] = field(default=1, metadata=OPTIONAL)  # of the task's world
+    options: Annotated[str, Meta(max_length=MAX_OPTIONS)] = field(default="", metadata=OPTIONAL)  # of the task, frozen
+    version: Annotated[int, Meta(ge=1, le=2**31 - 1)] = field(default=1, metadata=OPTIONAL)  # of the task's world
     score_word: Word = field(default="seed", metadata=OPTIONAL)  # what a scored seed is called
-    marks: Annotated[tuple[float, ...], Length(0, 8)] = field(default=(), metadata=OPTIONAL)  # scores to compare with
-    action_names: Annotated[tuple[Word, ...], Length(0, MAX_OUTPUTS)] = field(default=(), metadata=OPTIONAL)
+    # scores to compare with
+    marks: Annotated[tuple[float, ...], Meta(max_length=8)] = field(default=(), metadata=OPTIONAL)
+    action_names: Annotated[tuple[Word, ...], Meta(max_length=MAX_OUTPUTS)] = field(default=(), metadata=OPTIONAL)
 
     def __post_init__(self) -> None:
         size = len(self.scale)

@@ -18,8 +18,12 @@ GYMNASIUM = "gymnasium"
 PACKAGES = {
     "eclipse-zenoh": ("zenoh", ""),
     "msgpack": ("msgpack", ""),
+    "msgspec": ("msgspec", ""),
     "numpy": ("numpy", ""),
     "cma": ("cma", ""),
+    "cmaes": ("cmaes", ""),
+    "prometheus-client": ("prometheus_client", ""),
+    "rich": ("rich", ""),
     GYMNASIUM: ("gymnasium", "worker"),
     "pygame-ce": ("pygame", "worker"),
     "box2d": ("Box2D", "worker"),

@@ -140,7 +140,7 @@ class LiveView:
         try:
             return LiveFrame.of(keys.worker_from_key(str(sample.key_expr)), frame)
         except MalformedError as error:
-            self.dropped.dropped[error.args[0]] += 1
+            self.dropped.dropped[error.reason] += 1
             return None
 
     def _receive_last_status(self) -> None:

@@ -10,6 +10,8 @@ import json
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
+from msgspec import Meta
+
 from dreamfleet.common.monitoring.equal_fitness import describe_equal_fitness
 from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.protocol.check_counts import CheckCounts
@@ -26,10 +28,9 @@ from dreamfleet.common.runs.records import (
     in_values,
 )
 from dreamfleet.common.serialization.display import Displayed
-from dreamfleet.common.serialization.optional_fields import OPTIONAL
 from dreamfleet.common.serialization.validation import (
+    OPTIONAL,
     Count,
-    Length,
     MalformedError,
     Moment,
     Seconds,
@@ -41,7 +42,7 @@ from dreamfleet.common.serialization.validation import (
 STATUS_SCHEMA_VERSION = 2
 PARTS = ("", "generation", "workers", "history", "evaluations", "candidates", "best", "story")
 FINAL_STATES = ("ended", "left")  # the coordinator leaves in these states
-LongText = Annotated[str, Length(0, 10_000)]
+LongText = Annotated[str, Meta(max_length=10_000)]
 
 
 @dataclass(frozen=True)
@@ -188,7 +189,7 @@ class Event:
     ago: float  # seconds
     what: EventKind
     worker: Word
-    job: Annotated[str, Length(0, 128)]  # kind generation/candidate/episode; empty if of no known job
+    job: Annotated[str, Meta(max_length=128)]  # kind generation/candidate/episode; empty if of no known job
     why: Text = field(default="", metadata=OPTIONAL)  # a worker left, or was refused
 
 

@@ -12,12 +12,12 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.printable import plural
-from dreamfleet.common.serialization.optional_fields import OPTIONAL
-from dreamfleet.common.serialization.validation import Count, Length, Text
+from dreamfleet.common.serialization.validation import OPTIONAL, Count, Text
 
 MAX_LISTED = 512  # batches in one reply
 MAX_BATCH = 32 << 20  # bytes of a body: 8 million numbers
@@ -196,7 +196,7 @@ class CandidateError:
 class BatchLine:
     """A batch in a list: its id, its state, and its candidates."""
 
-    id: Annotated[str, Length(0, 128)]
+    id: Annotated[str, Meta(max_length=128)]
     state: BatchState
     population: Count
     generation: Count | None = field(default=None, metadata=OPTIONAL)
@@ -212,24 +212,24 @@ class BatchReply:
     SCHEMA = "batch-reply"
 
     v: Count
-    run: Annotated[str, Length(0, 128)]
+    run: Annotated[str, Meta(max_length=128)]
     refused: Refusal = ""
     why: Text = ""
-    id: Annotated[str, Length(0, 128)] = ""
+    id: Annotated[str, Meta(max_length=128)] = ""
     state: BatchState = ""
     population: Count = 0
     size: Count = 0
     episodes: Count = 0  # of each candidate
     done: Count = 0  # candidates that have a fitness or an error
     generation: Count | None = None  # of the run in which it is scored; `None` while it waits
-    run_state: Annotated[str, Length(0, 64)] = ""
+    run_state: Annotated[str, Meta(max_length=64)] = ""
     run_why: Text = ""  # why the run is paused
     offset: Count = 0
-    fitness: Annotated[tuple[float | None, ...], Length(0, PAGE_CANDIDATES)] = ()
-    errors: Annotated[tuple[CandidateError, ...], Length(0, PAGE_CANDIDATES)] = ()
+    fitness: Annotated[tuple[float | None, ...], Meta(max_length=PAGE_CANDIDATES)] = ()
+    errors: Annotated[tuple[CandidateError, ...], Meta(max_length=PAGE_CANDIDATES)] = ()
     is_new: bool = field(default=False, metadata=OPTIONAL)  # this query completed it
     # Of the query `list`: open batches in their order, then finished ones, the last first.
-    batches: Annotated[tuple[BatchLine, ...], Length(0, MAX_LISTED)] = field(default=(), metadata=OPTIONAL)
+    batches: Annotated[tuple[BatchLine, ...], Meta(max_length=MAX_LISTED)] = field(default=(), metadata=OPTIONAL)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,9 +239,9 @@ class BatchEvent:
     SCHEMA = "batch-event"
 
     v: Count
-    run: Annotated[str, Length(0, 128)]
+    run: Annotated[str, Meta(max_length=128)]
     incarnation: Count
-    id: Annotated[str, Length(0, 128)]
+    id: Annotated[str, Meta(max_length=128)]
     state: BatchState
     done: Count
     population: Count

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
+from msgspec import Meta
+
 from dreamfleet.common.printable import plural, printable
 from dreamfleet.common.protocol.messages import Share
-from dreamfleet.common.serialization.optional_fields import OPTIONAL
-from dreamfleet.common.serialization.validation import Count, Length, Text
+from dreamfleet.common.serialization.validation import OPTIONAL, Count, Text
 
 MAX_BARRED = 16  # hosts that are named
 BY_OPERATOR = " (by the operator)"  # behind the name of a host that no check found wrong
@@ -27,9 +28,9 @@ class CheckCounts:
     differing: Count = 0  # of these, those that some host did not repeat to the bit
     unchecked: Count = 0  # drawn results that no other host of their class could repeat
     recalled: Count = field(default=0, metadata=OPTIONAL)  # results of barred hosts that count no more
-    barred: Annotated[tuple[Text, ...], Length(0, MAX_BARRED)] = field(default=(), metadata=OPTIONAL)
+    barred: Annotated[tuple[Text, ...], Meta(max_length=MAX_BARRED)] = field(default=(), metadata=OPTIONAL)
     # Of the barred hosts, those that the operator named: no check found them wrong.
-    by_operator: Annotated[tuple[Text, ...], Length(0, MAX_BARRED)] = field(default=(), metadata=OPTIONAL)
+    by_operator: Annotated[tuple[Text, ...], Meta(max_length=MAX_BARRED)] = field(default=(), metadata=OPTIONAL)
     waiting: Text = field(default="", metadata=OPTIONAL)  # which hosts differ, while nobody has decided between them
 
     @property

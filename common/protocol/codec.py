@@ -7,16 +7,27 @@ value of a wrong type, out of range, or NaN. `CountingDecoder` counts such paylo
 from __future__ import annotations
 
 import json
+import logging
 from collections import Counter
-from dataclasses import fields
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import msgpack
+import msgspec
 
 from dreamfleet.common.protocol.keys import PROTOCOL_VERSION
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, Message
-from dreamfleet.common.serialization.validation import MalformedError, T, checker_of, to_checked_plain, to_plain
+from dreamfleet.common.serialization.validation import (
+    SCHEMA,
+    MalformedError,
+    T,
+    convert,
+    from_plain,
+    from_plain_lenient,
+    to_plain,
+)
 
+log = logging.getLogger(__name__)
 M = TypeVar("M", bound=Message)
 
 
@@ -27,10 +38,20 @@ def encoding(kind: type[Any]) -> str:
 
 def encode(message: Message) -> bytes:
     """Encode a message as msgpack; `MalformedError` if it breaks its own schema, as a peer would drop it."""
-    payload: bytes = msgpack.packb({"v": PROTOCOL_VERSION, **to_checked_plain(message)})
+    try:
+        checked = convert(type(message), _to_builtins(message))  # its words are the schema's own: see `_to_builtins`
+        payload: bytes = msgpack.packb({"v": PROTOCOL_VERSION, **_to_builtins(checked)})
+    except (TypeError, UnicodeEncodeError) as error:  # a value that is no plain data, or half a surrogate pair
+        raise MalformedError(str(error), SCHEMA) from error
     if len(payload) > MAX_MESSAGE:
         raise MalformedError("oversize")
     return payload
+
+
+def _to_builtins(message: Message) -> dict[str, Any]:
+    """The fields of a message; one that *is* its default is left out, and an equal one of another object is not."""
+    plain: dict[str, Any] = msgspec.to_builtins(message, builtin_types=(bytes,))
+    return plain
 
 
 def decode(kind: type[M], payload: bytes) -> M:
@@ -45,14 +66,13 @@ def decode(kind: type[M], payload: bytes) -> M:
         raise MalformedError("not a message")
     if raw.pop("v", None) != PROTOCOL_VERSION:
         raise MalformedError("unknown version")
-    message: M = checker_of(kind)(raw)
-    return message
+    return convert(kind, raw)
 
 
 def encode_json(document: Any) -> bytes:
     """Encode a dataclass as JSON, checked like `encode`."""
     plain = to_plain(document)
-    checker_of(type(document))(plain)
+    from_plain(type(document), plain)
     return json.dumps(plain, allow_nan=False).encode()
 
 
@@ -66,9 +86,7 @@ def decode_json(kind: type[T], payload: bytes) -> T:
         raise MalformedError("not JSON") from error
     if not isinstance(raw, dict):
         raise MalformedError("not a message")
-    known = {field.name for field in fields(kind)}  # type: ignore[arg-type]
-    document: T = checker_of(kind)({name: value for name, value in raw.items() if name in known})
-    return document
+    return from_plain_lenient(kind, raw)
 
 
 class CountingDecoder:
@@ -79,16 +97,17 @@ class CountingDecoder:
 
     def decode(self, kind: type[M], payload: bytes) -> M | None:
         """Decode a message; `None` if it is malformed."""
-        try:
-            return decode(kind, payload)
-        except MalformedError as error:
-            self.dropped[error.args[0]] += 1
-            return None
+        return self._count(decode, kind, payload)
 
     def decode_json(self, kind: type[T], payload: bytes) -> T | None:
         """Decode a JSON document; `None` if it is malformed."""
+        return self._count(decode_json, kind, payload)
+
+    def _count(self, read: Callable[[type[T], bytes], T], kind: type[T], payload: bytes) -> T | None:
         try:
-            return decode_json(kind, payload)
+            return read(kind, payload)
         except MalformedError as error:
-            self.dropped[error.args[0]] += 1
+            if error.reason not in self.dropped:  # the first one: a flood of them must not fill the log
+                log.info("dropped a message as malformed: %s", error)
+            self.dropped[error.reason] += 1
             return None

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from dreamfleet.common.serialization.optional_fields import OPTIONAL
-from dreamfleet.common.serialization.validation import Length, Text
+from msgspec import Meta
+
+from dreamfleet.common.serialization.validation import Packed, Text
 
 MAX_CAUSE = 128  # characters
 FailureKind = Literal["host", "usage", "crash", "other"]
@@ -15,13 +15,13 @@ FailureKind = Literal["host", "usage", "crash", "other"]
 `crash`: the scoring process ended or was killed."""
 
 
-@dataclass(frozen=True)
-class Failure:
+class Failure(Packed, frozen=True):
     """Why an attempt at a job failed; `cause` is equal for equal failures, on every host and in every run."""
 
     text: Text  # for people
-    cause: Annotated[str, Length(1, MAX_CAUSE)]  # an exception's class, or fixed words: no number, path or address
-    kind: FailureKind = field(default="other", metadata=OPTIONAL)
+    # An exception's class, or fixed words: no number, path or address
+    cause: Annotated[str, Meta(min_length=1, max_length=MAX_CAUSE)]
+    kind: FailureKind = "other"
 
     @classmethod
     def of_host(cls, what: str) -> Failure:

@@ -12,9 +12,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
+from msgspec import Meta
+
 from dreamfleet.common.printable import plural, printable, truncate
 from dreamfleet.common.protocol.messages import HostClass
-from dreamfleet.common.serialization.validation import Count, Length, Text
+from dreamfleet.common.serialization.validation import Count, Text
 
 BY_FINGERPRINT = "fingerprint-"  # prefix of classes that are derived from a fingerprint
 NON_DETERMINISTIC = "non-deterministic"  # the class of a host where equal episodes gave other bits
@@ -31,7 +33,7 @@ class HostClassShare:
 
     host_class: HostClass
     results: Count
-    fingerprints: Annotated[tuple[Text, ...], Length(0, MAX_LISTED)]  # the most frequent ones of its hosts
+    fingerprints: Annotated[tuple[Text, ...], Meta(max_length=MAX_LISTED)]  # the most frequent ones of its hosts
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class HostClasses:
     """The host classes of a run's accepted results: their number, and the `MAX_LISTED` largest, the largest first."""
 
     total: Count = 0
-    largest: Annotated[tuple[HostClassShare, ...], Length(0, MAX_LISTED)] = ()
+    largest: Annotated[tuple[HostClassShare, ...], Meta(max_length=MAX_LISTED)] = ()
     results: Count = 0  # of all classes
 
     @classmethod

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.serialization.validation import Between, Length, Word
+from dreamfleet.common.serialization.validation import Word
 
 MAX_AXES = 4
 MAX_CELLS = 10_000  # of an archive
@@ -24,9 +25,9 @@ EPSILON = 1e-6  # as in pyribs: a measure on a cell's lower bound lies in it wha
 NO_ARCHIVE = "none"
 STEPS, INFO, TRUTH = "steps", "info.", "truth."
 
-MeasureNames = Annotated[tuple[Word, ...], Length(0, MAX_AXES)]
+MeasureNames = Annotated[tuple[Word, ...], Meta(max_length=MAX_AXES)]
 Measures = Annotated[
-    tuple[Annotated[float, Between(-LARGEST_MEASURE, LARGEST_MEASURE)], ...], Length(0, MAX_AXES)
+    tuple[Annotated[float, Meta(ge=-LARGEST_MEASURE, le=LARGEST_MEASURE)], ...], Meta(max_length=MAX_AXES)
 ]  # of one episode, in the order of the names
 
 

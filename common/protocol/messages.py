@@ -1,7 +1,7 @@
-"""All messages of protocol version 2, as frozen dataclasses.
+"""All messages of protocol version 2, frozen: structs in msgpack, dataclasses in JSON.
 
-The annotations are the schema: `dreamfleet.common.protocol.codec` derives its checks from them. A message has at most
-`MAX_MESSAGE` bytes; larger batches are split, and long vectors and files are sent in parts.
+The annotations are the schema, which msgspec checks. A message has at most `MAX_MESSAGE` bytes; larger batches are
+split, and long vectors and files are sent in parts.
 """
 
 from __future__ import annotations
@@ -12,13 +12,24 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 
+from msgspec import Meta
+
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.measures import MeasureNames, Measures
 from dreamfleet.common.serialization.display import DisplayedFields
-from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
-from dreamfleet.common.serialization.validation import Between, Count, Digest, Length, Seconds, Text, Word
+from dreamfleet.common.serialization.validation import (
+    OPTIONAL,
+    Count,
+    Digest,
+    Finite,
+    Packed,
+    Seconds,
+    Text,
+    Word,
+    to_plain,
+)
 
 MAX_MESSAGE = 48 * 1024
 MAX_PART = 40 * 1024  # leaves room for the rest of the message
@@ -36,17 +47,20 @@ MIN_TEMPERATURE, MAX_TEMPERATURE = 1e-3, 1e3  # of a dream
 OWN_END_VERSION = 10  # added to the world's version by runs with an end rule of their own
 
 
-Tag = Annotated[bytes, Length(TAG_BYTES, TAG_BYTES)]  # the first bytes of a digest, unique among one worker's jobs
-Part = Annotated[bytes, Length(0, MAX_PART)]
-Temperature = Annotated[float, Between(MIN_TEMPERATURE, MAX_TEMPERATURE)]
-Horizon = Annotated[int, Between(1, 10**6)]  # maximum steps of an episode that is scored for the optimiser
-Share = Annotated[float, Between(0.0, 1.0)]
+# The first bytes of a digest, unique among one worker's jobs
+Tag = Annotated[bytes, Meta(min_length=TAG_BYTES, max_length=TAG_BYTES)]
+Part = Annotated[bytes, Meta(max_length=MAX_PART)]
+Temperature = Annotated[float, Meta(ge=MIN_TEMPERATURE, le=MAX_TEMPERATURE)]
+Horizon = Annotated[int, Meta(ge=1, le=10**6)]  # maximum steps of an episode that is scored for the optimiser
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 MIN_SHARE, MAX_SHARE = 0.01, 100.0
-FleetShare = Annotated[float, Between(MIN_SHARE, MAX_SHARE)]  # of a fleet's slots, relative to the other runs' shares
-Patience = Annotated[int, Between(0, 10**6)]  # steps without reward after which a scored episode ends; 0: never
-Packages = Annotated[tuple[Word, ...], Length(0, 64)]
-Reason = Annotated[str, Length(0, MAX_REASON)]  # why a worker leaves, or why a run has ended; empty: nothing is said
-HostClass = Annotated[str, Length(0, 32)]  # see `host_classes`; empty: not known yet
+# Of a fleet's slots, relative to the other runs' shares
+FleetShare = Annotated[float, Meta(ge=MIN_SHARE, le=MAX_SHARE)]
+Patience = Annotated[int, Meta(ge=0, le=10**6)]  # steps without reward after which a scored episode ends; 0: never
+Packages = Annotated[tuple[Word, ...], Meta(max_length=64)]
+# Why a worker leaves, or why a run has ended; empty: nothing is said
+Reason = Annotated[str, Meta(max_length=MAX_REASON)]
+HostClass = Annotated[str, Meta(max_length=32)]  # see `host_classes`; empty: not known yet
 Kind = Literal["score", "evaluate", "collect"]
 VerdictWord = Literal["accepted", "duplicate", "obsolete", "refused"]
 
@@ -66,19 +80,19 @@ class TaskSpec(DisplayedFields):
     """
 
     task: Word
-    bundle: Annotated[str, Length(0, 64)]  # SHA-256 of the bundle's file, hexadecimal; empty without one
+    bundle: Annotated[str, Meta(max_length=64)]  # SHA-256 of the bundle's file, hexadecimal; empty without one
     horizon: Horizon
     patience: Patience
     controller: ControllerShape | None = field(default=None, metadata=OPTIONAL)  # `None`: linear on z and h
     temperature: Temperature | None = field(default=None, metadata=OPTIONAL)  # of a dream
     # The task's options, as canonical JSON, such as arguments of its environment.
-    options: Annotated[str, Length(0, MAX_OPTIONS)] = field(default="", metadata=OPTIONAL)
+    options: Annotated[str, Meta(max_length=MAX_OPTIONS)] = field(default="", metadata=OPTIONAL)
     # Version of the task: another one computes another fitness.
-    version: Annotated[int, Between(1, 10**6)] = field(default=1, metadata=OPTIONAL)
+    version: Annotated[int, Meta(ge=1, le=10**6)] = field(default=1, metadata=OPTIONAL)
     recorded: Share = field(default=0.0, metadata=OPTIONAL)  # share of dreams that begin at recorded states
     driven: bool = field(default=False, metadata=OPTIONAL)  # score a dream task in the real environment
     # When dreams end, in place of the bundle's own rule: a text that `EndRule.parse` reads. Empty: the bundle's own.
-    end: Annotated[str, Length(0, MAX_END)] = field(default="", metadata=OPTIONAL)
+    end: Annotated[str, Meta(max_length=MAX_END)] = field(default="", metadata=OPTIONAL)
     measures: MeasureNames = field(default=(), metadata=OPTIONAL)  # that each episode gives beside its fitness
 
     @property
@@ -109,32 +123,29 @@ class TaskSpec(DisplayedFields):
 
     @cached_property
     def _json(self) -> str:
-        return json.dumps(to_dict(self), sort_keys=True)
+        return json.dumps(to_plain(self), sort_keys=True)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Message:
+class Message(Packed, frozen=True, kw_only=True):
     """Fields of every message; the codec adds the protocol version."""
 
     SCHEMA: ClassVar[str]
 
-    run_uid: Annotated[str, Length(32, 32)]
+    run_uid: Annotated[str, Meta(min_length=32, max_length=32)]
     incarnation: Count
 
 
-@dataclass(frozen=True)
-class VectorPart:
+class VectorPart(Packed, frozen=True):
     """Bytes from `offset` of an array of little-endian `dtype` and `shape` whose SHA-256 is `id`."""
 
     id: Digest
     dtype: Literal["<f4", "<f8"]
-    shape: Annotated[tuple[Count, ...], Length(1, 4)]
+    shape: Annotated[tuple[Count, ...], Meta(min_length=1, max_length=4)]
     offset: Count
     data: Part
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(Packed, frozen=True):
     """One episode of a candidate, or of the mean (`evaluate`, `collect`): the unit of dispatch."""
 
     kind: Kind
@@ -142,15 +153,15 @@ class Job:
     generation: Count
     candidate: Count
     episode: Count
-    seeds: Annotated[tuple[Count, ...], Length(1, 64)]
+    seeds: Annotated[tuple[Count, ...], Meta(min_length=1, max_length=64)]
     vector: Digest
     digest: Digest
     stall: Seconds  # a slot without a step for so long is hung
     # Overrides of the specification; `None`: none.
-    temperature: Temperature | None = field(default=None, metadata=OPTIONAL)
-    horizon: Horizon | None = field(default=None, metadata=OPTIONAL)
-    patience: Patience | None = field(default=None, metadata=OPTIONAL)
-    driven: bool | None = field(default=None, metadata=OPTIONAL)
+    temperature: Temperature | None = None
+    horizon: Horizon | None = None
+    patience: Patience | None = None
+    driven: bool | None = None
 
     @property
     def overrides(self) -> tuple[float | None, int | None, int | None, bool | None]:
@@ -167,16 +178,14 @@ class Job:
         return run_spec.with_overrides(*self.overrides)
 
 
-@dataclass(frozen=True)
-class Verdict:
+class Verdict(Packed, frozen=True):
     """The coordinator's decision on a result; the worker stops repeating that result."""
 
     digest: Digest
     verdict: VerdictWord
 
 
-@dataclass(frozen=True, kw_only=True)
-class JobBatch(Message):
+class JobBatch(Message, frozen=True, kw_only=True):
     """Coordinator to one worker; `number` counts from 1 without gaps in each `numbering`."""
 
     SCHEMA: ClassVar[str] = "job"
@@ -188,70 +197,65 @@ class JobBatch(Message):
     jobs: tuple[Job, ...]
     cancels: tuple[Digest, ...]
     verdicts: tuple[Verdict, ...]
-    leave: bool = field(default=False, metadata=OPTIONAL)  # the run is over: the worker exits
-    ended: bool = field(default=False, metadata=OPTIONAL)  # the run has ended: the worker leaves it
-    why: Reason = field(default="", metadata=OPTIONAL)  # it ended
+    leave: bool = False  # the run is over: the worker exits
+    ended: bool = False  # the run has ended: the worker leaves it
+    why: Reason = ""  # it ended
 
 
-@dataclass(frozen=True)
-class Result:
+class Result(Packed, frozen=True):
     """A finished job: a fitness or an error; a collected rollout also has the hash of its upload."""
 
     digest: Digest
-    fitness: float | None
+    fitness: Finite | None
     steps: Count
     seconds: Seconds
     error: Failure | None
     upload: Digest | None
-    measures: Measures = field(default=(), metadata=OPTIONAL)  # those that the specification names, in its order
+    measures: Measures = ()  # those that the specification names, in its order
 
 
-@dataclass(frozen=True, kw_only=True)
-class ResultBatch(Message):
+class ResultBatch(Message, frozen=True, kw_only=True):
     """One worker to the coordinator; each result is repeated until its verdict arrives."""
 
     SCHEMA: ClassVar[str] = "result"
 
     fingerprint: Text
     results: tuple[Result, ...]
-    host_class: HostClass = field(default="", metadata=OPTIONAL)  # of the worker's host
+    host_class: HostClass = ""  # of the worker's host
 
 
-@dataclass(frozen=True)
-class RunningJob:
+class RunningJob(Packed, frozen=True):
     """A job in a slot, and its environment steps so far."""
 
     tag: Tag
     steps: Count
 
 
-@dataclass(frozen=True, kw_only=True)
-class Heartbeat(Message):
+class Heartbeat(Message, frozen=True, kw_only=True):
     """One worker to the coordinator, periodically: its jobs and load."""
 
     SCHEMA: ClassVar[str] = "beat"
 
     nonce: Word
     numbering: Count
-    seen: Annotated[int, Between(0, MAX_BATCHES)]  # all batches of this numbering up to this number have arrived
-    capacity: Annotated[int, Between(0, MAX_LEASES)]  # slots times the jobs that the task batches in one
-    slots: Annotated[int, Between(0, MAX_SLOTS)]
-    queued: Annotated[tuple[Tag, ...], Length(0, MAX_LEASES)]
-    running: Annotated[tuple[RunningJob, ...], Length(0, MAX_LEASES)]
-    unacked: Annotated[tuple[Tag, ...], Length(0, MAX_LEASES)]  # oldest first
-    load: Annotated[float, Between(0.0, 1e6)]  # the host's load average over one minute
-    steps_per_second: Annotated[float, Between(0.0, 1e9)]
+    seen: Annotated[int, Meta(ge=0, le=MAX_BATCHES)]  # all batches of this numbering up to this number have arrived
+    capacity: Annotated[int, Meta(ge=0, le=MAX_LEASES)]  # slots times the jobs that the task batches in one
+    slots: Annotated[int, Meta(ge=0, le=MAX_SLOTS)]
+    queued: Annotated[tuple[Tag, ...], Meta(max_length=MAX_LEASES)]
+    running: Annotated[tuple[RunningJob, ...], Meta(max_length=MAX_LEASES)]
+    unacked: Annotated[tuple[Tag, ...], Meta(max_length=MAX_LEASES)]  # oldest first
+    load: Annotated[float, Meta(ge=0.0, le=1e6)]  # the host's load average over one minute
+    steps_per_second: Annotated[float, Meta(ge=0.0, le=1e9)]
     drawn_by: Word  # renderer of the slots' pictures: native, gymnasium, or - if the task does not say
-    host_class: HostClass = field(default="", metadata=OPTIONAL)
-    reason: Reason = field(default="", metadata=OPTIONAL)  # the worker leaves, and this is its last heartbeat
+    host_class: HostClass = ""
+    reason: Reason = ""  # the worker leaves, and this is its last heartbeat
     # Of `capacity`, what the worker's other runs use now: jobs given to it would wait.
-    taken: Annotated[int, Between(0, MAX_LEASES)] = field(default=0, metadata=OPTIONAL)
+    taken: Annotated[int, Meta(ge=0, le=MAX_LEASES)] = 0
     # Candidates' drives that a slot does side by side; `capacity` of a dream's run counts its dreams.
-    together: Annotated[int, Between(1, MOST_TOGETHER)] = field(default=1, metadata=OPTIONAL)
+    together: Annotated[int, Meta(ge=1, le=MOST_TOGETHER)] = 1
 
 
-@dataclass(frozen=True, kw_only=True)
-class BundlePart(Message):
+class BundlePart(Message, frozen=True, kw_only=True):
     """Bytes from `offset` of a bundle of `total` bytes."""
 
     SCHEMA: ClassVar[str] = "bundle"
@@ -262,8 +266,7 @@ class BundlePart(Message):
     data: Part
 
 
-@dataclass(frozen=True, kw_only=True)
-class UploadPart(Message):
+class UploadPart(Message, frozen=True, kw_only=True):
     """Bytes from `offset` of the output of the job `digest`; `sha256` is the hash of all `total` bytes."""
 
     SCHEMA: ClassVar[str] = "upload"
@@ -275,8 +278,7 @@ class UploadPart(Message):
     data: Part
 
 
-@dataclass(frozen=True, kw_only=True)
-class ViewFrame(Message):
+class ViewFrame(Message, frozen=True, kw_only=True):
     """A slot's current observation: a `height x width x 3` picture of 8-bit values, row by row; empty without one.
 
     `latent`, `state` and `parameters` are float32, little-endian; with the run's world model a viewer can decode them
@@ -288,19 +290,19 @@ class ViewFrame(Message):
     slot: Count
     tag: Tag  # of the job
     step: Count  # finished steps of the episode
-    reward: float  # their total reward
-    height: Annotated[int, Between(1, MAX_PICTURE_SIDE)]
-    width: Annotated[int, Between(1, MAX_PICTURE_SIDE)]
+    reward: Finite  # their total reward
+    height: Annotated[int, Meta(ge=1, le=MAX_PICTURE_SIDE)]
+    width: Annotated[int, Meta(ge=1, le=MAX_PICTURE_SIDE)]
     picture: Part
-    packed: bool = field(default=False, metadata=OPTIONAL)  # the picture is deflated
-    kind: Kind = field(default="score", metadata=OPTIONAL)  # of the job
-    generation: Count = field(default=0, metadata=OPTIONAL)
-    candidate: Count = field(default=0, metadata=OPTIONAL)
-    seed: Count = field(default=0, metadata=OPTIONAL)
-    action: Annotated[tuple[float, ...], Length(0, 64)] = field(default=(), metadata=OPTIONAL)  # the next one
-    latent: Part = field(default=b"", metadata=OPTIONAL)
-    state: Part = field(default=b"", metadata=OPTIONAL)  # the world model's recurrent state before the action
-    parameters: Part = field(default=b"", metadata=OPTIONAL)  # of the controller
+    packed: bool = False  # the picture is deflated
+    kind: Kind = "score"  # of the job
+    generation: Count = 0
+    candidate: Count = 0
+    seed: Count = 0
+    action: Annotated[tuple[Finite, ...], Meta(max_length=64)] = ()  # the next one
+    latent: Part = b""
+    state: Part = b""  # the world model's recurrent state before the action
+    parameters: Part = b""  # of the controller
 
 
 @dataclass(frozen=True)
@@ -313,13 +315,13 @@ class HelloRequest:
     protocol_max: Count
     package: Word
     worker: Word
-    tasks: Annotated[tuple[Word, ...], Length(0, 256)]
+    tasks: Annotated[tuple[Word, ...], Meta(max_length=256)]
     fingerprint: Text
     slots: Count
     packages: Packages = field(default=NUMERIC_PACKAGES, metadata=OPTIONAL)  # whose versions the fingerprint names
     host_class: HostClass = field(default="", metadata=OPTIONAL)
     # Shows that it runs on the coordinator's own host, as its user (`common/security/anchor_key.py`); empty if not.
-    anchor: Annotated[str, Length(0, 64)] = field(default="", metadata=OPTIONAL)
+    anchor: Annotated[str, Meta(max_length=64)] = field(default="", metadata=OPTIONAL)
 
 
 @dataclass(frozen=True)
@@ -344,7 +346,7 @@ class HelloReply:
     numbering: Count = field(default=0, metadata=OPTIONAL)  # of the following batches; it increases
     share: FleetShare = field(default=1.0, metadata=OPTIONAL)  # of a worker's slots, relative to its other runs
     # Refused, as the worker did not announce this task of no package: its user may start it with that.
-    unannounced_task: Annotated[str, Length(0, 128)] = field(default="", metadata=OPTIONAL)
+    unannounced_task: Annotated[str, Meta(max_length=128)] = field(default="", metadata=OPTIONAL)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -356,15 +358,15 @@ class ClaimNote:
     run_uid: Word
     incarnation: Count
     nonce: Word
-    began: Annotated[float, Between(0.0, 1e12)]  # seconds since 1970, by its own clock
+    began: Annotated[float, Meta(ge=0.0, le=1e12)]  # seconds since 1970, by its own clock
 
 
 @dataclass(frozen=True)
 class Intervals:
     """Intervals of a worker's heartbeats and repetitions, in seconds; part of `HelloReply`."""
 
-    beat: Annotated[float, Between(0.05, 60.0)] = 1.0
-    repeat: Annotated[float, Between(0.05, 60.0)] = 1.0
+    beat: Annotated[float, Meta(ge=0.05, le=60.0)] = 1.0
+    repeat: Annotated[float, Meta(ge=0.05, le=60.0)] = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)

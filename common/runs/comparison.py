@@ -17,7 +17,7 @@ from dreamfleet.common.runs.learning import LearningCurve, Point
 from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, expand_task_options, in_values
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.common.serialization.validation import to_plain
 
 Scores = dict[int, float]  # by validation seed
 
@@ -111,7 +111,7 @@ BUDGETS: dict[str, Callable[[Effort], float]] = {
 
 def differing_settings(sides: Sequence[ComparedRun]) -> dict[str, list[Any]]:
     """The settings that differ, each with one value a run; `None` is the default."""
-    flat = [_flatten(expand_task_options(to_dict(each.settings))) for each in sides]
+    flat = [_flatten(expand_task_options(to_plain(each.settings))) for each in sides]
     names = sorted({name for each in flat for name in each})
     rows = {name: [each.get(name) for each in flat] for name in names}
     return {name: values for name, values in rows.items() if any(value != values[0] for value in values)}

@@ -8,21 +8,22 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
+from msgspec import Meta
+
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import read_text
 from dreamfleet.common.printable import format_number, one_line
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.common.runs.standard_error import format_with_error, score_digits
-from dreamfleet.common.serialization.optional_fields import OPTIONAL
-from dreamfleet.common.serialization.validation import Length, MalformedError, Seconds, from_plain_lenient
+from dreamfleet.common.serialization.validation import OPTIONAL, MalformedError, Seconds, from_plain_lenient
 
 GYMNASIUM = "gymnasium"  # the judge of worlds that gymnasium itself has
 FORMER_MARKS = (800.0, 900.0)  # of reports that name none: only drives with laps were compared with them
 MAX_MARKS = 8
 MIN_EPISODES_TO_SOLVE = 100  # customary number of episodes for gymnasium's threshold of solving an environment
 MAX_BYTES, MAX_EPISODES, MAX_SEED = 64 << 20, 10**5, 2**63
-Drives = Annotated[tuple[EpisodeResult, ...], Length(1, MAX_EPISODES)]
+Drives = Annotated[tuple[EpisodeResult, ...], Meta(min_length=1, max_length=MAX_EPISODES)]
 
 
 @dataclass(frozen=True)
@@ -42,9 +43,9 @@ class EvaluationReport:
     #: mean score from which the environment counts as solved; `None` if none is named
     threshold: float | None = field(default=None, metadata=OPTIONAL)
     #: episodes without a score; every statistic leaves them out
-    failed: Annotated[tuple[FailedEpisode, ...], Length(0, MAX_EPISODES)] = field(default=(), metadata=OPTIONAL)
+    failed: Annotated[tuple[FailedEpisode, ...], Meta(max_length=MAX_EPISODES)] = field(default=(), metadata=OPTIONAL)
     #: scores of which the share of episodes above them is reported
-    marks: Annotated[tuple[float, ...], Length(0, MAX_MARKS)] = field(default=FORMER_MARKS, metadata=OPTIONAL)
+    marks: Annotated[tuple[float, ...], Meta(max_length=MAX_MARKS)] = field(default=FORMER_MARKS, metadata=OPTIONAL)
     #: of `task`, as a run freezes them
     options: str = field(default="", metadata=OPTIONAL)
 

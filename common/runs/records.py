@@ -8,6 +8,8 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Annotated, Any, Literal, TypeVar, cast
 
+from msgspec import Meta
+
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
@@ -21,17 +23,17 @@ from dreamfleet.common.runs.standard_error import (
     error_from_sample_std,
     format_with_error,
 )
-from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
-from dreamfleet.common.serialization.validation import Between, Count, Length, MalformedError, from_plain
+from dreamfleet.common.serialization.validation import OPTIONAL, Count, MalformedError, from_plain, to_plain
 
 MAX_STAGES = 32  # of a schedule; statuses contain them too
-PopulationSize = Annotated[int, Between(2, 10**5)]
-EpisodesPerCandidate = Annotated[int, Between(1, 10**4)]
-ConfirmationEpisodes = Annotated[int, Between(0, 10**4)]  # fresh tracks; 0: no confirmation
+PopulationSize = Annotated[int, Meta(ge=2, le=10**5)]
+EpisodesPerCandidate = Annotated[int, Meta(ge=1, le=10**4)]
+ConfirmationEpisodes = Annotated[int, Meta(ge=0, le=10**4)]  # fresh tracks; 0: no confirmation
 OnFailure = Literal["worst", "redraw", "pause"]
 EXTERNAL = "external"  # the optimiser of a run whose candidates others submit
 SUBMITTED = "candidates as others submit them"  # in place of such a run's population
-EpisodeCount = Annotated[int, Between(1, 2**63 - 1)]  # at least 1: a standard error divides by it
+EpisodeCount = Annotated[int, Meta(ge=1, le=2**63 - 1)]  # at least 1: a standard error divides by it
+AxisText = Annotated[str, Meta(min_length=1, max_length=MAX_AXIS)]
 
 
 def stage_option(default: Any, text: str) -> Any:
@@ -112,11 +114,9 @@ class RunSettings:
     # What becomes of a candidate whose episode fails everywhere: it ranks last, it is drawn anew, or the run pauses.
     on_failure: OnFailure = field(default="pause", metadata=OPTIONAL)
     # A schedule. The settings above are its first stage's, which changes none. The last stage has no end.
-    stages: Annotated[tuple[StageSettings, ...], Length(0, MAX_STAGES)] = field(default=(), metadata=OPTIONAL)
+    stages: Annotated[tuple[StageSettings, ...], Meta(max_length=MAX_STAGES)] = field(default=(), metadata=OPTIONAL)
     # Axes of its archive, each as MEASURE=LOW:HIGH:CELLS; empty: it measures nothing beside fitness.
-    archive: Annotated[tuple[Annotated[str, Length(1, MAX_AXIS)], ...], Length(0, MAX_AXES)] = field(
-        default=(), metadata=OPTIONAL
-    )
+    archive: Annotated[tuple[AxisText, ...], Meta(max_length=MAX_AXES)] = field(default=(), metadata=OPTIONAL)
 
     @property
     def is_external(self) -> bool:
@@ -125,7 +125,7 @@ class RunSettings:
 
     def to_json(self) -> str:
         """The text in the journal."""
-        return json.dumps(to_dict(self), sort_keys=True)
+        return json.dumps(to_plain(self), sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> RunSettings:
@@ -286,7 +286,7 @@ class StoredConfirmation:
 
     def to_json(self) -> str:
         """The text in the journal."""
-        return json.dumps(to_dict(self), allow_nan=False)
+        return json.dumps(to_plain(self), allow_nan=False)
 
     @classmethod
     def from_json(cls, text: str) -> StoredConfirmation:

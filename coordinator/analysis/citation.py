@@ -32,8 +32,8 @@ from dreamfleet.common.runs.run_paths import trust_flag
 from dreamfleet.common.runs.run_provenance import RunProvenance, read_run_provenance, read_run_settings
 from dreamfleet.common.runs.seeds import TRAINING_FIRST
 from dreamfleet.common.runs.stages import begun_stages, describe_limit, describe_stages
-from dreamfleet.common.serialization.optional_fields import to_dict
 from dreamfleet.common.serialization.times import parse_time
+from dreamfleet.common.serialization.validation import to_plain
 from dreamfleet.common.worlds.score_words import score_word_of_run
 
 AUTHORS = "The dreamfleet authors"
@@ -52,7 +52,7 @@ def citation_facts(run: RunFolder) -> dict[str, Any]:
         "failed_candidates": count_failed(history), "replaced_seeds": run.count_reseeds(history),
         "on_failure": settings.on_failure,
         "spent": {**asdict(spent), "core_hours": spent.core_hours},
-        "settings": to_dict(settings), "receipt": to_dict(receipt), "commands": _commands(run),
+        "settings": to_plain(settings), "receipt": to_plain(receipt), "commands": _commands(run),
         "software": software_facts(receipt),
     }  # fmt: skip
 

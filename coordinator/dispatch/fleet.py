@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 from itertools import count
 from typing import Literal
+
+from msgspec.structs import replace
 
 from dreamfleet.common.monitoring.status import EventKind
 from dreamfleet.common.printable import plural

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+
+from msgspec.structs import replace
 
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, MAX_PART, VectorPart, Verdict
 from dreamfleet.coordinator.jobs.work import Work

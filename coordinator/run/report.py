@@ -17,7 +17,7 @@ from dreamfleet.common.errors import write_error
 from dreamfleet.common.files.atomic_write import fsync_path
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation
 from dreamfleet.common.runs.run_provenance import RECEIPT, RunProvenance
-from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.common.serialization.validation import to_plain
 
 SAVE_INTERVAL = 5.0  # seconds between two saves of means without evaluation: each waits for the disk
 
@@ -108,7 +108,7 @@ class ControllerWriter:
         if self.current is None or self.current == self._saved or not (self._due or at_once):
             return
         controller = self.current.controller()
-        provenance = {**controller.provenance, RECEIPT: to_dict(self._receipt())}
+        provenance = {**controller.provenance, RECEIPT: to_plain(self._receipt())}
         try:
             replace(controller, provenance=provenance).save(self._path)
         except OSError as error:

@@ -9,9 +9,11 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from datetime import UTC, datetime
 from math import nan
+
+from msgspec.structs import replace
 
 from dreamfleet.common.errors import NotWritableNowError
 from dreamfleet.common.protocol.host_classes import HostClasses

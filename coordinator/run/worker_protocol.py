@@ -5,7 +5,9 @@ No transport: the service decodes what arrives and sends what is returned.
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
+
+from msgspec.structs import replace
 
 from dreamfleet.common.errors import DreamfleetError, InternalError, NotWritableNowError
 from dreamfleet.common.host.packages import package_version
@@ -27,8 +29,7 @@ from dreamfleet.common.protocol.messages import (
     UploadPart,
 )
 from dreamfleet.common.protocol.result_bounds import LONGEST_EPISODE, max_steps, rejection_reason
-from dreamfleet.common.serialization.optional_fields import to_dict
-from dreamfleet.common.serialization.validation import MAX_TEXT
+from dreamfleet.common.serialization.validation import MAX_TEXT, to_plain
 from dreamfleet.coordinator.dispatch.failures import LONGEST_ERROR
 from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
 from dreamfleet.coordinator.dispatch.refusals import Refusal
@@ -75,7 +76,7 @@ class WorkerProtocol:
             why=truncate(why, MAX_TEXT),
             remedy=truncate(remedy, MAX_TEXT),
             unannounced_task=task,
-            spec={} if why else to_dict(self._run.settings.task),
+            spec={} if why else to_plain(self._run.settings.task),
             intervals={} if why else asdict(self._intervals),
             packages=self._run.settings.packages,
             numbering=numbering,

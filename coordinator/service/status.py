@@ -12,7 +12,7 @@ from dreamfleet.common.monitoring.status import STATUS_SCHEMA_VERSION, Event, Po
 from dreamfleet.common.protocol.codec import encode_json
 from dreamfleet.common.protocol.messages import MAX_MESSAGE
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration, with_error
-from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.common.serialization.validation import to_plain
 from dreamfleet.coordinator.dispatch.event_log import FleetEvent
 from dreamfleet.coordinator.jobs.generation import CandidateScores
 from dreamfleet.coordinator.service.snapshot import Snapshot
@@ -142,7 +142,7 @@ def _best(snapshot: Snapshot, offset: int) -> dict[str, Any]:
     controller = reported.controller()
     part = controller.parameters[offset : offset + PARAMETERS].astype("<f4").tobytes()
     about = {
-        "shape": to_dict(controller.shape),
+        "shape": to_plain(controller.shape),
         "task": controller.task,
         "bundle": controller.bundle,
         "provenance": controller.provenance,

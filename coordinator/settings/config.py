@@ -13,6 +13,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from msgspec import Meta
+
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.controller import ControllerShape
@@ -55,7 +57,7 @@ from dreamfleet.common.runs.records import (
     StageSettings,
 )
 from dreamfleet.common.runs.stages import stages_of
-from dreamfleet.common.serialization.validation import Between, Count
+from dreamfleet.common.serialization.validation import Count
 from dreamfleet.coordinator.settings.bounds import check_bounds
 from dreamfleet.coordinator.settings.presets import check_preset_fits
 from dreamfleet.coordinator.settings.run_checks import check_subspace, try_optimiser
@@ -68,7 +70,7 @@ from dreamfleet.coordinator.settings.task_options import (
 DEFAULT_BUNDLE, NO_BUNDLE = "tiny", "none"
 DEFAULT_HORIZON = 1000  # steps
 LARGEST_STEP = 1e6  # of sigma0: parameters travel in single precision
-Interval = Annotated[int, Between(0, 10**6)]  # generations; 0: never
+Interval = Annotated[int, Meta(ge=0, le=10**6)]  # generations; 0: never
 
 
 def frozen_option(record: type, default: Any, text: str) -> Any:
@@ -109,7 +111,7 @@ class RunConfig:
         "(docs/reference/tasks.md)",
     )
     controller: Literal["linear", "hidden"] = option("linear", "a linear map, or one with a layer of tanh units")
-    hidden_units: Annotated[int, Between(1, 10**5)] = option(8, "units of a hidden controller's layer")
+    hidden_units: Annotated[int, Meta(ge=1, le=10**5)] = option(8, "units of a hidden controller's layer")
     features: Literal["zh", "z"] = frozen_option(
         RunSettings, "zh", "what the controller sees: latent and hidden state, or latent alone"
     )

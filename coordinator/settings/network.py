@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
+from msgspec import Meta
+
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.protocol.messages import FleetShare, Share
-from dreamfleet.common.serialization.validation import Between
 from dreamfleet.common.transport.network import parse_metrics_address
 from dreamfleet.coordinator.settings.bounds import check_bounds
 from dreamfleet.coordinator.settings.live_log import parse_sinks
@@ -19,11 +20,11 @@ class NetworkConfig:
 
     listen: tuple[str, ...] = option((), "listen here (default tcp/127.0.0.1:7447, unless --connect is given)")
     connect: tuple[str, ...] = option((), "connect to these stand-alone routers; with --listen, do both")
-    beat: Annotated[float, Between(0.05, 60.0)] = option(1.0, "seconds between a worker's beats")
-    evaluation_share: Annotated[float, Between(0.0, 0.9)] = option(
+    beat: Annotated[float, Meta(ge=0.05, le=60.0)] = option(1.0, "seconds between a worker's beats")
+    evaluation_share: Annotated[float, Meta(ge=0.0, le=0.9)] = option(
         0.25, "share of a busy fleet's time for evaluations, 0 to 0.9; 0: only idle slots"
     )  # the search needs the rest
-    failure_limit: Annotated[float, Between(0.0, 1.0)] = option(
+    failure_limit: Annotated[float, Meta(ge=0.0, le=1.0)] = option(
         0.5, "pause when more than this share of the last five generations' candidates failed, 0 to 1"
     )
     share: FleetShare = option(

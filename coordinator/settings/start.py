@@ -26,7 +26,7 @@ from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.common.runs.run_provenance import read_run_provenance
-from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.common.serialization.validation import to_plain
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.storage.journal import Journal
@@ -66,7 +66,7 @@ class StartPoint:
     def facts(self) -> dict[str, str]:
         """What the journal keeps of it, whole: the file that it came from may be gone when the run is continued."""
         mean = base64.b64encode(self.mean.astype("<f8").tobytes()).decode()
-        spent = {} if self.effort is None else {START_EFFORT: json.dumps(to_dict(self.effort))}
+        spent = {} if self.effort is None else {START_EFFORT: json.dumps(to_plain(self.effort))}
         revoked = {} if self.revoked is None else {REVOKED: self.revoked}
         return {START_SOURCE: self.source, START_MEAN: mean, **spent, **revoked}
 

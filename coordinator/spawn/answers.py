@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from dreamfleet.common.serialization.validation import Count, Length
+from msgspec import Meta
 
-Name = Annotated[str, Length(0, 4096)]
-Line = Annotated[str, Length(0, 1 << 16)]
+from dreamfleet.common.serialization.validation import Count
+
+Name = Annotated[str, Meta(max_length=4096)]
+Line = Annotated[str, Meta(max_length=1 << 16)]
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class InstallAnswer:
 class HostAnswer:
     """What `look` finds on a host."""
 
-    python: Annotated[tuple[int, ...], Length(2, 2)]
+    python: Annotated[tuple[int, ...], Meta(min_length=2, max_length=2)]
     executable: Name
     machine: Name
     system: Name

@@ -120,7 +120,7 @@ class Connection:
         try:
             return from_plain(answer, self._answer(silence, on_message))
         except MalformedError as error:
-            self._end(f"its answer to {do!r} has {error}: what runs there is not the agent of this version")
+            self._end(f"its answer to {do!r} does not fit ({error}): what runs there is not the agent of this version")
             raise self._failure() from error
 
     def interrupt(self) -> None:

@@ -39,7 +39,7 @@ def test_a_coordinator_drops_and_counts_what_is_malformed_or_foreign(processes, 
         assert not list(session.get(keys.bundle("test", "ab" * 32), timeout=1))
     while sum((dropped := processes.status()["dropped"]).values()) < 16:
         pass
-    assert dropped == {"not msgpack": 6, "oversize": 3, "foreign run": 3, "wrong fields": 3, "not JSON": 1}
+    assert dropped == {"not msgpack": 6, "oversize": 3, "foreign run": 3, "schema": 3, "not JSON": 1}
     processes.worker("--task", tasks.SLOW_TOY)
     assert coordinator.finish()[0] == 0
 

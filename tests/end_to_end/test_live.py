@@ -6,6 +6,7 @@ import signal
 import subprocess
 from contextlib import ExitStack
 
+import msgspec
 import pytest
 
 from dreamfleet.common.errors import ConnectionFailedError, JournalError, UsageError
@@ -91,7 +92,7 @@ def test_who_is_not_there_is_named_and_a_coordinator_that_is_killed_is_missed(pr
 def test_hostile_frames_are_dropped_and_counted(processes, run):
     with Client((processes.endpoint,)) as client, LiveView(client) as view:
         (sight,) = sights(view, 1)
-        own = {**vars(MSGPACK["view"]), "run_uid": sight.frame.run_uid, "incarnation": 1}
+        own = {**msgspec.structs.asdict(MSGPACK["view"]), "run_uid": sight.frame.run_uid, "incarnation": 1}
         payloads = {
             "oversize": bytes(60_000), "not msgpack": b"\xc1", "foreign run": encode(MSGPACK["view"]),
             "wrong length": encode(ViewFrame(**{**own, "height": 200, "width": 200})),

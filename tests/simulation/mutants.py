@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import msgspec
 import numpy as np
 
 from dreamfleet.common.protocol.messages import MAX_PART
@@ -150,7 +151,7 @@ def fleet_accepts_what_it_has_accepted_already(original):
 def fleet_believes_every_result_of_the_generation_that_is_open(original):
     def judge(self, identity, result, given, host_class):
         if result.digest not in self.jobs and result.fitness is not None and self.jobs:
-            result = replace(result, digest=next(iter(self.jobs)))
+            result = msgspec.structs.replace(result, digest=next(iter(self.jobs)))
             given = self.find_job_for_result(identity, result)
         return original(self, identity, result, given, host_class)
 
@@ -181,7 +182,7 @@ def fleet_keeps_the_leases_of_a_worker_that_joins_again(_original):
 def fleet_believes_beats_of_other_numberings(original):
     def beat(self, identity, beat, now):
         if member := self.members.get(identity):  # which then shows no more batches than were sent, or is found out
-            beat = replace(beat, numbering=member.numbering, seen=min(beat.seen, member.number))
+            beat = msgspec.structs.replace(beat, numbering=member.numbering, seen=min(beat.seen, member.number))
         return original(self, identity, beat, now)
 
     return beat

@@ -11,6 +11,8 @@ from functools import lru_cache
 from itertools import count
 from typing import Any
 
+import msgspec
+
 from dreamfleet.common.protocol.messages import HelloRequest, Job, JobBatch
 from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
 from dreamfleet.coordinator.run.run import BY_HAND
@@ -364,7 +366,8 @@ class World:
         if link.garbled and batch.jobs:
             link.garbled = False
             first, *others = batch.jobs
-            batch = replace(batch, jobs=(replace(first, seeds=(first.seeds[0] + 1,)), *others))
+            other = msgspec.structs.replace(first, seeds=(first.seeds[0] + 1,))
+            batch = msgspec.structs.replace(batch, jobs=(other, *others))
         self._transmit_down(host, send.identity, batch)
 
     def _transmit_down(self, host: int, identity: str, message: JobBatch | Welcome) -> None:

@@ -9,6 +9,7 @@ import threading
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import zenoh
 
@@ -138,7 +139,7 @@ class Attacker:
             return
         self.hello(guest.identity)
         running = tuple(RunningJob(digest[:TAG_BYTES], steps) for digest in list(guest.held)[-64:])
-        beat = replace(
+        beat = msgspec.structs.replace(
             MSGPACK["beat"], run_uid=self.head.run_uid, incarnation=self.head.incarnation, nonce=self.head.nonce,
             numbering=guest.numbering, seen=guest.seen, capacity=guest.capacity, slots=guest.capacity, queued=(),
             unacked=(), running=running,
@@ -154,7 +155,8 @@ class Attacker:
     def forge(self, **changes):
         """Send a forged batch to the overheard worker."""
         if self.head is not None:
-            batch = replace(self.head, **{"vectors": (), "jobs": (), "cancels": (), "verdicts": (), **changes})
+            own = {"vectors": (), "jobs": (), "cancels": (), "verdicts": (), **changes}
+            batch = msgspec.structs.replace(self.head, **own)
             self.session.put(keys.job(RUN, self.worker), encode(batch))
 
 

@@ -18,7 +18,7 @@ from dreamfleet.common.artifacts.bundle import (
     BundleManifest,
     write_bundle,
 )
-from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.common.serialization.validation import to_plain
 from dreamfleet.worker.training.data.dataset import find_world, preprocessing_of_size
 from dreamfleet.worker.worldmodel.export import (
     export_controller,
@@ -136,6 +136,6 @@ def _write(path, task, preprocessing, seed, vae, rnn, weights, initial, recorded
         parts[RECORDED_STATES] = npy(recorded)
     manifest = BundleManifest(
         "random", task, preprocessing, (vae.picture, vae.picture, 3), vae.latent, rnn.hidden, rnn.actions,
-        provenance={"seed": seed}, models={"vae": to_dict(vae), "mdnrnn": to_dict(rnn)}, world=facts,
+        provenance={"seed": seed}, models={"vae": to_plain(vae), "mdnrnn": to_plain(rnn)}, world=facts,
     )  # fmt: skip
     return write_bundle(path, manifest, parts)

@@ -1,8 +1,7 @@
 """A fleet of two workers and its jobs, without a run."""
 
-from dataclasses import replace
-
 import numpy as np
+from msgspec.structs import replace
 
 from dreamfleet.common.protocol.messages import TAG_BYTES, Heartbeat, Result, RunningJob
 from dreamfleet.coordinator.dispatch.fleet import Fleet as _Fleet

@@ -8,10 +8,11 @@ from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any
 
+from msgspec import Meta
+
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.printable import format_number
-from dreamfleet.common.serialization.optional_fields import OPTIONAL
-from dreamfleet.common.serialization.validation import Count, Length, MalformedError, from_plain
+from dreamfleet.common.serialization.validation import OPTIONAL, Count, MalformedError, from_plain
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class TrainingProgress:
 
     update: Count
     oldest: Count
-    episodes: Annotated[tuple[EpisodeRecord, ...], Length(0, 10**7)]
+    episodes: Annotated[tuple[EpisodeRecord, ...], Meta(max_length=10**7)]
     learning: dict[str, Any] = field(default_factory=dict, metadata=OPTIONAL)
 
 

@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.wrappers import TransformObservation
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import Continuous
@@ -20,8 +21,7 @@ from dreamfleet.common.artifacts.task_options import write_options
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.user_code import describe_error
 from dreamfleet.common.protocol.tasks import GYM
-from dreamfleet.common.serialization.optional_fields import OPTIONAL, to_dict
-from dreamfleet.common.serialization.validation import Between, Length, MalformedError, from_plain
+from dreamfleet.common.serialization.validation import OPTIONAL, MalformedError, from_plain, to_plain
 from dreamfleet.worker.gym.environments import (
     RGB,
     action_meanings,
@@ -67,12 +67,12 @@ class PixelOptions:
     """
 
     environment: dict[str, Any] = field(default_factory=dict, metadata=OPTIONAL)  # arguments of `gymnasium.make`
-    observation: Annotated[str, Length(0, 128)] = field(
+    observation: Annotated[str, Meta(max_length=128)] = field(
         default="", metadata=OPTIONAL
     )  # a Dict's key, `render` or `all`
     crop: str = field(default="", metadata=OPTIONAL)  # `top:bottom,left:right`; empty: the whole picture
     size: int = field(default=SIZES[0], metadata=OPTIONAL)  # height and width
-    skip: Annotated[int, Between(1, 1000)] = field(default=1, metadata=OPTIONAL)  # steps for which an action is held
+    skip: Annotated[int, Meta(ge=1, le=1000)] = field(default=1, metadata=OPTIONAL)  # steps for which an action is held
     difference: bool = field(default=False, metadata=OPTIONAL)  # show movement, in grey
 
     def __post_init__(self) -> None:
@@ -102,7 +102,7 @@ class PixelOptions:
     @property
     def text(self) -> str:
         """The options that differ from their defaults as canonical JSON; empty if none does."""
-        return write_options(to_dict(self))
+        return write_options(to_plain(self))
 
     @property
     def rows_and_columns(self) -> Crop | None:

@@ -35,7 +35,7 @@ from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import read_regular
 from dreamfleet.common.host.packages import package_version
-from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.common.serialization.validation import to_plain
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld
 from dreamfleet.worker.tasks.api import Preprocessing
 from dreamfleet.worker.training import train_mdnrnn, train_vae
@@ -216,7 +216,7 @@ def make_manifest(
         hidden=rnn.hidden,
         actions=rnn.actions,
         provenance=provenance,
-        models={"vae": to_dict(vae), "mdnrnn": to_dict(rnn)},
+        models={"vae": to_plain(vae), "mdnrnn": to_plain(rnn)},
         world=facts,
     )
 

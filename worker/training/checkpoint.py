@@ -18,8 +18,7 @@ from safetensors.torch import save
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.host.stop_signals import signals_deferred
-from dreamfleet.common.serialization.optional_fields import to_dict
-from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.serialization.validation import MalformedError, from_plain, to_plain
 from dreamfleet.worker.training.data.data_folder import explain_write_errors
 
 T = TypeVar("T")
@@ -33,7 +32,7 @@ def save_checkpoint(path: Path, model: torch.nn.Module, optimiser: torch.optim.A
     tensors = {f"model.{name}": tensor for name, tensor in model.state_dict().items()}
     for index, state in optimiser.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": torch.as_tensor(value) for name, value in state.items()}
-    about = {"progress": json.dumps(progress), "config": json.dumps(to_dict(model.config))}
+    about = {"progress": json.dumps(progress), "config": json.dumps(to_plain(model.config))}
     with signals_deferred(), explain_write_errors(path), atomic_write(path) as file:
         file.write(save({name: tensor.contiguous() for name, tensor in tensors.items()}, about))
 

@@ -22,7 +22,7 @@ from dreamfleet.common.artifacts.bundle import (
 )
 from dreamfleet.common.errors import BundleError
 from dreamfleet.common.files.archives import parse_array
-from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.common.serialization.validation import to_plain
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.training.data.data_folder import explain_write_errors
 from dreamfleet.worker.training.unbundle import Models, restore_models
@@ -67,7 +67,7 @@ def write_eight_bit_bundle(bundle: Bundle, out: Path) -> Bundle:
     manifest = bundle.manifest
     made = replace(
         manifest, name=out.stem, parts={}, provenance=manifest.provenance | {SINGLE_PRECISION: bundle.sha256},
-        models=manifest.models | {EIGHT_BITS: to_dict(ranges)},
+        models=manifest.models | {EIGHT_BITS: to_plain(ranges)},
     )  # fmt: skip
     with explain_write_errors(out):
         return write_bundle(out, made, parts)

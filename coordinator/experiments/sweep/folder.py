@@ -12,8 +12,7 @@ from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write, reporting_unwritable_folder
 from dreamfleet.common.files.regular_files import path_exists, read_text
 from dreamfleet.common.protocol.keys import check_run_name
-from dreamfleet.common.serialization.optional_fields import OPTIONAL
-from dreamfleet.common.serialization.validation import MalformedError, from_plain, to_plain
+from dreamfleet.common.serialization.validation import OPTIONAL, MalformedError, from_plain, to_plain
 from dreamfleet.coordinator.experiments.local_run import has_begun
 from dreamfleet.coordinator.experiments.sweep.options import SweepOptions
 from dreamfleet.coordinator.experiments.sweep.plan import Sweep

@@ -7,8 +7,7 @@ from dreamfleet.common.artifacts.actions import Continuous, grouped, one_hot
 from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts, WorldFacts
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.serialization.optional_fields import to_dict
-from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.serialization.validation import MalformedError, from_plain, to_plain
 
 ABOUT = {"packages": ("numpy", "vizdoom"), "horizon": 525, "frames_per_second": 9}
 ACTIONS = {
@@ -27,7 +26,7 @@ def test_facts_are_the_same_after_json(actions):
         version=2, score_word="game", marks=(750.0,),
         action_names=tuple(f"move {number}" for number in range(actions.actions)),
     )  # fmt: skip
-    found = from_plain(WorldFacts, json.loads(json.dumps(to_dict(facts))))
+    found = from_plain(WorldFacts, json.loads(json.dumps(to_plain(facts))))
     assert found == facts
     assert found.actions == actions
     logits = np.random.default_rng(1).normal(size=(9, actions.outputs)).astype(np.float32)
@@ -35,7 +34,7 @@ def test_facts_are_the_same_after_json(actions):
 
 
 def test_what_is_as_usual_is_not_written():
-    written = to_dict(WorldFacts.of(ACTIONS["thirds"], **ABOUT))
+    written = to_plain(WorldFacts.of(ACTIONS["thirds"], **ABOUT))
     assert sorted(written) == ["frames_per_second", "high", "horizon", "low", "packages", "scale", "shift"]
 
 
@@ -70,7 +69,7 @@ def test_what_is_as_usual_is_not_written():
 )
 def test_facts_that_make_no_world_are_refused(change):
     with pytest.raises(MalformedError):
-        from_plain(WorldFacts, {**to_dict(WorldFacts.of(one_hot(3), **ABOUT)), **change})
+        from_plain(WorldFacts, {**to_plain(WorldFacts.of(one_hot(3), **ABOUT)), **change})
 
 
 @pytest.mark.parametrize("text", ["", "drawn ", "half", "-0.1", "1.01", "nan"])
@@ -110,8 +109,8 @@ def test_drawn_ends_of_a_model_with_heavier_ends_come_as_often_as_they_really_do
 def test_the_weight_of_odds_leaves_thresholds_and_is_written_only_where_it_is_given():
     assert EndRule(odds_weight=3.0).bars(np.array([0.1]), 1.0) == np.float32(0.5)
     for rule, extra in ((EndRule("drawn"), set()), (EndRule("drawn", odds_weight=3.0), {"odds_weight"})):
-        assert set(to_dict(rule)) == {"kind", "at", *extra}
-        assert from_plain(EndRule, to_dict(rule)) == rule
+        assert set(to_plain(rule)) == {"kind", "at", *extra}
+        assert from_plain(EndRule, to_plain(rule)) == rule
 
 
 @pytest.mark.parametrize("weight", [0.0, -1.0, 1e7, float("nan")])

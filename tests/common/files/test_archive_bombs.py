@@ -15,7 +15,7 @@ import pytest
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.files.archives import ArchiveLimits, DamagedArchiveError, read_arrays
-from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.common.serialization.validation import to_plain
 from tests.support.bundles import npy
 from tests.support.processes import DEADLINE, ROOT
 
@@ -112,7 +112,7 @@ def external_weights(path):
 def rewrite(path, small, parts):
     """A packed bundle with other parts and their right hashes."""
     hashes = {name: hashlib.sha256(data).hexdigest() for name, data in parts.items()}
-    packed(path, ("manifest.json", json.dumps({**to_dict(small.manifest), "parts": hashes})), *parts.items())
+    packed(path, ("manifest.json", json.dumps({**to_plain(small.manifest), "parts": hashes})), *parts.items())
 
 
 def paths_and_links(path):

@@ -1,5 +1,6 @@
+import re
 import sys
-from importlib.metadata import packages_distributions
+from importlib.metadata import packages_distributions, requires
 
 import pytest
 
@@ -47,3 +48,8 @@ def test_a_version_that_another_package_brought_is_found(found, is_wrong, monkey
 def test_what_is_installed_here_is_what_is_required():
     assert wanted_versions("gymnasium")
     assert not any(wrong_version(name) for name in packages.PACKAGES)
+
+
+def test_doctor_looks_for_all_that_every_role_requires():
+    required = {re.match(r"[\w.-]+", each)[0] for each in requires("dreamfleet") if "extra ==" not in each}
+    assert {name for name, (_, extra) in packages.PACKAGES.items() if not extra} == required

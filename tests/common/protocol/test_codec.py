@@ -2,7 +2,7 @@
 
 `python -m tests.common.protocol.test_codec` writes a new message's fixture; it never writes one that exists.
 
-Tests messages.py, common/serialization/optional_fields.py and common/serialization/validation.py.
+Tests messages.py.
 """
 
 import dataclasses
@@ -16,8 +16,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace as changed
 
 from dreamfleet.common.protocol.codec import CountingDecoder, decode, decode_json, encode, encode_json, encoding
+from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.keys import PROTOCOL_VERSION
 from dreamfleet.common.protocol.messages import (
     MAX_MESSAGE,
@@ -27,7 +29,7 @@ from dreamfleet.common.protocol.messages import (
     JobBatch,
     ResultBatch,
 )
-from dreamfleet.common.serialization.validation import MalformedError
+from dreamfleet.common.serialization.validation import SCHEMA, MalformedError
 from tests.support.mutations import mutations
 from tests.support.samples import JSON, MSGPACK, VECTOR_ID
 
@@ -80,24 +82,24 @@ def result_with(**changes):
         (msgpack.packb({1: 2}), "not msgpack"),
         (damaged(v=1), "unknown version"),
         (damaged(v=None), "unknown version"),
-        (damaged(extra=1), "wrong fields"),
-        (damaged(run_uid="short"), "wrong length"),
-        (damaged(run_uid=b"0" * 32), "wrong type"),
-        (damaged(incarnation=-1), "out of range"),
-        (damaged(incarnation=True), "wrong type"),
-        (damaged(incarnation=2**63), "out of range"),
-        (damaged(results={}), "wrong type"),
-        (damaged(results=[None]), "wrong type"),
-        (result_with(fitness=float("nan")), "not finite"),
-        (result_with(fitness=float("inf")), "not finite"),
-        (result_with(fitness="1"), "wrong type"),
-        (result_with(digest=b"\x01" * 31), "wrong length"),
-        (result_with(error={"text": "x" * 3000, "cause": "x"}), "wrong length"),
-        (result_with(error={"text": "x", "cause": ""}), "wrong length"),
-        (result_with(error={"text": "x", "cause": "x", "kind": "odd"}), "unknown word"),
-        (result_with(error="x"), "wrong type"),
-        (damaged("beat", queued=[b"abcdefgh"] * 2000), "wrong length"),
-        (damaged("view", height=0), "out of range"),
+        (damaged(extra=1), SCHEMA),
+        (damaged(run_uid="short"), SCHEMA),
+        (damaged(run_uid=b"0" * 32), SCHEMA),
+        (damaged(incarnation=-1), SCHEMA),
+        (damaged(incarnation=True), SCHEMA),
+        (damaged(incarnation=2**63), SCHEMA),
+        (damaged(results={}), SCHEMA),
+        (damaged(results=[None]), SCHEMA),
+        (result_with(fitness=float("nan")), SCHEMA),
+        (result_with(fitness=float("inf")), SCHEMA),
+        (result_with(fitness="1"), SCHEMA),
+        (result_with(digest=b"\x01" * 31), SCHEMA),
+        (result_with(error={"text": "x" * 3000, "cause": "x"}), SCHEMA),
+        (result_with(error={"text": "x", "cause": ""}), SCHEMA),
+        (result_with(error={"text": "x", "cause": "x", "kind": "odd"}), SCHEMA),
+        (result_with(error="x"), SCHEMA),
+        (damaged("beat", queued=[b"abcdefgh"] * 2000), SCHEMA),
+        (damaged("view", height=0), SCHEMA),
         (b"\x00" * (MAX_MESSAGE + 1), "oversize"),
     ],
 )
@@ -109,20 +111,41 @@ def test_malformed_messages_are_dropped_and_counted(payload, reason):
     assert inbox.dropped == {reason: 1}
 
 
+def test_a_default_is_not_written_whichever_object_it_is():
+    result = MSGPACK["result"].results[1]
+    payloads = {
+        encode(changed(MSGPACK["result"], results=(changed(result, error=Failure("x", "y", kind)),)))
+        for kind in ("other", "".join(("ot", "her")))
+    }
+    assert len(payloads) == 1
+
+
+def test_the_log_has_the_first_fault_alone(caplog):
+    caplog.set_level("INFO")
+    inbox = CountingDecoder()
+    for _ in range(3):
+        assert inbox.decode(ResultBatch, damaged(extra=1)) is None
+    assert len(caplog.records) == 1
+    assert "extra" in caplog.text
+
+
 def test_an_unknown_word_is_malformed():
     raw = msgpack.unpackb(encode(MSGPACK["job"]))
     raw["jobs"][0]["kind"] = "mine-bitcoin"
-    with pytest.raises(MalformedError, match="unknown word"):
+    with pytest.raises(MalformedError) as caught:
         decode(JobBatch, msgpack.packb(raw))
+    assert caught.value.reason == SCHEMA
 
 
 def test_messages_are_checked_before_encoding():
-    batch = dataclasses.replace(MSGPACK["job"], vectors=MSGPACK["job"].vectors * 2000)
-    with pytest.raises(MalformedError, match="oversize"):
+    batch = changed(MSGPACK["job"], vectors=MSGPACK["job"].vectors * 2000)
+    with pytest.raises(MalformedError) as caught:
         encode(batch)
-    beat = dataclasses.replace(MSGPACK["beat"], load=float("nan"))
-    with pytest.raises(MalformedError, match="not finite"):
+    assert caught.value.reason == "oversize"
+    beat = changed(MSGPACK["beat"], load=float("nan"))
+    with pytest.raises(MalformedError) as caught:
         encode(beat)
+    assert caught.value.reason == SCHEMA
 
 
 def test_hello_ignores_fields_of_later_versions():
@@ -156,8 +179,8 @@ def test_mutated_messages_decode_or_are_counted(data):
 
 def test_vectors_round_trip_to_the_bit():
     vector = np.array([0.0, -0.0, 1e-45, 3.4e38], dtype="<f4")
-    part = dataclasses.replace(MSGPACK["job"].vectors[0], id=VECTOR_ID, shape=(4,), data=vector.tobytes())
-    received = decode(JobBatch, encode(dataclasses.replace(MSGPACK["job"], vectors=(part,))))
+    part = changed(MSGPACK["job"].vectors[0], id=VECTOR_ID, shape=(4,), data=vector.tobytes())
+    received = decode(JobBatch, encode(changed(MSGPACK["job"], vectors=(part,))))
     assert received.vectors[0].data == vector.tobytes()
 
 
@@ -194,9 +217,9 @@ def test_a_million_damaged_messages_never_raise_are_all_counted_and_leave_nothin
 
 def test_half_a_surrogate_pair_is_malformed():
     hello = JSON["hello-request"]
-    with pytest.raises(MalformedError, match="surrogate"):
+    with pytest.raises(MalformedError):
         decode_json(HelloRequest, json.dumps({**dataclasses.asdict(hello), "fingerprint": "\ud800"}).encode())
-    with pytest.raises(MalformedError, match="surrogate"):
+    with pytest.raises(MalformedError):
         encode_json(dataclasses.replace(hello, fingerprint="\ud800"))
     assert (
         decode_json(HelloRequest, encode_json(dataclasses.replace(hello, fingerprint="ä \U0001f697"))).fingerprint
@@ -215,4 +238,4 @@ if __name__ == "__main__":
 
 def test_a_too_large_batch_number_is_refused():
     with pytest.raises(MalformedError):
-        encode(dataclasses.replace(MSGPACK["beat"], seen=2**63 - 1))
+        encode(changed(MSGPACK["beat"], seen=2**63 - 1))

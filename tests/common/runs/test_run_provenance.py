@@ -19,7 +19,7 @@ from dreamfleet.common.runs.run_provenance import (
     read_run_settings,
     validation_seed_ranges,
 )
-from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.common.serialization.validation import to_plain
 from tests.support.samples import SPEC
 
 SETTINGS = RunSettings(SPEC, ControllerShape(1, 3), 4, 2, 0.1, "diagonal", 1, 2, 3, confirm_episodes=8)
@@ -37,7 +37,7 @@ def controller(**provenance):
 
 @pytest.mark.parametrize("receipt", [RECEIPTS, RunProvenance(0, Effort())])
 def test_a_receipt_round_trips_in_a_controller_file(tmp_path, receipt):
-    controller(**{RECEIPT: to_dict(receipt)}).save(tmp_path / "a.npz")
+    controller(**{RECEIPT: to_plain(receipt)}).save(tmp_path / "a.npz")
     found = read_run_provenance(Controller.load(tmp_path / "a.npz"))
     assert found == receipt
     if found.start is not None:

@@ -18,7 +18,7 @@ from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL
 from dreamfleet.common.runs.run_provenance import RECEIPT, RunProvenance
 from dreamfleet.common.runs.seeds import training_seeds
-from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.common.serialization.validation import to_plain
 from dreamfleet.coordinator.storage.journal import Journal
 
 RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
@@ -97,7 +97,7 @@ def test_receipt_and_comparison_count_the_same_effort(change, printed, tmp_path)
 def test_it_cites_the_software_in_the_version_that_served_the_run(change, printed, tmp_path):
     run = tmp_path / "runs" / "reality"
     found = Controller.load(run / CONTROLLER)
-    found.provenance[RECEIPT] = to_dict(RunProvenance(3, Effort(), versions={"dreamfleet": "0.0.7"}))
+    found.provenance[RECEIPT] = to_plain(RunProvenance(3, Effort(), versions={"dreamfleet": "0.0.7"}))
     found.save(run / CONTROLLER)
     said, facts = printed("receipt", "reality"), json.loads(printed("receipt", "reality", "--json"))
     assert facts["software"] == {"title": "dreamfleet", "authors": "The dreamfleet authors", "version": "0.0.7"}

@@ -1,11 +1,11 @@
 """Tests fleet.py, member.py, pending_jobs.py and speculative_execution.py."""
 
 import tracemalloc
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from dreamfleet.common.protocol.messages import MAX_SLOTS, TAG_BYTES, Result
 from dreamfleet.coordinator.dispatch.fleet import (

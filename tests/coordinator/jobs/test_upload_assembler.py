@@ -1,9 +1,9 @@
 import hashlib
-from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from dreamfleet.common.protocol.messages import MAX_PART, MAX_UPLOAD, UploadPart
 from dreamfleet.coordinator.jobs.upload_assembler import UploadAssembler, UploadLimits

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import msgspec
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -82,7 +83,7 @@ def test_the_end_waits_for_every_rollout(bench):
 def test_upload_parts_of_a_job_that_was_not_given_are_dropped_and_counted(bench):
     (name, job), _ = bench.reach_collection()
     part = bench.parts(job)[0]
-    for stranger, each in (("x/0badc0de", part), (name, replace(part, digest=b"x" * 32))):
+    for stranger, each in (("x/0badc0de", part), (name, msgspec.structs.replace(part, digest=b"x" * 32))):
         bench.upload(stranger, each)
     assert bench.run.dropped == {"unwanted upload": 2}
     assert len(bench.run.background_jobs.rollout_collections.uploads) == 0
@@ -91,7 +92,7 @@ def test_upload_parts_of_a_job_that_was_not_given_are_dropped_and_counted(bench)
 def test_a_collected_rollout_without_its_upload_is_an_error(bench):
     (name, job), _ = bench.reach_collection()
     bench.verdicts()
-    bench.deliver(name, replace(result_of(job), upload=None))
+    bench.deliver(name, msgspec.structs.replace(result_of(job), upload=None))
     assert ("refused" in verdict for *_, verdict in bench.verdicts())
     assert "not kept" in next(iter(bench.run.fleet.jobs.failures[0].errors.values()))
 
@@ -169,7 +170,7 @@ def test_under_loss_duplication_late_parts_and_restarts_each_rollout_is_kept_who
     for kind, *what in steps:
         if kind in ("part", "spoilt"):
             part = bench.parts(jobs[what[1]])[what[2]]
-            bench.upload(what[0], part if kind == "part" else replace(part, data=bytes(len(part.data))))
+            bench.upload(what[0], part if kind == "part" else msgspec.structs.replace(part, data=bytes(len(part.data))))
         elif kind == "result":
             bench.deliver(what[0], result_of(jobs[what[1]]))
         elif kind == "adopt":

@@ -12,7 +12,7 @@ from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import Description
 from dreamfleet.common.runs.lookup import find_subspace
 from dreamfleet.common.runs.records import RunSettings, StageSettings
-from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.common.serialization.validation import to_plain
 from dreamfleet.coordinator.settings.config import RunConfig, config_values
 from dreamfleet.coordinator.settings.presets import PRESETS, find_preset
 from dreamfleet.coordinator.settings.start import StartPoint
@@ -62,7 +62,7 @@ def test_jobs_of_other_controllers_have_other_digests(random_bundle):
     plain = TaskSpec("car-racing", "ab" * 32, 10, 0)
     other = TaskSpec("car-racing", "ab" * 32, 10, 0, random_bundle.shape_of("z", 24))
     assert plain.digest("score", b"x", (1,)) != other.digest("score", b"x", (1,))
-    assert to_dict(other)["controller"] == {"features": 32, "actions": 3, "hidden": 24}
+    assert to_plain(other)["controller"] == {"features": 32, "actions": 3, "hidden": 24}
 
 
 def test_a_share_of_recorded_states_is_frozen_with_a_dream_and_can_be_configured_again(tmp_path):

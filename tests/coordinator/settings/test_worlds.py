@@ -11,7 +11,7 @@ from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts, WorldF
 from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.protocol.messages import OWN_END_VERSION, TaskSpec
 from dreamfleet.common.runs.records import RunSettings
-from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.common.serialization.validation import to_plain
 from dreamfleet.common.worlds import shipped
 from dreamfleet.coordinator.experiments.demo import DemoConfig
 from dreamfleet.coordinator.service.main import RunRequest, _resolve_settings
@@ -128,7 +128,7 @@ def test_an_end_rule_of_the_runs_own_is_another_version(bundle):
 
 def test_a_dream_of_the_first_world_may_have_an_end_too(random_bundle):
     plain = settings_of(random_bundle, task="dream")
-    assert "end" not in to_dict(plain.task)
+    assert "end" not in to_plain(plain.task)
     assert settings_of(random_bundle, task="dream", end="0.5") == plain
     assert settings_of(random_bundle, task="dream", end="drawn").task.version == 1 + OWN_END_VERSION
 
@@ -173,4 +173,4 @@ def test_each_demonstration_has_a_world_model_that_ships():
 
 
 def test_the_words_of_an_earlier_specification_stand():
-    assert to_dict(TaskSpec("dream", "", 10, 0)).keys() == {"task", "bundle", "horizon", "patience"}
+    assert to_plain(TaskSpec("dream", "", 10, 0)).keys() == {"task", "bundle", "horizon", "patience"}

@@ -133,10 +133,10 @@ def test_an_environment_without_such_pictures_is_refused_with_the_reason(name, o
         ("[]", "are not options of pictures"),
         ('{"zoom": 2}', "there is no zoom.*known are environment, observation, crop, size, skip, difference"),
         ('{"size": 32}', "64 or 96 pixels wide, not 32"),
-        ('{"skip": 0}', "out of range"),
-        ('{"skip": true}', "wrong type"),
+        ('{"skip": 0}', r"\$\.skip"),
+        ('{"skip": true}', r"\$\.skip"),
         ('{"crop": "1:2"}', "a crop is top:bottom,left:right"),
-        ('{"environment": 5}', "wrong type"),
+        ('{"environment": 5}', r"\$\.environment"),
         ("[" * 100_000, "are not options of pictures"),
     ],
 )

@@ -1,5 +1,6 @@
-import dataclasses
 import hashlib
+
+from msgspec.structs import replace
 
 from dreamfleet.common.protocol.messages import MAX_LEASES, MAX_PART, JobBatch, VectorPart
 from dreamfleet.worker.service import backlog as room
@@ -49,7 +50,7 @@ def test_seen_is_the_highest_number_without_a_gap():
 
 def test_parts_of_a_vector_may_arrive_in_batches_in_any_order():
     backlog = Backlog(SPEC)
-    first, second = (dataclasses.replace(WHOLE, offset=at, data=VECTOR[at : at + 32]) for at in (0, 32))
+    first, second = (replace(WHOLE, offset=at, data=VECTOR[at : at + 32]) for at in (0, 32))
     backlog.add_batch(batch(2, (job(0),), (second,)))
     assert not backlog.take(1)
     backlog.add_batch(batch(1, (), (first,)))
@@ -71,14 +72,14 @@ def test_a_job_that_a_slot_has_is_not_queued_again():
 
 def test_a_job_with_another_jobs_digest_is_refused():
     backlog = Backlog(SPEC)
-    wrong = dataclasses.replace(job(0), seeds=(5,))
+    wrong = replace(job(0), seeds=(5,))
     assert backlog.add_batch(batch(1, (wrong,))) == [(wrong, DAMAGED)]
     assert not backlog.take(1)
 
 
 def test_a_job_has_the_temperature_that_it_names():
     backlog, warm = Backlog(SPEC), job(1, temperature=1.5)
-    renamed = [dataclasses.replace(warm, temperature=wrong) for wrong in (None, 1.25)]
+    renamed = [replace(warm, temperature=wrong) for wrong in (None, 1.25)]
     assert [each for each, _ in backlog.add_batch(batch(1, (warm, *renamed)))] == renamed
     assert backlog.take(5) == [(warm, VECTOR)]
 
@@ -92,7 +93,7 @@ def test_jobs_taken_together_have_one_temperature():
 
 def test_a_job_has_the_horizon_and_patience_that_it_names():
     backlog, short = Backlog(SPEC), job(1, horizon=400, patience=0)
-    renamed = [dataclasses.replace(short, **wrong) for wrong in ({"horizon": None}, {"patience": 1}, {"horizon": 401})]
+    renamed = [replace(short, **wrong) for wrong in ({"horizon": None}, {"patience": 1}, {"horizon": 401})]
     assert [each for each, _ in backlog.add_batch(batch(1, (short, *renamed)))] == renamed
     assert backlog.take(5) == [(short, VECTOR)]
 
@@ -106,7 +107,7 @@ def test_jobs_taken_together_have_one_stage():
 
 def test_a_damaged_vector_is_never_scored():
     backlog = Backlog(SPEC)
-    backlog.add_batch(batch(1, (job(0),), (dataclasses.replace(WHOLE, data=VECTOR[::-1]),)))
+    backlog.add_batch(batch(1, (job(0),), (replace(WHOLE, data=VECTOR[::-1]),)))
     assert not backlog.take(1)
 
 
@@ -114,7 +115,7 @@ def test_the_oldest_vectors_that_no_job_needs_are_dropped():
     backlog = Backlog(SPEC)
     for number in range(1, 500):
         data = number.to_bytes(8, "little")
-        part = dataclasses.replace(WHOLE, id=hashlib.sha256(data).digest(), shape=(2,), data=data)
+        part = replace(WHOLE, id=hashlib.sha256(data).digest(), shape=(2,), data=data)
         backlog.add_batch(batch(number, vectors=(part,)))
     assert len(backlog._vectors) <= MAX_UNUSED_VECTORS
 
@@ -162,7 +163,7 @@ def test_bytes_of_vectors_are_limited(monkeypatch):
 
 def test_jobs_of_a_corrupted_vector_are_dropped_and_can_be_given_again():
     backlog = Backlog(SPEC)
-    backlog.add_batch(batch(1, vectors=(dataclasses.replace(WHOLE, data=bytes(64)),)))
+    backlog.add_batch(batch(1, vectors=(replace(WHOLE, data=bytes(64)),)))
     backlog.add_batch(batch(2, (job(0), job(1))))
     assert not backlog.take(2)
     assert not backlog.queued

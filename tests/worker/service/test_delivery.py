@@ -64,7 +64,7 @@ def test_foreign_and_malformed_messages_are_dropped_and_counted(stage, cached):
         hand.put(payload)
     hand.send(1, mine)
     assert hand.results(mine) == {mine.digest}
-    assert made.inbox.dropped == {"foreign coordinator": 2, "not msgpack": 2, "oversize": 1, "wrong fields": 1}
+    assert made.inbox.dropped == {"foreign coordinator": 2, "not msgpack": 2, "oversize": 1, "schema": 1}
 
 
 def test_a_job_whose_content_differs_from_its_digest_is_an_error(stage, cached):

@@ -1,9 +1,8 @@
 """Scoring a group of jobs, without a child process."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from dreamfleet.worker.service.job_group import AbandonedError, score_group
 from dreamfleet.worker.tasks.api import Score

@@ -4,11 +4,11 @@ import os
 import queue
 import signal
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from time import monotonic, sleep
 
 import pytest
+from msgspec.structs import replace
 
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.protocol.messages import TaskSpec

@@ -1,9 +1,9 @@
 """A worker that serves several runs side by side."""
 
 from concurrent.futures import wait
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.service.config import WorkerConfig

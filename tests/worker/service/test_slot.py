@@ -10,12 +10,12 @@ import signal
 import subprocess
 import sys
 import threading
-from dataclasses import replace
 from pathlib import Path
 from time import monotonic
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.worker.scoring.failure_cause import crash

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.serialization.optional_fields import to_dict
+from dreamfleet.common.serialization.validation import to_plain
 from dreamfleet.worker.worldmodel import mdnrnn_config as mdnrnn
 from dreamfleet.worker.worldmodel import vae_config as vae
 from dreamfleet.worker.worldmodel.inference import Decoder, DreamStep, Encoder, PolicyStep
@@ -168,8 +168,8 @@ def test_sizes_that_make_no_model_are_refused(make):
 def test_a_model_of_the_paper_is_written_as_it_was_before_every_layer_had_a_flag():
     later = {"error_factor", "kernels", "strides", "decoder_channels", "decoder_kernels", "pixel_weight"}
     later |= {"activate_dense"}
-    assert set(to_dict(vae.PAPER)) == set(asdict(vae.PAPER)) - later
-    assert not {"lost", "first_reward", "done_factor", "done_weight", "reward_scale"} & set(to_dict(mdnrnn.REWARDED))
+    assert set(to_plain(vae.PAPER)) == set(asdict(vae.PAPER)) - later
+    assert not {"lost", "first_reward", "done_factor", "done_weight", "reward_scale"} & set(to_plain(mdnrnn.REWARDED))
 
 
 def test_the_first_step_sees_the_label_that_the_notebooks_drives_begin_with(tmp_path):
