@@ -1,6 +1,7 @@
 """The examples in docstrings run as they stand, and every public name has one."""
 
 import doctest
+import re
 from importlib import import_module
 
 import pytest
@@ -61,17 +62,31 @@ def fleet(tmp_path_factory):
         yield processes
 
 
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """The folder that the examples run in, with an exported agent."""
+@pytest.fixture(scope="module")
+def agent():
     config = AgentConfig(channels=(4, 4), kernels=(8, 4), strides=(4, 2), hidden=8, frame_skip=3)
     weights = {name: tensor.numpy() for name, tensor in Networks(config).online.state_dict().items()}
     manifest = AgentManifest("drqn", "car-racing", "box-64", config.table, config.frame_skip, 2 * config.hidden)
-    TrainedAgent(manifest, export_network(weights, config)).save(tmp_path / "drqn.zip")
+    return TrainedAgent(manifest, export_network(weights, config))
+
+
+@pytest.fixture
+def folder(agent, tmp_path, monkeypatch):
+    """The folder that the examples run in, with an exported agent."""
+    agent.save(tmp_path / "drqn.zip")
     monkeypatch.chdir(tmp_path)
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
+STARTS_A_RUN = re.compile(r"\b(start_run|evolve|minimise|maximise)\(")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if STARTS_A_RUN.search(test.docstring) else ())
+        for name, test in EXAMPLES.items()
+    ],
+)
 def test_an_example_runs(name, folder, request, monkeypatch):
     test = EXAMPLES[name]
     if RUN in test.docstring:

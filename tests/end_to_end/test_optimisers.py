@@ -8,6 +8,7 @@ import pytest
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.coordinator.settings.start import latest_mean_and_sigma
 from tests.support import tasks
+from tests.support.processes import call_here
 
 OWN = "tests.support.optimisers:ParentsAndChildren"
 
@@ -60,7 +61,7 @@ def test_a_run_of_another_optimiser_is_continued_and_forked_to_one_of_ones_own(p
     ],
 )
 def test_a_search_that_cannot_be_is_refused_before_there_is_a_run(processes, arguments, says):
-    code, _, err = processes.call("coordinator", "--runs-dir", processes.runs, *arguments)
+    code, _, err = call_here("coordinator", "--runs-dir", processes.runs, *arguments)
     assert code == 2
     assert says in err.strip().splitlines()[-1]
     assert "Traceback" not in err

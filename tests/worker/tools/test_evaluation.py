@@ -20,6 +20,7 @@ from dreamfleet.worker.scoring.episode import EpisodeConfig
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.tools.evaluation import evaluate, evaluate_in_processes
 from tests.support import rough_tasks, tasks
+from tests.support.processes import call_here
 
 SEEDS = (10_000, 10_001, 10_002)
 
@@ -87,7 +88,7 @@ def test_an_episode_that_fails_is_reported_and_the_others_go_on(processes, contr
         30 - failed,
         [each.seed for each in report.failed],
     )
-    code, out, err = processes.call(
+    code, out, err = call_here(
         "verify", "report", tmp_path / "toy.json", "--bundle", random_bundle.path, "--jobs", jobs
     )
     assert (code, f"{30 - failed} bit-identical scores" in out) == (0, True), err
@@ -220,21 +221,21 @@ def test_the_report_is_what_it_prints_and_can_be_repeated_to_the_bit(processes, 
     assert (recorded.task, recorded.world, recorded.threshold) == (tasks.TOY, tasks.TOY, None)
     assert recorded.fingerprint == fingerprint(find_task(tasks.TOY).world.packages)
     assert [each.finished for each in recorded.drives] == [None] * 3
-    code, said, err = processes.call("verify", "report", out, "--episodes", 2, "--jobs", 1)
+    code, said, err = call_here("verify", "report", out, "--episodes", 2, "--jobs", 1)
     assert (code, "2 bit-identical scores" in said) == (0, True), err
     out.write_text(replace(recorded, drives=(replace(recorded.drives[0], steps=9), *recorded.drives[1:])).to_json())
-    code, said, err = processes.call("verify", "report", out, "--jobs", 1, "--json")
+    code, said, err = call_here("verify", "report", out, "--jobs", 1, "--json")
     assert (code, json.loads(said)["reproduced"]) == (1, False), err
     out.write_text(replace(recorded, controller="ef" * 32).to_json())
-    code, _, err = processes.call("verify", "report", out)
+    code, _, err = call_here("verify", "report", out)
     assert (code, "records the controller efefefefefef" in err) == (1, True)
     out.write_text(replace(recorded, bundle="ef" * 32).to_json())
-    code, _, err = processes.call("verify", "report", out)
+    code, _, err = call_here("verify", "report", out)
     assert (code, "records drives by the world model efefefefefef" in err) == (1, True)
 
 
 def test_an_unwritable_report_is_an_error_before_the_first_episode(processes, controller, random_bundle, tmp_path):
     controller(tasks.HANGING).save(tmp_path / "toy.npz")
     judged = ("evaluate", "--controller", tmp_path / "toy.npz", "--bundle", random_bundle.path, "--out", tmp_path)
-    code, _, err = processes.call(*judged)
+    code, _, err = call_here(*judged)
     assert (code, "is a folder" in err) == (2, True)
