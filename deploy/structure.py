@@ -98,6 +98,12 @@ def riddles(path: Path) -> list[tuple[int, str]]:
     return found
 
 
+def starting_children() -> set[str]:
+    """The files that start child processes and do not wait for them at once."""
+    starts = re.compile(r"\bPopen\(|(?<!psutil)\.(Process|Pool)\(|ProcessPoolExecutor\(|\bos\.fork\(")
+    return {str(path) for path in sources(*SIDES) if starts.search((ROOT / path).read_text())}
+
+
 def words_of(path: Path) -> Iterator[str]:
     """The names and the texts in a Python file's code: no comments, and no texts that stand alone, as docstrings do."""
     tree = ast.parse((ROOT / path).read_text())
@@ -160,6 +166,7 @@ def measure() -> dict[str, object]:
     figures["files_under_40_lines"] = sum(2 < lines < 40 for lines in lengths.values())
     figures["files_over_400_lines"] = {path: lines for path, lines in lengths.items() if lines > LONG_FILE}
     figures["duplicate_class_names"] = class_names()
+    figures["files_that_start_children"] = sorted(starting_children())
     with suppress(ImportError):
         figures["command_line"] = surface()
     figures["riddles"] = {part: sum(len(riddles(path)) for path in sources(part)) for part in (*SIDES, "tests")}

@@ -12,6 +12,7 @@ from deploy.structure import (
     names_outside_rooms,
     room_arrows,
     sources,
+    starting_children,
     surface,
 )
 from dreamfleet.common.worlds import shipped
@@ -27,6 +28,13 @@ NAMING_WORLDS = {
     "worker/dream/__init__.py": "an environment's former name, which notebooks and agents of others use",
     "worker/bench/environment.py": "compares our CarRacing with gymnasium's, by the episode loop above its room",
     "worker/baselines/agents.py": "baselines without a world model are agents of CarRacing, trained by rooms above its",
+}
+# Files that start child processes and do not wait for them at once. This list may only shrink.
+STARTING_CHILDREN = {
+    "common/host/child.py": "the one class for it",
+    "common/host/descendants.py": "its guard",
+    "coordinator/spawn/agent.py": "runs on a host where nothing of ours is installed",
+    "worker/bench/dispatch.py": "measures the standard library's pool",
 }
 # Modules whose test no name leads to. This list may only shrink.
 WITHOUT_TEST = {
@@ -68,6 +76,10 @@ def test_the_command_line_does_not_grow_again():
     found = surface()
     assert found["verbs"] <= MOST_VERBS
     assert found["distinct_flags"] <= MOST_FLAGS
+
+
+def test_one_class_supervises_child_processes():
+    assert starting_children() == STARTING_CHILDREN.keys()
 
 
 def test_no_world_is_named_outside_its_room():

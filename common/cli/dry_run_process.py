@@ -10,10 +10,9 @@ import sys
 import tempfile
 from contextlib import suppress
 from time import monotonic
-from typing import IO
 
-from dreamfleet.common.host.descendants import Descendants
-from dreamfleet.common.host.processes import parent_death_command
+from dreamfleet.common.host.child import CommandChild
+from dreamfleet.common.host.parent_death import parent_death_command
 from dreamfleet.common.printable import one_line
 
 LOOK_INTERVAL = 0.1  # seconds between two looks whether the child runs: a process that it left may hold its pipes
@@ -29,45 +28,43 @@ class DryRunError(Exception):
     """The dry run was ended; the text says what its environment did."""
 
 
-class DryRunProcess:
+class DryRunProcess(CommandChild):
     """A module that reads its request from stdin, writes lines to stdout, and prints to stderr. Use it in a `with`.
 
-    Its argument is a file descriptor, which is closed by `begin`: until then it only loads what it needs.
+    Its argument is a file descriptor, which is closed by `begin`: until then it only loads what it needs. This class
+    reads both pipes itself, because here no wait may be without end, and no output without limit.
     """
 
     def __init__(self, module: str, request: str, hash_seed: int) -> None:
         """`hash_seed` is Python's own, by which texts are hashed: the order of a set depends on it."""
         waits, self._go = os.pipe()
-        self._descendants = Descendants()
         self._lines: list[bytes] = []  # unread, the next one last
         self._begun = bytearray()  # a line without its end
         self._printed = bytearray()
         self._sizes = [0, 0]  # bytes that it answered and printed
-        with tempfile.TemporaryFile() as stdin, self._descendants.starting():
+        python = sys.executable, "-P", "-m", module
+        with tempfile.TemporaryFile() as stdin:
             stdin.write(request.encode())
             stdin.seek(0)
-            self._child = subprocess.Popen(  # noqa: S603 - our own interpreter and module
-                [*parent_death_command(), sys.executable, "-P", "-m", module, str(waits)], pass_fds=(waits,),
-                env={**os.environ, "PYTHONHASHSEED": str(hash_seed)}, stdin=stdin,
-                stdout=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=0, start_new_session=True,
+            super().__init__(
+                ["/usr/bin/env", f"PYTHONHASHSEED={hash_seed}", *parent_death_command(), *python, str(waits)],
+                stdin=stdin, stdout=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=0, pass_fds=(waits,),
             )  # fmt: skip
         os.close(waits)
         self._selector = selectors.DefaultSelector()
-
-    def __enter__(self) -> DryRunProcess:
-        self._descendants.add_session(self._child.pid)
-        for number, pipe in enumerate(self._pipes()):
+        self._pipes = [each for each in (self.popen.stdout, self.popen.stderr) if each is not None]
+        for number, pipe in enumerate(self._pipes):
             os.set_blocking(pipe.fileno(), False)
             self._selector.register(pipe, selectors.EVENT_READ, number)
-        return self
 
-    def __exit__(self, *_error: object) -> None:
-        self._kill()
+    def end(self, patience: float = 0, limit: float = KILL_GRACE) -> bool:
+        """Kill it, and close its pipes."""
+        has_ended = super().end(patience, limit)
         self.begin()
-        self._descendants.forget()
         self._selector.close()
-        for pipe in self._pipes():
+        for pipe in self._pipes:
             pipe.close()
+        return has_ended
 
     def begin(self, word: bytes = b"") -> None:
         """Let it begin its dry run; it reads the `word` of one byte, if there is one, from the descriptor."""
@@ -82,9 +79,9 @@ class DryRunProcess:
         until, late = monotonic() + seconds, f"took longer than {seconds:.4g} s"
         is_closed = False
         while not self._lines:
-            has_ended = self._child.poll() is not None
+            has_ended = self.exit_code is not None
             if has_ended:
-                self._descendants.kill()  # then its pipes hold only what was written before
+                self.kill()  # then its pipes hold only what was written before
             ready = self._selector.select(0 if has_ended else LOOK_INTERVAL)
             for key, _ in ready:
                 self._read(key)
@@ -98,23 +95,13 @@ class DryRunProcess:
                 raise DryRunError(late)
         return self._lines.pop()
 
-    @property
-    def exit_code(self) -> int | None:
-        """The child's, negative for a signal; `None` while it runs."""
-        return self._child.returncode
-
     def describe_failure(self) -> str:
         """How the ended child ended before it was through, and what it printed last."""
-        code = self._child.returncode
+        code = self.popen.returncode
         how = f"crashed ({_signal_name(-code)})" if code < 0 else f"ended the process (exit code {code})"
         lines = self._printed.decode(errors="replace").splitlines()
         words = [text for line in lines if (text := one_line(line))]
         return f"{how}: {words[-1][:MAX_FAULT_CHARS]}" if words else how
-
-    def _pipes(self) -> tuple[IO[bytes], IO[bytes]]:
-        assert self._child.stdout is not None
-        assert self._child.stderr is not None
-        return self._child.stdout, self._child.stderr
 
     def _answers_ended(self) -> bool:
         return all(key.data != 0 for key in self._selector.get_map().values())
@@ -135,13 +122,6 @@ class DryRunProcess:
             if b"\n" in chunk:
                 *lines, self._begun = self._begun.split(b"\n")
                 self._lines[:0] = [bytes(line) for line in reversed(lines)]
-
-    def _kill(self) -> None:
-        with suppress(OSError):
-            self._child.kill()
-        self._descendants.kill()
-        with suppress(subprocess.TimeoutExpired):
-            self._child.wait(KILL_GRACE)
 
 
 def _signal_name(number: int) -> str:

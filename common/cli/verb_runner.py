@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points
 from itertools import takewhile
@@ -12,7 +11,7 @@ from typing import Any
 
 from dreamfleet.common.cli.command_line import GROUP, Verb, load_verb
 from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
-from dreamfleet.common.host.processes import VerbProcess, parent_death_command
+from dreamfleet.common.host.processes import VerbProcess
 from dreamfleet.common.host.stop_signals import Stop
 
 POLL_INTERVAL = 0.2  # seconds between checks whether to stop
@@ -53,7 +52,7 @@ class ProcessRunner:
                     kept.flush()
                     on_line(line.strip())
 
-            child = VerbProcess(*words, inside=parent_death_command())
+            child = VerbProcess(*words, ends_with_parent=True)
             try:
                 wait_for_end(child, self._stop, forward_lines)
                 code, out = child.finish()
@@ -73,11 +72,8 @@ def wait_for_end(
     child: VerbProcess, stop: Stop, on_poll: Callable[[], None] = lambda: None, interval: float = POLL_INTERVAL
 ) -> None:
     """Wait until a verb has ended, calling `on_poll` meanwhile; `StoppedError` as soon as `stop` is true."""
-    while child.popen.poll() is None:
+    while not child.wait(0):
         if stop():
             raise StoppedError("stopped")
         on_poll()
-        try:
-            child.popen.wait(interval)
-        except subprocess.TimeoutExpired:
-            continue
+        child.wait(interval)

@@ -16,7 +16,13 @@ import sys
 import threading
 from collections.abc import Iterator, Set
 from contextlib import contextmanager, suppress
-from pathlib import Path
+
+if __name__ == "__main__":  # the guard, whose interpreter starts without a look for packages
+    for number in (signal.SIGINT, signal.SIGTERM):  # a service manager sends it to all processes of a service
+        signal.signal(number, signal.SIG_IGN)
+    sys.path[:] = sys.argv[2:]
+
+import psutil
 
 VARIABLE = "DREAMFLEET_DESCENDS_FROM"  # marks, each followed by a space
 GUARD_LIMIT = 2.0  # seconds in which the guard ends the descendants of a process that exits
@@ -73,35 +79,29 @@ class Descendants:
 
 
 def kill_descendants(mark: str, sessions: Set[int]) -> None:
-    """End all processes with this mark or of these sessions with SIGKILL; without `/proc`, the process groups."""
+    """End all processes with this mark or of these sessions with SIGKILL."""
     for group in sessions:
         with suppress(OSError):
             os.killpg(group, signal.SIGKILL)
     for _ in range(ROUNDS):
-        found = list(_find(f"{mark} ".encode(), sessions))
-        for pid in found:
-            with suppress(OSError):
-                os.kill(pid, signal.SIGKILL)
-        if not found:
+        if not (found := list(_find(mark, sessions))):
             return
+        for process in found:
+            with suppress(psutil.Error, OSError):
+                process.kill()
 
 
-def _find(mark: bytes, sessions: Set[int]) -> Iterator[int]:
-    """The process ids of running descendants."""
-    own = os.getpid()
-    processes: list[Path] = []
-    with suppress(OSError):  # no `/proc`, or no descriptor left to read it
-        processes = list(Path("/proc").glob("[0-9]*"))
-    for process in processes:
-        with suppress(OSError):  # it has ended, or is another user's
-            if (pid := int(process.name)) == own:
-                continue
-            if os.getsid(pid) in sessions:
-                state = (process / "stat").read_bytes().rpartition(b") ")[2][:1]
-                if state not in b"ZX":  # a zombie has ended
-                    yield pid
-            elif mark in (process / "environ").read_bytes():
-                yield pid
+def _find(mark: str, sessions: Set[int]) -> Iterator[psutil.Process]:
+    """The running descendants."""
+    pids: list[int] = []
+    with suppress(psutil.Error, OSError):  # no `/proc`, or no descriptor left to read it
+        pids = psutil.pids()
+    for pid in pids:
+        with suppress(psutil.Error, OSError):  # it has ended, or is another user's
+            process = psutil.Process(pid)
+            is_ours = os.getsid(pid) in sessions or mark in process.environ().get(VARIABLE, "").split()
+            if is_ours and pid != os.getpid() and process.status() not in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD):
+                yield process
 
 
 def _update_guard(*sessions: int) -> None:
@@ -109,7 +109,7 @@ def _update_guard(*sessions: int) -> None:
     global _guard  # noqa: PLW0603 - one a process, as multiprocessing's resource tracker
     if _guard is None or _guard.poll() is not None:
         _guard = subprocess.Popen(  # noqa: S603 - this file in our own interpreter
-            [sys.executable, "-I", "-S", __file__, _TOKEN],
+            [sys.executable, "-I", "-S", __file__, _TOKEN, *map(str, sys.path)],
             stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             start_new_session=True, bufsize=0, cwd="/",
         )  # fmt: skip
@@ -131,8 +131,6 @@ def _end_guard() -> None:
 
 def main() -> None:
     """Be the guard: read sessions until the process that writes them ends, then end the descendants."""
-    for number in (signal.SIGINT, signal.SIGTERM):  # a service manager sends it to all processes of a service
-        signal.signal(number, signal.SIG_IGN)
     sessions: set[int] = set()
     for line in sys.stdin:
         session = int(line)

@@ -24,6 +24,7 @@ PACKAGES = {
     "cmaes": ("cmaes", ""),
     "prometheus-client": ("prometheus_client", ""),
     "rich": ("rich", ""),
+    "psutil": ("psutil", ""),
     GYMNASIUM: ("gymnasium", "worker"),
     "pygame-ce": ("pygame", "worker"),
     "box2d": ("Box2D", "worker"),

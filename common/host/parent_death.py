@@ -29,13 +29,6 @@ def signals_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def end_on_signals() -> None:
-    """Let SIGINT and SIGTERM end this child of `signals_blocked` at once: a traceback would say nothing."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, signal.SIGTERM))
-
-
 def exit_with_parent(parent: int) -> None:
     """Make Linux kill this process when its parent ends; on other systems, it ends when it next reads its pipe."""
     try:
@@ -44,6 +37,11 @@ def exit_with_parent(parent: int) -> None:
         return
     if os.getppid() != parent:
         raise SystemExit(1)
+
+
+def parent_death_command() -> tuple[str, ...]:
+    """The prefix of a command that makes it end with this thread, also on SIGKILL; Linux only."""
+    return (sys.executable, "-P", "-m", "dreamfleet.common.host.parent_death", str(os.getpid()))
 
 
 def main() -> None:

@@ -1,26 +1,29 @@
 """Work for several processes, each result as it comes; no process hangs its parent or outlives it.
 
-`concurrent.futures` alone waits for ever where a process hangs, or crashed and left another behind, which holds its
-pipes. And it cannot say which piece of work a process was lost with. So each process has an executor of its own.
+`concurrent.futures` waits for ever where a process hangs, or crashed and left another behind, which holds its pipes.
+And it cannot say which piece of work a process was lost with.
 """
 
 from __future__ import annotations
 
+import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import active_children, get_context
-from time import monotonic, sleep
+from functools import partial
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from time import monotonic
 from typing import Any, Generic, NoReturn, TypeVar
 
-from dreamfleet.common.host.descendants import Descendants
+from dreamfleet.common.host.child import FunctionChild
 from dreamfleet.common.host.foreign_code import send_stdout_to_stderr
-from dreamfleet.common.host.parent_death import signals_blocked
 from dreamfleet.common.host.stall_watch import START_LIMIT, StallWatch, describe_slow_start, describe_stall
 from dreamfleet.common.host.user_code import keep_user_arguments
 
 LOOK_INTERVAL = 1.0  # seconds between two looks whether all processes run
+SEND_LIMIT = int(START_LIMIT)  # seconds that a process may take to read an item that its pipe does not hold
 EXIT_GRACE = 2.0  # seconds that processes may take to exit once there is no more work
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
@@ -44,6 +47,8 @@ def map_in_processes(
 ) -> Generator[Answer, None, None]:  # fmt: skip
     """Yield `work(item)` of each item as it ends, in `count` spawned processes that begin with `start(*arguments)`.
 
+    The processes end with this one, and leave Ctrl-C and SIGTERM to it.
+
     An item whose answer `has_failed`, or that ends its process, is worked on once more in a fresh process, unless it
     was its process's first: an earlier item may have spoilt that process. So no failure follows from `count`.
 
@@ -54,7 +59,8 @@ def map_in_processes(
 
     When closed early, it waits until what runs is done; after any other exception it ends the processes at once.
     """
-    idle = [_Process[Item, Answer](start, arguments, work, stall) for _ in range(min(count, len(items)))]
+    serve = partial(_serve, start, arguments, work)
+    idle = [_Process[Item, Answer](serve, stall) for _ in range(min(count, len(items)))]
     pool = _Pool(deque(items), idle, on_loss, on_look, has_failed)
     processes = tuple(idle)
     try:
@@ -64,11 +70,12 @@ def map_in_processes(
             pool.waiting.clear()
             for _ in pool.answers():
                 pass
-        for each in processes:
-            each.shut_down()
+        children = [each.child for each in processes if each.child]
+        for child in children:
+            child.send(None)
         until = monotonic() + EXIT_GRACE
-        while any(each.is_alive for each in processes) and monotonic() < until:
-            sleep(0.005)
+        for child in children:
+            child.wait(until - monotonic())
     finally:
         for each in processes:
             each.kill()
@@ -77,20 +84,13 @@ def map_in_processes(
 class _Process(Generic[Item, Answer]):
     """A process that works on one item at a time. If it is lost, the next item starts another."""
 
-    def __init__(
-        self, start: Callable[..., None], arguments: tuple[Any, ...], work: Callable[[Item], Answer], stall: float
-    ) -> None:
-        self._start, self._arguments, self._work, self._stall = start, arguments, work, stall
+    def __init__(self, serve: Callable[..., None], stall: float) -> None:
+        self._serve, self._stall = serve, stall
         self._counter: Any = get_context("spawn").Value("Q", 0, lock=False)
-        self._executor: ProcessPoolExecutor | None = None
-        self._process: Any = None
+        self.child: FunctionChild | None = None  # it reads items, and ends at a `None`
+        self._asked: deque[Future[Answer]] = deque()  # of this child
         self.is_fresh = True  # whether its item is, or was, its first
-        self._descendants, self._watch = Descendants(), StallWatch()
-
-    @property
-    def is_alive(self) -> bool:
-        """Whether it runs."""
-        return self._process is not None and self._process.is_alive()
+        self._watch = StallWatch()
 
     @property
     def steps(self) -> int:
@@ -100,21 +100,23 @@ class _Process(Generic[Item, Answer]):
     def submit(self, item: Item) -> Future[Answer]:
         """Begin the work on an item; start the process if there is none."""
         self._watch.restart()
-        self.is_fresh = self._executor is None
-        if self._executor is not None:
-            return self._executor.submit(self._work, item)
-        self._counter.value, others = 0, set(active_children())
-        arguments = (self._counter, self._start, self._arguments)
-        self._executor = ProcessPoolExecutor(1, get_context("spawn"), _begin, arguments)
-        with signals_blocked(), self._descendants.starting():
-            future = self._executor.submit(self._work, item)
-        self._process = next(iter(set(active_children()) - others), None)
+        self.is_fresh = self.child is None
+        if self.child is None:
+            self._counter.value, self._asked = 0, deque()
+            take = partial(_take, self._asked)
+            self.child = FunctionChild(self._serve, self._counter, on_message=take, send_limit=SEND_LIMIT)
+        self._asked.append(future := Future[Answer]())
+        self.child.send((item,))
         return future
 
     def find_loss(self, gap: float) -> int | str | None:
         """Why it is of no use any longer, as `on_loss` gets it; `gap` is for how long this host was suspended."""
-        if not self.is_alive:
-            return self.lose()
+        assert self.child is not None  # it works
+        if self.child.exit_code is not None or not self.child.is_heard:
+            self.child.wait(EXIT_GRACE)
+            status = self.child.exit_code
+            self.kill()
+            return "it closed its pipe and ran on" if status is None else status
         quiet = self._watch.quiet_seconds(self.steps, monotonic(), gap)
         limit = self._stall if self.steps else max(self._stall, START_LIMIT)
         if not self._stall or quiet <= limit:
@@ -122,28 +124,11 @@ class _Process(Generic[Item, Answer]):
         self.kill()
         return describe_stall(limit) if self.steps else describe_slow_start(limit)
 
-    def lose(self) -> int | str:
-        """Give it up, after it ended or closed its pipe; return its exit status, or what it did instead."""
-        until = monotonic() + EXIT_GRACE
-        while (status := getattr(self._process, "exitcode", None)) is None and monotonic() < until:
-            sleep(0.005)
-        self.kill()
-        return "it closed its pipe and ran on" if status is None else int(status)
-
-    def shut_down(self) -> None:
-        """Let it end."""
-        if self._executor is not None:
-            self._executor.shutdown(wait=False, cancel_futures=True)
-
     def kill(self) -> None:
         """End it and what it started."""
-        if self._executor is None:
-            return
-        self.shut_down()
-        if self._process is not None:
-            self._process.kill()
-        self._descendants.kill()
-        self._executor = self._process = None
+        if self.child is not None:
+            self.child.end(limit=EXIT_GRACE)
+        self.child = None
 
 
 class _Pool(Generic[Item, Answer]):
@@ -168,9 +153,9 @@ class _Pool(Generic[Item, Answer]):
             self._on_look(sum(process.steps for process, _ in self._running.values()))
             gap, looked_at = max(0.0, monotonic() - looked_at - LOOK_INTERVAL), monotonic()
             for future, (process, item) in list(self._running.items()):
-                if future.done():
-                    reason = process.lose() if isinstance(future.exception(), BrokenProcessPool) else None
-                elif (reason := process.find_loss(gap)) is None:
+                is_answered = future.done() and not isinstance(future.exception(), BrokenProcessPool)
+                reason = None if is_answered else process.find_loss(gap)
+                if not is_answered and reason is None:
                     continue
                 del self._running[future]
                 failed = reason is not None or (future.exception() is None and self._has_failed(future.result()))
@@ -182,10 +167,31 @@ class _Pool(Generic[Item, Answer]):
                 yield future.result() if reason is None else self._on_loss(item, reason)
 
 
-def _begin(steps: Any, start: Callable[..., None], arguments: tuple[Any, ...]) -> None:
-    """Initialise a process of the pool. What it prints goes to stderr: its parent answers on stdout."""
+def _take(asked: deque[Future[Answer]], message: tuple[Answer | None, BaseException | None] | None) -> None:
+    """Hand on what a process answers, or that it closed its pipe."""
+    if not asked:
+        return
+    future = asked.popleft()
+    answer, error = message or (None, BrokenProcessPool())
+    future.set_exception(error) if error else future.set_result(answer)  # type: ignore[arg-type]  # perhaps `None`
+
+
+def _serve(
+    start: Callable[..., None], arguments: tuple[Any, ...], work: Callable[[Item], Answer],
+    pipe: Connection[Any, Any], steps: Any,
+) -> None:  # fmt: skip
+    """Be a process of the pool. What it prints goes to stderr: its parent answers on stdout."""
     global _steps  # noqa: PLW0603 - one a process
     send_stdout_to_stderr()
     keep_user_arguments()
     _steps = steps
     start(*arguments)
+    while (items := pipe.recv()) is not None:
+        try:
+            pipe.send((work(*items), None))
+        except BaseException as error:  # a simulator may raise anything
+            error.add_note(traceback.format_exc())
+            try:
+                pipe.send((None, error))
+            except Exception as fault:  # it cannot be pickled
+                pipe.send((None, RuntimeError(f"{type(error).__name__} cannot be sent: {fault}")))

@@ -7,7 +7,6 @@ import os
 import queue
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
 import threading
@@ -19,12 +18,12 @@ from pathlib import Path
 from typing import IO, Any
 
 from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.host.child import KILL_LIMIT, PATIENCE, CommandChild
+from dreamfleet.common.host.parent_death import parent_death_command
 from dreamfleet.common.host.reports import FAILURE, VARIABLE, ReportPipe
 
 KEPT_LINES = 10_000  # the last lines of each stream that are kept, at least
 POLL_INTERVAL = 0.02  # seconds between two looks at what a verb reported
-PATIENCE = 3.0  # seconds to wait after each SIGTERM
-KILL_LIMIT = 30.0  # seconds to wait after SIGKILL: a process in a system call that does not return does not end
 
 
 def command(*words: object) -> list[str]:
@@ -45,11 +44,6 @@ def shell_command(*words: object) -> str:
     return shlex.join([*program, *map(str, words)])
 
 
-def parent_death_command() -> tuple[str, ...]:
-    """The prefix of a command that makes it end with this process, also on SIGKILL; Linux only."""
-    return (sys.executable, "-P", "-m", "dreamfleet.common.host.parent_death", str(os.getpid()))
-
-
 def run_verb_to_end(*words: object) -> None:
     """Run a verb in this terminal and wait; `DreamfleetError` if it fails."""
     if subprocess.run(command(*words), check=False).returncode != 0:  # noqa: S603 - our own interpreter and verb
@@ -64,20 +58,16 @@ def run_verb_for_json(*words: object) -> Any:
     return json.loads(done.stdout)
 
 
-class VerbProcess:
+class VerbProcess(CommandChild):
     """A running verb. Threads read its output, or it goes to the file `log`, so that it never blocks on a reader.
 
-    Use it in a `with`, or call `end`. It leads a new process session, so that Ctrl-C reaches only the parent.
+    One that `ends_with_parent` ends with the thread that starts it.
     """
 
     def __init__(
-        self,
-        *words: object,
-        log: Path | None = None,
-        environment: Mapping[str, str] | None = None,
-        inside: Sequence[str] = (),
-        read: Callable[[IO[bytes]], None] | None = None,
-    ) -> None:
+        self, *words: object, log: Path | None = None, environment: Mapping[str, str] | None = None,
+        inside: Sequence[str] = (), read: Callable[[IO[bytes]], None] | None = None, ends_with_parent: bool = False,
+    ) -> None:  # fmt: skip
         """`inside` is a prefix of the command; `read` consumes a binary stdout in a thread, until its end."""
         self.lines: list[str] = []  # the last lines of stderr
         self._log = log
@@ -85,14 +75,15 @@ class VerbProcess:
         self._new_lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._reports = ReportPipe()
         inherited = {**(os.environ if environment is None else environment), VARIABLE: str(self._reports.write)}
+        within = (*inside, *(parent_death_command() if ends_with_parent else ()))
         with ExitStack() as stack:
             stack.callback(os.close, self._reports.write)
             if log is not None:
                 log.parent.mkdir(parents=True, exist_ok=True)
             target = subprocess.PIPE if log is None else stack.enter_context(log.open("wb"))
-            self.popen = subprocess.Popen(  # noqa: S603 - our own interpreter and verb
-                [*inside, *command(*words)], stdout=target, stderr=target, env=inherited, start_new_session=True,
-                pass_fds=(self._reports.write,),
+            super().__init__(
+                [*within, *command(*words)], is_own=True,
+                stdout=target, stderr=target, env=inherited, pass_fds=(self._reports.write,),
             )  # fmt: skip
         streams = (
             (self.popen.stdout, read or (lambda stream: _drain(stream, self._out.append, None))),
@@ -103,12 +94,6 @@ class VerbProcess:
         ]
         for reader in self._readers:
             reader.start()
-
-    def __enter__(self) -> VerbProcess:
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self.end()
 
     def wait_for(self, text: str, times: int = 1, timeout: float = 60.0) -> str:
         """Block until stderr contained `text` in `times` new lines since the last wait; returns the last of them."""
@@ -139,7 +124,7 @@ class VerbProcess:
         """Block until it reports a value of this name; `DreamfleetError` if it ends before, or does not in time."""
         deadline = time.monotonic() + timeout
         while True:
-            has_ended = self.popen.poll() is not None
+            has_ended = self.exit_code is not None
             if found := self.reports(name):
                 return found[0]
             if has_ended or time.monotonic() > deadline:
@@ -159,19 +144,14 @@ class VerbProcess:
         lines: Iterable[str] = self.lines if self._log is None else self._log.read_text(errors="replace").splitlines()
         printed = [line.strip() for line in lines if line.strip()]
         said = printed[-1] if printed else "it printed nothing"
-        code = self.popen.poll()
+        code = self.exit_code
         return said if code is None or code >= 0 else f"killed by signal {-code}; its last line: {said}"
 
-    def end(self, patience: float = PATIENCE) -> None:
-        """Send SIGTERM, twice if needed, then SIGKILL to its whole process group."""
-        for _ in range(2 if patience else 0):
-            if self.popen.poll() is None:
-                self.popen.send_signal(signal.SIGTERM)
-                _wait(self.popen, patience)
-        if self.popen.poll() is None:
-            os.killpg(self.popen.pid, signal.SIGKILL)
-        _wait(self.popen, KILL_LIMIT)
+    def end(self, patience: float = PATIENCE, limit: float = KILL_LIMIT) -> bool:
+        """As `Child.end`, and wait for the last lines."""
+        has_ended = super().end(patience, limit)
         self._join()
+        return has_ended
 
     def _add_line(self, line: str) -> None:
         self.lines.append(line)
@@ -190,8 +170,3 @@ def _drain(stream: IO[bytes], take: Callable[[str], None], end: queue.SimpleQueu
             take(line.decode(errors="replace"))
     if end is not None:
         end.put(None)
-
-
-def _wait(popen: subprocess.Popen[bytes], seconds: float) -> None:
-    with suppress(subprocess.TimeoutExpired):
-        popen.wait(seconds)

@@ -9,17 +9,15 @@ from __future__ import annotations
 import logging
 import math
 import os
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from multiprocessing import get_context
 from pathlib import Path
 from time import monotonic
 from typing import Any
 
 from dreamfleet.common.files.locks import open_lock, wait_for_lock
-from dreamfleet.common.host.parent_death import signals_blocked
-from dreamfleet.common.host.stop_signals import end_within, outlive_stop_signals
+from dreamfleet.common.host.child import FunctionChild
+from dreamfleet.common.host.stop_signals import end_within
 from dreamfleet.common.printable import one_line, truncate
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.analysis.export import scalars_of
@@ -53,65 +51,54 @@ def live_log(run: Path, log_to: Sequence[str]) -> Iterator[None]:
 
 
 class _Follower:
-    """A process that follows a run for one record, and a thread that logs what it reports."""
+    """A process that follows a run for one record; it hands over the last steps of a killed coordinator, too."""
 
     def __init__(self, run: Path, text: str) -> None:
-        context = get_context("spawn")
         self._kind = parse_sink(text).kind  # what follows it may hold a password
         self._is_over = False
-        heard, said = context.Pipe(duplex=False)
-        over, self._end = context.Pipe(duplex=False)  # an event's lock would be lost with a process that is killed
-        arguments = run.absolute(), parse_sink(text), over, said
-        name = f"log to {self._kind}"
-        self._process = context.Process(target=_follow_in_child, args=arguments, name=name, daemon=True)
-        with signals_blocked():
-            self._process.start()
-        said.close()
-        over.close()
-        threading.Thread(target=self._relay, args=(heard,), name=name, daemon=True).start()
+        arguments = run.absolute(), parse_sink(text)
+        self._child = FunctionChild(
+            _follow_in_child, *arguments, on_message=self._relay, is_own=True, ends_with_parent=False
+        )
 
     def ask_to_end(self) -> None:
         """Let it write the last steps and end."""
         self._is_over = True
-        with suppress(OSError):  # it is gone
-            self._end.send(None)
+        self._child.send(None)
 
     def end(self, until: float) -> None:
         """Wait for its end, which was asked for, until this time."""
-        self._process.join(max(0.0, until - monotonic()))
-        if self._process.is_alive():
-            self._process.kill()
+        if not self._child.wait(until - monotonic()):
             log.warning("%s had not taken everything %g s after the run's end: the last steps may be missing there",
                         self._kind, GRACE)  # fmt: skip
+        self._child.end()
 
-    def _relay(self, heard: Any) -> None:
-        with suppress(EOFError, OSError):
-            while True:
-                log.warning("%s", heard.recv())
-        if not self._is_over:
+    def _relay(self, text: str | None) -> None:
+        if text is not None:
+            log.warning("%s", text)
+        elif not self._is_over:
             log.warning("the process that writes the curves to %s has ended: the run goes on, and a resumed run writes "
                         "what is missing there", self._kind)  # fmt: skip
 
 
-def _follow_in_child(run: Path, name: SinkName, over: Any, said: Any) -> None:
-    outlive_stop_signals()  # the parent says when to stop
+def _follow_in_child(pipe: Any, run: Path, name: SinkName) -> None:
     silent = os.open(os.devnull, os.O_RDWR)
     for stream in (1, 2):  # libraries print there
         os.dup2(silent, stream)
 
     def is_over() -> bool:
         """Whether the coordinator ends, or was killed: then this process ends soon, whatever it waits for."""
-        if not over.poll(INTERVAL):
+        if not pipe.poll(INTERVAL):
             return False
         try:
-            over.recv()
+            pipe.recv()
         except (EOFError, OSError):
             end_within(GRACE, 1)
         return True
 
     def report(text: str) -> None:
         with suppress(OSError):  # the parent is gone
-            said.send(text)
+            pipe.send(text)
 
     with open_lock(run / f"log-to-{name.kind}.lock") as lock:
         wait_for_lock(lock)  # the process of a killed coordinator may still hand its last steps over

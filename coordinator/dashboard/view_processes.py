@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import re
-import subprocess
 from base64 import b64encode
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import suppress
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.host.processes import VerbProcess, parent_death_command
+from dreamfleet.common.host.processes import VerbProcess
 from dreamfleet.common.monitoring.mjpeg import read_parts
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol import keys
@@ -139,7 +138,7 @@ class _ViewProcess:
         self._loop = asyncio.get_running_loop()
         # The child is signalled when the thread that started it dies, so the loop's own thread starts it.
         self._child = VerbProcess(
-            "live", *flags, "--fps", RATE, "--out", "-", inside=(*NICE, *parent_death_command()), read=self._read
+            "live", *flags, "--fps", RATE, "--out", "-", inside=NICE, read=self._read, ends_with_parent=True
         )
         self.task = asyncio.create_task(self._run())
 
@@ -190,8 +189,7 @@ class _ViewProcess:
     def _stop_process(self) -> None:
         """In a thread: wait for a process whose stream ended; kill any other, which has nothing to lose."""
         if self._ended.is_set():
-            with suppress(subprocess.TimeoutExpired):
-                self._child.popen.wait(PATIENCE)
+            self._child.wait(PATIENCE)
         self._child.end(patience=0)
 
     def _read(self, stream: IO[bytes]) -> None:
@@ -225,5 +223,5 @@ def _picture_event(picture: bytes, facts: Mapping[str, Any]) -> bytes:
 
 
 def _end_reason(child: VerbProcess) -> str:
-    code = child.popen.returncode
+    code = child.exit_code or 0
     return f"The process that draws it was ended by signal {-code}." if code < 0 else child.last_line()

@@ -29,7 +29,6 @@ from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, Usa
 from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.host.processes import (
     VerbProcess,
-    parent_death_command,
     run_verb_for_json,
     run_verb_to_end,
     shell_command,
@@ -179,7 +178,7 @@ class Demo:
             return
         where = ("--connect", self._endpoint, "--runs-dir", self._runs_dir)
         page = stack.enter_context(
-            VerbProcess("dashboard", *where, "--host", "127.0.0.1", "--port", 0, inside=parent_death_command())
+            VerbProcess("dashboard", *where, "--host", "127.0.0.1", "--port", 0, ends_with_parent=True)
         )
         with suppress(DreamfleetError):
             self._print(f"the dashboard is at {page.wait_for_report(ADDRESS, START_SECONDS)}")

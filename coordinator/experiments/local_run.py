@@ -17,7 +17,7 @@ from dreamfleet.common.cli import model_commands
 from dreamfleet.common.cli.verb_runner import POLL_INTERVAL, wait_for_end
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, StoppedError, UsageError
 from dreamfleet.common.files.regular_files import path_exists
-from dreamfleet.common.host.processes import VerbProcess, parent_death_command
+from dreamfleet.common.host.processes import VerbProcess
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import Stop, signals_deferred
 from dreamfleet.common.monitoring.client import Client
@@ -90,7 +90,7 @@ class LocalRun:
     def __exit__(self, *_error: object) -> None:
         with signals_deferred():  # a second Ctrl-C would leave processes behind
             for each in self._workers:  # together: each may be in an episode
-                each.popen.terminate()
+                each.ask_to_end()
             self._stack.close()
 
     def connect(self, endpoint: str) -> Client:
@@ -100,7 +100,7 @@ class LocalRun:
         """
         deadline = time.monotonic() + START_SECONDS
         while True:
-            if (code := self.coordinator.popen.poll()) is not None:
+            if (code := self.coordinator.exit_code) is not None:
                 raise (UsageError if code == UsageError.exit_code else DreamfleetError)(self.coordinator.last_line())
             wait_for_listener((endpoint,), POLL_INTERVAL, lambda: False)
             try:
@@ -126,18 +126,18 @@ class LocalRun:
 
     def _start(self, words: Sequence[str], log: Path) -> VerbProcess:
         with signals_deferred():  # what is started is also ended
-            process = VerbProcess(*words, inside=parent_death_command(), log=log, environment=self._environment)
+            process = VerbProcess(*words, log=log, environment=self._environment, ends_with_parent=True)
             return self._stack.enter_context(process)
 
     def check_workers(self) -> None:
         """`DreamfleetError` if a worker failed."""
         for each in self._workers:
-            if each.popen.poll() not in (None, 0):
+            if each.exit_code not in (None, 0):
                 raise DreamfleetError(f"this host's worker failed: {each.last_line()}")
 
     def check_some_worker(self) -> None:
         """`DreamfleetError` if every worker failed: the coordinator would wait for ever."""
-        if self._workers and all(each.popen.poll() not in (None, 0) for each in self._workers):
+        if self._workers and all(each.exit_code not in (None, 0) for each in self._workers):
             raise DreamfleetError(f"this host's workers failed: {self._workers[-1].last_line()}")
 
     def wait(self, stop: Stop, on_poll: Callable[[], None], interval: float = POLL_INTERVAL) -> None:

@@ -110,7 +110,7 @@ class StartedRun(StoredRun):
         `DreamfleetError` if a process fails or the run pauses by itself, `StoppedError` if somebody else stops it.
         """
         while True:
-            over = self._processes.coordinator.popen.poll() is not None
+            over = self._processes.coordinator.exit_code is not None
             for generation in self.history(self._next):
                 self._next = generation.number + 1
                 yield generation
@@ -144,9 +144,9 @@ class StartedRun(StoredRun):
                 if not status.is_over:
                     self._processes.check_workers()
         except ConnectionFailedError:  # it ended between two looks, or failed
-            if self._processes.coordinator.popen.poll() is None:
+            if self._processes.coordinator.exit_code is None:
                 raise
-        if self._is_live and self._processes.coordinator.popen.poll() is not None:
+        if self._is_live and self._processes.coordinator.exit_code is not None:
             self._processes.check_end()
 
     @property
@@ -365,6 +365,6 @@ def _open(processes: LocalRun, path: Path, address: str, stack: ExitStack, *, re
     try:
         client = stack.enter_context(processes.connect(address))
     except DreamfleetError:
-        if processes.coordinator.popen.poll() != 0:
+        if processes.coordinator.exit_code != 0:
             raise
     return StartedRun(path, processes, address, client, resumed=resumed)

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
 import shlex
-import signal
-import subprocess
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib.resources import files
+from subprocess import PIPE
 from time import monotonic
 from typing import Any, TypeVar
 
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError
+from dreamfleet.common.host.child import CommandChild
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.serialization.validation import MAX_TEXT, MalformedError, from_plain
 from dreamfleet.coordinator.spawn.agent import MARK
@@ -92,9 +91,8 @@ class Connection:
         self._fault = ""  # why this side ended the connection
         self._changed = threading.Condition()
         try:
-            self._popen = subprocess.Popen(  # noqa: S603 - the user's ssh client
-                words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
-            )
+            # Its own: it ends as our pipe does, and may leave a shared connection, which is the user's.
+            self._child = CommandChild(words, is_own=True, stdin=PIPE, stdout=PIPE, stderr=PIPE)
         except OSError as error:
             raise DreamfleetError(
                 f"{ssh[0]} cannot be run ({error.strerror}): install an ssh client, or name --ssh"
@@ -138,24 +136,18 @@ class Connection:
 
     def close(self) -> None:
         """Close the connection, which ends workers that use its tunnel. From any thread."""
-        with suppress(OSError):
-            self._popen.terminate()
-        try:
-            self._popen.wait(PATIENCE)
-        except subprocess.TimeoutExpired:
-            self._popen.kill()
-            self._popen.wait()
+        self._child.end(PATIENCE)
 
     @property
     def _ended(self) -> bool:
-        return self._popen.poll() is not None
+        return self._child.exit_code is not None
 
     def _send(self, *data: bytes) -> None:
-        assert self._popen.stdin is not None
+        assert self._child.popen.stdin is not None
         with suppress(BrokenPipeError, ValueError):  # `_answer` reports why
             for each in data:
-                self._popen.stdin.write(each)
-            self._popen.stdin.flush()
+                self._child.popen.stdin.write(each)
+            self._child.popen.stdin.flush()
 
     def _answer(self, silence: float | None, on_message: OnMessage) -> dict[str, Any]:
         """The next answer; hands on the messages before it. Only `follow`, of endless patience, has lines of a log."""
@@ -179,9 +171,9 @@ class Connection:
 
     def _read_message(self) -> tuple[Any, Any]:
         """The next line with our mark, parsed; skips what the remote shell prints."""
-        assert self._popen.stdout is not None
+        assert self._child.popen.stdout is not None
         mark, begins = MARK.encode(), True
-        while line := self._popen.stdout.readline(MAX_LINE):
+        while line := self._child.popen.stdout.readline(MAX_LINE):
             if begins and line.startswith(mark) and line.endswith(b"\n"):
                 with suppress(ValueError, RecursionError, AttributeError):
                     ((kind, content),) = json.loads(line[len(mark) :]).items()
@@ -216,20 +208,18 @@ class Connection:
     def _end(self, fault: str) -> None:
         """End a connection whose host misbehaves. From any thread."""
         self._fault = self._fault or fault
-        with suppress(OSError):
-            os.killpg(self._popen.pid, signal.SIGKILL)
+        self._child.kill()
 
     def _failure(self) -> ConnectionFailedError:
         if self._fault:
             return ConnectionFailedError(self._fault)
-        with suppress(subprocess.TimeoutExpired):
-            self._popen.wait(PATIENCE)
+        self._child.wait(PATIENCE)
         self._listener.join(PATIENCE)
-        return ConnectionFailedError(explain(list(self._stderr_lines), self._popen.poll(), self._address))
+        return ConnectionFailedError(explain(list(self._stderr_lines), self._child.exit_code, self._address))
 
     def _listen(self) -> None:
-        assert self._popen.stderr is not None
-        while line := self._popen.stderr.readline(MAX_MESSAGE):
+        assert self._child.popen.stderr is not None
+        while line := self._child.popen.stderr.readline(MAX_MESSAGE):
             text = line.decode(errors="replace").rstrip()
             with self._changed:
                 self._stderr_lines.append(text)

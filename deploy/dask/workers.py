@@ -14,7 +14,8 @@ from threading import Event
 
 from distributed import Client, Worker, WorkerPlugin
 
-from dreamfleet.common.host.processes import command, parent_death_command
+from dreamfleet.common.host.parent_death import parent_death_command
+from dreamfleet.common.host.processes import command
 
 
 class Scoring(WorkerPlugin):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
+import queue
 import socket
 import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from importlib import import_module
 from importlib.util import find_spec
 from multiprocessing import get_context
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from dreamfleet.common.errors import DreamfleetError
-from dreamfleet.common.host.parent_death import end_on_signals, signals_blocked
+from dreamfleet.common.host.child import FunctionChild
 from dreamfleet.common.host.processes import VerbProcess
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.worker.bench.simulated_workers import run_simulated_workers
@@ -120,7 +120,6 @@ class BenchRun:
             self.coordinator = stack.enter_context(
                 VerbProcess("coordinator", "--run", "bench", "--runs-dir", self._runs, *self._arguments)
             )
-            self._coordinator = self.coordinator.popen
             self._stack = stack.pop_all()
         return self
 
@@ -134,25 +133,19 @@ class BenchRun:
     @contextmanager
     def crowd(self, count: int, slots: int, seconds: float = 0.0) -> Iterator[None]:
         """Start `count` simulated workers in one process, whose jobs take so many `seconds`."""
-        process = get_context("spawn").Process(
-            target=run_simulated_workers, args=(self.endpoint, count, slots, seconds), daemon=True
-        )
-        process.start()
-        try:
+        arguments = self.endpoint, count, slots, seconds
+        with FunctionChild(_run_simulated_workers, *arguments, on_message=lambda _message: None, is_own=True):
             yield
-        finally:
-            process.kill()
-            process.join(5)
 
     def finish(self) -> None:
         """Wait until the run ends; `DreamfleetError` if it fails or takes too long."""
         deadline = time.monotonic() + RUN_SECONDS
-        while self._coordinator.poll() is None:
-            self.peak_mb = max(self.peak_mb, _resident_mb(self._coordinator.pid))
+        while self.coordinator.exit_code is None:
+            self.peak_mb = max(self.peak_mb, self.coordinator.memory / 1e6)
             if time.monotonic() > deadline:
                 raise DreamfleetError(f"the run did not end within {RUN_SECONDS:g} s")
             time.sleep(0.1)
-        if self._coordinator.returncode:
+        if self.coordinator.exit_code:
             raise DreamfleetError("the run's coordinator failed")
 
     def generation_seconds(self) -> float:
@@ -161,11 +154,8 @@ class BenchRun:
             return statistics.median(each.seconds for each in run.history()[1:])
 
 
-def _resident_mb(pid: int) -> float:
-    try:
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-    except (OSError, ValueError, IndexError):
-        return 0.0
+def _run_simulated_workers(_pipe: Connection[Any, Any], *arguments: Any) -> None:
+    run_simulated_workers(*arguments)
 
 
 # ---- peers: the same work ----
@@ -188,18 +178,10 @@ Peer = Callable[[], AbstractContextManager[Mapper]]
 
 def run_peer(peer: Peer) -> Figures | None:
     """Measure a peer in its own process; `None` if it hangs or fails."""
-    ours, theirs = get_context("spawn").Pipe(duplex=False)
-    process = get_context("spawn").Process(target=_send_figures, args=(theirs, peer))
-    process.start()
-    theirs.close()
-    try:
-        return ours.recv() if ours.poll(PEER_SECONDS) else None
-    except EOFError:
-        return None
-    finally:
-        process.terminate()
-        process.join(5)
-        process.kill()
+    answers: queue.SimpleQueue[Figures | None] = queue.SimpleQueue()
+    with FunctionChild(_send_figures, peer, on_message=answers.put), suppress(queue.Empty):
+        return answers.get(timeout=PEER_SECONDS)
+    return None
 
 
 def _send_figures(pipe: Connection[Figures, Any], peer: Peer) -> None:
@@ -225,9 +207,7 @@ def peer_figures(peer: Peer) -> Figures:
 @contextmanager
 def pool_peer() -> Iterator[Mapper]:
     """The standard library's pool, one job per message."""
-    with signals_blocked():
-        processes = get_context("spawn").Pool(SLOTS, end_on_signals)
-    with processes as pool:
+    with get_context("spawn").Pool(SLOTS) as pool:
         yield lambda work, count: pool.map(work, range(count), chunksize=1)
 
 

@@ -1,19 +1,16 @@
 """A scoring child process: it reads groups of jobs from a pipe and writes their results back. It never uses Zenoh.
 
-This module imports nothing heavy, so that a child arranges to die with its parent before it loads a simulator.
+This module imports nothing heavy: a child ends with its parent only once what it was started with is loaded.
 """
 
 from __future__ import annotations
 
 import faulthandler
-import os
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking, make_stdout_nonblocking
-from dreamfleet.common.host.parent_death import exit_with_parent
-from dreamfleet.common.host.stop_signals import outlive_stop_signals
 from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.host.user_code import keep_user_arguments
 
@@ -48,16 +45,12 @@ class ScorerArguments:
 
 
 def serve_jobs(
-    pipe: Connection[Any, Any], steps: Any, abandoned: Any, is_watched: Any, arguments: ScorerArguments, parent: int
+    pipe: Connection[Any, Any], steps: Any, abandoned: Any, is_watched: Any, arguments: ScorerArguments
 ) -> None:
     """Score groups of jobs from the pipe until it closes.
 
     `steps`, `abandoned` and `is_watched` are memory shared with the parent.
     """
-    exit_with_parent(parent)
-    os.setsid()  # the worker ends the whole session, and Ctrl-C reaches only the worker
-    outlive_stop_signals()
-    os.register_at_fork(after_in_child=pipe.close)  # a copy would hide this process's end from the worker
     with suppress(OSError, AttributeError, ValueError, RuntimeError):  # without a stderr a crash leaves no traceback
         faulthandler.enable()
     make_stderr_nonblocking()  # inherited from the worker, whose reader may be suspended

@@ -155,7 +155,7 @@ class Slot:
         group.number = self._sent
         if group is self._groups[0]:
             self._watch.restart()
-        if not self._child.send(group.number, group.work):
+        if not self._child.send_group(group.number, group.work):
             self._kill("it read no job")
 
     def show(self, wanted: bool) -> None:
@@ -251,7 +251,7 @@ class Slot:
         if self._child is None or 0 <= now - self._looked_at < LOOK_INTERVAL:
             return
         self._looked_at = now
-        if self._given_up_at == math.inf and self._child.exit_status is not None:
+        if self._given_up_at == math.inf and self._child.exit_code is not None:
             self._child.kill()  # what it left behind, so that the reader hears the pipe's end after the last message
             self._given_up_at = monotonic() + EXIT_GRACE
         elif monotonic() > self._given_up_at:
@@ -298,8 +298,8 @@ class Slot:
         """
         assert self._child is not None  # it has just sent its last event
         if self._given_up_at == math.inf:
-            self._child.wait_for_exit()
-        steps, status = self.steps, self._child.exit_status
+            self._child.wait(EXIT_GRACE)
+        steps, status = self.steps, self._child.exit_code
         self._child.close(LOOK_INTERVAL)
         failure = self._why_ended(status)
         reason = failure.cause if failure.kind == "crash" else failure.text

@@ -17,6 +17,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host import parent_death
 
@@ -64,18 +66,14 @@ def remove_leftovers() -> None:
     """Remove what is left of games whose starting process was killed before it had started them."""
     for folder in Path(tempfile.gettempdir()).glob(f"{FOLDER_PREFIX}*"):
         owner = folder.name.removeprefix(FOLDER_PREFIX).partition("-")[0]
-        with suppress(OSError):  # another process removes it, too
+        with suppress(OSError, psutil.NoSuchProcess):  # another process removes it, too
             if owner.isdecimal() and folder.lstat().st_uid == os.getuid() and not _is_running(int(owner)):
                 _remove(folder)
 
 
 def _is_running(process: int) -> bool:
     """Whether a process of this user runs; a zombie does not."""
-    try:
-        state = Path(f"/proc/{process}/stat").read_bytes().rpartition(b") ")[2][:1]
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-    return state not in b"ZX"
+    return psutil.pid_exists(process) and bool(psutil.Process(process).status() != psutil.STATUS_ZOMBIE)
 
 
 def _remove(folder: Path) -> None:

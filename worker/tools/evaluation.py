@@ -11,11 +11,9 @@ from typing import ClassVar
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.host.packages import package_version
-from dreamfleet.common.host.parent_death import exit_with_parent
 from dreamfleet.common.host.process_pool import count_step, map_in_processes
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.stall_watch import STALL_SECONDS
-from dreamfleet.common.host.stop_signals import outlive_stop_signals
 from dreamfleet.common.host.unseen_drawing import draw_offscreen, draw_unseen
 from dreamfleet.common.protocol.result_bounds import rejection_reason
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
@@ -77,8 +75,7 @@ def evaluate_in_processes(
 
     pin_thread_pools()
     start, drive = _ProcessEvaluator.start, _ProcessEvaluator.drive
-    arguments = agent, os.getpid()
-    for each in map_in_processes(jobs, start, arguments, drive, seeds, lose, stall, has_failed=has_failed):
+    for each in map_in_processes(jobs, start, (agent,), drive, seeds, lose, stall, has_failed=has_failed):
         ended = ended or each not in lost
         yield each
 
@@ -139,11 +136,9 @@ class _ProcessEvaluator:
     driver: ClassVar[_Driver]
 
     @classmethod
-    def start(cls, agent: Agent, parent: int) -> None:
-        """Initialise the process, which ends with its parent."""
-        exit_with_parent(parent)
+    def start(cls, agent: Agent) -> None:
+        """Initialise the process."""
         draw_unseen()
-        outlive_stop_signals()  # Ctrl-C reaches the whole process group; the parent ends this process
         # The first episode loads the agent, so that errors are reported as that episode's. No Ctrl-C raises here.
         cls.driver = _Driver(agent, (BaseException,))
 

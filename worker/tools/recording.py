@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -13,10 +12,9 @@ from typing import Any, ClassVar, NoReturn
 
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.files.atomic_write import reporting_write_errors
-from dreamfleet.common.host.parent_death import exit_with_parent
 from dreamfleet.common.host.process_pool import count_step, map_in_processes
 from dreamfleet.common.host.stall_watch import STALL_SECONDS
-from dreamfleet.common.host.stop_signals import Stop, never_stop, outlive_stop_signals
+from dreamfleet.common.host.stop_signals import Stop, never_stop
 from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
 from dreamfleet.worker.scoring.agents import Agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
@@ -73,11 +71,10 @@ def record_in_process(
     def lose(_item: object, reason: int | str) -> NoReturn:
         raise DreamfleetError(f"the episode of seed {seed} failed: {crash(reason).text}")
 
-    arguments = os.getpid(), is_stopped
     with reporting_write_errors(out), TemporaryDirectory(prefix=f".{out.stem}-", dir=out.parent) as folder:
         video = Path(folder).absolute() / out.name  # a simulator may change the current folder of its process
         items = [(film, seed, video)]
-        (made,) = map_in_processes(1, _Recorder.start, arguments, _Recorder.record, items, lose, stall, look)
+        (made,) = map_in_processes(1, _Recorder.start, (is_stopped,), _Recorder.record, items, lose, stall, look)
         video.replace(out)
     return made
 
@@ -88,10 +85,8 @@ class _Recorder:
     is_stopped: ClassVar[Any]
 
     @classmethod
-    def start(cls, parent: int, is_stopped: Any) -> None:
-        """Initialise the process, which ends with its parent."""
-        exit_with_parent(parent)
-        outlive_stop_signals()  # Ctrl-C reaches the whole process group; the parent says when to stop
+    def start(cls, is_stopped: Any) -> None:
+        """Initialise the process; the parent says when to stop."""
         cls.is_stopped = is_stopped
 
     @classmethod

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +11,9 @@ from typing import TYPE_CHECKING, ClassVar
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.host.fingerprint import fingerprint
-from dreamfleet.common.host.parent_death import exit_with_parent
 from dreamfleet.common.host.process_pool import count_step, map_in_processes
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.stall_watch import STALL_SECONDS
-from dreamfleet.common.host.stop_signals import outlive_stop_signals
 from dreamfleet.common.host.trusted_modules import check_trusted
 from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.protocol.failures import Failure
@@ -162,7 +159,7 @@ def _drive_all(
 
     pin_thread_pools()
     attempts = map_in_processes(
-        1, _Replayer.start, (os.getpid(), spec, bundle, torch_device), _Replayer.drive, items, lose, stall,
+        1, _Replayer.start, (spec, bundle, torch_device), _Replayer.drive, items, lose, stall,
         has_failed=lambda attempt: attempt.error is not None,
     )  # fmt: skip
     return {each.episode: each for each in attempts}
@@ -177,11 +174,9 @@ class _Replayer:
     scorer: ClassVar[Scorer | None] = None
 
     @classmethod
-    def start(cls, parent: int, spec: TaskSpec, bundle: Path | None, torch_device: str) -> None:
-        """Initialise the process, which ends with its parent."""
-        exit_with_parent(parent)
+    def start(cls, spec: TaskSpec, bundle: Path | None, torch_device: str) -> None:
+        """Initialise the process."""
         draw_unseen()
-        outlive_stop_signals()  # Ctrl-C reaches the whole process group; the parent ends this process
         cls.spec, cls.bundle, cls.torch_device = spec, bundle, torch_device
 
     @classmethod

@@ -118,24 +118,23 @@ def _compare(args: argparse.Namespace) -> int:
 
 def measure_on_one_thread(measure: Callable[..., dict[str, Any]], bundle_name: str, *more: object) -> dict[str, Any]:
     """The figures of `measure(bundle, *more)`, called in a child process whose libraries use one thread."""
-    from concurrent.futures import ProcessPoolExecutor
     from concurrent.futures.process import BrokenProcessPool
-    from multiprocessing import get_context
+    from functools import partial
+    from operator import call
 
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.common.errors import DreamfleetError
-    from dreamfleet.common.host.parent_death import end_on_signals, signals_blocked
+    from dreamfleet.common.host.process_pool import map_in_processes
+    from dreamfleet.common.host.resource_limits import pin_thread_pools
 
     bundle: Bundle = find_bundle(bundle_name)
     _pin_libraries()
     # A child: numpy's library reads its thread count once, when loaded, and this process has loaded it.
-    with ProcessPoolExecutor(1, get_context("spawn"), end_on_signals) as pool:
-        try:
-            with signals_blocked():
-                measured = pool.submit(measure, bundle, *more)
-            return measured.result()
-        except BrokenProcessPool as error:
-            raise DreamfleetError("the process that measured has crashed; is memory short?") from error
+    try:
+        (figures,) = map_in_processes(1, pin_thread_pools, (), call, [partial(measure, bundle, *more)])
+    except BrokenProcessPool as error:
+        raise DreamfleetError("the process that measured has crashed; is memory short?") from error
+    return figures
 
 
 def _pin_libraries() -> None:

@@ -15,7 +15,8 @@ from typing import Any
 from dreamfleet.common.cli.model_commands import Words, command
 from dreamfleet.common.cli.verb_runner import POLL_INTERVAL
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, StoppedError
-from dreamfleet.common.host.processes import PATIENCE, VerbProcess, parent_death_command
+from dreamfleet.common.host.child import PATIENCE
+from dreamfleet.common.host.processes import VerbProcess
 from dreamfleet.common.host.stop_signals import Stop, signals_deferred
 from dreamfleet.common.monitoring.client import Client
 from dreamfleet.common.protocol.pause_kind import PauseKind
@@ -165,7 +166,7 @@ class SweepRunner:
         """Note which runs are over. A coordinator that was killed is started again."""
         for each in self.progress:
             process = self._coordinators.get(each.run.name)
-            if process is None or (code := process.popen.poll()) is None:
+            if process is None or (code := process.exit_code) is None:
                 continue
             del self._coordinators[each.run.name]
             process.end()
@@ -206,7 +207,7 @@ class SweepRunner:
                 each.paused_since = self._looked_at
             elif self._looked_at - each.paused_since > PAUSE_PATIENCE:
                 each.state, each.text = "failed", f"paused: {status.get('why')}"
-                self._coordinators[each.run.name].popen.terminate()
+                self._coordinators[each.run.name].ask_to_end()
 
     def _uid_of(self, name: str) -> str | None:
         """A run's own name for ever; `None` before it has begun."""
@@ -220,12 +221,12 @@ class SweepRunner:
     def _check_helpers(self) -> None:
         """Start a router or worker again that was killed; `DreamfleetError` if one fails."""
         for name, (words, process, started) in list(self._helpers.items()):
-            code = process.popen.poll()
+            code = process.exit_code
             if code is None:
                 continue
             if code >= 0 and name == "router":
                 raise DreamfleetError(f"the sweep's router failed: {process.last_line()}")
-            if code >= 0 and not any(each.popen.poll() is None for each in self._workers):
+            if code >= 0 and not any(each.exit_code is None for each in self._workers):
                 raise DreamfleetError(f"this host's workers failed: {process.last_line()}")
             if code < 0 and time.monotonic() - started > RESTART_PAUSE:
                 process.end()
@@ -241,18 +242,17 @@ class SweepRunner:
     def _start(self, words: Words, log: Path) -> VerbProcess:
         alone = ALONE if self._fleet.has_router else {}  # a fleet of the user's has its own
         environment = {**os.environ, **alone, CHECKED: self._checks}
-        return VerbProcess(*words, inside=parent_death_command(), log=log, environment=environment)
+        return VerbProcess(*words, log=log, environment=environment, ends_with_parent=True)
 
     def _end(self) -> None:
         """End the workers, then the coordinators, which leave their runs open, then the router."""
         routers = [process for name, (_, process, _) in self._helpers.items() if name == "router"]
         for together in (self._workers, list(self._coordinators.values()), routers):
             for each in together:
-                if each.popen.poll() is None:
-                    each.popen.terminate()
+                each.ask_to_end()
             deadline = time.monotonic() + PATIENCE
-            while time.monotonic() < deadline and any(each.popen.poll() is None for each in together):
-                time.sleep(POLL_INTERVAL / 4)
+            for each in together:
+                each.wait(deadline - time.monotonic())
             for each in together:
                 each.end()
 

@@ -14,8 +14,8 @@ from dreamfleet.common.cli.health import missing_for_role, run_checks
 from tests.support.processes import DEADLINE, ROOT, environment
 
 COORDINATOR = (
-    "cma", "cmaes", "eclipse-zenoh", "msgpack", "msgspec", "numpy", "prometheus-client", "rich", "pygments",
-    "markdown-it-py", "mdurl", "dreamfleet",
+    "cma", "cmaes", "eclipse-zenoh", "msgpack", "msgspec", "numpy", "prometheus-client", "psutil", "rich",
+    "pygments", "markdown-it-py", "mdurl", "dreamfleet",
 )  # fmt: skip
 
 

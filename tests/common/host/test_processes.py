@@ -1,10 +1,5 @@
 """Verbs as child processes."""
 
-import os
-import select
-import subprocess
-import sys
-
 import pytest
 
 from dreamfleet.common.errors import DreamfleetError
@@ -54,22 +49,6 @@ def test_waiting_for_missing_output_times_out(tmp_path):
         child.wait_for("nothing of the kind")
     with pytest.raises(DreamfleetError, match="dreamfleet runs failed"):
         run_verb_to_end("runs", "show", "absent", "--runs-dir", tmp_path)
-
-
-def test_a_child_dies_with_a_killed_parent(tmp_path):
-    program = (
-        "import sys; from dreamfleet.common.host.processes import VerbProcess, parent_death_command\n"
-        "child = VerbProcess('worker', '--connect', 'tcp/127.0.0.1:1', inside=parent_death_command())\n"
-        "print(child.popen.pid, flush=True); sys.stdin.read()"
-    )
-    pipe = subprocess.PIPE
-    with subprocess.Popen([sys.executable, "-c", program], stdin=pipe, stdout=pipe, text=True) as parent:
-        child = os.pidfd_open(int(parent.stdout.readline()))
-        parent.kill()
-    try:
-        assert select.select([child], [], [], DEADLINE)[0], "it lives on"
-    finally:
-        os.close(child)
 
 
 @pytest.mark.slow

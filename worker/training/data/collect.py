@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -17,10 +16,8 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.bundle import hash_file
 from dreamfleet.common.errors import DatasetError, DreamfleetError
 from dreamfleet.common.files.atomic_write import atomic_write
-from dreamfleet.common.host.parent_death import exit_with_parent
 from dreamfleet.common.host.process_pool import count_step, map_in_processes
 from dreamfleet.common.host.resource_limits import pin_thread_pools
-from dreamfleet.common.host.stop_signals import outlive_stop_signals
 from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.printable import plural
 from dreamfleet.worker.scoring.episode import EpisodeConfig, ResetHook, run_episode
@@ -83,7 +80,7 @@ def collect(
     pin_thread_pools()
     absolute = folder.absolute()  # a simulator may change the current folder of its process
     tasks = [(absolute, config, number, tuple(pilots), world) for number in numbers]
-    yield from map_in_processes(jobs, _start_process, (os.getpid(),), _collect_one, tasks, _lose, stall)
+    yield from map_in_processes(jobs, draw_unseen, (), _collect_one, tasks, _lose, stall)
 
 
 def _lose(task: tuple[Path, CollectConfig, int, tuple[Pilot, ...], DataWorld], reason: int | str) -> NoReturn:
@@ -91,12 +88,6 @@ def _lose(task: tuple[Path, CollectConfig, int, tuple[Pilot, ...], DataWorld], r
         f"drive {task[2]} failed: {crash(reason).text}; what was written before is whole, and `dreamfleet doctor` "
         "looks for a cause in this host"
     )
-
-
-def _start_process(parent: int) -> None:
-    exit_with_parent(parent)
-    outlive_stop_signals()  # Ctrl-C reaches the whole process group; the parent lets this episode finish
-    draw_unseen()
 
 
 def _collect_one(task: tuple[Path, CollectConfig, int, tuple[Pilot, ...], DataWorld]) -> int:
