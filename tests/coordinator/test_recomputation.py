@@ -277,8 +277,9 @@ def test_a_run_is_what_its_journal_comes_to(processes, random_bundle, kind):
 @pytest.mark.slow
 def test_a_run_with_failures_is_what_its_journal_comes_to(processes, random_bundle):
     answer = started(
-        processes, "brittle", random_bundle, "--evaluation-episodes", 9, "--failure-limit", 1, task=BRITTLE
-    )
+        processes, "brittle", random_bundle, "--evaluation-episodes", 9, "--failure-limit", 1, "--generations", 4,
+        task=BRITTLE,
+    )  # fmt: skip
     found = Recomputed(processes.runs / "brittle" / "journal.sqlite")
     kinds = {kind for kind, _, _ in found.failed}
     assert kinds == {"score", "evaluate"}, "choose another seed"
