@@ -101,12 +101,10 @@ class RunSettings:
     features: Literal["zh", "z"] = field(default="zh", metadata=OPTIONAL)  # inputs of the controller
     collect_every: Count = field(default=0, metadata=OPTIONAL)  # generations; 0: never
     collect_episodes: EpisodesPerCandidate = field(default=1, metadata=OPTIONAL)
-    # Only older runs have one: the temperature was multiplied by it when evaluations fell. 1: never.
-    heat: float = field(default=1.0, metadata=OPTIONAL)
     packages: Packages = field(default=NUMERIC_PACKAGES, metadata=OPTIONAL)  # in its fingerprint
     optimiser: str = field(default="cma", metadata=OPTIONAL)  # registered, or module:attribute
     optimiser_options: tuple[str, ...] = field(default=(), metadata=OPTIONAL)  # each as name=value
-    # Fresh tracks of the confirmation at the run's end; 0: none, as in older runs.
+    # Fresh tracks of the confirmation at the run's end; 0: none.
     confirm_episodes: ConfirmationEpisodes = field(default=0, metadata=OPTIONAL)
     # Share of a candidate's episodes in a dream task that are scored in reality: its first ones.
     driven: Share = field(default=0.0, metadata=OPTIONAL)

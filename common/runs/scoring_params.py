@@ -1,4 +1,4 @@
-"""The scoring parameters of each generation of a run: its stage, and the temperature of its dream.
+"""The scoring parameters of each generation of a run: its stage, and what that changes.
 
 They are a pure function of the run's settings and of the generations and evaluations finished before it opens.
 """
@@ -6,14 +6,13 @@ They are a pure function of the run's settings and of the generations and evalua
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from dreamfleet.common.protocol.messages import MAX_TEMPERATURE, TaskSpec
+from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
-from dreamfleet.common.runs.stages import BegunStage, Stage, StageTracker, latest_usable_evaluation
+from dreamfleet.common.runs.stages import BegunStage, Stage, StageTracker
 
 if TYPE_CHECKING:
     from dreamfleet.common.runs.run_folder import RunFolder
@@ -52,7 +51,6 @@ class ScheduleState:
 
     def __init__(self, settings: RunSettings) -> None:
         self.stages = StageTracker(settings)
-        self._settings = settings
         self._own = settings.task
 
     def scoring_params(
@@ -64,47 +62,15 @@ class ScheduleState:
         depends on.
         """
         begun = self.stages.advance_to(generation, history, finished)
-        temperature = _temperature_at(generation, self._settings, finished)
-        return ScoringParams(begun.stage.spec(self._own).with_overrides(temperature), begun)
+        return ScoringParams(begun.stage.spec(self._own), begun)
 
     def required_evaluation(self, generation: int) -> int:
         """The generation of the evaluation that must finish before the next `generation` opens; negative: none."""
-        return max(_raising_evaluation(generation, self._settings), self.stages.required_evaluation(generation))
+        return self.stages.required_evaluation(generation)
 
     def spec(self, generation: int) -> TaskSpec:
         """The specification of collecting rollouts with the mean after `generation`."""
         return self.stages.stage_of(generation).stage.spec(self._own)
-
-
-def _raising_evaluation(generation: int, settings: RunSettings) -> int:
-    """The last evaluation, by its generation, that may raise the temperature of `generation`; negative: none."""
-    return -1 if settings.heat == 1 else latest_usable_evaluation(settings.evaluate_every, generation)
-
-
-def _temperature_at(
-    generation: int, settings: RunSettings, finished: Mapping[int, StoredEvaluation]
-) -> float | None:  # fmt: skip
-    """The temperature of `generation`; `None` for tasks without one.
-
-    It is constant in every run that can be started today. In older runs with `heat`, each scheduled evaluation clearly
-    below the best one since the last raise multiplies the temperature by `heat`.
-    """
-    temperature, best = settings.task.temperature, None
-    if temperature is None or (last := _raising_evaluation(generation, settings)) < 0:
-        return temperature
-    for number in range(settings.evaluate_every - 1, last + 1, settings.evaluate_every):
-        evaluation = finished.get(number)
-        if evaluation is not None and best is not None and _fell_behind(evaluation, best):
-            temperature, best = min(temperature * settings.heat, MAX_TEMPERATURE), None
-        elif evaluation is not None and (best is None or evaluation.mean > best.mean):
-            best = evaluation
-    return temperature
-
-
-def _fell_behind(evaluation: StoredEvaluation, best: StoredEvaluation) -> bool:
-    """The rule that runs with `heat` raised by, kept to the bit: unpaired errors with `episodes` in the denominator."""
-    errors = (each.std / math.sqrt(each.episodes) for each in (best, evaluation))
-    return best.mean - evaluation.mean > 2 * math.hypot(*errors)
 
 
 def scoring_params_at(

@@ -58,7 +58,7 @@ def _first_affected(brought: dict[str, int], settings: RunSettings) -> int | Non
     An evaluation decides about candidates only where a stage ends at a score, and from the next generation on.
     """
     found = [brought["score"]] if "score" in brought else []
-    is_decided = settings.heat != 1 or any(each.score is not None for each in settings.stages)
+    is_decided = any(each.score is not None for each in settings.stages)
     if "evaluate" in brought and is_decided:
         found.append(brought["evaluate"] + 1)
     return min(found, default=None)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,8 +21,6 @@ from dreamfleet.coordinator.settings.start import (
     stored_subspace,
 )
 
-log = logging.getLogger("dreamfleet.coordinator")
-
 
 @dataclass(frozen=True)
 class Fork:
@@ -40,7 +37,7 @@ class Fork:
                 raise UsageError(
                     f"run {source} has no search of its own, and no mean to begin at: begin with --init CONTROLLER"
                 )
-            start, (_, sigma), heat = start_from_run(stored), latest_mean_and_sigma(stored), stored.settings.heat
+            start, (_, sigma) = start_from_run(stored), latest_mean_and_sigma(stored)
             scoring_params = scoring_params_of(stored, len(stored.history()))
             stage = scoring_params.stage
             if is_try(stored.settings.stages, stage.number) and "schedule" not in given:
@@ -56,12 +53,6 @@ class Fork:
             settings = {**config_values(stored.settings, stored.bundle_path), **present}
             if not stage.whole:
                 settings["loaded_subspace"] = stored_subspace(stored.fact(SUBSPACE_FACT), stored.settings, stored.path)
-        if heat != 1.0:
-            log.warning(
-                "run %s raised its temperature by --heat %g, which is gone: the new run keeps its temperature",
-                source,
-                heat,
-            )
         if {"environment", "observation", "normalise"} & set(given):
             settings.pop("task_options", None)  # described anew, and refused if that makes another world of it
         if "optimiser" in given and "optimiser_options" not in given:

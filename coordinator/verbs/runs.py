@@ -197,12 +197,10 @@ def _function_facts(mean: NDArray[np.float32] | None, options: str) -> dict[str,
 
 
 def _flatten_settings(settings: RunSettings) -> dict[str, object]:
-    """Settings by name, with those of task and controller, without stages; heat only of older runs that have it."""
+    """Settings by name, with those of task and controller, without stages."""
     flat: dict[str, object] = {}
     plain = asdict(settings)
     del plain["stages"], plain["task"]["controller"]  # the same as the run's own
-    if settings.heat == 1.0:
-        del plain["heat"]
     for name, value in plain.items():
         flat |= {name: value} if not isinstance(value, dict) else _prefix_names(name, value)
     return {name: None if value in (None, "", ()) else format_setting(value) for name, value in flat.items()}

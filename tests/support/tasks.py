@@ -15,17 +15,17 @@ from dreamfleet.worker.tasks.api import Continuous, Score, Task, World
 
 MODULE = "tests.support.tasks"
 (
-    TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC, EXPLODING, ENDLESS,
+    TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, EXPLODING, ENDLESS,
     CHATTY, PAINTED, ROUNDED, SECOND_TOY, BRITTLE, FRAGILE,
 ) = (
     f"{MODULE}:{name}"
     for name in (
-        "Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Silent", "Judged", "Counted", "Heavy", "Optimistic",
+        "Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Silent", "Judged", "Counted", "Heavy",
         "Exploding", "Endless", "Chatty", "Painted", "Rounded", "SecondToy", "Brittle",
         "Fragile",
     )
 )  # fmt: skip
-ALL = TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, OPTIMISTIC, PAINTED
+ALL = TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, PAINTED
 STEPS_FOLDER = "DREAMFLEET_TEST_STEPS"  # where `Counted` writes
 ROUNDING = "DREAMFLEET_TEST_ROUNDING"  # if set, `Rounded` computes as on another host class
 ODD_REWARD = (
@@ -380,16 +380,6 @@ class OnesBatch:
         return [Score(1.0, 1)] * len(episodes)
 
 
-class Optimistic(Toy):
-    """The dream rewards ever larger actions, less at higher temperature; in reality these soon cost reward."""
-
-    name = OPTIMISTIC
-    batch_size = 4
-
-    def make_batch(self, assignment):
-        return OptimisticBatch(assignment.spec.temperature)
-
-
 class Exploding(Toy):
     """Rewards are finite, but their mean overflows."""
 
@@ -415,19 +405,6 @@ class Constant:
     def score(self, episodes, on_step):
         on_step(self._score.steps)
         return [self._score for _ in episodes]
-
-
-class OptimisticBatch:
-    def __init__(self, temperature):
-        self._temperature = temperature
-
-    def score(self, episodes, on_step):
-        scores = []
-        for vector, seed in episodes:
-            noise = np.random.default_rng(seed).normal(1.0, 0.1, 8) / self._temperature
-            scores.append(Score(float((vector[:8].astype(np.float64) * noise).sum()), 10))
-            on_step(10 * len(scores))
-        return scores
 
 
 class Painted(Toy):

@@ -412,7 +412,7 @@ class BatchedTask(Protocol):
     def make_batch(self, assignment: Assignment) -> Batch:
         """A batch that scores candidates; `BundleError` if the bundle cannot do that.
 
-        Called again whenever the specification's temperature, horizon or patience changes.
+        Called again whenever the specification's horizon or patience changes.
         """
 
 

@@ -165,17 +165,16 @@ def test_stages_and_their_reasons_are_described():
 
 
 def test_candidates_are_scored_with_their_stage_and_temperature():
-    warm = replace(PLAIN, task=replace(SPEC, temperature=1.0), heat=1.5)
+    warm = replace(PLAIN, task=replace(SPEC, temperature=1.0))
     settings = replace(warm, stages=(StageSettings(4), StageSettings(horizon=50, patience=0)))
-    cooled = evaluated({1: 100.0, 3: 10.0})
-    spec = scoring_params_at(6, settings, history(*[10] * 6), cooled).spec
-    assert spec == replace(SPEC, horizon=50, patience=0, temperature=1.5)
+    spec = scoring_params_at(6, settings, history(*[10] * 6), ()).spec
+    assert spec == replace(SPEC, horizon=50, patience=0, temperature=1.0)
 
 
 def test_settings_and_digests_without_a_schedule_are_unchanged():
     assert '"stages"' not in PLAIN.to_json()
     assert scoring_params_at(5, PLAIN, history(*[10] * 5), ()).spec == SPEC
-    written = "32b5b1f8a6bee0b22ed62a5034cdf1657709a3c7b15707ad38a792110c7c9de4"  # by the version before heat
+    written = "32b5b1f8a6bee0b22ed62a5034cdf1657709a3c7b15707ad38a792110c7c9de4"
     assert SPEC.with_overrides(horizon=SPEC.horizon).digest("score", b"x" * 32, (1,)).hex() == written
 
 
