@@ -105,11 +105,10 @@ class TaskSpec(DisplayedFields):
         return json.loads(self.options or "{}").get(name, default)
 
     def with_overrides(
-        self, temperature: float | None = None, horizon: int | None = None, patience: int | None = None,
-        driven: bool | None = None,
-    ) -> TaskSpec:  # fmt: skip
+        self, horizon: int | None = None, patience: int | None = None, driven: bool | None = None
+    ) -> TaskSpec:
         """This specification with other values; `None` leaves a value as it is."""
-        named = {"temperature": temperature, "horizon": horizon, "patience": patience, "driven": driven}
+        named = {"horizon": horizon, "patience": patience, "driven": driven}
         others: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
         return replace(self, **others) if others else self
 
@@ -158,15 +157,14 @@ class Job(Packed, frozen=True):
     digest: Digest
     stall: Seconds  # a slot without a step for so long is hung
     # Overrides of the specification; `None`: none.
-    temperature: Temperature | None = None
     horizon: Horizon | None = None
     patience: Patience | None = None
     driven: bool | None = None
 
     @property
-    def overrides(self) -> tuple[float | None, int | None, int | None, bool | None]:
+    def overrides(self) -> tuple[int | None, int | None, bool | None]:
         """The overrides, in the order of `TaskSpec.with_overrides`."""
-        return self.temperature, self.horizon, self.patience, self.driven
+        return self.horizon, self.patience, self.driven
 
     @property
     def runs_alone(self) -> bool:

@@ -32,10 +32,9 @@ class Generation:
     """A table of scores, a row for each candidate and a column for each episode, and the digest of each place.
 
     With `racing` all candidates drive the first half of the episodes; after this barrier only the better half of the
-    candidates drives the second half. Ties go to the lower index. `run_spec` is the run's
-    specification, if `spec` differs from it: at a raised temperature or in a later stage. In a dream the first `driven`
-    episodes are driven in the real world. R8: a candidate of which a wanted episode failed for good has no fitness,
-    needs no more episodes, and ranks last.
+    candidates drives the second half. Ties go to the lower index. `run_spec` is the run's specification, if `spec`
+    differs from it: in a later stage. In a dream the first `driven` episodes are driven in the real world. R8: a
+    candidate of which a wanted episode failed for good has no fitness, needs no more episodes, and ranks last.
 
     Only wanted places count. A result may be known of a place that is not wanted: of the second half before the
     barrier, or of a candidate that passed an earlier barrier and stays below this one.

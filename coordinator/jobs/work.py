@@ -74,14 +74,14 @@ def make_work(
 ) -> list[Work]:  # fmt: skip
     """Make a job for each seed. A job is one episode; episodes are numbered from `first` on.
 
-    `run_spec` is the run's specification if `spec` differs from it. A job names its temperature, horizon, patience and
-    whether it is driven only if they differ from the run's. R1: the digest covers kind, parameters, seeds and
-    specification, so a correct result is the same from any worker and still fits after a restart.
+    `run_spec` is the run's specification if `spec` differs from it. A job names its horizon, patience and whether it is
+    driven only if they differ from the run's. R1: the digest covers kind, parameters, seeds and specification, so a
+    correct result is the same from any worker and still fits after a restart.
     """
     identity = hashlib.sha256(vector).digest()
     run_spec = run_spec or spec
     stall = FUNCTION_STALL_SECONDS if is_function_task(spec.task) else STALL_SECONDS
-    names = "temperature", "horizon", "patience", "driven"
+    names = "horizon", "patience", "driven"
     overrides: dict[str, Any] = {
         name: given for name in names if (given := getattr(spec, name)) != getattr(run_spec, name)
     }

@@ -31,8 +31,8 @@ class HopelessError(Exception):
     """All candidates of a generation fail whatever is tried: the run would wait for somebody to change the task."""
 
 
-Named = tuple[float | None, int | None, int | None, bool | None]  # nothing is driven where nothing dreams
-"""Temperature, horizon and patience of a job where they are not the run's."""
+Named = tuple[int | None, int | None, bool | None]  # nothing is driven where nothing dreams
+"""Horizon and patience of a job, and whether it is driven, where they are not the run's."""
 
 
 class Strategy:
@@ -120,7 +120,7 @@ def fails(share: float, vector: bytes, seed: int) -> bool:
 
 
 def _fitness(identity: bytes, seed: int, named: Named) -> float:
-    content = seed, *(named if any(named[1:]) else named[:1])
+    content = seed, None, *(named if any(named) else ())
     hashed = hashlib.blake2b(identity + repr(content).encode(), digest_size=4).digest()
     return 1.0 + int.from_bytes(hashed, "little") / 2**32
 
@@ -153,13 +153,13 @@ def _truth(shape: Shape) -> Truth:
     strategy = Strategy(Search(np.zeros(settings.controller.size), shape.population, settings.sigma0, shape.run_seed))
     truth, counted, second = Truth([], [], [], {}, {}, 0), set(), False
     for number in range(shape.generations):
-        named: Named = (None, None, None, None)
+        named: Named = (None, None, None)
         episodes, racing = shape.episodes, shape.racing
         if not second and _first_is_over(shape, number, truth.evaluations):
             second = True
             strategy = _second_search(shape, strategy) if shape.anew else strategy
         if second:
-            named, episodes, racing = (None, SECOND_HORIZON, SECOND_PATIENCE, None), episodes + 1, not racing
+            named, episodes, racing = (SECOND_HORIZON, SECOND_PATIENCE, None), episodes + 1, not racing
         vectors = tuple(row.astype("<f4").tobytes() for row in strategy.ask())
         truth.vectors.append(vectors)
         vectors, seeds, fitness, driven = _scored(
@@ -172,7 +172,7 @@ def _truth(shape: Shape) -> Truth:
         mean = strategy.mean.astype("<f4").tobytes()
         if _due(shape.evaluate_every, number, last and shape.ends):
             tracks = validation_seeds(shape.evaluation_episodes)
-            values = np.array([fitness_of(mean, seed, (None, None, None, None)) for seed in tracks])
+            values = np.array([fitness_of(mean, seed, (None, None, None)) for seed in tracks])
             truth.evaluations[number] = StoredEvaluation(number, len(tracks), float(values.mean()), float(values.std()))
             counted |= {("evaluate", mean, seed) for seed in tracks}
         if _due(shape.collect_every, number, last and shape.ends):

@@ -67,10 +67,6 @@ MSGPACK = {
         jobs=(job(), job(1), job(0, "evaluate"), job(0, "collect")), cancels=(b"\x05" * 32,),
         verdicts=tuple(Verdict(bytes([n]) * 32, word) for n, word in enumerate(VERDICTS)),
     ),
-    "job-raised": JobBatch(
-        **HEAD, nonce="c0ffee00c0ffee00", numbering=3, number=10, vectors=(),
-        jobs=(job(temperature=1.5),), cancels=(), verdicts=(),
-    ),
     "job-staged": JobBatch(
         **HEAD, nonce="c0ffee00c0ffee00", numbering=3, number=11, vectors=(),
         jobs=(job(horizon=400, patience=60), job(horizon=400), job(patience=0)), cancels=(), verdicts=(),

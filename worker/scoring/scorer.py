@@ -116,8 +116,8 @@ class Scorer(Displayed):
     ) -> Score:  # fmt: skip
         """A candidate's score under the run's horizon and patience, or, for `evaluate`, in a whole episode.
 
-        `parameters` `(size,)`. `spec` replaces the run's specification; it may differ in temperature, horizon, patience
-        and whether episodes are driven. `on_step` gets the number of steps so far.
+        `parameters` `(size,)`. `spec` replaces the run's specification; it may differ in horizon, patience and
+        whether episodes are driven. `on_step` gets the number of steps so far.
         """
         return self.score_all([(kind, parameters, seed)], on_step, spec)[0]
 

@@ -75,7 +75,7 @@ def test_a_share_of_recorded_states_is_frozen_with_a_dream_and_can_be_configured
     assert "recorded" not in plain.to_json()
     assert RunConfig(task="dream", recorded=0.0).settings(bundle) == plain
     assert settings.task.digest("score", b"x", (1,)) != plain.task.digest("score", b"x", (1,))
-    assert settings.task.with_overrides(2.0, 100, 50).recorded == 0.5
+    assert settings.task.with_overrides(100, 50).recorded == 0.5
 
 
 @pytest.mark.parametrize(

@@ -67,9 +67,7 @@ def staged(tmp_path, random_bundle):
 def undisturbed(staged):
     bench = staged("undisturbed")
     named = bench.drive(lambda _: 0)
-    assert (
-        list(named.values()) == [(None, None, None, None)] * 2 + [(None, 400, 0, None)] * 6 + [(None, 600, 0, None)] * 3
-    )
+    assert list(named.values()) == [(None, None, None)] * 2 + [(400, 0, None)] * 6 + [(600, 0, None)] * 3
     *_, begun = bench.outcome()
     assert [each.since for each in begun] == BEGUN
     return bench.outcome()
@@ -212,7 +210,7 @@ def test_a_kept_drive_is_driven_as_the_candidates_of_its_generation(staged):
     lives[1].update({job.generation: job for job in bench.given if job.kind == "collect"})
     assert lives[0].items() <= lives[1].items()
     kept = [lives[1][number] for number in range(3)]
-    assert [each.overrides for each in kept] == [(None, None, None, None)] * 2 + [(None, 400, 0, None)]
+    assert [each.overrides for each in kept] == [(None, None, None)] * 2 + [(400, 0, None)]
     assert all(each.digest == each.spec(SPEC).digest("collect", each.vector, each.seeds) for each in kept)
 
 

@@ -122,7 +122,7 @@ def test_an_end_rule_of_the_runs_own_is_another_version(bundle):
     assert RunSettings.from_json(own.to_json()) == own
     assert RunConfig(**config_values(own, bundle.path)).settings(bundle) == own
     assert own.task.digest("score", b"x", (1,)) != plain.task.digest("score", b"x", (1,))
-    assert own.task.with_overrides(temperature=2.0).end == "0.25"
+    assert own.task.with_overrides(horizon=20).end == "0.25"
     assert settings_of(bundle, task="dream", end="drawn") == plain, "the bundle's own rule is no rule of the run's own"
 
 

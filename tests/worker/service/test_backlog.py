@@ -77,20 +77,6 @@ def test_a_job_with_another_jobs_digest_is_refused():
     assert not backlog.take(1)
 
 
-def test_a_job_has_the_temperature_that_it_names():
-    backlog, warm = Backlog(SPEC), job(1, temperature=1.5)
-    renamed = [replace(warm, temperature=wrong) for wrong in (None, 1.25)]
-    assert [each for each, _ in backlog.add_batch(batch(1, (warm, *renamed)))] == renamed
-    assert backlog.take(5) == [(warm, VECTOR)]
-
-
-def test_jobs_taken_together_have_one_temperature():
-    jobs = [job(episode, temperature=each) for episode, each in enumerate((None, None, 1.5, 1.5, 2.25))]
-    backlog = Backlog(SPEC)
-    backlog.add_batch(batch(1, jobs))
-    assert [[each.episode for each, _ in backlog.take(5)] for _ in range(4)] == [[0, 1], [2, 3], [4], []]
-
-
 def test_a_job_has_the_horizon_and_patience_that_it_names():
     backlog, short = Backlog(SPEC), job(1, horizon=400, patience=0)
     renamed = [replace(short, **wrong) for wrong in ({"horizon": None}, {"patience": 1}, {"horizon": 401})]

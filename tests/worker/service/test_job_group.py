@@ -21,7 +21,7 @@ class Scorer:
 
     def score_all(self, episodes, on_step, spec):
         assert all(np.array_equal(vector, np.frombuffer(VECTOR, "<f4")) for _, vector, _ in episodes)
-        assert spec == SPEC.with_overrides(WORK[0][0].temperature)
+        assert spec == SPEC
         for number, _ in enumerate(self._scores):
             on_step(number + 1)
         return list(self._scores)
@@ -78,7 +78,7 @@ def test_an_abandoned_group_has_no_results_and_no_failure():
 
 def test_steps_before_an_error_are_divided_among_the_jobs():
     class Failing(Scorer):
-        def score_all(self, episodes, on_step, temperature):
+        def score_all(self, episodes, on_step, spec):
             on_step(9)
             raise RuntimeError("the road has ended")
 

@@ -234,19 +234,6 @@ def test_a_controller_of_another_size_is_refused(random_bundle):
         find_task("car-racing").make_policy(Assignment.of("car-racing", random_bundle)).begin(np.zeros(15, np.float32))
 
 
-def test_a_group_is_scored_at_its_jobs_temperature(random_bundle):
-    spec = TaskSpec("dream", random_bundle.sha256, 20, 0, temperature=1.0)
-    random = np.random.default_rng(1)
-    jobs = [("score", random.normal(size=867).astype(np.float32), seed) for seed in (1, 2, 3)]
-    scorer, found = Scorer(spec, random_bundle), {}
-    for temperature in (None, 1.5, None, 2.25, 1.5):
-        scores = scorer.score_all(jobs, lambda _: None, spec.with_overrides(temperature))
-        assert scores == [scorer.score(*each, spec=spec.with_overrides(temperature)) for each in jobs]
-        assert scores == found.setdefault(temperature, scores)
-        assert scores == Scorer(spec.with_overrides(temperature), random_bundle).score_all(jobs, lambda _: None)
-    assert len({score.fitness for scores in found.values() for score in scores}) == 9
-
-
 @pytest.mark.parametrize(("task", "horizons"), [("dream", (20, 7, 20)), ("car-racing", (4, 2, 4))])
 def test_a_group_is_scored_with_its_stages_horizon(random_bundle, task, horizons):
     spec = TaskSpec(task, random_bundle.sha256, horizons[0], 0)
