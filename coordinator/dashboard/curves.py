@@ -20,7 +20,6 @@ from dreamfleet.common.runs.records import (
     StoredGeneration,
     in_values,
 )
-from dreamfleet.common.runs.scoring_params import ScheduleState
 from dreamfleet.common.runs.stages import begun_stages, describe_steps, join_distinct
 
 MOST_POINTS = 600  # sent and drawn at most: a screen shows no more
@@ -62,7 +61,6 @@ def curves(
     settings, task = data.settings, data.settings.task
     rows = [in_values(each, task) for each in downsample(data.history)]
     dreamt = settings.task.task == DREAM
-    finished = {each.generation: each for each in data.evaluations}
     stages = begun_stages(settings, data.history, data.evaluations)
     steps = join_distinct(
         describe_steps(each.stage.horizon, each.stage.driven, dreamt=dreamt, limit=data.episode_limit)
@@ -81,7 +79,6 @@ def curves(
         "high": [_rounded(high) for _, high in band],
         "band": "± 1 standard deviation" if quartiles is None else "the middle half of the candidates",
         "sigma": [_rounded(each.sigma) for each in rows],
-        "temperature": _temperatures(data, rows, finished),
         "evaluations": _evaluations(data, spent),
         "confirmed": None if data.confirmed is None else _confirmed(data.confirmed, data, spent),
         "stages": [each.since for each in stages[1:]],
@@ -134,17 +131,6 @@ def _band(rows: Sequence[StoredGeneration], quartiles: Quartiles | None, task: T
     fitness = [quartiles.get(each.number) for each in rows]
     return [(each.mean, each.mean) if pair is None else tuple(sorted(value_of(end, task) for end in pair))  # type: ignore[misc]
             for each, pair in zip(rows, fitness, strict=True)]  # fmt: skip
-
-
-def _temperatures(
-    data: RunData, rows: Sequence[StoredGeneration], finished: Mapping[int, StoredEvaluation]
-) -> list[float] | None:
-    """Each generation's temperature; `None` if the task has none."""
-    if data.settings.task.temperature is None:
-        return None
-    agenda = ScheduleState(data.settings)
-    found = [agenda.scoring_params(each.number, data.history, finished).spec.temperature for each in rows]
-    return [each for each in found if each is not None]
 
 
 def _evaluations(data: RunData, spent: Sequence[Effort] | None) -> dict[str, Any]:

@@ -210,16 +210,13 @@ export const fitness = (element, curves) => {
   });
 };
 
-// The step size; beside it, in a panel of its own, the temperature of a dream where that changes.
-export const search = (element, curves) => {
-  const heats = new Set(curves.temperature);
-  const apart = heats.size > 1;
-  element.classList.toggle("two", apart);
+// The step size.
+export const search = (element, curves) =>
   draw(element, () => {
     const traces = [line(curves.generation, curves.sigma, "step size", "purple")];
     const shape = {
-      xaxis: { ...generations(curves.generation.at(-1) ?? 0), ...(apart && { anchor: "y2" }) },
-      yaxis: axis({ type: "log", exponentformat: "power", dtick: 1, minor: { showgrid: false }, ...(apart && { domain: UPPER }) }),
+      xaxis: generations(curves.generation.at(-1) ?? 0),
+      yaxis: axis({ type: "log", exponentformat: "power", dtick: 1, minor: { showgrid: false } }),
       annotations: [heading("step size (logarithmic)")],
     };
     // A single decade or less has its own ticks, or there would be one at most.
@@ -228,14 +225,8 @@ export const search = (element, curves) => {
       delete shape.yaxis.dtick;
       shape.yaxis.nticks = 5;
     }
-    if (apart) {
-      traces.push(line(curves.generation, curves.temperature, "temperature", "red", { yaxis: "y2", line: { color: colour("red"), width: 1.6, shape: "hv" } }));
-      shape.yaxis2 = axis({ domain: LOWER, rangemode: "tozero", nticks: 6 });
-      shape.annotations.push(heading("temperature of the dream", LOWER[1]));
-    }
     return { traces, shape, keys: [] };
   });
-};
 
 const OVER = {
   generation: "generation",

@@ -46,14 +46,13 @@ def test_columns_are_equally_long_and_the_band_says_what_it_is():
     assert (drawn["low"][3], drawn["high"][3]) == (2.0, 5.0)
 
 
-def test_only_a_dream_has_a_temperature_and_two_axes():
+def test_only_a_dream_has_two_axes():
     plain = curves(data(3), None)
-    assert (plain["temperature"], plain["dreamt"], plain["fitness_axis"]) == (None, False, "fitness over 1,000 steps")
+    assert (plain["dreamt"], plain["fitness_axis"]) == (False, "fitness over 1,000 steps")
     task = dataclasses.replace(STATUS.settings.task, task="dream", temperature=1.5)
     dream = curves(data(3, settings=dataclasses.replace(STATUS.settings, task=task)), None)
-    assert (dream["temperature"], dream["dreamt"]) == ([1.5, 1.5, 1.5], True)
-    assert (dream["fitness_axis"], dream["score_axis"]) == (
-        "fitness over 1,000 dreamt steps", "score in reality, mean of 16 seeds",
+    assert (dream["dreamt"], dream["fitness_axis"], dream["score_axis"]) == (
+        True, "fitness over 1,000 dreamt steps", "score in reality, mean of 16 seeds",
     )  # fmt: skip
 
 
