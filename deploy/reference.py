@@ -127,7 +127,7 @@ VERBS_HEAD = f"""{NOTE}
 [Exit codes](exit-codes.md) says how a verb ends.
 
 A word in capitals stands for a value: `--run RUN`. *Settings* names the tables of [settings](settings.md) whose keys
-are flags of that verb too, or those of their keys that are. *Common* flags are described below. `--json`,
+are flags of that verb too, or those of their keys that are. *Common* flags are described [below](#common-flags). `--json`,
 where a verb has it beside these, prints the answer as JSON. Each verb also has these:
 
 """
@@ -233,7 +233,7 @@ def _verb(name: str, summary: str, parser: argparse.ArgumentParser, often: Set[s
     rows = [_row(each) for each in own]
     shared = ", ".join(_flag_of(row) for row in rows if row in often)
     lines = [f"*Settings:* {', '.join(_keys_of(parser, each) for each in of_tables)}." if of_tables else ""]
-    lines += [f"*Common:* {shared}." if shared else ""]
+    lines += [f"*[Common](#common-flags):* {shared}." if shared else ""]
     lines += ["`--json`." if any(_help(each) == JSON for each in parser._actions) else ""]
     if any(lines):
         yield " ".join(filter(None, lines)) + "\n"
