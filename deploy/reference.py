@@ -127,8 +127,8 @@ VERBS_HEAD = f"""{NOTE}
 [Exit codes](exit-codes.md) says how a verb ends.
 
 A word in capitals stands for a value: `--run RUN`. *Settings* names the tables of [settings](settings.md) whose keys
-are flags of that verb too, or those of their keys that are. *Common* flags are described [below](#common-flags). `--json`,
-where a verb has it beside these, prints the answer as JSON. Each verb also has these:
+are flags of that verb too, or those of their keys that are. *Common* flags are described [below](#common-flags).
+`--json`, where a verb has it beside these, prints the answer as JSON. Each verb also has these:
 
 """
 
