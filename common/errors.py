@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from errno import EACCES, EDQUOT, EISDIR, ENOSPC, EPERM, EROFS
+from typing import Any
 
 
 class DreamfleetError(Exception):
@@ -19,6 +20,16 @@ class DreamfleetError(Exception):
     """
 
     exit_code = 1
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Whatever its constructor takes, it reaches another process with its text and fields."""
+        return _rebuild, (type(self), self.args, vars(self))
+
+
+def _rebuild(kind: type[DreamfleetError], args: tuple[Any, ...], fields: dict[str, Any]) -> DreamfleetError:
+    error = kind.__new__(kind, *args)
+    vars(error).update(fields)
+    return error
 
 
 class UsageError(DreamfleetError):
