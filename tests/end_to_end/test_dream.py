@@ -9,6 +9,7 @@ import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support.bundles import states, write_random_bundle
+from tests.support.processes import call_here
 
 GENERATIONS, POPULATION, EPISODES = 4, 4, 3
 
@@ -43,10 +44,10 @@ def test_who_dreams_and_who_dies_meanwhile_changes_no_bit(processes, random_bund
     alone = outcome(processes, "alone")
     assert alone == outcome(processes, "three")
     assert [generation for generation, _ in alone[2]] == [1, 3]
-    code, out, err = processes.call("verify", "candidate", "alone", "--runs-dir", processes.runs, "--candidate", "2/3")
+    code, out, err = call_here("verify", "candidate", "alone", "--runs-dir", processes.runs, "--candidate", "2/3")
     assert code == 0, err
     assert out.count("same bits") == EPISODES
-    code, out, err = processes.call("evaluate", "--controller", "alone", "--runs-dir", processes.runs, "--episodes", 1)
+    code, out, err = call_here("evaluate", "--controller", "alone", "--runs-dir", processes.runs, "--episodes", 1)
     assert code == 0, err
 
 
@@ -75,7 +76,7 @@ def test_who_dreams_on_a_torch_device_changes_no_bit_either(processes, random_bu
             assert all(("dreams-on-cpu" in each) == (name != "plain") for each in named)
     assert classes[1] == classes[2]
     assert not classes[0] & classes[1]
-    code, out, err = processes.call("verify", "candidate", "two", "--runs-dir", processes.runs, "--candidate", "2/3")
+    code, out, err = call_here("verify", "candidate", "two", "--runs-dir", processes.runs, "--candidate", "2/3")
     assert (code, out.count("same bits")) == (0, EPISODES), err
 
 
@@ -92,11 +93,11 @@ def test_dreams_from_recorded_states_are_the_same_on_every_worker(processes, tmp
     assert alone == outcome(processes, "two")
     assert alone[0] != outcome(processes, "plain")[0]
     runs = ("--runs-dir", processes.runs)
-    code, out, err = processes.call("verify", "candidate", "alone", *runs, "--candidate", "2/3")
+    code, out, err = call_here("verify", "candidate", "alone", *runs, "--candidate", "2/3")
     assert (code, out.count("same bits")) == (0, EPISODES), err
-    code, out, err = processes.call("runs", "show", "alone", *runs, "--json")
+    code, out, err = call_here("runs", "show", "alone", *runs, "--json")
     assert json.loads(out)["settings"]["task"]["recorded"] == 0.5, err
-    code, out, err = processes.call("evaluate", "--controller", "alone", *runs, "--episodes", 1)
+    code, out, err = call_here("evaluate", "--controller", "alone", *runs, "--episodes", 1)
     assert code == 0, err
     code, out, err = processes.call("coordinator", "--from", "alone", *runs, "--task", "car-racing")
     assert (code, err.count("\n")) == (2, 1)
@@ -171,7 +172,7 @@ def test_a_run_that_dreams_then_mixes_then_drives_gives_the_same_bits_through_ki
     assert scores[0] == scores[1]
     for generation in range(1, len(DRIVEN)):
         candidate = ("--candidate", f"{generation}/3")
-        code, out, err = processes.call("verify", "candidate", "night", "--runs-dir", processes.runs, *candidate)
+        code, out, err = call_here("verify", "candidate", "night", "--runs-dir", processes.runs, *candidate)
         assert (code, "DIFFERS" in out) == (0, False), err
-    code, out, err = processes.call("evaluate", "--controller", "night", "--runs-dir", processes.runs, "--episodes", 1)
+    code, out, err = call_here("evaluate", "--controller", "night", "--runs-dir", processes.runs, "--episodes", 1)
     assert code == 0, err
