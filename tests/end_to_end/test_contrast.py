@@ -9,6 +9,7 @@ import pytest
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support.drives import write_encoded_drives
+from tests.support.processes import call_here
 
 RUN = (
     "--generations 2 --population 4 --episodes 1 --horizon 10 --evaluate-every 1 --evaluation-episodes 1"
@@ -50,17 +51,15 @@ def test_a_stopped_contrast_continues_and_compares_the_kinds(processes, data, tm
     assert (code, "begun with other run_flags" in err) == (2, True), err
 
 
-def test_what_cannot_be_contrasted_is_said_at_once(processes, tmp_path):
+def test_what_cannot_be_contrasted_is_said_at_once(tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
-    code, _, err = processes.call("lab", "contrast", "--data", empty, "--out", tmp_path / "out")
+    code, _, err = call_here("lab", "contrast", "--data", empty, "--out", tmp_path / "out")
     assert (code, "has no episodes: collect, train the VAE and encode there first" in err) == (1, True), err
     for flags, why in (
         ("--sigma0 0.1", "a run would never end"),
         ("--generations 2 --seed 4", "--seed in --run-flags: lab contrast sets them for each run"),
         ("--generations 2 --population 1", "--population must be from 2 to"),
     ):
-        code, _, err = processes.call(
-            "lab", "contrast", "--data", empty, "--out", tmp_path / "out", "--run-flags", flags
-        )
+        code, _, err = call_here("lab", "contrast", "--data", empty, "--out", tmp_path / "out", "--run-flags", flags)
         assert (code, why in err) == (2, True), err

@@ -16,7 +16,7 @@ import pytest
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.coordinator.settings.start import latest_mean_and_sigma
 from tests.support import tasks
-from tests.support.processes import DEADLINE, free_port
+from tests.support.processes import DEADLINE, call_here, free_port
 
 
 @pytest.fixture
@@ -132,16 +132,14 @@ def test_a_worker_that_does_not_know_the_task_is_refused(processes, settings):
 def test_a_second_coordinator_of_a_live_run_is_refused(processes, settings):
     processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
     elsewhere = f"tcp/127.0.0.1:{free_port()}"
-    code, _, err = processes.call(
-        "coordinator", "--resume", "test", "--runs-dir", processes.runs, "--listen", elsewhere
-    )
+    code, _, err = call_here("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--listen", elsewhere)
     assert code != 0
     assert "held by a live coordinator" in err
 
 
 def test_a_foreign_coordinator_on_the_same_network_is_refused(processes, settings, tmp_path):
     processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
-    code, _, err = processes.call(
+    code, _, err = call_here(
         "coordinator", "--run", "test", "--runs-dir", tmp_path / "elsewhere", "--connect", processes.endpoint,
         *settings, "--generations", 1,
     )  # fmt: skip
@@ -157,7 +155,7 @@ def test_a_new_run_whose_port_is_taken_is_not_created(processes, settings, flag)
         other.listen()
         taken = f"127.0.0.1:{other.getsockname()[1]}"
         where = ("--listen", f"tcp/{taken}") if flag == "--listen" else ("--listen", processes.endpoint, flag, taken)
-        code, _, err = processes.call("coordinator", "--run", "test", "--runs-dir", processes.runs, *where, *settings)
+        code, _, err = call_here("coordinator", "--run", "test", "--runs-dir", processes.runs, *where, *settings)
     assert code == 1
     assert taken in err
     assert flag in err
@@ -214,7 +212,7 @@ def test_a_fork_begins_where_its_run_was_and_may_change_what_is_frozen(processes
 
 
 def test_parameters_of_another_world_model_are_no_beginning(processes, settings):
-    code, _, err = processes.call("coordinator", "--runs-dir", processes.runs, *settings, "--init", "tiny")
+    code, _, err = call_here("coordinator", "--runs-dir", processes.runs, *settings, "--init", "tiny")
     assert code != 0
     assert "belongs to the world model" in err
 

@@ -40,6 +40,10 @@ def fail(_words):
     raise RuntimeError("a bug")
 
 
+def hang(_words):
+    time.sleep(300)
+
+
 def end_by_a_signal(_words):
     os.kill(os.getpid(), signal.SIGUSR1)
 
@@ -57,14 +61,14 @@ def print_usage(_words):
         (print_usage, "7 lines on stderr"),
         (lambda _words: 3, "exit code 3"),
         (lambda _words: 0, ""),
-        (lambda _words: time.sleep(300), "Traceback"),
+        (hang, "Traceback"),
     ],
 )
 def test_it_sees_what_it_is_there_to_find(bug, found, tmp_path, monkeypatch):
     monkeypatch.setattr(command_line, "main", bug)
     for name in ("work", "home", "tmp"):
         (tmp_path / name).mkdir()
-    child = start([], tmp_path, LIMIT)
+    child = start([], tmp_path, 1.0 if bug is hang else LIMIT)
     while (complaint := child.poll()) is None:
         time.sleep(0.01)
     assert found in complaint

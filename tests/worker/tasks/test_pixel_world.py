@@ -286,6 +286,6 @@ def test_the_pixel_world_is_gymnasiums_and_punishes_standing_still():
     assert 10 <= np.mean(lives) < 40
 
 
-@pytest.mark.parametrize("name", ["car-racing", DODGE_TASK])
+@pytest.mark.parametrize("name", [pytest.param("car-racing", marks=pytest.mark.slow), DODGE_TASK])
 def test_a_recordable_task_keeps_the_contract(name):
     check_world(find_task(name))
