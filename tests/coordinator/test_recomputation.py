@@ -262,7 +262,7 @@ def check_status(processes, name, found):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["plain", "racing", "schedule"])
+@pytest.mark.parametrize("kind", ["plain", pytest.param("racing", marks=pytest.mark.long), "schedule"])
 def test_a_run_is_what_its_journal_comes_to(processes, random_bundle, kind):
     flags = {"plain": (), "racing": ("--racing",), "schedule": ("--schedule", processes.folder / "stages.toml")}[kind]
     (processes.folder / "stages.toml").write_text(SCHEDULE)

@@ -261,7 +261,7 @@ def test_schemathesis_finds_no_broken_promise_in_the_description(processes, tmp_
     path.write_text(json.dumps(described))
     done = subprocess.run(
         [sys.executable, "-m", "schemathesis.cli", "run", path, "--url", bridge.address, "--phases", "coverage,fuzzing",
-         "--checks", "all", "--max-examples", "15", "--seed", "1", "--no-color"],
+         "--checks", "all", "--max-examples", "8", "--seed", "1", "--no-color"],
         cwd=tmp_path, capture_output=True, text=True, check=False, timeout=DEADLINE,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout

@@ -49,9 +49,9 @@ def test_a_run_without_a_bundle_evolves_and_any_fleet_gives_its_bits(processes):
                 "--evaluate-every", 2, "--evaluation-episodes", 3)  # fmt: skip
     assert evolve(processes, "one", 1, *settings) == evolve(processes, "two", 2, *settings)
     assert not (processes.runs / "one" / "bundle.zip").exists()
-    code, out, err = processes.call("verify", "candidate", "one", "--runs-dir", processes.runs, "--candidate", "2/3")
+    code, out, err = call_here("verify", "candidate", "one", "--runs-dir", processes.runs, "--candidate", "2/3")
     assert (code, out.count("same bits")) == (0, 2), err
-    code, out, err = processes.call(
+    code, out, err = call_here(
         "evaluate", "--controller", "one", "--runs-dir", processes.runs, "--episodes", 3, "--json"
     )
     assert code == 0, err
@@ -88,11 +88,11 @@ def test_a_worker_that_lacks_the_environment_says_so_and_the_run_waits(processes
 
 @pytest.mark.slow
 def test_what_can_be_scored_in_is_listed(processes):
-    code, out, err = processes.call("tasks", "--json")
+    code, out, err = call_here("tasks", "--json")
     assert code == 0, err
     rows = {row["task"]: row["ready"] for row in json.loads(out)}
     assert rows["car-racing"] and rows["dream"] and rows["gym:ENVIRONMENT"]  # noqa: PT018
-    assert "gym:ENVIRONMENT" in processes.call("tasks")[1]
+    assert "gym:ENVIRONMENT" in call_here("tasks")[1]
 
 
 @pytest.mark.parametrize(
@@ -123,7 +123,7 @@ def test_it_is_learnt_from_zero_on_two_workers_and_one_gives_the_same_bits(proce
     settings, generations, wanted = LEARNT[name]
     settings = (*settings, "--generations", generations, "--evaluate-every", 10)
     two = evolve(processes, name, 2, *settings)
-    code, out, err = processes.call(
+    code, out, err = call_here(
         "evaluate", "--controller", name, "--runs-dir", processes.runs, "--episodes", 50, "--json", timeout=300
     )
     assert code == 0, err
@@ -143,11 +143,11 @@ def test_what_a_run_is_begun_in_is_tried_first(processes):
     assert code == 2
     assert "is not deterministic, so --strict cannot hold" in err
     assert not (processes.runs / "odd").exists()
-    code, out, _ = processes.call("tasks", ODD, "--environment", "fault=noise", "--json")
+    code, out, _ = call_here("tasks", ODD, "--environment", "fault=noise", "--json")
     assert (code, json.loads(out)["varies"][:13]) == (0, "equal actions")
-    code, out, _ = processes.call("tasks", ODD, "--environment", "fault=crash")
+    code, out, _ = call_here("tasks", ODD, "--environment", "fault=crash")
     assert (code, "crashed (SIGSEGV)" in out) == (1, True)
-    assert processes.call("tasks", "car-racing")[0] == 0
+    assert call_here("tasks", "car-racing")[0] == 0
     code, out, _ = processes.call("doctor", "--task", ODD)
     assert code == 0
     assert [f"task {ODD}", "can be scored"] in [cells(line)[1:3] for line in out.splitlines()]

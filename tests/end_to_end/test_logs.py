@@ -9,6 +9,7 @@ from dreamfleet.common.protocol import keys
 from dreamfleet.common.transport.session import Network, open_session
 from dreamfleet.coordinator.service.status import encode_part
 from tests.support import tasks
+from tests.support.processes import call_here
 from tests.support.served import snapshot
 
 
@@ -47,7 +48,7 @@ def test_an_orderly_end_is_not_logged_as_a_loss(processes, random_bundle):
     coordinator.wait_for("generation 0: mean")
     drained.popen.terminate()
     assert "left (drained after a stop signal)" in coordinator.wait_for("worker drained/")
-    code, out, err = processes.call("status", "test", "--connect", processes.endpoint)
+    code, out, err = call_here("status", "test", "--connect", processes.endpoint)
     assert (code, "╭─ test · running" in out) == (0, True), err
     for verb, said in (("pause", "paused: by hand"), ("resume", "resumed"), ("stop", "")):
         assert processes.call(verb, "test", "--connect", processes.endpoint)[0] == 0
@@ -68,7 +69,7 @@ def test_the_events_of_a_killed_workers_jobs_are_printed_while_the_run_lives(pro
     assert "host-a" in coordinator.wait_for("is lost: it was killed, or its connection was cut; ")
 
     def story(*words):
-        code, out, err = processes.call("story", "test", "--connect", processes.endpoint, *words, "--json")
+        code, out, err = call_here("story", "test", "--connect", processes.endpoint, *words, "--json")
         assert code == 0, err
         return json.loads(out)
 
@@ -78,11 +79,11 @@ def test_the_events_of_a_killed_workers_jobs_are_printed_while_the_run_lives(pro
     assert {"given", "accepted", "reissued"} <= set(whats)
     assert {each["job"].split("/")[1] for each in story("--job", "0/3")} == {"3"}
     assert len(story("--last", "3")) == 3
-    code, out, err = processes.call("story", "test", "--connect", processes.endpoint, "--last", "2")
+    code, out, err = call_here("story", "test", "--connect", processes.endpoint, "--last", "2")
     assert (code, len(out.splitlines()), "the last 2 of " in err) == (0, 3, True), err
-    code, _, err = processes.call("story", "test", "--connect", processes.endpoint, "--job", "three")
+    code, _, err = call_here("story", "test", "--connect", processes.endpoint, "--job", "three")
     assert (code, "write generation/index" in err) == (2, True)
-    code, _, err = processes.call("story", "test", "--connect", processes.endpoint, "--worker", "host-b")
+    code, _, err = call_here("story", "test", "--connect", processes.endpoint, "--worker", "host-b")
     assert (code, "knows no worker 'host-b': known are host-a" in err) == (2, True), err
 
 
@@ -93,7 +94,7 @@ def test_a_coordinator_from_before_stories_is_said_to_be_old_and_not_absent(proc
         key = keys.status("night")
         session.declare_queryable(key, lambda query: query.reply(key, status))
         for run in ((), ("night",)):
-            code, _, err = processes.call("story", *run, "--connect", processes.endpoint)
+            code, _, err = call_here("story", *run, "--connect", processes.endpoint)
             assert (code, "run night sends no events: a worker's join file may not read" in err) == (1, True), err
-    code, _, err = processes.call("story", "night", "--connect", processes.endpoint)
+    code, _, err = call_here("story", "night", "--connect", processes.endpoint)
     assert (code, "no one answers" in err) == (1, True), err

@@ -9,7 +9,7 @@ import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
-from tests.support.processes import DEADLINE, environment, free_port
+from tests.support.processes import DEADLINE, call_here, environment, free_port
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_what_is_given_as_a_run_goes_on_is_stronger_and_is_kept(processes, setti
     with open_run(processes.runs, "test") as run:
         assert json.loads(run.fact("limits")) == {"generations": 3, "minutes": 30}
         assert json.loads(run.fact("network")) == {"listen": [elsewhere], "beat": 0.2}
-    code, out, _ = processes.call("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--json")
+    code, out, _ = call_here("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--json")
     assert code == 0
     assert json.loads(out)["ended"] == "3 generations"
 
@@ -69,7 +69,7 @@ def test_what_is_given_as_a_run_goes_on_is_stronger_and_is_kept(processes, setti
 @pytest.mark.slow
 def test_a_limit_that_has_passed_ends_at_once_and_names_no_controller_that_is_not_there(processes, settings):
     stopped(processes, settings)
-    code, out, _ = processes.call(
+    code, out, _ = call_here(
         "coordinator", "--resume", "test", "--runs-dir", processes.runs, "--generations", 1
     )  # fmt: skip
     assert code == 0
@@ -110,14 +110,14 @@ def test_one_file_serves_coordinator_worker_and_status(processes, random_bundle)
     )
     coordinator = processes.start("coordinator", "--run", "filed", "--config", path)
     coordinator.wait_for("incarnation")
-    code, out, err = processes.call("status", "--config", path, "--json")
+    code, out, err = call_here("status", "--config", path, "--json")
     assert code == 0, err
     status = json.loads(out)
     assert (status["run"], status["settings"]["population"], status["settings"]["episodes"]) == ("filed", 4, 2)
     worker = processes.start("worker", "--config", path, "--task", tasks.TOY)
     assert coordinator.finish()[0] == 0
     assert worker.finish()[0] == 0
-    code, out, _ = processes.call("runs", "list", "--config", path)
+    code, out, _ = call_here("runs", "list", "--config", path)
     assert "\nfiled " in out
 
 
