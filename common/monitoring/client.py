@@ -38,6 +38,7 @@ QUERY_TIMEOUT = 3.0
 NAMES_TIMEOUT, SHOWN_RUNS = 1.0, 4  # of the names of other runs in an error text
 PATIENCE = 1.0  # seconds without an answer after which a watched run counts as gone
 MAX_PARAMETERS = 16 << 20  # of a controller; the same as in a controller file
+MAX_WAITING_STATUSES = 64  # of those that coordinators publish as they leave
 MAX_RESTARTS = 5  # of fetching a controller in parts while new controllers replace it
 
 
@@ -122,9 +123,10 @@ class Client(Displayed):
     def watch_documents(self, run: str, pause: float, patience: float = PATIENCE) -> Iterator[dict[str, Any]]:
         """Like `watch`, but yields raw statuses."""
         last_statuses: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        enqueue = enqueue_into(last_statuses, "status", max_waiting=1)
+        enqueue = enqueue_into(last_statuses, "status", max_waiting=MAX_WAITING_STATUSES)
         subscriber: Any = self.session.declare_subscriber(keys.event_status(keys.check_run_name(run)), enqueue)
         lost_at: float | None = None  # while nobody answers: when the run counts as gone
+        run_uid = ""  # unknown until it answers
         try:
             while True:
                 try:
@@ -134,14 +136,13 @@ class Client(Displayed):
                     if monotonic() >= lost_at:
                         raise
                 else:
-                    lost_at = None
+                    lost_at, run_uid = None, str(document.get("run_uid", ""))
                     yield document
                     if document.get("state") in FINAL_STATES:
                         return
                 wait = pause if lost_at is None else min(pause, max(lost_at - monotonic(), 0.0))
-                with suppress(queue.Empty):
-                    _, sample = last_statuses.get(timeout=wait)
-                    yield read_document(sample.payload.to_bytes())
+                if (last := take_final_status(last_statuses, run_uid, wait)) is not None:
+                    yield last
                     return
         finally:
             subscriber.undeclare()
@@ -173,7 +174,8 @@ class Client(Displayed):
                 f"the coordinator of run {document.get('run')} sends no events: a worker's join file may not read "
                 "them, so use a viewer's"
             )
-        return [from_plain_lenient(Event, row) for row in rows], int(document.get("total", len(rows)))
+        rows, total = _read_page({"total": len(rows), **document}, "story")
+        return [from_plain_lenient(Event, row) for row in rows], total
 
     def evaluations(self, run: str) -> list[StoredEvaluation]:
         """All finished evaluations of `run`, oldest first."""
@@ -211,10 +213,10 @@ class Client(Displayed):
     def fetch_rows(self, part: str, run: str, offset: int = 0) -> Iterator[dict[str, Any]]:
         """All raw rows from `offset` on of a paged part: `workers`, `history` or `evaluations`."""
         while True:
-            document = self.document(run, part, f"offset={offset}")
-            yield from document[part]
-            offset += len(document[part])
-            if offset >= document["total"] or not document[part]:
+            rows, total = _read_page(self.document(run, part, f"offset={offset}"), part)
+            yield from rows
+            offset += len(rows)
+            if offset >= total or not rows:
                 return
 
     def control(self, run: str, verb: str, host: str = "") -> str:
@@ -261,6 +263,34 @@ class Client(Displayed):
 
     def _query(self, selector: str) -> list[dict[str, Any]]:
         return [read_document(payload) for payload in query_all(self.session, [selector], QUERY_TIMEOUT)]
+
+
+def take_final_status(statuses: queue.SimpleQueue[Any], run_uid: str, timeout: float) -> dict[str, Any] | None:
+    """The status in which the coordinator of a run leaves, if one comes in `timeout` seconds.
+
+    Anybody may publish at an open port, so other runs' statuses and what is no such status are passed over. An empty
+    `run_uid` is that of any run.
+    """
+    deadline = monotonic() + timeout
+    with suppress(queue.Empty):
+        while True:
+            _, sample = statuses.get(timeout=max(deadline - monotonic(), 0.0))
+            with suppress(MalformedError):
+                status = read_status(document := read_document(sample.payload.to_bytes()))
+                if status.is_over and run_uid in ("", status.run_uid):
+                    return document
+    return None
+
+
+def _read_page(document: dict[str, Any], part: str) -> tuple[list[Any], int]:
+    """The rows of a page of a list, and how many the list has."""
+    rows, total = document.get(part), document.get("total")
+    if not isinstance(rows, list) or type(total) is not int:
+        raise MalformedError(
+            f"the coordinator of run {document.get('run')} sends no list of {part} that this version can read: install "
+            "the same dreamfleet on both sides"
+        )
+    return rows, total
 
 
 def _check_total(about: dict[str, Any]) -> int:

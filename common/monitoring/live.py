@@ -13,7 +13,6 @@ import queue
 import threading
 from collections import deque
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, field
 from time import monotonic
 from types import TracebackType
@@ -24,8 +23,8 @@ import zenoh
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import ConnectionFailedError, UsageError
-from dreamfleet.common.monitoring.client import Client
-from dreamfleet.common.monitoring.status import WorkerStatus, read_document, read_status
+from dreamfleet.common.monitoring.client import MAX_WAITING_STATUSES, Client, take_final_status
+from dreamfleet.common.monitoring.status import WorkerStatus, read_status
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import CountingDecoder
 from dreamfleet.common.protocol.frame_pictures import unpack_picture
@@ -82,7 +81,7 @@ class LiveView:
             raise UsageError(f"run {self.run} has no worker {worker!r}: it has {known}")
 
     def __enter__(self) -> LiveView:
-        enqueue = enqueue_into(self._last_statuses, "status", max_waiting=1)
+        enqueue = enqueue_into(self._last_statuses, "status", max_waiting=MAX_WAITING_STATUSES)
         self._status_subscriber: Any = self._client.session.declare_subscriber(keys.event_status(self.run), enqueue)
         return self
 
@@ -145,9 +144,8 @@ class LiveView:
 
     def _receive_last_status(self) -> None:
         """Take the final status, which a coordinator publishes as it leaves; afterwards nobody answers queries."""
-        with suppress(queue.Empty):
-            _, sample = self._last_statuses.get_nowait()
-            self.status = read_status(read_document(sample.payload.to_bytes()))
+        last = take_final_status(self._last_statuses, self.status.run_uid, 0.0)
+        self.status = self.status if last is None else read_status(last)
 
     def _refresh_status(self) -> None:
         """Query the status after a silence: the run may be another one, or the worker may have left."""

@@ -390,9 +390,10 @@ def read_status(document: dict[str, Any]) -> Status:
     except MalformedError as error:
         run, schema = document.get("run", "?"), document.get("schema", "?")
         package = document.get("package") or "another version"
+        differs = "" if schema == STATUS_SCHEMA_VERSION else f"schema {schema}, not {STATUS_SCHEMA_VERSION}: "
         raise MalformedError(
-            f"this version cannot read the status of run {run} (schema {schema}, not {STATUS_SCHEMA_VERSION}: "
-            f"{error}); install the coordinator's dreamfleet ({package}) here"
+            f"this version cannot read the status of run {run} ({differs}{error}); install the coordinator's "
+            f"dreamfleet ({package}) here"
         ) from error
 
 

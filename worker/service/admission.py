@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import random
 from collections.abc import Collection, Iterator
 from contextlib import suppress
@@ -113,10 +114,12 @@ def find_run_with_fewest_slots(session: zenoh.Session, excluded: Collection[str]
     """The live run with the fewest slots by its share, without those in `excluded`; of equals the first by name."""
     found = []
     for document in _live_statuses(session):
-        with suppress(ValueError, KeyError, TypeError, OverflowError):  # anybody may answer anything
-            if document["state"] not in ("ended", "paused") and document["run"] not in excluded:
-                slots = int(document["slots"]) / max(float(document.get("share", 1.0)), MIN_SHARE)
-                found.append((slots, str(document["run"])))
+        with suppress(ValueError, KeyError, TypeError, OverflowError, UsageError):  # anybody may answer anything
+            name = keys.check_run_name(document["run"])
+            if document["state"] not in ("ended", "paused") and name not in excluded:
+                slots, share = int(document["slots"]), float(document.get("share", 1.0))
+                if math.isfinite(share):
+                    found.append((slots / max(share, MIN_SHARE), name))
     return min(found)[1] if found else None
 
 

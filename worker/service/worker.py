@@ -105,6 +105,7 @@ class Worker:
         self._started_at, self._stops = monotonic(), StopRequests()
         self._membership = self._new_membership()  # of no run: it says when the whole worker leaves
         self._refusals = RefusalBackoff() if config.any else RefusalBackoff(*SINGLE_RUN_DELAYS)
+        self._silences = RefusalBackoff(*SINGLE_RUN_DELAYS)  # of runs with a status that answer no hello
         self._events: Events = queue.SimpleQueue()
         self._slots = SharedSlots(self._slot_count)
         self._served: list[ServedRun] = []
@@ -339,13 +340,21 @@ class Worker:
             return None
 
     def _request_any_run(self, session: zenoh.Session) -> Admission | None:
-        excluded = self._refusals.refusing_runs(monotonic()) | {each.name for each in self._served}
-        run = find_run_with_fewest_slots(session, excluded)
-        try:
-            return None if run is None else self._request_admission(session, run)
-        except RefusedError as error:
-            self._handle_refusal(str(run), error)
+        served, now = {each.name for each in self._served}, monotonic()
+        passed_over = self._refusals.refusing_runs(now) | self._silences.refusing_runs(now)
+        run = find_run_with_fewest_slots(session, served | passed_over)
+        if run is None:
             return None
+        try:
+            admission = self._request_admission(session, run)
+        except RefusedError as error:
+            self._handle_refusal(run, error)
+            return None
+        if admission is None:  # its coordinator waits for its disk, for example: others go first meanwhile
+            self._silences.add(run, monotonic())
+        else:
+            self._silences.forget(run)
+        return admission
 
     def _handle_refusal(self, run: str, error: Exception) -> None:
         """Raise the error with `--exit-when-done`; otherwise log it and ask again later.

@@ -39,8 +39,11 @@ def run(args: argparse.Namespace) -> int:
     worker = Worker(config, resolve_network(args, "worker", "coordinator"), tuple(args.task), args.typed)
     call_on_signals(worker.stop)
     report(BEGUN, True)
+    code = 1
     try:
         worker.serve()
+        code = 0
     finally:
-        end_within(END_LIMIT, 1)  # at its exit, the interpreter would wait without a limit for a child that cannot end
-    return 0
+        # At its exit, the interpreter would wait without a limit for a child that cannot end.
+        end_within(END_LIMIT, code)
+    return code

@@ -41,15 +41,23 @@ def test_results_with_long_errors_are_split_into_messages():
     assert sum(map(len, messages)) == 200
 
 
-@pytest.mark.parametrize("slots", ["1e999", "1" + 400 * "0", "NaN", "[]"])
-def test_an_odd_status_of_another_run_keeps_no_worker_from_a_run(slots):
-    """Tests admission.py."""
-    good, odd = ({"state": "running", "run": name, "slots": 3} for name in ("good", "odd"))
-    answers = {"good": json.dumps(good), "odd": json.dumps(odd).replace("3", slots)}
+@pytest.mark.parametrize(
+    "odd",
+    [
+        {"slots": "1e999"}, {"slots": "1" + 400 * "0"}, {"slots": "NaN"}, {"slots": "[]"}, {"share": "NaN"},
+        *({"run": json.dumps(name)} for name in ("", "a#b", "*", "\ud800", ["odd"])),
+    ],
+    ids=lambda odd: f"{odd}"[:20],
+)  # fmt: skip
+def test_an_odd_status_of_another_run_keeps_no_worker_from_a_run(odd):
+    """Tests admission.py. A name that no key may contain raised where the run was asked."""
+    good = {"state": '"running"', "run": '"good"', "slots": "3", "share": "1.0"}
+    answers = {"good": good, "odd": {**good, "run": '"odd"', "slots": "400", **odd}}
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with open_session(Network(listen=(endpoint,))) as served:
-        for name, answer in answers.items():
-            served.declare_queryable(keys.status(name), lambda query, said=answer: query.reply(query.key_expr, said))
+        for name, fields in answers.items():
+            said = "{" + ", ".join(f'"{field}": {value}' for field, value in fields.items()) + "}"
+            served.declare_queryable(keys.status(name), lambda query, said=said: query.reply(query.key_expr, said))
         with open_session(Network(connect=(endpoint,))) as session:
             while (found := find_run_with_fewest_slots(session)) is None:
                 pass  # the declarations are on their way

@@ -1,5 +1,7 @@
 """When and how a worker leaves."""
 
+import subprocess
+import sys
 from contextlib import ExitStack
 
 import pytest
@@ -192,3 +194,11 @@ def test_without_a_flag_it_says_why_its_run_ended_and_waits_for_it(stage, said, 
     wait_for(said, f"run test ended after 2 generations; waiting for run test to go on at {hand.endpoint}")
     stage.also(hand, tasks.SLOW_TOY).ready()
     assert not served.done()
+
+
+@pytest.mark.slow
+def test_a_worker_that_served_to_the_end_says_so_however_long_its_exit_takes():
+    lingers = "import atexit, sys, time; atexit.register(time.sleep, 3600); from dreamfleet.__main__ import main; "
+    words = ("worker", "--connect", f"tcp/127.0.0.1:{free_port()}", "--lifetime", "0.1")
+    ended = subprocess.run([sys.executable, "-c", lingers + "sys.exit(main())", *words], check=False, timeout=DEADLINE)
+    assert ended.returncode == 0

@@ -64,6 +64,15 @@ def test_a_run_whose_coordinator_vanished_holds_up_no_other(both):
     assert two.result(two.job()).fitness is not None
 
 
+def test_a_run_that_answers_no_hello_holds_up_no_other(stage, cached):
+    silent = stage.hand(run="one")
+    good = stage.also(silent, run="two")
+    silent.answer_no_hello()
+    good.slots = 1  # so the silent one is asked first
+    stage.worker(run=None, any=True)
+    good.ready()
+
+
 def test_a_run_that_ends_makes_room_for_the_next(stage, cached):
     one = stage.hand(run="one")
     stage.worker(run=None, any=True, runs=1)
