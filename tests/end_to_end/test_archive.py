@@ -82,16 +82,16 @@ def test_a_killed_run_goes_on_to_the_same_archive(processes, settings, optimiser
     assert archive == other_archive
 
     runs = ("--runs-dir", processes.runs)
-    code, out, _ = processes.call("runs", "show", "whole", "--json", *runs)
+    code, out, _ = call_here("runs", "show", "whole", "--json", *runs)
     facts = json.loads(out)["archive"]
     assert code == 0
     assert (facts["cells"], facts["filled"]) == (36, len(archive.elites))
     assert facts["best"]["fitness"] == archive.best.fitness
     numbers = ",".join(map(str, archive.best.cell))
-    note = processes.call("evaluate", "--controller", "whole", "--cell", numbers, "--episodes", 1, *runs)[2]
+    note = call_here("evaluate", "--controller", "whole", "--cell", numbers, "--episodes", 1, *runs)[2]
     assert f"whole, {archive.describe_elite(archive.best)}" in note
     picture = processes.folder / "archive.svg"
-    assert processes.call("runs", "plot", "whole", "--kind", "archive", "--out", picture, *runs)[0] == 0
+    assert call_here("runs", "plot", "whole", "--kind", "archive", "--out", picture, *runs)[0] == 0
     assert "action0" in picture.read_text() or picture.stat().st_size > 5_000
     with dreamfleet.open_run("whole", processes.runs) as run:
         frame, figure = run.to_pandas("elites"), run.plot("archive")
@@ -105,7 +105,7 @@ def test_a_killed_run_goes_on_to_the_same_archive(processes, settings, optimiser
     if optimiser == "cma-me":
         check_page(processes, archive.best.cell)
     folder = processes.folder / "tables"
-    assert processes.call("runs", "export", "whole", "--csv", "--out", folder, *runs)[0] == 0
+    assert call_here("runs", "export", "whole", "--csv", "--out", folder, *runs)[0] == 0
     with np.load(folder / "elites.npz") as elites:
         parameters = elites["parameters"][np.argmax(elites["fitness"])]
     assert np.array_equal(parameters, vectors[archive.best.generation * POPULATION + archive.best.candidate])

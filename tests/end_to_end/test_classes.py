@@ -13,7 +13,7 @@ from dreamfleet.common.protocol.messages import HelloRequest
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.transport.session import Network, open_session
 from tests.support import tasks
-from tests.support.processes import DEADLINE, environment
+from tests.support.processes import DEADLINE, call_here, environment
 
 OTHER = "riscv64 other"
 ODD = ("env", f"{tasks.ROUNDING}=1")  # a host on which a sum comes out otherwise, in its last bit
@@ -123,13 +123,13 @@ def test_status_runs_show_and_list_name_the_classes_of_results(processes, settin
     while (status := processes.status())["classes"]["total"] < 2:
         pass
     assert len({each["host_class"] for each in status["worker_list"]} - {""}) >= 1
-    shown = processes.call("status", "--connect", processes.endpoint)[1]
+    shown = call_here("status", "--connect", processes.endpoint)[1]
     assert "mixed: 2 classes" in shown
-    _, out, _ = processes.call("runs", "show", "test", "--runs-dir", processes.runs)
+    _, out, _ = call_here("runs", "show", "test", "--runs-dir", processes.runs)
     assert "mixed: 2 classes" in out
     for each in status["classes"]["largest"]:
         assert f"class {each['host_class']}" in out
-    (row,) = json.loads(processes.call("runs", "list", "--runs-dir", processes.runs, "--json")[1])
+    (row,) = json.loads(call_here("runs", "list", "--runs-dir", processes.runs, "--json")[1])
     assert row["classes"] == 2
 
 
