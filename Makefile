@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 SUPPLY := .venv-supply
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
-SOURCES := pyproject.toml constraints.txt $(wildcard worker/car_racing/native/*)
+SOURCES := pyproject.toml constraints.txt $(wildcard worker/worlds/car_racing/native/*)
 
 # Every process of every test would compile our modules again where an environment forbids the cache.
 unexport PYTHONDONTWRITEBYTECODE
@@ -33,8 +33,8 @@ test-newest:  ## a short part of the tests, those without torch, on the newest P
 	@if [ -z "$(NEWEST)" ]; then echo "neither Python 3.13 nor 3.12 is here: nothing was run"; \
 	else $(MAKE) short VENV=.venv-newest PYTHON=$(NEWEST); fi
 # What another version of Python breaks first: syntax, dataclasses, threads and processes, pickles, warnings, one run.
-SHORT := tests/common/files tests/common/host tests/common/protocol tests/common/serialization tests/common/cli/test_config.py \
-  tests/coordinator/settings tests/coordinator/storage tests/coordinator/run tests/coordinator/experiments/test_minimise.py \
+SHORT := tests/common/files tests/common/host tests/common/protocol tests/common/schema tests/common/cli/test_config.py \
+  tests/coordinator/settings tests/coordinator/storage tests/coordinator/run tests/experiments/test_minimise.py \
   tests/worker/service tests/worker/scoring tests/test_structure.py
 WITHOUT_TORCH := --ignore tests/worker/scoring/test_other_processors.py \
   --deselect tests/worker/service/test_slot_pool.py::test_a_torch_device_that_is_not_there_ends_the_worker_at_once
@@ -104,7 +104,7 @@ sanitize: $(VENV)/.dev  ## 200,000 steps of the native picture under AddressSani
 	mkdir -p build
 	cc -std=c11 -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all -ffp-contract=off -fwrapv -shared -fPIC \
 	  -I$$($(BIN)/python -c "import sysconfig; print(sysconfig.get_path('include'))") \
-	  worker/car_racing/native/*.c -lm -o build/sanitized.so
+	  worker/worlds/car_racing/native/*.c -lm -o build/sanitized.so
 	LD_PRELOAD=$$(cc -print-file-name=libasan.so) ASAN_OPTIONS=detect_leaks=0 SDL_VIDEODRIVER=dummy \
 	  $(BIN)/python deploy/sanitize.py build/sanitized.so $(or $(STEPS),200000)
 

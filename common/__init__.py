@@ -1,1 +1,1 @@
-"""Code that the coordinator and the worker share: protocol, artifacts, run records, configuration, monitoring."""
+"""Code that the coordinator and the worker share: protocol, artifacts, run records, configuration, client."""

@@ -20,18 +20,18 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from dreamfleet.common.cli.command_line import GROUP, build_parser, load_verb
 from dreamfleet.common.cli.global_config import GlobalConfig
 from dreamfleet.common.verbs.router import RouterConfig
-from dreamfleet.coordinator.bridge.config import BridgeConfig
-from dreamfleet.coordinator.dashboard.config import DashboardConfig
-from dreamfleet.coordinator.experiments.demo import DemoConfig
-from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
-from dreamfleet.coordinator.experiments.started_run import setting_names
+from dreamfleet.coordinator.addons.bridge.config import BridgeConfig
+from dreamfleet.coordinator.addons.dashboard.config import DashboardConfig
+from dreamfleet.coordinator.addons.spawn.config import SpawnConfig
 from dreamfleet.coordinator.settings import run_setup
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
-from dreamfleet.coordinator.spawn.config import SpawnConfig
-from dreamfleet.worker.baselines.agent_config import AgentConfig
-from dreamfleet.worker.baselines.learning_config import LearningConfig
+from dreamfleet.experiments.demo import DemoConfig
+from dreamfleet.experiments.iteration.config import IterateConfig
+from dreamfleet.experiments.started_run import setting_names
+from dreamfleet.worker.addons.baselines.agent_config import AgentConfig
+from dreamfleet.worker.addons.baselines.learning_config import LearningConfig
 from dreamfleet.worker.service.config import WorkerConfig
 from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
@@ -85,7 +85,7 @@ UNITS = {
     "worker.drain_timeout": "seconds", "worker.lifetime": "seconds", "worker.slot_memory": "MiB",
     "worker.coordinator_timeout": "seconds",
 }  # fmt: skip
-RUN_ARGUMENTS = Path(__file__).parents[1] / "coordinator" / "experiments" / "run_arguments.py"
+RUN_ARGUMENTS = Path(__file__).parents[1] / "dreamfleet" / "experiments" / "run_arguments.py"
 RUN_ARGUMENTS_HEAD = '''"""Settings of `start_run` and `evolve`. Written by `make reference`: change the flags."""
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ import sys
 from importlib.machinery import ExtensionFileLoader
 from importlib.util import module_from_spec, spec_from_file_location
 
-NAME = "dreamfleet.worker.car_racing._native"
+NAME = "dreamfleet.worker.worlds.car_racing._native"
 
 
 def use(path: str) -> None:
@@ -32,7 +32,7 @@ def drive(steps: int) -> None:
     """Make `steps` environment steps; episodes continue for a while after the car leaves the field."""
     import numpy as np
 
-    from dreamfleet.worker.car_racing.environment import CarRacing, _native
+    from dreamfleet.worker.worlds.car_racing.environment import CarRacing, _native
 
     random = np.random.default_rng(0)
     kinds = ("raw-96", "raw-96", "box-64")

@@ -17,16 +17,16 @@ from contextlib import suppress
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-SIDES = ("common", "coordinator", "worker")
+SIDES = ("common", "coordinator", "worker", "dreamfleet/experiments")  # and the floor above both
 # Words that a reader has to read twice; `style` in CONTRIBUTING.md says what to write instead.
 RIDDLES = re.compile(r"\b(tell|tells|telling|told|untold|whoever|whomever)\b|\b(?:is|are|was|were|be|been) had\b")
 LONG_FILE = 400
 # The worlds that ship: what names each of them, and its rooms, the files and folders in which that may stand.
 WORLDS = {
     re.compile("car.?racing", re.IGNORECASE): (
-        "worker/car_racing", "common/worlds/car_racing.py", "common/artifacts/car_racing_variants.py",
+        "worker/worlds/car_racing", "common/worlds/car_racing.py", "common/artifacts/car_racing_variants.py",
     ),
-    re.compile("take.?cover|doom", re.IGNORECASE): ("worker/takecover", "common/worlds/takecover.py"),
+    re.compile("take.?cover|doom", re.IGNORECASE): ("worker/worlds/takecover", "common/worlds/takecover.py"),
 }  # fmt: skip
 
 
@@ -34,6 +34,11 @@ def sources(*folders: str) -> list[Path]:
     """The Python files below these folders of the repository, as paths relative to it."""
     found = (path for folder in folders for path in (ROOT / folder).rglob("*.py"))
     return sorted(path.relative_to(ROOT) for path in found)
+
+
+def module_of(path: Path) -> str:
+    """The dotted name of a file's module, without `dreamfleet.`."""
+    return ".".join(path.with_suffix("").parts).removeprefix("dreamfleet.")
 
 
 def room_of(module: str) -> str:
@@ -54,11 +59,12 @@ def imports_of(path: Path) -> Iterator[str]:
 def room_arrows(side: str) -> dict[str, set[str]]:
     """Which rooms of a side each of its rooms imports."""
     arrows: dict[str, set[str]] = defaultdict(set)
+    name = side.removeprefix("dreamfleet/")
     for path in sources(side):
-        own = room_of(".".join(path.with_suffix("").parts))
+        own = room_of(module_of(path))
         if own == "__init__":
             continue
-        others = {room_of(name) for name in imports_of(path) if name.startswith(f"{side}.")}
+        others = {room_of(module) for module in imports_of(path) if module.startswith(f"{name}.")}
         arrows[own] |= others - {own, "", "__init__"}
     return dict(arrows)
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 BANNED = Path(__file__).with_name("banned-words.txt")
-SIDES = ("common", "coordinator", "worker")
+SIDES = ("common", "coordinator", "worker", "dreamfleet/experiments")
 LONG_SENTENCE = 30  # words
 USER = ("tutorials", "how-to", "reference", "explanation")  # folders of docs/ whose words have one limit together
 PRINTED = "printed"  # the name under which texts of the code are counted

@@ -27,16 +27,16 @@ if TYPE_CHECKING:
     from dreamfleet.common.artifacts.bundle import Bundle
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.common.artifacts.controller import Controller, ControllerShape
+    from dreamfleet.common.client.client import Client
+    from dreamfleet.common.client.remote_scorer import RemoteBatch, RemoteScorer
     from dreamfleet.common.errors import DreamfleetError, UsageError
-    from dreamfleet.common.monitoring.client import Client
-    from dreamfleet.common.monitoring.remote_scorer import RemoteBatch, RemoteScorer
     from dreamfleet.common.protocol.messages import TaskSpec
     from dreamfleet.common.protocol.tasks import Description
     from dreamfleet.common.runs.episode_results import EpisodeResults
-    from dreamfleet.coordinator.analysis.stored_run import StoredRun as Run
-    from dreamfleet.coordinator.analysis.stored_run import open_run
-    from dreamfleet.coordinator.experiments.minimise import maximise, minimise
-    from dreamfleet.coordinator.experiments.started_run import evolve, start_run
+    from dreamfleet.coordinator.views.stored_run import StoredRun as Run
+    from dreamfleet.coordinator.views.stored_run import open_run
+    from dreamfleet.experiments.minimise import maximise, minimise
+    from dreamfleet.experiments.started_run import evolve, start_run
     from dreamfleet.worker.scoring.scorer import Scorer
     from dreamfleet.worker.tasks.api import Task, World
     from dreamfleet.worker.tools.public_api import (
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "Bundle": "common.artifacts.bundle",
-    "Client": "common.monitoring.client",
+    "Client": "common.client.client",
     "Continuous": "common.artifacts.actions",
     "Controller": "common.artifacts.controller",
     "ControllerShape": "common.artifacts.controller",
@@ -57,25 +57,25 @@ _HOMES = {
     "Discrete": "common.artifacts.actions",
     "DreamfleetError": "common.errors",
     "EpisodeResults": "common.runs.episode_results",
-    "RemoteBatch": "common.monitoring.remote_scorer",
-    "RemoteScorer": "common.monitoring.remote_scorer",
-    "Run": "coordinator.analysis.stored_run:StoredRun",
+    "RemoteBatch": "common.client.remote_scorer",
+    "RemoteScorer": "common.client.remote_scorer",
+    "Run": "coordinator.views.stored_run:StoredRun",
     "Scorer": "worker.scoring.scorer",
     "Task": "worker.tasks.api",
     "TaskSpec": "common.protocol.messages",
     "UsageError": "common.errors",
     "World": "worker.tasks.api",
     "evaluate": "worker.tools.public_api",
-    "evolve": "coordinator.experiments.started_run",
+    "evolve": "experiments.started_run",
     "find_agent": "worker.tools.public_api",
     "find_bundle": "common.artifacts.bundle_store",
     "find_controller": "worker.tools.public_api",
     "make_environment": "worker.tools.public_api",
     "make_policy": "worker.tools.public_api",
-    "maximise": "coordinator.experiments.minimise",
-    "minimise": "coordinator.experiments.minimise",
-    "open_run": "coordinator.analysis.stored_run",
-    "start_run": "coordinator.experiments.started_run",
+    "maximise": "experiments.minimise",
+    "minimise": "experiments.minimise",
+    "open_run": "coordinator.views.stored_run",
+    "start_run": "experiments.started_run",
 }
 __all__ = [
     "Bundle",

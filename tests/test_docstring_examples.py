@@ -7,12 +7,12 @@ from importlib import import_module
 import pytest
 
 import dreamfleet
-from deploy.structure import ROOT, SIDES, sources
+from deploy.structure import ROOT, SIDES, module_of, sources
 from dreamfleet.common.artifacts.trained_agent import AgentManifest, TrainedAgent
 from dreamfleet.coordinator.optimisers import api as optimisers_api
-from dreamfleet.worker.baselines.agent_config import AgentConfig
-from dreamfleet.worker.baselines.export import export_network
-from dreamfleet.worker.baselines.network import Networks
+from dreamfleet.worker.addons.baselines.agent_config import AgentConfig
+from dreamfleet.worker.addons.baselines.export import export_network
+from dreamfleet.worker.addons.baselines.network import Networks
 from dreamfleet.worker.tasks import api as tasks_api
 from tests.support.processes import processes_in
 
@@ -32,8 +32,8 @@ def name_of(found):
 
 def find_examples():
     """The doctests of all modules by name. Those of public names import all that they use."""
-    paths = [path.with_suffix("") for path in sources(*SIDES) if ">>>" in (ROOT / path).read_text()]
-    names = [".".join(("dreamfleet", *path.parts)).removesuffix(".__init__") for path in paths]
+    paths = [path for path in sources(*SIDES) if ">>>" in (ROOT / path).read_text()]
+    names = [f"dreamfleet.{module_of(path)}".removesuffix(".__init__") for path in paths]
     tests = [
         test
         for module in (dreamfleet, *map(import_module, names))

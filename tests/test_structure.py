@@ -26,21 +26,21 @@ NAMING_WORLDS = {
     "common/host/packages.py": "packages and extras, as pyproject.toml names them",
     "worker/health.py": "doctor asks it where gymnasium may be absent, which CarRacing's room imports",
     "worker/dream/__init__.py": "an environment's former name, which notebooks and agents of others use",
-    "worker/bench/environment.py": "compares our CarRacing with gymnasium's, by the episode loop above its room",
-    "worker/baselines/agents.py": "baselines without a world model are agents of CarRacing, trained by rooms above its",
+    "worker/addons/bench/environment.py": "compares our CarRacing with gymnasium's, by the episode loop above its room",
+    "worker/addons/baselines/agents.py": "baselines are agents of CarRacing, trained by rooms above its",
 }
 # Files that start child processes and do not wait for them at once. This list may only shrink.
 STARTING_CHILDREN = {
     "common/host/child.py": "the one class for it",
     "common/host/descendants.py": "its guard",
-    "coordinator/spawn/agent.py": "runs on a host where nothing of ours is installed",
-    "worker/bench/dispatch.py": "measures the standard library's pool",
+    "coordinator/addons/spawn/agent.py": "runs on a host where nothing of ours is installed",
+    "worker/addons/bench/dispatch.py": "measures the standard library's pool",
 }
 # Modules whose test no name leads to. This list may only shrink.
 WITHOUT_TEST = {
     "common/errors.py",  # exceptions alone
     # measurements, which people start
-    *(f"worker/bench/{name}.py" for name in ("batches", "dream", "live", "policy", "torch_steps")),
+    *(f"worker/addons/bench/{name}.py" for name in ("batches", "dream", "live", "policy", "torch_steps")),
 }
 
 
@@ -48,7 +48,13 @@ def listed_modules(test: Path) -> set[str]:
     """The files that a test's docstring lists behind "Tests": with their folders, or of the folder that it mirrors."""
     docstring = re.match(r'"""(.*?)"""', (ROOT / test).read_text(), re.DOTALL)
     names = re.findall(r"[\w/]+\.py\b", docstring[1].partition("Tests ")[2]) if docstring else []
-    return {name if "/" in name else str(test.relative_to("tests").with_name(name)) for name in names}
+    return {name if "/" in name else mirrored(test.with_name(name)) for name in names}
+
+
+def mirrored(test: Path) -> str:
+    """The path that a file of the tests mirrors: `tests/experiments` stands for `dreamfleet/experiments`."""
+    path = str(test.relative_to("tests"))
+    return f"dreamfleet/{path}" if path.startswith("experiments/") else path
 
 
 def test_no_room_imports_a_room_above_it():
@@ -93,7 +99,7 @@ def test_no_world_is_named_outside_its_room():
 def test_a_test_of_each_module_has_its_name_or_lists_it():
     modules = {str(path) for path in sources(*SIDES) if path.name != "__init__.py"}
     tests = [path for path in sources("tests") if path.name.startswith("test_")]
-    named = {str(path.relative_to("tests").with_name(path.name.removeprefix("test_"))) for path in tests}
+    named = {mirrored(path.with_name(path.name.removeprefix("test_"))) for path in tests}
     listed = set().union(*(listed_modules(path) for path in tests))
     assert listed - modules == set(), "a docstring of a test lists what is not there"
     missing = modules - named - listed

@@ -11,8 +11,8 @@ def examine() -> Iterator[Finding]:
     """Check that the native renderer was built and draws the same pictures as the installed gymnasium."""
     remedy = "install a C compiler, then pip install --force-reinstall --no-deps dreamfleet; gymnasium draws until then"
     try:
-        from dreamfleet.worker.car_racing.environment import is_native_available
-        from dreamfleet.worker.car_racing.native_check import native_is_exact
+        from dreamfleet.worker.worlds.car_racing.environment import is_native_available
+        from dreamfleet.worker.worlds.car_racing.native_check import native_is_exact
     except ModuleNotFoundError as error:
         yield Finding("native picture", False, False, f"no {error.name}", "worker", "pip install 'dreamfleet[worker]'")
         return

@@ -33,8 +33,8 @@ from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArch
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import is_folder, open_regular, read_regular
 from dreamfleet.common.printable import plural
-from dreamfleet.common.serialization.display import Displayed
-from dreamfleet.common.serialization.validation import OPTIONAL, MalformedError, Word, from_plain, to_plain
+from dreamfleet.common.schema.display import Displayed
+from dreamfleet.common.schema.validation import OPTIONAL, MalformedError, Word, from_plain, to_plain
 
 FORMAT = 1
 TO_BUNDLE = "--out world.zip"  # of `import`, for another program's world model

@@ -24,8 +24,8 @@ from dreamfleet.common.files.archives import ArchiveLimits, read_arrays
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.host.packages import install_command_for
 from dreamfleet.common.printable import plural
-from dreamfleet.common.serialization.display import Displayed
-from dreamfleet.common.serialization.validation import OPTIONAL, to_plain
+from dreamfleet.common.schema.display import Displayed
+from dreamfleet.common.schema.validation import OPTIONAL, to_plain
 
 if TYPE_CHECKING:
     from dreamfleet.common.artifacts.bundle import Bundle

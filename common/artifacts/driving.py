@@ -11,7 +11,7 @@ from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, FACTS, V
 from dreamfleet.common.artifacts.task_options import read_options, write_options
 from dreamfleet.common.artifacts.world_facts import RewardFacts, WorldFacts
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.serialization.validation import MalformedError
+from dreamfleet.common.schema.validation import MalformedError
 
 __all__ = [
     "FIRST_WORLD",

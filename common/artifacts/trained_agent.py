@@ -17,8 +17,8 @@ from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArch
 from dreamfleet.common.files.atomic_write import open_output
 from dreamfleet.common.files.regular_files import open_regular, read_regular
 from dreamfleet.common.printable import plural
-from dreamfleet.common.serialization.display import Displayed
-from dreamfleet.common.serialization.validation import MalformedError, Word, from_plain
+from dreamfleet.common.schema.display import Displayed
+from dreamfleet.common.schema.validation import MalformedError, Word, from_plain
 
 FORMAT = 1
 MANIFEST, NETWORK = "agent.json", "network.onnx"

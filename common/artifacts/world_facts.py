@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import MAX_OUTPUTS, Continuous
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.serialization.validation import OPTIONAL, MalformedError, Word
+from dreamfleet.common.schema.validation import OPTIONAL, MalformedError, Word
 
 DRAWN: Final = "drawn"  # the text of the rule that draws its ends
 ODDS_WEIGHTS: Final = (1e-6, 1e6)  # the least and the most

@@ -14,7 +14,7 @@ from dreamfleet.common.cli.dry_run_process import DryRunError, DryRunProcess
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.protocol.tasks import Description, is_function_task
-from dreamfleet.common.serialization.validation import OPTIONAL, from_plain
+from dreamfleet.common.schema.validation import OPTIONAL, from_plain
 
 CHILD = "dreamfleet.worker.scoring.task_check"
 LAST_STEP = "close()"

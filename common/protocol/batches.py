@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.printable import plural
-from dreamfleet.common.serialization.validation import OPTIONAL, Count, Text
+from dreamfleet.common.schema.validation import OPTIONAL, Count, Text
 
 MAX_LISTED = 512  # batches in one reply
 MAX_BATCH = 32 << 20  # bytes of a body: 8 million numbers

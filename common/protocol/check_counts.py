@@ -9,7 +9,7 @@ from msgspec import Meta
 
 from dreamfleet.common.printable import plural, printable
 from dreamfleet.common.protocol.messages import Share
-from dreamfleet.common.serialization.validation import OPTIONAL, Count, Text
+from dreamfleet.common.schema.validation import OPTIONAL, Count, Text
 
 MAX_BARRED = 16  # hosts that are named
 BY_OPERATOR = " (by the operator)"  # behind the name of a host that no check found wrong

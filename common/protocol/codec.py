@@ -17,7 +17,7 @@ import msgspec
 
 from dreamfleet.common.protocol.keys import PROTOCOL_VERSION
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, Message
-from dreamfleet.common.serialization.validation import (
+from dreamfleet.common.schema.validation import (
     SCHEMA,
     MalformedError,
     T,

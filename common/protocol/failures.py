@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from dreamfleet.common.serialization.validation import Packed, Text
+from dreamfleet.common.schema.validation import Packed, Text
 
 MAX_CAUSE = 128  # characters
 FailureKind = Literal["host", "usage", "crash", "other"]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.protocol.messages import MAX_PICTURE_SIDE, ViewFrame
-from dreamfleet.common.serialization.validation import MalformedError
+from dreamfleet.common.schema.validation import MalformedError
 
 MAX_PACKED = 32 * 1024  # bytes; leaves room for the rest of a frame
 ZLIB_LEVEL = 1  # shrinks a 64x64 picture to a quarter in 0.1 ms

@@ -16,7 +16,7 @@ from msgspec import Meta
 
 from dreamfleet.common.printable import plural, printable, truncate
 from dreamfleet.common.protocol.messages import HostClass
-from dreamfleet.common.serialization.validation import Count, Text
+from dreamfleet.common.schema.validation import Count, Text
 
 BY_FINGERPRINT = "fingerprint-"  # prefix of classes that are derived from a fingerprint
 NON_DETERMINISTIC = "non-deterministic"  # the class of a host where equal episodes gave other bits

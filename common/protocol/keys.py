@@ -95,7 +95,7 @@ def claim(run: str, nonce: str) -> str:
 
 
 def status(run: str, part: str = "") -> str:
-    """Query for a run's status, as JSON; `part` is one of `dreamfleet.common.monitoring.status.PARTS`."""
+    """Query for a run's status, as JSON; `part` is one of `dreamfleet.common.client.status.PARTS`."""
     return f"{_PREFIX}/{run}/status/{part}" if part else f"{_PREFIX}/{run}/status"
 
 

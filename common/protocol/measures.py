@@ -15,7 +15,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.serialization.validation import Word
+from dreamfleet.common.schema.validation import Word
 
 MAX_AXES = 4
 MAX_CELLS = 10_000  # of an archive

@@ -18,8 +18,8 @@ from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.measures import MeasureNames, Measures
-from dreamfleet.common.serialization.display import DisplayedFields
-from dreamfleet.common.serialization.validation import (
+from dreamfleet.common.schema.display import DisplayedFields
+from dreamfleet.common.schema.validation import (
     OPTIONAL,
     Count,
     Digest,

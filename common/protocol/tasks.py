@@ -21,7 +21,7 @@ from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.host.packages import GYMNASIUM, install_command_for, wrong_version
 from dreamfleet.common.host.trusted_modules import check_trusted, import_trusted
 from dreamfleet.common.host.user_code import user_code
-from dreamfleet.common.serialization.display import DisplayedFields
+from dreamfleet.common.schema.display import DisplayedFields
 
 GROUP = "dreamfleet.tasks"
 _NAME = re.compile(r"[\w-][\w.-]*(:\S+)?", re.ASCII)

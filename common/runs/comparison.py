@@ -17,7 +17,7 @@ from dreamfleet.common.runs.learning import LearningCurve, Point
 from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, expand_task_options, in_values
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.common.serialization.validation import to_plain
+from dreamfleet.common.schema.validation import to_plain
 
 Scores = dict[int, float]  # by validation seed
 

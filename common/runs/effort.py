@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite
 from dreamfleet.common.protocol.tasks import DREAM, is_function_task
-from dreamfleet.common.serialization.validation import OPTIONAL, Count, MalformedError, from_plain_lenient
+from dreamfleet.common.schema.validation import OPTIONAL, Count, MalformedError, from_plain_lenient
 
 START_EFFORT = "start_effort"  # name of a fact in the journal
 SHORT_HOURS = 0.1  # core-hours below which slot time is printed in core-seconds

@@ -9,8 +9,8 @@ from statistics import fmean, median
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.printable import join_some, plural
 from dreamfleet.common.runs.standard_error import format_with_error, sample_std, standard_error
-from dreamfleet.common.serialization.display import Displayed
-from dreamfleet.common.serialization.validation import Count
+from dreamfleet.common.schema.display import Displayed
+from dreamfleet.common.schema.validation import Count
 
 MAX_NAMED = 3  # failed episodes in a text
 

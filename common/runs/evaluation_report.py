@@ -16,7 +16,7 @@ from dreamfleet.common.printable import format_number, one_line
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.common.runs.standard_error import format_with_error, score_digits
-from dreamfleet.common.serialization.validation import OPTIONAL, MalformedError, Seconds, from_plain_lenient
+from dreamfleet.common.schema.validation import OPTIONAL, MalformedError, Seconds, from_plain_lenient
 
 GYMNASIUM = "gymnasium"  # the judge of worlds that gymnasium itself has
 FORMER_MARKS = (800.0, 900.0)  # of reports that name none: only drives with laps were compared with them

@@ -23,7 +23,7 @@ from dreamfleet.common.runs.standard_error import (
     error_from_sample_std,
     format_with_error,
 )
-from dreamfleet.common.serialization.validation import OPTIONAL, Count, MalformedError, from_plain, to_plain
+from dreamfleet.common.schema.validation import OPTIONAL, Count, MalformedError, from_plain, to_plain
 
 MAX_STAGES = 32  # of a schedule; statuses contain them too
 PopulationSize = Annotated[int, Meta(ge=2, le=10**5)]

@@ -49,8 +49,8 @@ from dreamfleet.common.runs.run_lock import is_run_locked
 from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, rollout_path, run_paths
 from dreamfleet.common.runs.seeds import CHOOSING_OFFSET, CONFIRMING_OFFSET, VALIDATION, count_reseeds
 from dreamfleet.common.runs.stages import begun_stages
-from dreamfleet.common.serialization.display import Displayed
-from dreamfleet.common.serialization.times import elapsed_seconds
+from dreamfleet.common.schema.display import Displayed
+from dreamfleet.common.schema.times import elapsed_seconds
 
 MAX_LISTED_RUNS = 8  # in the error for an unknown run name
 # Names of facts in the journal.

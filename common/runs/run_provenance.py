@@ -20,7 +20,7 @@ from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.seeds import CONFIRMING_OFFSET, VALIDATION
-from dreamfleet.common.serialization.validation import OPTIONAL, Count, MalformedError, from_plain_lenient
+from dreamfleet.common.schema.validation import OPTIONAL, Count, MalformedError, from_plain_lenient
 
 RECEIPT = "receipt"  # key in a controller's provenance
 

@@ -13,8 +13,8 @@ from pathlib import Path
 from dreamfleet.common.errors import AccessError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import read_regular
+from dreamfleet.common.schema.validation import MalformedError, Moment, from_plain
 from dreamfleet.common.security.credentials import Credentials, identity, issue_command
-from dreamfleet.common.serialization.validation import MalformedError, Moment, from_plain
 
 log = logging.getLogger(__name__)
 LEDGER_FILE = "issued.json"  # in the authority's folder

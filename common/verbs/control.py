@@ -33,7 +33,7 @@ class ControlVerb:
 
     def run(self, args: argparse.Namespace) -> int:
         """Send the request, and print how the run continues."""
-        from dreamfleet.common.monitoring.client import Client
+        from dreamfleet.common.client.client import Client
         from dreamfleet.common.runs.lookup import naming_the_stored_run
 
         asked = self.request_with_workers if self.request_with_workers and args.workers else self.name

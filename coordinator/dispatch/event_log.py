@@ -9,7 +9,7 @@ from collections import OrderedDict, deque
 from collections.abc import Collection, Iterator
 from typing import Literal, NamedTuple
 
-from dreamfleet.common.monitoring.status import EventKind
+from dreamfleet.common.client.status import EventKind
 from dreamfleet.common.protocol.messages import Job
 
 BLOCK, BLOCKS = 256, 128  # events in a block, and blocks that are kept

@@ -13,7 +13,7 @@ from typing import Literal
 
 from msgspec.structs import replace
 
-from dreamfleet.common.monitoring.status import EventKind
+from dreamfleet.common.client.status import EventKind
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.messages import MAX_SLOTS, Heartbeat, Result, Verdict, VerdictWord
 from dreamfleet.coordinator.dispatch.event_log import EventLog, Note

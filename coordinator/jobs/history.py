@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from dreamfleet.common.monitoring.equal_fitness import EqualFitness
+from dreamfleet.common.client.equal_fitness import EqualFitness
 from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite
 from dreamfleet.common.runs.records import StoredGeneration
 

@@ -17,7 +17,7 @@ from dreamfleet.common.errors import write_error
 from dreamfleet.common.files.atomic_write import fsync_path
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation
 from dreamfleet.common.runs.run_provenance import RECEIPT, RunProvenance
-from dreamfleet.common.serialization.validation import to_plain
+from dreamfleet.common.schema.validation import to_plain
 
 SAVE_INTERVAL = 5.0  # seconds between two saves of means without evaluation: each waits for the disk
 

@@ -24,7 +24,7 @@ from dreamfleet.common.protocol.stop_kind import StopKind, StopReason
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_folder import ENDING, EPISODE_LIMIT, STOP_KIND
 from dreamfleet.common.runs.scoring_params import ScheduleState
-from dreamfleet.common.serialization.times import elapsed_seconds
+from dreamfleet.common.schema.times import elapsed_seconds
 from dreamfleet.coordinator.dispatch.failures import JobFailure, host_of, shorten
 from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.jobs.generation import Generation

@@ -14,7 +14,7 @@ from dreamfleet.common.printable import printable, truncate
 from dreamfleet.common.protocol.check_counts import MAX_BARRED, CheckCounts
 from dreamfleet.common.protocol.failures import describe_job
 from dreamfleet.common.protocol.messages import Job, Result
-from dreamfleet.common.serialization.validation import MAX_TEXT
+from dreamfleet.common.schema.validation import MAX_TEXT
 from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.dispatch.member import Member, MemberState

@@ -29,7 +29,7 @@ from dreamfleet.common.protocol.messages import (
     UploadPart,
 )
 from dreamfleet.common.protocol.result_bounds import LONGEST_EPISODE, max_steps, rejection_reason
-from dreamfleet.common.serialization.validation import MAX_TEXT, to_plain
+from dreamfleet.common.schema.validation import MAX_TEXT, to_plain
 from dreamfleet.coordinator.dispatch.failures import LONGEST_ERROR
 from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
 from dreamfleet.coordinator.dispatch.refusals import Refusal

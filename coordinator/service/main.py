@@ -12,6 +12,7 @@ from time import monotonic
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.cli.add_ons import add_on
 from dreamfleet.common.cli.global_config import GlobalConfig
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
@@ -28,8 +29,6 @@ from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, Revocatio
 from dreamfleet.common.security.credentials import Credentials
 from dreamfleet.common.transport.session import Network
 from dreamfleet.common.worlds.score_words import score_word
-from dreamfleet.coordinator.analysis.live_log import live_log
-from dreamfleet.coordinator.analysis.sinks import check_sinks
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.service.service import OpenRun, Service
 from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, RunConfig
@@ -122,7 +121,8 @@ def _serve_life(request: RunRequest, stop: Stop) -> Run:
     if request.config is not None and request.name == ARCHIVE:
         raise UsageError(f"{ARCHIVE!r} is where archived runs lie: choose another name")
     _check_file_system(folder)
-    check_sinks(request.network.log_to)
+    if log_to := request.network.log_to:
+        add_on("check-sinks")(log_to)
     settings, bundle, limit = _resolve_settings(request, folder)
     if request.network.verify and settings.is_external:
         raise UsageError(
@@ -145,7 +145,8 @@ def _serve_life(request: RunRequest, stop: Stop) -> Run:
             served = stack.enter_context(closing(ServedBundle(folder / BUNDLE))) if bundle else None
             file_watch = FileWatch(journal, served, request.with_absolute_paths.resume_command)
             stack.enter_context(closing(file_watch))
-            stack.enter_context(live_log(folder, request.network.log_to))
+            if log_to:
+                stack.enter_context(add_on("live-log")(folder, log_to))
             anchor_key = make_anchor_key() if request.network.verify else b""
             run = Run(journal, settings, request.limits, request.network, monotonic(), anchor_key)
             return OpenRun(run, file_watch, served)

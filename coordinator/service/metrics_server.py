@@ -77,7 +77,7 @@ class _MetricsServer(HTTPServer):
 
 
 def _handler(snapshot: Callable[[], Snapshot]) -> type[BaseHTTPRequestHandler]:
-    from dreamfleet.common.monitoring.prometheus import CONTENT_TYPE, exposition  # only where they are served
+    from dreamfleet.coordinator.views.prometheus import CONTENT_TYPE, exposition  # only where they are served
 
     class Handler(BaseHTTPRequestHandler):
         timeout = PATIENCE

@@ -13,7 +13,7 @@ from dreamfleet.common.errors import RefusedError
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import decode_json, encode_json
 from dreamfleet.common.protocol.messages import ClaimNote
-from dreamfleet.common.serialization.validation import MalformedError
+from dreamfleet.common.schema.validation import MalformedError
 from dreamfleet.common.transport.session import LEASE_MS, enqueue_into
 from dreamfleet.coordinator.service.leader_check import LeaderCheck
 

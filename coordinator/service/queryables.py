@@ -12,8 +12,8 @@ from typing import Any
 
 import zenoh
 
+from dreamfleet.common.client.status import PARTS
 from dreamfleet.common.host.error_counter import ErrorCounter
-from dreamfleet.common.monitoring.status import PARTS
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import encode, encoding
 from dreamfleet.common.protocol.messages import MAX_PART, BundlePart

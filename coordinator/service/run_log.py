@@ -13,10 +13,10 @@ from itertools import islice
 from time import monotonic, time
 from typing import Any
 
+from dreamfleet.common.client.equal_fitness import EqualFitness
+from dreamfleet.common.client.eta import estimate_eta, summarise_status
+from dreamfleet.common.client.status import Status
 from dreamfleet.common.host.reports import ADDRESS, report
-from dreamfleet.common.monitoring.equal_fitness import EqualFitness
-from dreamfleet.common.monitoring.eta import estimate_eta, summarise_status
-from dreamfleet.common.monitoring.status import Status
 from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.protocol.tasks import is_function_task, is_unregistered
 from dreamfleet.common.runs.records import StoredGeneration, count_episodes, format_mean, in_values, with_error

@@ -30,9 +30,9 @@ from dreamfleet.common.protocol.messages import (
     UploadPart,
 )
 from dreamfleet.common.runs.records import StoredGeneration
+from dreamfleet.common.schema.validation import MalformedError
 from dreamfleet.common.security.certificate_ledger import RevocationWatcher
 from dreamfleet.common.security.credentials import worker_seat_identity
-from dreamfleet.common.serialization.validation import MalformedError
 from dreamfleet.common.transport.session import Network, open_session
 from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
 from dreamfleet.coordinator.dispatch.refusals import Refusal

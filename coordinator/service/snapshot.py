@@ -9,8 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 
-from dreamfleet.common.host.packages import package_version
-from dreamfleet.common.monitoring.status import (
+from dreamfleet.common.client.status import (
     STATUS_SCHEMA_VERSION,
     EpisodeProgress,
     FailureStatus,
@@ -23,6 +22,7 @@ from dreamfleet.common.monitoring.status import (
     WorkerCount,
     WorkerStatus,
 )
+from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.protocol.result_bounds import MAX_SECONDS, clamp_count
 from dreamfleet.common.runs.records import StoredEvaluation
 from dreamfleet.coordinator.dispatch.event_log import EventLogView

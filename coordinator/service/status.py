@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from typing import Any, Protocol, TypeVar
 
-from dreamfleet.common.monitoring.status import STATUS_SCHEMA_VERSION, Event, Population, Status, WorkerStatus
+from dreamfleet.common.client.status import STATUS_SCHEMA_VERSION, Event, Population, Status, WorkerStatus
 from dreamfleet.common.protocol.codec import encode_json
 from dreamfleet.common.protocol.messages import MAX_MESSAGE
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration, with_error
-from dreamfleet.common.serialization.validation import to_plain
+from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.coordinator.dispatch.event_log import FleetEvent
 from dreamfleet.coordinator.jobs.generation import CandidateScores
 from dreamfleet.coordinator.service.snapshot import Snapshot

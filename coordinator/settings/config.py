@@ -57,7 +57,7 @@ from dreamfleet.common.runs.records import (
     StageSettings,
 )
 from dreamfleet.common.runs.stages import stages_of
-from dreamfleet.common.serialization.validation import Count
+from dreamfleet.common.schema.validation import Count
 from dreamfleet.coordinator.settings.bounds import check_bounds
 from dreamfleet.coordinator.settings.presets import check_preset_fits
 from dreamfleet.coordinator.settings.run_checks import check_subspace, try_optimiser

@@ -21,7 +21,7 @@ from dreamfleet.common.files.regular_files import path_exists, read_text
 from dreamfleet.common.host.reports import WARNING, report
 from dreamfleet.common.printable import printable
 from dreamfleet.common.protocol.tasks import DREAM
-from dreamfleet.common.serialization.validation import MalformedError, from_plain, to_plain
+from dreamfleet.common.schema.validation import MalformedError, from_plain, to_plain
 from dreamfleet.coordinator.settings.config import RunConfig
 
 log = logging.getLogger("dreamfleet.coordinator")

@@ -26,7 +26,7 @@ from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.common.runs.run_provenance import read_run_provenance
-from dreamfleet.common.serialization.validation import to_plain
+from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.storage.journal import Journal

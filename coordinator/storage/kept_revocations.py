@@ -9,7 +9,7 @@ import json
 from collections.abc import Collection
 
 from dreamfleet.common.errors import JournalError
-from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.schema.validation import MalformedError, from_plain
 from dreamfleet.coordinator.storage.journal import Journal
 
 REVOKED = "revoked"  # the fact's name

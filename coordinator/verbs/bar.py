@@ -27,9 +27,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Ask the coordinator of a live run; without one, change the run's journal on this disk."""
+    from dreamfleet.common.client.client import Client
     from dreamfleet.common.errors import ConnectionFailedError
     from dreamfleet.common.files.regular_files import is_file
-    from dreamfleet.common.monitoring.client import Client
     from dreamfleet.common.protocol.keys import check_run_name, check_worker_name
     from dreamfleet.common.runs.run_paths import JOURNAL, resume_command
     from dreamfleet.coordinator.run.recall import bar_stored

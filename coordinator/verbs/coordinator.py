@@ -213,12 +213,12 @@ def _describe_failures(request: RunRequest, failed: int) -> str:
 def _report(
     args: argparse.Namespace, run: Run, request: RunRequest, outcome: ExitReport, *, nothing_new: bool
 ) -> None:  # fmt: skip
-    from dreamfleet.common.monitoring.eta import format_duration
+    from dreamfleet.common.client.eta import format_duration
     from dreamfleet.common.protocol.stop_kind import StopKind
     from dreamfleet.common.runs.records import describe_score, in_values, with_error
     from dreamfleet.common.runs.run_folder import open_run
     from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER
-    from dreamfleet.common.serialization.times import elapsed_seconds
+    from dreamfleet.common.schema.times import elapsed_seconds
     from dreamfleet.common.worlds.score_words import score_word_of_run
 
     again, ended = request.resume_command(), run.state.ended

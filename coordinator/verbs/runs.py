@@ -6,19 +6,20 @@ import argparse
 import json
 import shutil
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dreamfleet.common.cli.add_ons import find_add_on
 from dreamfleet.common.cli.command_line import SimpleVerb
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
+from dreamfleet.common.client.elites import EliteArchive
+from dreamfleet.common.client.equal_fitness import EqualFitness
+from dreamfleet.common.client.eta import format_duration
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.files.regular_files import is_folder, path_exists
-from dreamfleet.common.monitoring.elites import EliteArchive
-from dreamfleet.common.monitoring.equal_fitness import EqualFitness
-from dreamfleet.common.monitoring.eta import format_duration
 from dreamfleet.common.printable import format_number, format_setting, plural
 from dreamfleet.common.protocol.function_values import value_of
 from dreamfleet.common.protocol.tasks import DREAM, is_function_task
@@ -39,7 +40,6 @@ from dreamfleet.common.runs.run_paths import check_movable, reporting_folder_err
 from dreamfleet.common.runs.stages import begun_stages, describe_limit, describe_stages
 from dreamfleet.common.transport.network import SECURED_PREFIX
 from dreamfleet.common.worlds.score_words import score_word_of_run
-from dreamfleet.coordinator.experiments.sweep.folder import sweeps_of_runs
 
 if TYPE_CHECKING:
     import numpy as np
@@ -77,7 +77,8 @@ def list_runs(args: argparse.Namespace) -> int:
         raise UsageError(f"--runs-dir {args.runs_dir} is not a folder: name the one that holds runs")
     runs_dir = args.runs_dir / ARCHIVE_FOLDER if args.archived else args.runs_dir
     rows = [_run_row(path, in_text=not args.json) for path in run_paths(runs_dir)]
-    sweeps = sweeps_of_runs(args.runs_dir)  # an archived run was begun there
+    find_sweeps = find_add_on("sweeps-of-runs")
+    sweeps: Mapping[str, str] = find_sweeps(args.runs_dir) if find_sweeps else {}  # an archived run was begun there
     if args.json or any(row["run"] in sweeps for row in rows):
         rows = [{**row, "sweep": sweeps.get(row["run"])} for row in rows]
     if args.json:
@@ -323,7 +324,7 @@ def configure_export(parser: argparse.ArgumentParser) -> None:
 
 def export_run(args: argparse.Namespace) -> int:
     """Write a run's journal as tables, and print the files' paths."""
-    from dreamfleet.coordinator.analysis.export import export_csv, export_parquet, export_tensorboard
+    from dreamfleet.coordinator.views.export import export_csv, export_parquet, export_tensorboard
 
     kinds = {"csv": export_csv, "parquet": export_parquet, "tensorboard": export_tensorboard}
     if args.run_name.endswith(f".{args.kind}"):

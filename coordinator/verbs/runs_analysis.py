@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from dreamfleet.common.cli.add_ons import add_on
 from dreamfleet.common.cli.command_line import SimpleVerb
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer
@@ -42,7 +43,7 @@ def configure_plot(parser: argparse.ArgumentParser) -> None:
 
 def plot_runs(args: argparse.Namespace) -> int:
     """Draw, and print the picture's path."""
-    from dreamfleet.coordinator.analysis.plot import KINDS
+    from dreamfleet.coordinator.views.plot import KINDS
 
     kind = args.kind or ("fitness" if len(args.run_names) == 1 else "learning")
     out = args.out or _picture_name(args.run_names, kind)
@@ -65,18 +66,20 @@ def _picture_name(runs: Sequence[str], what: str) -> Path:
 
 
 def _draw_one(args: argparse.Namespace, kind: str, out: Path) -> None:
-    from dreamfleet.coordinator.analysis.archive_plot import plot_archive
-    from dreamfleet.coordinator.analysis.plot import plot_fitness
+    from dreamfleet.coordinator.views.plot import plot_fitness, save_figure
 
     if len(args.run_names) > 1:
         raise UsageError(f"--kind {kind} draws one run: name one")
     with open_run(args.runs_dir, args.run_names[0]) as stored, stored.read_transaction():
-        (plot_archive if kind == "archive" else plot_fitness)(stored, out)
+        if kind == "archive":
+            save_figure(add_on("archive-figure")(stored), out)
+        else:
+            plot_fitness(stored, out)
 
 
 def _draw_learning(args: argparse.Namespace, out: Path) -> None:
     from dreamfleet.common.runs.learning import LearningCurve
-    from dreamfleet.coordinator.analysis.plot import plot_learning, published_scores
+    from dreamfleet.coordinator.views.plot import plot_learning, published_scores
 
     curves = []
     for name in dict.fromkeys(args.run_names):
@@ -98,7 +101,7 @@ def configure_receipt(parser: argparse.ArgumentParser) -> None:
 
 def write_receipt(args: argparse.Namespace) -> int:
     """Print or write what a paper cites of a run, as Markdown or as JSON."""
-    from dreamfleet.coordinator.analysis.citation import citation_facts, format_markdown
+    from dreamfleet.coordinator.views.citation import citation_facts, format_markdown
 
     if args.out is not None:
         check_output_path(args.out)

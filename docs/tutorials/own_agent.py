@@ -23,7 +23,7 @@ from dreamfleet.common.runs.seeds import validation_seeds
 from dreamfleet.common.runs.standard_error import format_with_error, standard_error
 
 DREAM = "dreamfleet.worker.dream:dreamfleet/CarRacingDream-v0"
-REALITY = "dreamfleet.worker.car_racing:dreamfleet/CarRacingLatent-v0"
+REALITY = "dreamfleet.worker.worlds.car_racing:dreamfleet/CarRacingLatent-v0"
 ACTIONS = np.array(FIVE_CHOICES.choices, np.float32)  # nothing, right, left, gas, brake
 HOLD = 4  # steps
 DREAMS, HORIZON, TEMPERATURE = 64, 400, 1.25  # parallel dreams; steps; above 1, dreams are harder to exploit

@@ -15,8 +15,8 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
-from dreamfleet.common.monitoring.client import Client
-from dreamfleet.worker.bench.sleep_tasks import SLEEP_TASK
+from dreamfleet.common.client.client import Client
+from dreamfleet.worker.addons.bench.sleep_tasks import SLEEP_TASK
 from tests.support.bundles import write_random_bundle
 from tests.support.hosts import new_host
 from tests.support.processes import processes_in

@@ -16,7 +16,7 @@ CALLS = {"eval", "exec", "yaml.load", "yaml.full_load", "yaml.unsafe_load", "tor
 SAFE = {"torch.load": ("weights_only", True), "numpy.load": ("allow_pickle", False), "np.load": ("allow_pickle", False)}
 DEFAULTS = {"numpy.load", "np.load"}  # safe by default
 EXCEPTIONS = {  # a module's path, and why what it runs is our own
-    "common/serialization/validation.py": "code of our dataclasses' annotations, as the standard library's dataclasses",
+    "common/schema/validation.py": "code of our dataclasses' annotations, as the standard library's dataclasses",
 }
 
 

@@ -11,7 +11,7 @@ NO_ROOM = {"__pycache__", "pretrained"}  # `pretrained` holds files that ship, a
 
 
 def rooms_on_the_page() -> dict[str, set[str]]:
-    parts = re.split(r"^\*\*(\w+)/\*\*", PAGE.read_text(), flags=re.MULTILINE)
+    parts = re.split(r"^\*\*([\w/]+)/\*\*", PAGE.read_text(), flags=re.MULTILINE)
     tables = zip(parts[1::2], parts[2::2], strict=True)
     return {side: set(re.findall(r"^\| `(\w+)/` \|", text, re.MULTILINE)) for side, text in tables}
 
@@ -29,7 +29,9 @@ def test_what_it_names_exists():
         if isinstance(node, (ast.ClassDef, ast.FunctionDef))
     }
     words = re.findall(r"`([^`]+)`", PAGE.read_text())
-    paths = [word for word in words if re.fullmatch(r"(common|coordinator|worker|deploy|tests)/[\w/.]*", word)]
+    paths = [
+        word for word in words if re.fullmatch(r"(common|coordinator|worker|deploy|dreamfleet|tests)/[\w/.]*", word)
+    ]
     names = [word for word in words if re.fullmatch(r"[A-Z]\w+(\.\w+)?", word)]
     assert [path for path in paths if not (ROOT / path).exists()] == []
     assert [name for name in names if not set(name.split(".")) <= defined] == []

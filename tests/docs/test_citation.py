@@ -1,5 +1,5 @@
 """The citation is valid and of this version; what the issue templates ask for can be typed.
-Tests coordinator/analysis/citation.py."""
+Tests coordinator/views/citation.py."""
 
 import re
 import subprocess
@@ -11,8 +11,8 @@ import pytest
 from packaging.version import Version
 
 from dreamfleet.common.cli.command_line import build_parser
-from dreamfleet.common.cli.verb_runner import find_verb
-from dreamfleet.coordinator.analysis.citation import AUTHORS
+from dreamfleet.coordinator.views.citation import AUTHORS
+from dreamfleet.experiments.verb_runner import find_verb
 from tests.support.processes import DEADLINE, ROOT
 
 CITATION = ROOT / "CITATION.cff"

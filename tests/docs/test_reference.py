@@ -10,10 +10,10 @@ import dreamfleet
 from deploy import reference
 from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.common.cli.global_config import TABLES
-from dreamfleet.common.monitoring.prometheus import collect_metrics
-from dreamfleet.coordinator.experiments.run_arguments import RunArguments
-from dreamfleet.coordinator.experiments.started_run import setting_names
 from dreamfleet.coordinator.settings import run_setup
+from dreamfleet.coordinator.views.prometheus import collect_metrics
+from dreamfleet.experiments.run_arguments import RunArguments
+from dreamfleet.experiments.started_run import setting_names
 from tests.support.samples import STATUS
 
 

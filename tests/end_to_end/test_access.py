@@ -11,14 +11,14 @@ from functools import partial
 import pytest
 import zenoh
 
+from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import ConnectionFailedError, HandshakeRejectedError
-from dreamfleet.common.monitoring.client import Client
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import encode, encode_json
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.security.credentials import read_join_file
 from dreamfleet.common.transport.session import MAX_FORWARDED, Network, open_session
-from dreamfleet.coordinator.dashboard.live_runs import Watcher
+from dreamfleet.coordinator.addons.dashboard.live_runs import Watcher
 from dreamfleet.worker.service.admission import make_request
 from dreamfleet.worker.service.config import WorkerConfig
 from dreamfleet.worker.service.worker import Worker

@@ -1,5 +1,5 @@
 """A run with an archive: killed amid, it goes on to the same bits, and its elites can be listed, drawn and judged.
-Tests coordinator/analysis/archive_plot.py."""
+Tests coordinator/addons/quality_diversity/archive_plot.py."""
 
 import json
 import re
@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import TimeoutError as SlowPageError
 
 import dreamfleet
-from dreamfleet.common.monitoring.elites import EliteArchive
+from dreamfleet.common.client.elites import EliteArchive
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
 from tests.support.browser import chromium, tab

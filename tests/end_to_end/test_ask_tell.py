@@ -1,5 +1,5 @@
 """A search of somebody else's over a real fleet: batches over Zenoh, and what is killed amid one.
-Tests common/monitoring/batch_client.py, common/monitoring/remote_scorer.py and coordinator/service/batch_queries.py."""
+Tests common/client/batch_client.py, common/client/remote_scorer.py and coordinator/service/batch_queries.py."""
 
 import subprocess
 import sys
@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from dreamfleet import RemoteScorer
+from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import ConnectionFailedError
-from dreamfleet.common.monitoring.client import Client
 from dreamfleet.common.protocol.batches import BatchError
 from tests.support import tasks
 from tests.support.access import begin as begin_secured

@@ -1,7 +1,9 @@
 """Batches over HTTP: the bridge's answers to good and bad requests, and to connections that stop.
-Tests coordinator/bridge/app.py, coordinator/bridge/changes.py, coordinator/bridge/config.py,
-coordinator/bridge/guard.py, coordinator/bridge/openapi.py, coordinator/bridge/server.py and
-coordinator/verbs/serve.py."""
+
+Tests coordinator/addons/bridge/app.py, coordinator/addons/bridge/changes.py,
+coordinator/addons/bridge/config.py, coordinator/addons/bridge/guard.py, coordinator/addons/bridge/openapi.py,
+coordinator/addons/bridge/server.py and coordinator/addons/bridge/verb.py.
+"""
 
 import base64
 import http.client
@@ -19,7 +21,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from dreamfleet.coordinator.bridge.app import MOST_STREAMS
+from dreamfleet.coordinator.addons.bridge.app import MOST_STREAMS
 from tests.support import tasks
 from tests.support.access import begin as begin_secured
 from tests.support.batches import begin, count_results, resume, vectors
@@ -161,8 +163,8 @@ def test_bad_requests_are_refused_with_a_reason_and_lose_nothing(bridge):
 
 
 IMPATIENT = """
-from dreamfleet.coordinator.bridge import app, server
-from dreamfleet.coordinator.dashboard import server as page
+from dreamfleet.coordinator.addons.bridge import app, server
+from dreamfleet.coordinator.addons.dashboard import server as page
 
 app.BODY_TIMEOUT, page.IDLE_TIMEOUT, server.KEEP_ALIVE, server.BridgeConnection.keep_alive = 3.0, 1.0, 4, 4
 """  # Python imports it as `sitecustomize` before the verb begins

@@ -5,8 +5,8 @@ import signal
 
 import pytest
 
-from dreamfleet.worker.baselines.presets import find_preset
-from dreamfleet.worker.baselines.train import CHECKPOINT, CURVE, train_drqn
+from dreamfleet.worker.addons.baselines.presets import find_preset
+from dreamfleet.worker.addons.baselines.train import CHECKPOINT, CURVE, train_drqn
 from dreamfleet.worker.training.checkpoint import load_progress, load_weights
 from dreamfleet.worker.training.config_flags import override
 

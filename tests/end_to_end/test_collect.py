@@ -14,10 +14,10 @@ from dreamfleet.common.protocol.messages import MAX_PART, UploadPart
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.seeds import collection_seed
 from dreamfleet.common.transport.session import Network, open_session
-from dreamfleet.worker.car_racing.preprocessing import BOX, RAW
 from dreamfleet.worker.training.data.dataset import episode_paths, load_pictures
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+from dreamfleet.worker.worlds.car_racing.preprocessing import BOX, RAW
 from tests.support import tasks
 from tests.support.bundles import write_random_bundle
 

@@ -1,5 +1,5 @@
 """Two kinds of MDN-RNNs on one small data set, killed in between.
-Tests coordinator/experiments/contrast/trials.py and coordinator/verbs/contrast.py."""
+Tests dreamfleet/experiments/contrast/trials.py and dreamfleet/experiments/verbs/contrast.py."""
 
 import json
 import signal

@@ -1,4 +1,4 @@
-"""The page in a real browser, about real coordinators and workers. Tests coordinator/verbs/dashboard.py."""
+"""The page in a real browser, about real coordinators and workers. Tests coordinator/addons/dashboard/verb.py."""
 
 import dataclasses
 import json

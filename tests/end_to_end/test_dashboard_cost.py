@@ -9,7 +9,7 @@ from statistics import median
 
 import pytest
 
-from dreamfleet.common.monitoring.client import Client
+from dreamfleet.common.client.client import Client
 from tests.support import tasks
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]

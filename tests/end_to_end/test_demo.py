@@ -1,5 +1,8 @@
 """The demonstration, seconds long.
-Tests coordinator/experiments/demo.py, coordinator/experiments/demo_plans.py and coordinator/verbs/demo.py."""
+
+Tests dreamfleet/experiments/demo.py, dreamfleet/experiments/demo_plans.py and
+dreamfleet/experiments/verbs/demo.py.
+"""
 
 import os
 import re
@@ -15,8 +18,8 @@ from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.common.runs.standard_error import format_with_error
-from dreamfleet.coordinator.experiments.demo import Demo, DemoConfig, median_drive, plan_runs
-from dreamfleet.coordinator.experiments.demo_plans import PLANS
+from dreamfleet.experiments.demo import Demo, DemoConfig, median_drive, plan_runs
+from dreamfleet.experiments.demo_plans import PLANS
 from tests.support.processes import call_here
 from tests.support.tables import cells
 

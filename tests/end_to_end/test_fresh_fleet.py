@@ -13,12 +13,12 @@ from contextlib import ExitStack
 
 import pytest
 
+from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import DreamfleetError
-from dreamfleet.common.monitoring.client import Client
 from dreamfleet.common.security.authority import Authority
 from dreamfleet.common.security.credentials import read_join_file
 from dreamfleet.common.transport.session import Network
-from dreamfleet.coordinator.spawn.parcel import pack_wheel
+from dreamfleet.coordinator.addons.spawn.parcel import pack_wheel
 from tests.support.disks import small_disk
 from tests.support.hosts import new_host, require_hosts
 from tests.support.processes import free_port

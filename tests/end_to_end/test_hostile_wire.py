@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from dreamfleet.common.monitoring.status import PARTS
+from dreamfleet.common.client.status import PARTS
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import decode_json, encode, encode_json
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, ControlReply, HelloReply

@@ -1,5 +1,5 @@
 """Two rounds of world models and evolutions, seconds long each, left alone and killed.
-Tests coordinator/experiments/iteration/runner.py and coordinator/verbs/iterate.py."""
+Tests dreamfleet/experiments/iteration/runner.py and dreamfleet/experiments/verbs/iterate.py."""
 
 import json
 import os
@@ -18,15 +18,15 @@ from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.subspace import Subspace
-from dreamfleet.common.cli.verb_runner import ProcessRunner
 from dreamfleet.common.host.stop_signals import never_stop
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.coordinator.experiments.iteration.commands import Commands
-from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
-from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
-from dreamfleet.coordinator.experiments.iteration.ledger import FinishedPhase, IterationLedger
-from dreamfleet.coordinator.experiments.iteration.phases import PhaseRunner
-from dreamfleet.coordinator.experiments.iteration.plan import Phase
+from dreamfleet.experiments.iteration.commands import Commands
+from dreamfleet.experiments.iteration.config import IterateConfig
+from dreamfleet.experiments.iteration.layout import IterationFolder
+from dreamfleet.experiments.iteration.ledger import FinishedPhase, IterationLedger
+from dreamfleet.experiments.iteration.phases import PhaseRunner
+from dreamfleet.experiments.iteration.plan import Phase
+from dreamfleet.experiments.verb_runner import ProcessRunner
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle

@@ -1,5 +1,5 @@
 """Watching a live run: real coordinator, real workers, viewers that come, stay too long, and lie.
-Tests common/monitoring/live.py and worker/verbs/live.py."""
+Tests common/client/live.py and worker/verbs/live.py."""
 
 import json
 import signal
@@ -9,11 +9,11 @@ from contextlib import ExitStack
 import msgspec
 import pytest
 
+from dreamfleet.common.client.client import Client
+from dreamfleet.common.client.live import LiveView
+from dreamfleet.common.client.mjpeg import read_parts
 from dreamfleet.common.errors import ConnectionFailedError, JournalError, UsageError
 from dreamfleet.common.host.processes import command
-from dreamfleet.common.monitoring.client import Client
-from dreamfleet.common.monitoring.live import LiveView
-from dreamfleet.common.monitoring.mjpeg import read_parts
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import encode
 from dreamfleet.common.protocol.messages import ViewFrame

@@ -1,5 +1,5 @@
 """Workers whose coordinator is out of sight for a while, and what a run says of workers that left.
-Tests common/verbs/story.py."""
+Tests coordinator/verbs/story.py."""
 
 import json
 import time

@@ -7,8 +7,8 @@ import pytest
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.scoring_params import scoring_params_of
 from dreamfleet.common.runs.stages import begun_stages, stages_of
-from dreamfleet.coordinator.analysis.plot import plot_fitness
-from dreamfleet.worker.inspection.curve_sections import fitness_section
+from dreamfleet.coordinator.views.plot import plot_fitness
+from dreamfleet.worker.addons.inspection.curve_sections import fitness_section
 from tests.support import tasks
 from tests.support.tables import cells
 

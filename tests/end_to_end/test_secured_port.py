@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dreamfleet.common.monitoring.client import Client
+from dreamfleet.common.client.client import Client
 from dreamfleet.common.security.credentials import read_join_file
 from tests.support.access import begin, until, work
 from tests.support.attacks import CLAIMED, RUN, SECURED, SETTINGS, attacking, outcome, steers_by_name

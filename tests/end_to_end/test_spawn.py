@@ -1,5 +1,5 @@
 """Workers on hosts that a real sshd leads to: brought up, left, followed, ended; and whatever stands in the way.
-Tests coordinator/verbs/spawn.py."""
+Tests coordinator/addons/spawn/verb.py."""
 
 import json
 import os
@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from dreamfleet.common.security.authority import Authority
-from dreamfleet.coordinator.spawn.agent import process_start
-from dreamfleet.coordinator.spawn.parcel import pack_wheel
+from dreamfleet.coordinator.addons.spawn.agent import process_start
+from dreamfleet.coordinator.addons.spawn.parcel import pack_wheel
 from tests.support import tasks
 from tests.support.disks import small_disk
 from tests.support.hosts import new_host, require_hosts

@@ -1,5 +1,5 @@
 """Watching a run from anywhere, to its end, and judging what it reports.
-Tests common/monitoring/client.py, common/verbs/status.py and coordinator/service/queryables.py."""
+Tests common/client/client.py, coordinator/verbs/status.py and coordinator/service/queryables.py."""
 
 import json
 import os
@@ -10,10 +10,10 @@ import sys
 import pytest
 
 from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import ConnectionFailedError, ControllerError
-from dreamfleet.common.monitoring.client import Client
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.common.verbs import status
+from dreamfleet.coordinator.verbs import status
 from tests.support import tasks
 
 

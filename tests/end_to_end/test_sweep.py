@@ -1,6 +1,8 @@
 """A sweep with real processes: it ends with a comparison, survives the loss of everything, and refuses bad input.
-Tests coordinator/experiments/sweep/display.py, coordinator/experiments/sweep/runner.py and
-coordinator/verbs/sweep.py."""
+
+Tests dreamfleet/experiments/sweep/display.py, dreamfleet/experiments/sweep/runner.py and
+dreamfleet/experiments/verbs/sweep.py.
+"""
 
 import json
 import os
@@ -11,7 +13,7 @@ import time
 import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.coordinator.experiments.sweep import runner
+from dreamfleet.experiments.sweep import runner
 from tests.support import tasks
 from tests.support.processes import DEADLINE, ROOT, call_here
 

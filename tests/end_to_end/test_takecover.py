@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.worker.takecover.game import TakeCover
-from dreamfleet.worker.takecover.process import ARGUMENTS, FOLDER_PREFIX, GAME_NAME_FLAG
+from dreamfleet.worker.worlds.takecover.game import TakeCover
+from dreamfleet.worker.worlds.takecover.process import ARGUMENTS, FOLDER_PREFIX, GAME_NAME_FLAG
 from tests.support.doom import games, has_ended, name_of_game, shared_files
 from tests.support.processes import DEADLINE
 

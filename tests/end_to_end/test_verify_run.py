@@ -1,5 +1,5 @@
 """A run is repeated from its controller's provenance alone, with real processes, to the bit.
-Tests coordinator/verbs/verify_run.py."""
+Tests dreamfleet/experiments/verbs/verify_run.py."""
 
 import json
 import os

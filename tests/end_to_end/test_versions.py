@@ -3,8 +3,8 @@
 import time
 from dataclasses import replace
 
+from dreamfleet.common.client.client import Client
 from dreamfleet.common.host.fingerprint import fingerprint
-from dreamfleet.common.monitoring.client import Client
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import decode_json, encode_json
 from dreamfleet.common.protocol.messages import HelloReply

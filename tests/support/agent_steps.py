@@ -15,7 +15,7 @@ import time
 from contextlib import redirect_stdout
 from pathlib import Path
 
-from dreamfleet.coordinator.spawn import agent
+from dreamfleet.coordinator.addons.spawn import agent
 
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 WORKER = (

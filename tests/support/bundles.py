@@ -18,7 +18,7 @@ from dreamfleet.common.artifacts.bundle import (
     BundleManifest,
     write_bundle,
 )
-from dreamfleet.common.serialization.validation import to_plain
+from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.worker.training.data.dataset import find_world, preprocessing_of_size
 from dreamfleet.worker.worldmodel.export import (
     export_controller,

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dreamfleet.worker.takecover.game import TakeCover
-from dreamfleet.worker.takecover.process import GAME_NAME_FLAG, SHARED_FILES
+from dreamfleet.worker.worlds.takecover.game import TakeCover
+from dreamfleet.worker.worlds.takecover.process import GAME_NAME_FLAG, SHARED_FILES
 from tests.support.processes import DEADLINE, ROOT
 
 FAKE = Path(__file__).parent / "fake_vizdoom"

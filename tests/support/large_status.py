@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from dreamfleet.common.monitoring.status import Population, WorkerCount
+from dreamfleet.common.client.status import Population, WorkerCount
 from tests.support.samples import STATUS
 
 FLEET = tuple(

@@ -1,7 +1,7 @@
 """Ledgers of iterations."""
 
-from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
-from dreamfleet.coordinator.experiments.iteration.ledger import FinishedPhase, IterationLedger
+from dreamfleet.experiments.iteration.config import IterateConfig
+from dreamfleet.experiments.iteration.ledger import FinishedPhase, IterationLedger
 
 RUN = {"task": "dream", "population": 64, "collect_every": 0, "stages": ()}
 

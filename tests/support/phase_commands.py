@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from dreamfleet.coordinator.experiments.iteration.commands import Commands
-from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
-from dreamfleet.coordinator.experiments.iteration.layout import IterationFolder
+from dreamfleet.experiments.iteration.commands import Commands
+from dreamfleet.experiments.iteration.config import IterateConfig
+from dreamfleet.experiments.iteration.layout import IterationFolder
 from tests.support.ledgers import ledger
 
 LAYOUT = IterationFolder(Path("data"))

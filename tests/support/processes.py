@@ -10,9 +10,9 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 
 from dreamfleet.common.cli import command_line
+from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.host.processes import VerbProcess, command
-from dreamfleet.common.monitoring.client import Client
 
 ROOT = Path(__file__).parents[2]
 DEADLINE = 300  # seconds to wait for an event: many times the usual, since a machine may be busy

@@ -3,7 +3,7 @@
 import hashlib
 
 from dreamfleet.common.artifacts.controller import ControllerShape
-from dreamfleet.common.monitoring.status import (
+from dreamfleet.common.client.status import (
     EpisodeProgress,
     FailureStatus,
     GenerationStatus,

@@ -4,8 +4,8 @@ import dataclasses
 from contextlib import contextmanager
 from logging import getLogger
 
+from dreamfleet.common.client.status import WorkerCount
 from dreamfleet.common.host.error_counter import ErrorCounter
-from dreamfleet.common.monitoring.status import WorkerCount
 from dreamfleet.common.runs.records import StoredEvaluation
 from dreamfleet.common.transport.session import Network, open_session
 from dreamfleet.coordinator.dispatch.event_log import EventLog

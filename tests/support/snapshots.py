@@ -3,7 +3,7 @@
 import dataclasses
 from collections import Counter
 
-from dreamfleet.common.monitoring.status import read_document
+from dreamfleet.common.client.status import read_document
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.service.status import encode_part

@@ -11,7 +11,7 @@ import threading
 from contextlib import contextmanager
 from pathlib import Path
 
-from dreamfleet.coordinator.spawn.agent import process_start
+from dreamfleet.coordinator.addons.spawn.agent import process_start
 from tests.support.processes import DEADLINE, ROOT, free_port
 from tests.support.programs import find_program, require_programs
 

@@ -19,7 +19,7 @@ from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, class_from_fingerprint
 from dreamfleet.common.protocol.messages import MOST_TOGETHER, Kind, TaskSpec
-from dreamfleet.common.serialization.display import Displayed
+from dreamfleet.common.schema.display import Displayed
 from dreamfleet.worker.scoring.episode import EpisodeConfig, score, score_together
 from dreamfleet.worker.scoring.host_class_probe import REPEAT_LIMIT, HostClassProbe
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld, Rollout

@@ -19,8 +19,8 @@ from dreamfleet.common.printable import one_line
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import CountingDecoder, encode_json
 from dreamfleet.common.protocol.messages import MIN_SHARE, HelloReply, HelloRequest, Intervals, TaskSpec
+from dreamfleet.common.schema.validation import MAX_TEXT, MalformedError, from_plain
 from dreamfleet.common.security.anchor_key import anchor_proof
-from dreamfleet.common.serialization.validation import MAX_TEXT, MalformedError, from_plain
 from dreamfleet.common.transport.query import query_all, query_every_responder
 from dreamfleet.worker.tasks.registry import check_task_allowed
 

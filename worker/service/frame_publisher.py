@@ -15,7 +15,7 @@ import zenoh
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import encode, encoding
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, MAX_PART, TAG_BYTES, ViewFrame
-from dreamfleet.common.serialization.validation import MalformedError
+from dreamfleet.common.schema.validation import MalformedError
 from dreamfleet.worker.service.admission import Admission
 from dreamfleet.worker.service.frame_sampler import SampledFrame
 from dreamfleet.worker.service.job_group import JobWithVector

@@ -23,7 +23,7 @@ from dreamfleet.common.errors import BundleError, UsageError
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import Description
-from dreamfleet.common.serialization.display import DisplayedFields
+from dreamfleet.common.schema.display import DisplayedFields
 from dreamfleet.worker.tasks.policy import Driver, FlatPolicy
 
 __all__ = [

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import pygame
 
+from dreamfleet.common.client.mjpeg import write_part
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, open_output, reporting_write_errors
-from dreamfleet.common.monitoring.mjpeg import write_part
 from dreamfleet.worker.tools.canvas import Frame
 from dreamfleet.worker.tools.live_view import CaptionedFrame
 

@@ -8,7 +8,7 @@ from itertools import count
 from time import monotonic, sleep
 from typing import Any
 
-from dreamfleet.common.monitoring.live import LiveView
+from dreamfleet.common.client.live import LiveView
 from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
 from dreamfleet.worker.scoring.agents import Agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.monitoring.live import LiveFrame
+from dreamfleet.common.client.live import LiveFrame
 from dreamfleet.common.printable import plural, truncate
 from dreamfleet.common.worlds.score_words import profile_of
 from dreamfleet.worker.dream.parallel_dream import DreamContinuation

@@ -35,7 +35,7 @@ from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import read_regular
 from dreamfleet.common.host.packages import package_version
-from dreamfleet.common.serialization.validation import to_plain
+from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld
 from dreamfleet.worker.tasks.api import Preprocessing
 from dreamfleet.worker.training import train_mdnrnn, train_vae

@@ -18,7 +18,7 @@ from safetensors.torch import save
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.host.stop_signals import signals_deferred
-from dreamfleet.common.serialization.validation import MalformedError, from_plain, to_plain
+from dreamfleet.common.schema.validation import MalformedError, from_plain, to_plain
 from dreamfleet.worker.training.data.data_folder import explain_write_errors
 
 T = TypeVar("T")

@@ -22,7 +22,7 @@ from dreamfleet.common.artifacts.bundle import (
 )
 from dreamfleet.common.errors import BundleError
 from dreamfleet.common.files.archives import parse_array
-from dreamfleet.common.serialization.validation import to_plain
+from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.training.data.data_folder import explain_write_errors
 from dreamfleet.worker.training.unbundle import Models, restore_models

@@ -23,7 +23,7 @@ from dreamfleet.common.artifacts.bundle_store import describe_bundle
 from dreamfleet.common.errors import BundleError, DatasetError, UsageError
 from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.printable import one_line
-from dreamfleet.common.serialization.validation import MalformedError, from_plain
+from dreamfleet.common.schema.validation import MalformedError, from_plain
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.checkpoint import save_checkpoint
 from dreamfleet.worker.training.data.data_folder import explain_folder_errors

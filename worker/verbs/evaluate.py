@@ -69,7 +69,7 @@ def add_random_flags(parser: argparse.ArgumentParser) -> None:
 
 def named_agent(args: argparse.Namespace) -> Agent:
     """The agent of `--controller`; a note on stderr names the world of random actions."""
-    from dreamfleet.worker.baselines.agents import find_driver, is_random
+    from dreamfleet.worker.tools.drivers import find_driver, is_random
 
     arguments = parse_arguments("--environment", args.environment, ENVIRONMENT_EXAMPLE)
     options = {"environment": arguments} if arguments else {}
@@ -140,8 +140,8 @@ def judge(name: str, agent: Agent, seeds: tuple[int, ...], jobs: int) -> Evaluat
 
 def _choose_agent(args: argparse.Namespace) -> tuple[str, Agent]:
     """The name and controller to judge: from this disk, or from a live run."""
-    from dreamfleet.common.monitoring.client import Client
-    from dreamfleet.common.monitoring.elites import find_elite
+    from dreamfleet.common.client.client import Client
+    from dreamfleet.common.client.elites import find_elite
     from dreamfleet.common.runs.lookup import find_bundle_of
     from dreamfleet.worker.scoring.agents import make_agent
     from dreamfleet.worker.service.bundle_fetch import fetch_bundle_of

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
+from dreamfleet.common.cli.add_ons import add_on
 from dreamfleet.common.cli.global_config import add_global_flags, add_run_argument, resolve_network
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
@@ -18,7 +19,7 @@ from dreamfleet.common.runs.seeds import TEST
 from dreamfleet.worker.verbs.evaluate import add_random_flags, named_agent
 
 if TYPE_CHECKING:
-    from dreamfleet.common.monitoring.client import Client
+    from dreamfleet.common.client.client import Client
     from dreamfleet.worker.tools.frame_sinks import SendFrame
     from dreamfleet.worker.tools.live_sources import Driver
     from dreamfleet.worker.tools.live_view import CaptionedFrame
@@ -109,15 +110,13 @@ def _open_sink(args: argparse.Namespace) -> AbstractContextManager[SendFrame]:
 
 @contextmanager
 def _window(name: str) -> Iterator[SendFrame]:
-    from dreamfleet.worker.driving.picture_window import PictureWindow
-
-    with PictureWindow(name) as screen:
+    with add_on("picture-window")(name) as screen:
         yield lambda shown: screen.draw(None if shown is None else shown.picture)
 
 
 @contextmanager
 def _open_pictures(args: argparse.Namespace) -> Iterator[Iterator[CaptionedFrame | None]]:
-    from dreamfleet.common.monitoring.client import Client
+    from dreamfleet.common.client.client import Client
     from dreamfleet.common.runs.lookup import naming_the_stored_run
 
     if args.controller:
@@ -136,7 +135,7 @@ def _open_pictures(args: argparse.Namespace) -> Iterator[Iterator[CaptionedFrame
 def _worker_pictures(args: argparse.Namespace, client: Client) -> Iterator[Iterator[CaptionedFrame | None]]:
     """Pictures of what a worker of the run scores."""
     from dreamfleet.common.artifacts.bundle_store import BundleStore, default_cache
-    from dreamfleet.common.monitoring.live import LiveView
+    from dreamfleet.common.client.live import LiveView
     from dreamfleet.common.protocol.codec import CountingDecoder
     from dreamfleet.common.protocol.tasks import DREAM
     from dreamfleet.worker.service.bundle_fetch import fetch_bundle

@@ -61,8 +61,8 @@ def _reproduce(args: argparse.Namespace, path: Path, recorded: EvaluationReport)
 
 def _find_recorded_agent(args: argparse.Namespace, path: Path, recorded: EvaluationReport) -> Agent:
     from dreamfleet.common.runs.lookup import find_agent, find_bundle_of
-    from dreamfleet.worker.baselines.agents import is_random, make_random_agent
     from dreamfleet.worker.scoring.agents import make_agent
+    from dreamfleet.worker.tools.drivers import is_random, make_random_agent
 
     if is_random(recorded.name, args.runs_dir):
         return make_random_agent(recorded.name, recorded.task, json.loads(recorded.options or "{}"))

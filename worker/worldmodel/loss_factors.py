@@ -6,7 +6,7 @@ from dataclasses import field
 from typing import Any
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.serialization.validation import OPTIONAL
+from dreamfleet.common.schema.validation import OPTIONAL
 
 LEAST, MOST = 1e-6, 1e6  # beyond these, float32 loses the smaller part of the sum
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, EIGHT_BITS, SINGLE_PRECISION, Bundle
 from dreamfleet.common.artifacts.bundle_store import describe_bundle
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.serialization.validation import from_plain
+from dreamfleet.common.schema.validation import from_plain
 from dreamfleet.worker.worldmodel.choice_memory import ChoiceMemory
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, Prediction
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig

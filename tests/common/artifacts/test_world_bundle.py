@@ -18,8 +18,8 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.driving import WorldDriving
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts, WorldFacts
 from dreamfleet.common.errors import BundleError, ControllerError, UsageError
-from dreamfleet.worker.car_racing.task import WORLD
 from dreamfleet.worker.worldmodel.inference import PolicyStep
+from dreamfleet.worker.worlds.car_racing.task import WORLD
 from tests.support.bundles import write_world_bundle
 
 ABOUT = {

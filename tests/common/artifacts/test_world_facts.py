@@ -7,7 +7,7 @@ from dreamfleet.common.artifacts.actions import Continuous, grouped, one_hot
 from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts, WorldFacts
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.serialization.validation import MalformedError, from_plain, to_plain
+from dreamfleet.common.schema.validation import MalformedError, from_plain, to_plain
 
 ABOUT = {"packages": ("numpy", "vizdoom"), "horizon": 525, "frames_per_second": 9}
 ACTIONS = {

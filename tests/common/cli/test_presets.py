@@ -11,9 +11,10 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.coordinator.settings import presets as runs
 from dreamfleet.coordinator.settings.schedule import split_first_stage
 from dreamfleet.coordinator.verbs import coordinator
-from dreamfleet.worker.baselines import presets as baselines
+from dreamfleet.worker.addons.baselines import presets as baselines
+from dreamfleet.worker.addons.baselines import verb as baseline
 from dreamfleet.worker.training import presets
-from dreamfleet.worker.verbs import baseline, train
+from dreamfleet.worker.verbs import train
 from tests.support.processes import ROOT
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.files.archives import ArchiveLimits, DamagedArchiveError, read_arrays
-from dreamfleet.common.serialization.validation import to_plain
+from dreamfleet.common.schema.validation import to_plain
 from tests.support.bundles import npy
 from tests.support.processes import DEADLINE, ROOT
 

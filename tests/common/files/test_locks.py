@@ -8,7 +8,7 @@ import pytest
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.locks import folder_lock
 from dreamfleet.common.runs.run_lock import is_run_locked, run_lock
-from dreamfleet.coordinator.spawn.agent import Channel, FailedError, HostFolder
+from dreamfleet.coordinator.addons.spawn.agent import Channel, FailedError, HostFolder
 from dreamfleet.coordinator.storage import backup
 
 LOCKS = {

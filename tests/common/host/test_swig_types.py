@@ -9,8 +9,8 @@ import pytest
 @pytest.mark.parametrize(
     "script",
     [
-        "import dreamfleet.worker.car_racing.car",
-        "from dreamfleet.worker.gym.environments import make_environment; make_environment('LunarLander-v3', {})",
+        "import dreamfleet.worker.worlds.car_racing.car",
+        "from dreamfleet.worker.worlds.gym.environments import make_environment as make; make('LunarLander-v3', {})",
         "from dreamfleet.common.host.trusted_modules import import_trusted; import_trusted('Box2D', 'a test')",
     ],
     ids=["CarRacing", "gymnasium", "a module of the user"],

@@ -8,7 +8,7 @@ import pytest
 
 from dreamfleet.common.host import unseen_drawing
 from dreamfleet.common.host.unseen_drawing import describe_choice, draw_offscreen
-from dreamfleet.worker.gym.environments import make_environment
+from dreamfleet.worker.worlds.gym.environments import make_environment
 
 VARIABLES = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "PYGLET_HEADLESS")
 

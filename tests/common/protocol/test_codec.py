@@ -29,7 +29,7 @@ from dreamfleet.common.protocol.messages import (
     JobBatch,
     ResultBatch,
 )
-from dreamfleet.common.serialization.validation import SCHEMA, MalformedError
+from dreamfleet.common.schema.validation import SCHEMA, MalformedError
 from tests.support.mutations import mutations
 from tests.support.samples import JSON, MSGPACK, VECTOR_ID
 

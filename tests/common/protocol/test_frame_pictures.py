@@ -6,7 +6,7 @@ import pytest
 
 from dreamfleet.common.protocol.frame_pictures import pack_picture, unpack_picture
 from dreamfleet.common.protocol.messages import MAX_PART, MAX_PICTURE_SIDE, ViewFrame
-from dreamfleet.common.serialization.validation import MalformedError
+from dreamfleet.common.schema.validation import MalformedError
 from tests.support.samples import HEAD
 
 

@@ -19,7 +19,7 @@ from dreamfleet.common.runs.run_provenance import (
     read_run_settings,
     validation_seed_ranges,
 )
-from dreamfleet.common.serialization.validation import to_plain
+from dreamfleet.common.schema.validation import to_plain
 from tests.support.samples import SPEC
 
 SETTINGS = RunSettings(SPEC, ControllerShape(1, 3), 4, 2, 0.1, "diagonal", 1, 2, 3, confirm_episodes=8)

@@ -2,11 +2,11 @@
 
 import pytest
 
-from dreamfleet.common.monitoring.prometheus import exposition
-from dreamfleet.common.monitoring.status import WorkerCount, read_status
+from dreamfleet.common.client.status import WorkerCount, read_status
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.coordinator.dispatch.event_log import BLOCK, BLOCKS, EventLog
 from dreamfleet.coordinator.dispatch.fleet import DEPARTURE_GRACE, SILENT_AFTER
+from dreamfleet.coordinator.views.prometheus import exposition
 from tests.support.run_bench import A, B, Bench
 from tests.support.snapshots import SCORED, answered, score, snapshot_of
 

@@ -4,7 +4,7 @@ import pytest
 
 from dreamfleet.common.errors import InternalError
 from dreamfleet.common.protocol.messages import Result, ResultBatch
-from dreamfleet.common.serialization.validation import MAX_TEXT
+from dreamfleet.common.schema.validation import MAX_TEXT
 from dreamfleet.coordinator.dispatch.refusals import Refusal
 from tests.support.run_bench import SETTINGS, B, Bench
 

@@ -4,7 +4,7 @@ import dataclasses
 import socket
 from datetime import UTC, datetime, timedelta
 
-from dreamfleet.common.monitoring.status import EpisodeProgress, Throughput
+from dreamfleet.common.client.status import EpisodeProgress, Throughput
 from dreamfleet.common.security.credentials import Credentials
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.service.run_log import summary, worker_command

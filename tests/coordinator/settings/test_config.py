@@ -12,7 +12,7 @@ from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import Description
 from dreamfleet.common.runs.lookup import find_subspace
 from dreamfleet.common.runs.records import RunSettings, StageSettings
-from dreamfleet.common.serialization.validation import to_plain
+from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.coordinator.settings.config import RunConfig, config_values
 from dreamfleet.coordinator.settings.presets import PRESETS, find_preset
 from dreamfleet.coordinator.settings.start import StartPoint

@@ -9,7 +9,6 @@ import pytest
 from rich.console import Console
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.monitoring.status_panel import RunPanel
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.common.runs.records import StageSettings
@@ -21,6 +20,7 @@ from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConf
 from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.settings.fork import Fork
 from dreamfleet.coordinator.settings.limits import LimitsConfig
+from dreamfleet.coordinator.views.status_panel import RunPanel
 from tests.coordinator.evaluated import EVERY, Evaluated
 from tests.support.run_bench import SETTINGS
 from tests.support.samples import SPEC

@@ -11,15 +11,15 @@ from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts, WorldF
 from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.protocol.messages import OWN_END_VERSION, TaskSpec
 from dreamfleet.common.runs.records import RunSettings
-from dreamfleet.common.serialization.validation import to_plain
+from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.common.worlds import shipped
-from dreamfleet.coordinator.experiments.demo import DemoConfig
 from dreamfleet.coordinator.service.main import RunRequest, _resolve_settings
 from dreamfleet.coordinator.settings.config import RunConfig, config_values
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.settings.presets import find_preset
 from dreamfleet.coordinator.settings.start import StartPoint
+from dreamfleet.experiments.demo import DemoConfig
 from tests.support.bundles import write_world_bundle
 from tests.support.dreams import ABOUT, DRAWN, MODELS, VAE, WORLDS, write_bundle_of
 

@@ -7,10 +7,10 @@ from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, HostClasses, class_from_fingerprint
 from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.worker.car_racing import environment
 from dreamfleet.worker.scoring.host_class_probe import HostClassProbe, fixed_parameters
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tasks.policy import FlatPolicy
+from dreamfleet.worker.worlds.car_racing import environment
 from tests.support import tasks
 from tests.support.environments import ODD
 

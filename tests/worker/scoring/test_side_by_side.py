@@ -10,9 +10,9 @@ from dreamfleet import find_controller
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.worker.car_racing.task import CarRacingTask
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.worldmodel.mdnrnn_config import REWARDED
+from dreamfleet.worker.worlds.car_racing.task import CarRacingTask
 from tests.support.bundles import write_random_bundle
 from tests.support.variants import VARIANTS, vectors
 

@@ -8,7 +8,7 @@ from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import encode
 from dreamfleet.common.protocol.failures import MAX_CAUSE, Failure
 from dreamfleet.common.protocol.messages import Result, ResultBatch
-from dreamfleet.common.serialization.validation import MAX_TEXT
+from dreamfleet.common.schema.validation import MAX_TEXT
 from dreamfleet.common.transport.session import Network, open_session
 from dreamfleet.worker.service.admission import find_run_with_fewest_slots
 from dreamfleet.worker.service.outbox import Outbox

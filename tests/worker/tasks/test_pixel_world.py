@@ -12,7 +12,6 @@ from gymnasium import spaces
 
 from dreamfleet.common.artifacts.actions import Continuous
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.car_racing.preprocessing import BOX
 from dreamfleet.worker.tasks.drivers import HeldActions, UniformActions
 from dreamfleet.worker.tasks.pictures import (
     CropAndResize,
@@ -25,6 +24,7 @@ from dreamfleet.worker.tasks.pictures import (
     to_pixels,
 )
 from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.worlds.car_racing.preprocessing import BOX
 from tests.support.pixel_world import ACTIONS, DODGE, DODGE_TASK
 from tests.support.world_contract import check_world
 

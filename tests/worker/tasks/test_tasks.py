@@ -11,13 +11,13 @@ from dreamfleet.common.artifacts.car_racing_variants import FACTS, Variant
 from dreamfleet.common.errors import BundleError, ControllerError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import check_task, describe_task, is_self_describing
-from dreamfleet.worker.car_racing.preprocessing import BOX, RAW
 from dreamfleet.worker.scoring.episode import run_episode, score
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task, known_tasks
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+from dreamfleet.worker.worlds.car_racing.preprocessing import BOX, RAW
 from tests.support import tasks
 from tests.support.bundles import npy, write_random_bundle
 from tests.support.variants import VARIANTS

@@ -1,4 +1,4 @@
-"""Worlds that are recorded under options, and bundles that describe them. Tests worker/car_racing/task.py."""
+"""Worlds that are recorded under options, and bundles that describe them. Tests worker/worlds/car_racing/task.py."""
 
 import json
 from typing import ClassVar

@@ -1,5 +1,5 @@
 """Live frames of workers and of drives for the viewer, and their outputs.
-Tests frame_sinks.py, live_view.py and common/monitoring/mjpeg.py."""
+Tests frame_sinks.py, live_view.py and common/client/mjpeg.py."""
 
 import io
 import json
@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
+from dreamfleet.common.client.live import LiveFrame
+from dreamfleet.common.client.mjpeg import read_parts
 from dreamfleet.common.errors import DreamfleetError, UsageError
-from dreamfleet.common.monitoring.live import LiveFrame
-from dreamfleet.common.monitoring.mjpeg import read_parts
 from dreamfleet.common.protocol.codec import decode, encode
 from dreamfleet.common.protocol.frame_pictures import pack_picture
 from dreamfleet.common.protocol.messages import TaskSpec, ViewFrame

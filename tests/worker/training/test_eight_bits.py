@@ -14,7 +14,7 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import BundleError, ControllerError
 from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.common.serialization.validation import from_plain
+from dreamfleet.common.schema.validation import from_plain
 from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.training.eight_bits import write_eight_bit_bundle
 from dreamfleet.worker.training.unbundle import restore_models, unbundle

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from dreamfleet.common.errors import DatasetError, UsageError
-from dreamfleet.coordinator.experiments.iteration.config import IterateConfig
+from dreamfleet.experiments.iteration.config import IterateConfig
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble, make_manifest
 from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights

@@ -6,7 +6,7 @@ import pytest
 
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.cli.command_line import parse_flags
-from dreamfleet.common.cli.verb_runner import find_verb
+from dreamfleet.experiments.verb_runner import find_verb
 from tests.support.drives import write_drives
 
 SHORT = {"train vae": ["--updates", "1"], "train mdnrnn": ["--updates", "1"], "bundle": ["--recorded", "0"]}

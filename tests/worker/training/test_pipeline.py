@@ -1,6 +1,9 @@
 """From drives to a bundle: each stage by itself, and the pipeline of all of them.
-Tests assemble.py, encode.py, prediction_quality.py, train_mdnrnn.py, train_vae.py, worker/training/stages/encode.py,
-worker/verbs/encode.py and worker/verbs/pipeline.py."""
+
+Tests dreamfleet/experiments/pipeline.py, assemble.py, encode.py, prediction_quality.py, train_mdnrnn.py,
+train_vae.py, worker/training/stages/encode.py, worker/verbs/encode.py and
+dreamfleet/experiments/verbs/pipeline.py.
+"""
 
 import argparse
 import json
@@ -12,16 +15,16 @@ import pytest
 
 from dreamfleet.common.artifacts.bundle import WEIGHTS, Bundle
 from dreamfleet.common.errors import DatasetError, DreamfleetError, StoppedError, UsageError
-from dreamfleet.worker.training import pipeline as stages
+from dreamfleet.experiments import pipeline as stages
+from dreamfleet.experiments.pipeline import STAGES, check_vae
+from dreamfleet.experiments.verbs import pipeline
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble, load_quality, record_quality
 from dreamfleet.worker.training.checkpoint import load_weights
 from dreamfleet.worker.training.data.dataset import load_arrays
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.pipeline import STAGES, check_vae
 from dreamfleet.worker.training.prediction_quality import area_under_curve
 from dreamfleet.worker.training.presets import PRESETS, TrainConfig, find_preset
-from dreamfleet.worker.verbs import pipeline
 from dreamfleet.worker.worldmodel.inference import Encoder, PolicyStep
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig

@@ -8,8 +8,7 @@ import pytest
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.worker.car_racing.preprocessing import RAW
-from dreamfleet.worker.driving.scene import DreamScene
+from dreamfleet.worker.addons.driving.scene import DreamScene
 from dreamfleet.worker.scoring.agents import make_agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig, score
 from dreamfleet.worker.scoring.rollout import write_episode
@@ -25,6 +24,7 @@ from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.presets import PRESETS, TrainConfig
 from dreamfleet.worker.worldmodel import vae_config
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+from dreamfleet.worker.worlds.car_racing.preprocessing import RAW
 from tests.support.drives import write_drive, write_drives
 
 # SWIG warns as Box2D is imported, and an error there kills the process.

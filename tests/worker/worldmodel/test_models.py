@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.serialization.validation import to_plain
+from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.worker.worldmodel import mdnrnn_config as mdnrnn
 from dreamfleet.worker.worldmodel import vae_config as vae
 from dreamfleet.worker.worldmodel.inference import Decoder, DreamStep, Encoder, PolicyStep

@@ -1,5 +1,8 @@
 """Collecting rollouts: driven here, or imported from a run; a full disk and damaged rollouts name their files.
-Tests collect_config.py, pilot.py, rollouts.py, worker/car_racing/drivers.py and worker/car_racing/random_network.py."""
+
+Tests collect_config.py, pilot.py, rollouts.py, worker/worlds/car_racing/drivers.py and
+worker/worlds/car_racing/random_network.py.
+"""
 
 import errno
 import os
@@ -12,14 +15,14 @@ import pytest
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.errors import ControllerError, DatasetError, DreamfleetError, UsageError
 from dreamfleet.common.runs.lookup import find_controller
-from dreamfleet.worker.car_racing.drivers import DRIVERS, PushedDriver, UniformDriver
-from dreamfleet.worker.car_racing.random_network import RandomNetworkPolicy
 from dreamfleet.worker.scoring.rollout import DataWorld
 from dreamfleet.worker.training.data import collect as module
 from dreamfleet.worker.training.data.collect import collect, drive_episode, import_rollouts
 from dreamfleet.worker.training.data.collect_config import CollectConfig
 from dreamfleet.worker.training.data.dataset import episode_path, episode_paths, load_pictures, load_steps
 from dreamfleet.worker.training.data.pilot import Pilot
+from dreamfleet.worker.worlds.car_racing.drivers import DRIVERS, PushedDriver, UniformDriver
+from dreamfleet.worker.worlds.car_racing.random_network import RandomNetworkPolicy
 from tests.support import pixel_fakes
 from tests.support.drives import write_drive, write_drives
 

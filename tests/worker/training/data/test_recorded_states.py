@@ -9,8 +9,8 @@ import pytest
 
 from dreamfleet.common.artifacts.bundle import RECORDED_STATES, Bundle
 from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.worker.addons.inspection.page_builder import manifest_facts
 from dreamfleet.worker.dream.environment import Dream
-from dreamfleet.worker.inspection.page_builder import manifest_facts
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble
 from dreamfleet.worker.training.data.dataset import load_arrays

@@ -1,0 +1,1 @@
+"""Asking live runs from any host: status, batches, frames, and what follows from them."""

@@ -1,0 +1,130 @@
+"""A live run in a notebook: a card of its status that is replaced in place, as plain HTML without scripts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from html import escape
+
+from dreamfleet.common.client.eta import estimate_eta
+from dreamfleet.common.client.status import Status, WorkerStatus
+from dreamfleet.common.printable import format_number, one_line, plural, truncate
+from dreamfleet.common.protocol.function_values import fitness_word
+from dreamfleet.common.protocol.tasks import step_unit
+from dreamfleet.common.runs.records import StoredGeneration, format_mean, in_values
+
+MOST_WORKERS = 12  # in the card
+LONGEST = 160  # characters of a text in the card
+WIDTH, HEIGHT, LEFT, BOTTOM = 560, 120, 64, 18  # of the chart, pixels; room for its labels
+MARGIN = 8
+LINE = "rgba(128,128,128,.45)"
+CARD = f"font:14px/1.5 system-ui,sans-serif;max-width:600px;border:1px solid {LINE};border-radius:8px;padding:10px 16px"
+BAR = "height:6px;border-radius:3px;overflow:hidden;background:rgba(128,128,128,.25);margin:4px 0 8px"
+TABLE = "font:inherit;border-collapse:collapse;background:none"
+CELL = "text-align:left;padding:1px 16px 1px 0;font-weight:normal"
+
+
+def show_live(statuses: Iterable[Status]) -> bool:
+    """Show each status in the place of the one before, in a notebook's cell; elsewhere print a line of each.
+
+    Interrupting it ends the showing and not the run. Returns whether there was any status.
+    """
+    try:
+        from IPython.core.getipython import get_ipython
+        from IPython.display import display
+    except ModuleNotFoundError:
+        shell = None
+    else:
+        shell = get_ipython()
+    place, any_shown = None, False
+    try:
+        for status in statuses:
+            any_shown = True
+            if shell is None:
+                print(repr(status), flush=True)  # noqa: T201 - a terminal has no card
+            elif place is None:
+                place = display(status, display_id=True)  # type: ignore[no-untyped-call]
+            else:
+                place.update(status)
+    except KeyboardInterrupt:
+        return True
+    return any_shown
+
+
+def status_card(status: Status) -> str:
+    """The card: state, progress, the fitness of the last generations, and workers."""
+    task = status.settings.task
+    now, best = status.generation, in_values(status.confirmed or status.best, task)
+    shown = [in_values(each, task) for each in status.recent]
+    share = 100.0 if status.is_over else 100 * now.episodes_done / max(now.episodes, 1)
+    state = f"{status.state}: {status.why}" if status.why else status.state
+    reported = "" if best is None else f"{'confirmed' if status.confirmed else 'best evaluation'} {format_mean(best)}"
+    doing = [
+        f"generation {now.number:,}",
+        f"{now.episodes_done:,} of {plural(now.episodes, 'episode')}",
+        f"{status.throughput.steps_per_second:,.0f} {step_unit(task.task)}/s",
+        estimate_eta(status).description,
+    ]
+    facts = [*([plural(status.generations, "generation")] if status.is_over else doing), reported]
+    return (
+        f'<div style="{CARD}"><div><b>{_text(status.run)}</b> · {_text(task.task)}'
+        f'<span style="float:right">{_text(state)}</span></div>'
+        f"<div>{' · '.join(_text(each) for each in facts if each)}</div>"
+        f'<div style="{BAR}"><div style="height:100%;width:{share:.1f}%;background:#2a9d8f"></div></div>'
+        f"{fitness_chart(shown, fitness_word(task))}{_workers(status)}</div>"
+    )
+
+
+def fitness_chart(generations: Sequence[StoredGeneration], word: str = "fitness") -> str:
+    """The mean fitness of these generations as a line, between the worst and the best of each, as inline SVG."""
+    if len(generations) < 2:
+        return f'<div style="opacity:.7">the {word} is drawn from the second closed generation on</div>'
+    ends = [end for each in generations for end in (each.worst, each.best)]
+    low, high = min(ends), max(ends)
+    first, last = generations[0].number, generations[-1].number
+
+    def place(number: int, value: float) -> str:
+        x = LEFT + (WIDTH - LEFT - MARGIN) * (number - first) / (last - first)
+        y = MARGIN + (HEIGHT - BOTTOM - 2 * MARGIN) * (high - value) / ((high - low) or 1.0)
+        return f"{x:.1f},{y:.1f}"
+
+    line = " ".join(place(each.number, each.mean) for each in generations)
+    band = [place(each.number, each.best) for each in generations]
+    band += [place(each.number, each.worst) for each in reversed(generations)]
+    label = 'font-size="11" fill="currentColor" opacity=".75"'
+    bottom = HEIGHT - BOTTOM - MARGIN
+    return (
+        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" style="width:100%;max-width:{WIDTH}px;display:block" role="img" '
+        f'aria-label="{word} over generations"><polygon points="{" ".join(band)}" fill="#2a9d8f" opacity=".2"/>'
+        f'<polyline points="{line}" fill="none" stroke="#2a9d8f" stroke-width="2"/>'
+        f'<line x1="{LEFT}" y1="{MARGIN}" x2="{LEFT}" y2="{bottom}" stroke="currentColor" opacity=".4"/>'
+        f'<text x="{LEFT - 5}" y="{MARGIN + 8}" text-anchor="end" {label}>{_text(format_number(high))}</text>'
+        f'<text x="{LEFT - 5}" y="{bottom}" text-anchor="end" {label}>{_text(format_number(low))}</text>'
+        f'<text x="{LEFT}" y="{HEIGHT - 4}" {label}>generation {first:,}</text>'
+        f'<text x="{WIDTH - MARGIN}" y="{HEIGHT - 4}" text-anchor="end" {label}>{last:,}</text>'
+        f'<text x="{(LEFT + WIDTH) / 2}" y="{HEIGHT - 4}" text-anchor="middle" {label}>'
+        f"{word}: mean, worst to best</text></svg>"
+    )
+
+
+def _workers(status: Status) -> str:
+    present = [each for each in status.worker_list if each.state in ("present", "silent")]
+    rows = "".join(map(_worker, present[:MOST_WORKERS]))
+    more = status.workers.present - min(len(present), MOST_WORKERS)
+    head = f"{plural(status.workers.present, 'worker')}, {plural(status.slots, 'slot')}"
+    return (
+        f'<div style="margin-top:6px">{_text(head)}</div><table style="{TABLE}">{rows}</table>'
+        f"{f'<div>and {more} more</div>' if more > 0 and present else ''}"
+    )
+
+
+def _worker(worker: WorkerStatus) -> str:
+    cells = (
+        worker.name, plural(worker.slots, "slot"), f"{plural(worker.finished, 'job')} finished",
+        f"{worker.steps_per_second:,.0f} steps/s", "" if worker.state == "present" else worker.state,
+    )  # fmt: skip
+    columns = "".join(f'<td style="{CELL}">{_text(cell)}</td>' for cell in cells)
+    return f"<tr>{columns}</tr>"
+
+
+def _text(text: str) -> str:
+    return escape(truncate(one_line(text), LONGEST))

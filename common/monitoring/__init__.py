@@ -1,1 +1,0 @@
-"""The status of live runs: querying it, and views of it."""

@@ -1,0 +1,1 @@
+"""What a run can do without: each add-on registers itself by entry points."""

@@ -1,0 +1,176 @@
+"""The columns that the charts plot for a run, live or stored: generations and evaluations. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from dreamfleet.common.client.elites import exploration_note
+from dreamfleet.common.printable import plural
+from dreamfleet.common.protocol.function_values import fitness_word, is_minimised, spans_decades, value_of
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.protocol.tasks import DREAM, is_function_task
+from dreamfleet.common.runs.effort import Effort, GenerationEffort
+from dreamfleet.common.runs.records import (
+    RunSettings,
+    StoredConfirmation,
+    StoredEvaluation,
+    StoredGeneration,
+    in_values,
+)
+from dreamfleet.common.runs.stages import begun_stages, describe_steps, join_distinct
+
+MOST_POINTS = 600  # sent and drawn at most: a screen shows no more
+T = TypeVar("T")
+Quartiles = Mapping[int, tuple[float, float]]  # by generation
+
+
+@dataclass(frozen=True)
+class RunData:
+    """A run's settings and results."""
+
+    settings: RunSettings
+    history: Sequence[StoredGeneration]
+    evaluations: Sequence[StoredEvaluation]
+    confirmed: StoredConfirmation | None
+    episode_limit: int | None = None  # steps; of the environment itself
+
+
+def downsample(rows: Sequence[T]) -> Sequence[T]:
+    """Every k-th row and the last one, at most `MOST_POINTS`."""
+    step = sampling_step(len(rows))
+    kept = rows[::step]
+    return [*kept, rows[-1]] if (len(rows) - 1) % step else kept
+
+
+def sampling_step(rows: int) -> int:
+    """The k of `downsample` for so many rows."""
+    return max(math.ceil(rows / (MOST_POINTS - 1)), 1) if rows > MOST_POINTS else 1
+
+
+def curves(
+    data: RunData, quartiles: Quartiles | None, spent: Sequence[Effort] | None = None, word: str = "seed"
+) -> dict[str, Any]:
+    """The columns as a JSON document; `spent` is the effort up to each generation, including the run's start.
+
+    Without quartiles the band is one standard deviation around the mean; `band` names which one it is. `word` names a
+    seed of an evaluation.
+    """
+    settings, task = data.settings, data.settings.task
+    rows = [in_values(each, task) for each in downsample(data.history)]
+    dreamt = settings.task.task == DREAM
+    stages = begun_stages(settings, data.history, data.evaluations)
+    steps = join_distinct(
+        describe_steps(each.stage.horizon, each.stage.driven, dreamt=dreamt, limit=data.episode_limit)
+        for each in stages
+    )
+    band = _band(rows, quartiles, task)
+    is_log = (
+        is_minimised(task) and bool(rows) and spans_decades([end for each in rows for end in (each.best, each.mean)])
+    )
+    drawn: dict[str, Any] = {
+        "step": sampling_step(len(data.history)),
+        "generation": [each.number for each in rows],
+        "mean": [_rounded(each.mean) for each in rows],
+        "best": [_rounded(each.best) for each in rows],
+        "low": [_rounded(low) for low, _ in band],
+        "high": [_rounded(high) for _, high in band],
+        "band": "± 1 standard deviation" if quartiles is None else "the middle half of the candidates",
+        "sigma": [_rounded(each.sigma) for each in rows],
+        "evaluations": _evaluations(data, spent),
+        "confirmed": None if data.confirmed is None else _confirmed(data.confirmed, data, spent),
+        "stages": [each.since for each in stages[1:]],
+        "dreamt": dreamt,
+        "fitness_axis": _value_axis(task, is_log=is_log) if is_function_task(task.task) else f"fitness over {steps}",
+        "score_word": fitness_word(task),
+        "log": is_log,
+        "score_axis": _value_axis(task, is_log=is_log)
+        if is_function_task(task.task)
+        else f"score{' in reality' * dreamt}, mean of {plural(settings.evaluation_episodes, word)}",
+        "coming": _coming(settings),
+        "note": exploration_note(settings),
+    }
+    if spent is not None:
+        drawn |= _effort_columns([spent[each.number] for each in rows if each.number < len(spent)])
+    return drawn
+
+
+def _value_axis(task: TaskSpec, *, is_log: bool) -> str:
+    goal = "smaller is better" if is_minimised(task) else "larger is better"
+    return f"value: {goal}{' (log scale)' if is_log else ''}"
+
+
+def _coming(settings: RunSettings) -> str:
+    """What an empty chart will show."""
+    every = settings.evaluate_every
+    mean = f", and the evaluated mean {'of each generation' if every == 1 else f'every {every} generations'}"
+    return f"Once the first generation closes: the mean, the best and the spread of its candidates{mean * bool(every)}."
+
+
+def cumulative_effort(start: Effort, efforts: Iterable[GenerationEffort], generations: int) -> list[Effort]:
+    """The total effort after each of so many generations, without that of confirmations."""
+    by_generation: dict[int, Effort] = {}
+    for each in efforts:
+        if not each.confirming:
+            by_generation[each.generation] = by_generation.get(each.generation, Effort()) + each.effort
+    found, total = [], start
+    for number in range(generations):
+        total += by_generation.get(number, Effort())
+        found.append(total)
+    return found
+
+
+def _band(rows: Sequence[StoredGeneration], quartiles: Quartiles | None, task: TaskSpec) -> list[tuple[float, float]]:
+    """The band's ends of rows in values; quartiles are of fitness."""
+    if quartiles is None:
+        ends = [sorted((each.best, each.worst)) for each in rows]
+        return [(max(each.mean - each.std, low), min(each.mean + each.std, high))
+                for each, (low, high) in zip(rows, ends, strict=True)]  # fmt: skip
+    fitness = [quartiles.get(each.number) for each in rows]
+    return [(each.mean, each.mean) if pair is None else tuple(sorted(value_of(end, task) for end in pair))  # type: ignore[misc]
+            for each, pair in zip(rows, fitness, strict=True)]  # fmt: skip
+
+
+def _evaluations(data: RunData, spent: Sequence[Effort] | None) -> dict[str, Any]:
+    rows = downsample(data.evaluations)
+    columns: dict[str, Any] = {
+        "generation": [each.generation for each in rows],
+        "mean": [_rounded(value_of(each.mean, data.settings.task)) for each in rows],
+        "error": [_rounded(each.error) for each in rows],
+        "episodes": [each.episodes for each in rows],
+    }
+    if spent is not None:
+        columns |= _effort_columns([_effort_at(spent, each.generation) for each in rows])
+    return columns
+
+
+def _confirmed(found: StoredConfirmation, data: RunData, spent: Sequence[Effort] | None) -> dict[str, Any]:
+    point = {
+        "generation": found.generation,
+        "mean": _rounded(value_of(found.mean, data.settings.task)),
+        "error": _rounded(found.error),
+        "episodes": found.episodes,
+    }
+    if spent is None:
+        return point
+    columns = _effort_columns([_effort_at(spent, len(data.history) - 1)])
+    return point | {name: column[0] for name, column in columns.items()}
+
+
+def _effort_at(spent: Sequence[Effort], generation: int) -> Effort:
+    return spent[min(generation, len(spent) - 1)] if spent and generation >= 0 else Effort()
+
+
+def _effort_columns(efforts: Sequence[Effort]) -> dict[str, list[float]]:
+    return {
+        "steps": [each.steps for each in efforts],
+        "core_hours": [float(f"{each.core_hours:.6g}") for each in efforts],
+    }
+
+
+def _rounded(value: float | None) -> float | None:
+    """The number with 5 digits; `None` for NaN and infinity, and for no number."""
+    short = math.nan if value is None else float(f"{value:z.5g}")
+    return short if math.isfinite(short) else None

@@ -1,0 +1,40 @@
+"""`dreamfleet dashboard`: a page about live and past runs."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from dreamfleet.common.cli.config import add_flags, load
+from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
+from dreamfleet.common.host.reports import ADDRESS, report
+from dreamfleet.coordinator.addons.dashboard.config import DashboardConfig
+
+SUMMARY = "serve a read-only web page about live runs and those on this disk"
+EXTRAS = ("dashboard",)
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    add_global_flags(parser, "connect", "runs_dir")
+    parser.add_argument("--run", help="follow only this run (default: every live one)")
+    add_flags(parser, DashboardConfig)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve the page until Ctrl-C."""
+    config = load(DashboardConfig, "dashboard", **args.sources)
+    from dreamfleet.coordinator.addons.dashboard.live_runs import Watcher
+    from dreamfleet.coordinator.addons.dashboard.server import serve
+    from dreamfleet.coordinator.addons.dashboard.view_processes import ViewProcesses
+
+    network = resolve_network(args)
+    joined = () if args.global_config.join is None else ("--join", str(args.global_config.join))
+    views = ViewProcesses(("--connect", *network.connect, *joined), args.runs_dir, config.views)
+    serve(config, Watcher(network, args.run, args.runs_dir), views, args.runs_dir, _print_address)
+    return 0
+
+
+def _print_address(address: str) -> None:
+    print(f"the dashboard is at {address}", file=sys.stderr, flush=True)
+    report(ADDRESS, address)

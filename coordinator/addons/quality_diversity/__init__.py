@@ -1,0 +1,1 @@
+"""Many kinds of behaviour: optimisers that keep an archive, and its picture."""

@@ -1,0 +1,1 @@
+"""A run's numbers sent to other programs while it goes on."""

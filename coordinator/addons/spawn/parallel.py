@@ -1,0 +1,129 @@
+"""All hosts in parallel: a thread each, a failure is a row of the table, and Ctrl-C stops them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from contextlib import ExitStack
+from functools import partial
+
+from dreamfleet.common.errors import DreamfleetError, StoppedError
+from dreamfleet.common.host.stop_signals import Stop, stop_on_signals
+from dreamfleet.coordinator.addons.spawn.config import Host
+from dreamfleet.coordinator.addons.spawn.remote_host import FAILED, FleetAddress, HostStatus, RemoteHost
+
+log = logging.getLogger(__name__)
+POLL_INTERVAL = 0.2  # seconds between checks for a stop
+
+OnStatuses = Callable[[Sequence[HostStatus]], None]
+OnLogLine = Callable[[str, str], None]
+"""A host's name and a line of its worker's log."""
+
+
+def check(hosts: Sequence[Host], fleet_address: FleetAddress) -> list[HostStatus]:
+    """Describe each host; changes nothing."""
+    return _run_on_all(hosts, fleet_address, RemoteHost.check)
+
+
+def end(hosts: Sequence[Host], *, all_workers: bool, now: bool, keep: bool) -> list[HostStatus]:
+    """End the worker of each host, or all workers there, and remove their files."""
+    return _run_on_all(hosts, FleetAddress(()), partial(RemoteHost.end, all_workers=all_workers, now=now, keep=keep))
+
+
+def bring_up(
+    hosts: Sequence[Host], fleet_address: FleetAddress, on_statuses: OnStatuses, on_log_line: OnLogLine | None
+) -> list[HostStatus]:
+    """Start a worker on each host. With `on_log_line` or a tunnel, return only when they end or at Ctrl-C.
+
+    Calls `on_statuses` when all are up and when they ended, `on_log_line` for each line of a log.
+    """
+    with stop_on_signals() as stop, ExitStack() as stack:
+        remote_hosts = _open_remote_hosts(hosts, fleet_address, stack, on_log_line or _ignore_line)
+        rows = _run_in_threads(remote_hosts, RemoteHost.bring_up, stop, RemoteHost.close)
+        if stop():
+            raise StoppedError(
+                "interrupted: some workers may run; the same command continues, and `dreamfleet down` ends them"
+            )
+        on_statuses(rows)
+        up = [remote_host for remote_host, row in zip(remote_hosts, rows, strict=True) if row.state != FAILED]
+        held = [remote_host for remote_host in up if remote_host.forwards]
+        if held:
+            log.info("%s: the worker reaches its coordinator through this command, and ends with it (Ctrl-C)",
+                     ", ".join(remote_host.host.name for remote_host in held))  # fmt: skip
+        if watched := up if on_log_line else held:
+            then = dict(
+                zip(
+                    watched, _run_in_threads(watched, _follow_until_ended, stop, RemoteHost.stop_following), strict=True
+                )
+            )
+            rows = [then.get(remote_host, row) for remote_host, row in zip(remote_hosts, rows, strict=True)]
+            on_statuses(rows)
+    return rows
+
+
+def _follow_until_ended(remote_host: RemoteHost) -> HostStatus:
+    """Follow a worker until it ends or the command stops, which ends a worker that uses our tunnel."""
+    row = remote_host.follow()
+    if row is None and not remote_host.forwards:
+        return HostStatus(remote_host.host.name, "running", "continues without this command; `dreamfleet down` ends it")
+    ended = remote_host.end(all_workers=False, now=False, keep=True) if remote_host.forwards else None
+    return row or ended or HostStatus(remote_host.host.name, "ended", "")
+
+
+def _run_on_all(
+    hosts: Sequence[Host], fleet_address: FleetAddress, do: Callable[[RemoteHost], HostStatus]
+) -> list[HostStatus]:
+    with stop_on_signals() as stop, ExitStack() as stack:
+        rows = _run_in_threads(
+            _open_remote_hosts(hosts, fleet_address, stack, _ignore_line), do, stop, RemoteHost.close
+        )
+        if stop():
+            raise StoppedError("interrupted: the same command continues")
+        return rows
+
+
+def _open_remote_hosts(
+    hosts: Sequence[Host], fleet_address: FleetAddress, stack: ExitStack, on_log_line: OnLogLine
+) -> list[RemoteHost]:
+    remote_hosts = [
+        RemoteHost(each, fleet_address, partial(log.info, "%s %s", each.name), partial(on_log_line, each.name))
+        for each in hosts
+    ]
+    for remote_host in remote_hosts:
+        stack.callback(remote_host.close)
+    return remote_hosts
+
+
+def _run_in_threads(
+    remote_hosts: Sequence[RemoteHost],
+    do: Callable[[RemoteHost], HostStatus],
+    stop: Stop,
+    leave: Callable[[RemoteHost], None],
+) -> list[HostStatus]:
+    """The status of `do` for each host. The first Ctrl-C calls `leave` for each, the second closes all connections."""
+    left = False
+    with ThreadPoolExecutor(max(len(remote_hosts), 1)) as pool:
+        futures = [pool.submit(_status_of, remote_host, do) for remote_host in remote_hosts]
+        try:
+            while wait(futures, POLL_INTERVAL, FIRST_EXCEPTION).not_done:
+                if stop() and not left:
+                    left = True
+                    for remote_host in remote_hosts:
+                        leave(remote_host)
+        except BaseException:
+            for remote_host in remote_hosts:
+                remote_host.close()
+            raise
+        return [each.result() for each in futures]
+
+
+def _status_of(remote_host: RemoteHost, do: Callable[[RemoteHost], HostStatus]) -> HostStatus:
+    try:
+        return do(remote_host)
+    except DreamfleetError as error:
+        return HostStatus(remote_host.host.name, FAILED, str(error))
+
+
+def _ignore_line(_host: str, _line: str) -> None:
+    """Drop a line of a log."""

@@ -1,1 +1,0 @@
-"""Several verbs in sequence: the demonstration, iteration, contrast."""

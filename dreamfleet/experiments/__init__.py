@@ -1,0 +1,1 @@
+"""Experiments, above both sides: several runs in sequence or side by side, and one run of your program."""

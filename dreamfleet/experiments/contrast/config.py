@@ -1,0 +1,108 @@
+"""A contrast: kinds of MDN-RNNs, seeds, and how each is trained and evolved in. Pure."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from dreamfleet.common.cli.model_commands import Words, split_flags, with_settings
+from dreamfleet.common.cli.presets import default_run_preset
+from dreamfleet.common.errors import UsageError
+from dreamfleet.experiments.iteration.config import RESERVED_FLAGS
+
+# Equal parameters: 422,625 and 421,277 of 32 latents and three actions.
+KINDS = (("plain", ""), ("attentive", "--set window=8 hidden=236"))
+SEEDS = (1, 2, 3)
+RUN_FLAGS = "--generations 32"
+_NAME = re.compile(r"[a-z][a-z0-9-]{0,30}")
+MOST_SEED = 2**31 - 1
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One kind with one seed."""
+
+    kind: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """The name of its folder and its run."""
+        return f"{self.kind}-{self.seed}"
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """Kinds by name with their flags of `train mdnrnn`, the seeds that each is trained with, and flags for all."""
+
+    kinds: tuple[tuple[str, str], ...] = KINDS
+    seeds: tuple[int, ...] = SEEDS
+    mdnrnn_flags: str = ""
+    run_flags: str = RUN_FLAGS
+
+    def __post_init__(self) -> None:
+        names = [name for name, _ in self.kinds]
+        if len(names) < 2:
+            raise UsageError("give --kind NAME FLAGS twice or more: each is compared with the first")
+        for name in names:
+            if not _NAME.fullmatch(name):
+                raise UsageError(f"--kind {name!r}: a name has only a-z, 0-9 and '-', and begins with a letter")
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise UsageError(f"--kind {twice[0]} is given twice")
+        if not self.seeds or len(set(self.seeds)) < len(self.seeds):
+            raise UsageError("--seeds must be different ones, one at least")
+        if wrong := [seed for seed in self.seeds if not 0 <= seed <= MOST_SEED]:
+            raise UsageError(f"--seeds must be from 0 to {MOST_SEED}, not {wrong[0]}")
+        for flag, text in (
+            *((f"--kind {name}", text) for name, text in self.kinds),
+            ("--mdnrnn-flags", self.mdnrnn_flags),
+        ):
+            split_flags(flag, text, "lab contrast", RESERVED_FLAGS)
+
+    @property
+    def trials(self) -> tuple[Trial, ...]:
+        """All trials, seed by seed, so that an unfinished contrast compares kinds evenly too."""
+        return tuple(Trial(name, seed) for seed in self.seeds for name, _ in self.kinds)
+
+    def training_flags(self, trial: Trial) -> Words:
+        """The flags of a trial's `train mdnrnn` beside its folder and seed; of one given twice the kind's counts."""
+        own = dict(self.kinds)[trial.kind]
+        return (*split_flags("--mdnrnn-flags", self.mdnrnn_flags), *split_flags("--kind", own))
+
+    def run_flags_in(self, world: str) -> Words:
+        """The flags that all trials' `coordinator` have in common, in the dream of this task's world."""
+        return ("--preset", default_run_preset(world), *split_flags("--run-flags", self.run_flags))
+
+    def merge_settings(self, kept: dict[str, Any]) -> dict[str, Any]:
+        """The settings that a folder begun with `kept` has from now on: kinds and seeds are added, none is changed.
+
+        `UsageError` if its finished trials could not be compared with new ones.
+        """
+        mine, kinds = asdict(self), dict(self.kinds)
+        known: dict[str, str] = dict(kept.get("kinds", ()))
+        differing: list[str] = [
+            name for name in ("mdnrnn_flags", "run_flags") if name in kept and kept[name] != mine[name]
+        ]
+        differing += [
+            f"kind {name}" for name, flags in known.items() if _settings(kinds.get(name, flags)) != _settings(flags)
+        ]
+        if differing:
+            raise UsageError(f"it was begun with other {', '.join(differing)}: omit that, or begin in another --out")
+        seeds = tuple(dict.fromkeys((*kept.get("seeds", ()), *self.seeds)))
+        return {**mine, "kinds": tuple((known | kinds).items()), "seeds": seeds}
+
+
+def _settings(flags: str) -> Words:
+    """What a kind's flags set, in whichever of their two forms.
+
+    >>> _settings("--window 8 --hidden 236") == _settings("--set window=8 hidden=236")
+    True
+    """
+    return tuple(word for word in with_settings(split_flags("--kind", flags)) if word != "--set")
+
+
+def parse_kinds(given: Sequence[Sequence[str]]) -> tuple[tuple[str, str], ...]:
+    """The kinds of `--kind NAME FLAGS`, in order; by default the two that ship."""
+    return tuple((name, flags) for name, flags in given) or KINDS

@@ -1,0 +1,147 @@
+"""A contrast's trials: each trains an MDN-RNN, freezes it and evolves in it. A killed one resumes to the same end."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.cli import model_commands
+from dreamfleet.common.cli.model_commands import Words
+from dreamfleet.common.cli.presets import default_run_preset
+from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.files.regular_files import is_folder, path_exists, read_text
+from dreamfleet.common.host.stop_signals import Stop
+from dreamfleet.common.runs.records import best_evaluation
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.experiments.contrast.config import Contrast, Trial
+from dreamfleet.experiments.contrast.summary import TrialResult
+from dreamfleet.experiments.local_run import LocalFleet, evolve, has_begun, has_ended, task_flags
+from dreamfleet.experiments.verb_runner import ProcessRunner
+
+# Parts of the data set that trials link to. Its preset is none: a kind's flags change the preset of its world.
+SHARED = ("episodes", "encoded", "vae.safetensors")
+SETTINGS = "contrast.json"
+LOCK = "contrast.lock"
+MOST_BYTES = 1 << 20
+
+
+class Trials:
+    """All trials of a contrast in one folder, which the caller has locked."""
+
+    def __init__(
+        self, contrast: Contrast, data: Path, folder: Path, local_fleet: Callable[[], LocalFleet], stop: Stop
+    ) -> None:
+        self._contrast, self._data, self._folder = contrast, data, folder
+        self._local_fleet, self._stop, self._runner = local_fleet, stop, ProcessRunner(stop)
+        self._runs = folder / "runs"
+        self._parameters: dict[Trial, int] = {}
+
+    def begin(self) -> None:
+        """Check data and settings before hours of work, and keep the settings."""
+        for name in SHARED:
+            if not path_exists(self._data / name):
+                raise DatasetError(f"{self._data} has no {name}: collect, train the VAE and encode there first")
+        if not any((self._data / "encoded").iterdir()):
+            raise DatasetError(f"{self._data} has no encoded drives: dreamfleet encode --data {self._data}")
+        path = self._folder / SETTINGS
+        begun, data = _read_settings(path), str(self._data.resolve())
+        if begun.get("data", data) != data:
+            raise UsageError(f"{self._folder} was begun on {begun['data']}: begin in another --out")
+        kept = self._contrast.merge_settings(begun)
+        self._parameters = {trial: self._count_parameters(trial) for trial in self._contrast.trials}
+        _write_settings(path, {**kept, "data": data})
+
+    def do(self, trial: Trial, on_step: Callable[[str], None]) -> TrialResult:
+        """Do what is left of a trial; `on_step` is called as each part begins."""
+        self._link_data(trial)
+        model = self._model_path(trial)
+        if not path_exists(model):
+            on_step(f"{trial.name}: train mdnrnn")
+            self._runner.run_for_json(self._training_command(trial), self._log_path(trial, "mdnrnn"))
+            on_step(f"{trial.name}: bundle")
+            words = model_commands.bundle(self._trial_folder(trial), model)
+            self._runner.run_for_json(words, self._log_path(trial, "bundle"))
+        if not has_ended(self._runs, trial.name):
+            local_fleet = self._local_fleet()
+            world = Bundle.open(model).manifest.task
+            on_step(f"{trial.name}: evolve in the dream of {world}, from the preset {default_run_preset(world)}")
+            local_fleet = replace(local_fleet, worker=(*local_fleet.worker, *task_flags(world)))
+            words = self._run_command(trial, local_fleet, world)
+            evolve(trial.name, words, local_fleet, self._trial_folder(trial) / "logs", self._stop)
+        return self._outcome(trial)
+
+    def _count_parameters(self, trial: Trial) -> int:
+        """How many parameters its model has; `UsageError` for wrong training flags."""
+        self._link_data(trial)
+        words = (*self._training_command(trial), "--summary")
+        return int(self._runner.run_for_json(words, self._log_path(trial, "summary"))["parameters"])
+
+    def _trial_folder(self, trial: Trial) -> Path:
+        return self._folder / trial.name
+
+    def _model_path(self, trial: Trial) -> Path:
+        return self._trial_folder(trial) / f"{trial.name}.zip"
+
+    def _log_path(self, trial: Trial, name: str) -> Path:
+        return self._trial_folder(trial) / "logs" / f"{name}.log"
+
+    def _link_data(self, trial: Trial) -> None:
+        """Make the trial's own data folder, for the verbs that train, with links to the one data set."""
+        folder = self._trial_folder(trial)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in SHARED:
+            source = (self._data / name).resolve()
+            if source.exists() and not path_exists(folder / name):
+                (folder / name).symlink_to(source, target_is_directory=is_folder(source))
+
+    def _training_command(self, trial: Trial) -> Words:
+        return model_commands.train(
+            "mdnrnn", self._trial_folder(trial), *self._contrast.training_flags(trial), seed=trial.seed
+        )
+
+    def _run_command(self, trial: Trial, local_fleet: LocalFleet, world: str) -> Words:
+        if has_begun(self._runs, trial.name):
+            return model_commands.resume_run(trial.name, self._runs, local_fleet.listen)
+        return model_commands.begin_run(
+            trial.name, self._runs, local_fleet.listen, *local_fleet.coordinator, *self._contrast.run_flags_in(world),
+            world_model=self._model_path(trial), seed=trial.seed,
+        )  # fmt: skip
+
+    def _outcome(self, trial: Trial) -> TrialResult:
+        quality = Bundle.open(self._model_path(trial)).manifest.provenance.get("quality", {})
+        figures = {name: float(value) for name, value in quality.items() if isinstance(value, (int, float))}
+        trained = TrialResult(trial.kind, trial.seed, self._parameters[trial], figures)
+        with open_run(self._runs, trial.name) as run:
+            confirmed = run.confirmation()
+            judged = confirmed or best_evaluation(run.evaluations())
+        if judged is None:
+            return trained
+        return replace(
+            trained, score=judged.mean, error=judged.error, tracks=judged.episodes, confirmed=confirmed is not None
+        )
+
+
+def _read_settings(path: Path) -> dict[str, Any]:
+    """The settings that the folder was begun with; nothing if it is new."""
+    try:
+        found = json.loads(read_text(path, MOST_BYTES))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, RecursionError) as error:
+        raise DatasetError(f"{path} is damaged ({error}); put it back from a copy") from error
+    if not isinstance(found, dict):
+        raise DatasetError(f"{path} is damaged; put it back from a copy")
+    return found
+
+
+def _write_settings(path: Path, content: Any) -> None:
+    try:
+        with atomic_write(path) as file:
+            file.write((json.dumps(content, indent=1) + "\n").encode())
+    except OSError as error:
+        raise DatasetError(f"cannot write {path}: {error.strerror}; make room, or choose another --out") from error

@@ -1,0 +1,112 @@
+"""What a sweep keeps on disk, so that it can be resumed after everything was killed: its settings, before its runs."""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.files.atomic_write import atomic_write, reporting_unwritable_folder
+from dreamfleet.common.files.regular_files import path_exists, read_text
+from dreamfleet.common.protocol.keys import check_run_name
+from dreamfleet.common.schema.validation import OPTIONAL, MalformedError, from_plain, to_plain
+from dreamfleet.experiments.local_run import has_begun
+from dreamfleet.experiments.sweep.options import SweepOptions
+from dreamfleet.experiments.sweep.plan import Sweep
+
+SUFFIX = ".sweep"
+SETTINGS, LOCK, FIGURE = "sweep.json", "sweep.lock", "learning.png"
+MOST_BYTES = 4 << 20
+
+
+@dataclass(frozen=True)
+class VariedSetting:
+    """A setting that varies, and its values as texts."""
+
+    setting: str
+    values: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class StoredSweep:
+    """The settings of a sweep as they are stored."""
+
+    name: str
+    vary: tuple[VariedSetting, ...]
+    flags: tuple[str, ...]
+    tasks: tuple[str, ...]  # that its workers announce
+    options: SweepOptions = field(default=SweepOptions(), metadata=OPTIONAL)  # of the last time that it was served
+
+
+class SweepFolder:
+    """The folder of a sweep's own files, beside those of its runs; with its dot, its name cannot be a run's."""
+
+    def __init__(self, runs_dir: Path, name: str) -> None:
+        self.runs_dir, self.path = runs_dir, runs_dir / f"{name}{SUFFIX}"
+        self._name = name
+
+    @property
+    def lock(self) -> Path:
+        """The lock file of whoever serves the sweep."""
+        return self.path / LOCK
+
+    def check_new(self, sweep: Sweep) -> None:
+        """`UsageError` if the sweep, or a run of one of its names, exists."""
+        if path_exists(self.path / SETTINGS):
+            raise UsageError(
+                f"sweep {self._name} exists in {self.runs_dir}: continue it with --resume {self._name}, or give "
+                "another --run"
+            )
+        if taken := next((each.name for each in sweep.runs if has_begun(self.runs_dir, each.name)), None):
+            raise UsageError(f"run {taken} exists in {self.runs_dir}: give the sweep another --run")
+
+    def write(self, sweep: Sweep, tasks: tuple[str, ...], options: SweepOptions) -> None:
+        """Keep a sweep, and how it is served."""
+        vary = tuple(VariedSetting(key, tuple(values)) for key, values in sweep.vary.items())
+        stored = StoredSweep(sweep.name, vary, sweep.flags, tasks, options)
+        path = self.path / SETTINGS
+        with reporting_unwritable_folder(self.path, "choose another --runs-dir"), atomic_write(path) as file:
+            file.write((json.dumps(to_plain(stored), indent=1) + "\n").encode())
+
+    def read(self) -> tuple[Sweep, tuple[str, ...]]:
+        """The sweep and its workers' tasks; `UsageError` if there is none of this name."""
+        found = self._read()
+        return Sweep(found.name, {each.setting: each.values for each in found.vary}, found.flags), found.tasks
+
+    def read_options(self) -> SweepOptions:
+        """How the sweep was served the last time; errors as in `read`."""
+        return self._read().options
+
+    def _read(self) -> StoredSweep:
+        path = self.path / SETTINGS
+        try:
+            plain: Any = json.loads(read_text(path, MOST_BYTES))
+            return from_plain(StoredSweep, plain)
+        except FileNotFoundError:
+            raise UsageError(f"no sweep {self._name} in {self.runs_dir}: begin it with --run {self._name}") from None
+        except (OSError, ValueError, RecursionError, MalformedError) as error:
+            raise DreamfleetError(f"{path} is damaged ({error}); put it back from a copy") from error
+
+
+def find_sweep(runs_dir: Path, name: str) -> SweepFolder | None:
+    """The sweep of this name, also given as its folder's; `None` if there is none, or if a run has the name."""
+    try:
+        folder = SweepFolder(runs_dir, check_run_name(name.removesuffix(SUFFIX)))
+    except UsageError:  # a path, such as a report's
+        return None
+    if has_begun(runs_dir, name):
+        return None
+    return folder if path_exists(folder.path / SETTINGS) else None
+
+
+def sweeps_of_runs(runs_dir: Path) -> dict[str, str]:
+    """The sweep of each run that belongs to one, by names; a damaged sweep has none."""
+    found: dict[str, str] = {}
+    for path in sorted(runs_dir.glob(f"*{SUFFIX}")):
+        with suppress(DreamfleetError):
+            sweep, _ = SweepFolder(runs_dir, path.name.removesuffix(SUFFIX)).read()
+            found |= dict.fromkeys((each.name for each in sweep.runs), sweep.name)
+    return found

@@ -1,0 +1,268 @@
+"""Serve a sweep: a router, the coordinators of a few runs at a time, and workers that serve all of them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from dreamfleet.common.cli.model_commands import Words, command
+from dreamfleet.common.client.client import Client
+from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, StoppedError
+from dreamfleet.common.host.child import PATIENCE
+from dreamfleet.common.host.processes import VerbProcess
+from dreamfleet.common.host.stop_signals import Stop, signals_deferred
+from dreamfleet.common.protocol.pause_kind import PauseKind
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.transport.network import Network
+from dreamfleet.coordinator.settings.environment_check import CHECKED
+from dreamfleet.experiments.local_run import (
+    ALONE,
+    ANY_ADDRESS,
+    START_SECONDS,
+    has_begun,
+    has_ended,
+    task_flags,
+)
+from dreamfleet.experiments.sweep.folder import SweepFolder
+from dreamfleet.experiments.sweep.plan import Sweep, SweepRun, staggered_share
+from dreamfleet.experiments.verb_runner import POLL_INTERVAL
+
+STATUS_INTERVAL = 2.0  # seconds between two looks at all runs
+RESTART_PAUSE = 5.0  # seconds of life after which a worker or router that was killed is started again
+PAUSE_PATIENCE = 30.0  # seconds for which a run may pause by itself: a full disk or a host may get better
+FULL_DISK = 1 << 20  # bytes that are left of a disk on which a coordinator cannot even say so
+MOST_RESTARTS = 3  # of a run's coordinator that was killed
+
+
+@dataclass(frozen=True)
+class SweepFleet:
+    """Where the runs of a sweep meet their workers, and how many of each are on this host.
+
+    A router of the sweep's own listens at `network`; with `has_router` false, `network` reaches one that others run.
+    """
+
+    network: Network
+    workers: int
+    parallel: int
+    has_router: bool = True
+    security: Words = ()  # flags of the coordinators
+
+    @property
+    def endpoint(self) -> str:
+        """Where workers of other hosts connect to."""
+        return (self.network.listen or self.network.connect)[0]
+
+    @property
+    def local_endpoint(self) -> str:
+        """Where this host's own processes connect to."""
+        return ANY_ADDRESS.sub("/127.0.0.1:", self.endpoint)
+
+
+@dataclass
+class RunProgress:
+    """How far one run of the sweep is."""
+
+    run: SweepRun
+    state: str = "waiting"  # running, finished, failed, left open
+    text: str = ""
+    restarts: int = 0
+    paused_since: float | None = None  # while it is paused, and not by hand
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the sweep does nothing more for it."""
+        return self.state in ("finished", "failed", "left open")
+
+
+class SweepRunner:
+    """Serves all runs of a sweep to their ends; leaving the context ends its processes."""
+
+    def __init__(
+        self, sweep: Sweep, tasks: Sequence[str], folder: SweepFolder, fleet: SweepFleet, config: Path | None
+    ) -> None:
+        self.progress = [RunProgress(each) for each in sweep.runs]
+        self._sweep, self._tasks, self._folder, self._fleet = sweep, tasks, folder, fleet
+        self._config = () if config is None else ("--config", str(config))
+        self._coordinators: dict[str, VerbProcess] = {}
+        self._helpers: dict[str, tuple[Words, VerbProcess, float]] = {}  # router and workers, with when they started
+        self._looked_at = 0.0
+        self._uids: dict[str, str] = {}
+
+    def __enter__(self) -> SweepRunner:
+        with ExitStack() as stack:
+            # Fresh, as a task may have changed, and this user's alone.
+            self._checks = stack.enter_context(tempfile.TemporaryDirectory(prefix="dreamfleet-checks-"))
+            stack.callback(self._end)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        with signals_deferred():  # a second Ctrl-C would leave processes behind
+            self._stack.close()
+
+    def serve(self, stop: Stop, on_change: Callable[[], None]) -> None:
+        """Serve until every run is over; `StoppedError` as soon as `stop` is true."""
+        self._start_fleet()
+        with self._connect() as client:
+            while not all(each.is_over for each in self.progress):
+                if stop():
+                    raise StoppedError("stopped")
+                self._start_coordinators()
+                self._check_coordinators()
+                self._check_helpers()
+                self._look(client)
+                on_change()
+                time.sleep(POLL_INTERVAL)
+
+    def _start_fleet(self) -> None:
+        if self._fleet.has_router:
+            insecure = ("--insecure",) if "--insecure" in self._fleet.security else ()
+            self._start_helper("router", command("router", "--listen", self._fleet.endpoint, *insecure))
+        for number in range(self._fleet.workers):
+            name = f"core-{number}"
+            flags = ("--any", "--runs", self._fleet.parallel, "--slots", 1, "--name", name, *task_flags(*self._tasks))
+            self._start_helper(name, command("worker", "--connect", self._fleet.local_endpoint, *flags))
+
+    def _connect(self) -> Client:
+        """A client of the router, as soon as that listens."""
+        deadline = time.monotonic() + START_SECONDS
+        while True:
+            try:
+                return Client(replace(self._fleet.network, listen=(), connect=(self._fleet.local_endpoint,)))
+            except ConnectionFailedError:
+                self._check_helpers()
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(POLL_INTERVAL)
+
+    def _start_coordinators(self) -> None:
+        """Start or resume runs until `parallel` are open; a run that has ended before is finished."""
+        for each in self.progress:
+            if len(self._coordinators) >= self._fleet.parallel:
+                return
+            if each.state == "waiting":
+                name, runs_dir = each.run.name, self._folder.runs_dir
+                if has_ended(runs_dir, name):
+                    each.state, each.text = "finished", "before"
+                    continue
+                words = self._run_command(each.run, resumed=has_begun(runs_dir, name))
+                each.state, each.text = "running", ""
+                self._coordinators[name] = self._start(words, runs_dir / name / "coordinator.log")
+
+    def _run_command(self, run: SweepRun, *, resumed: bool) -> Words:
+        share = ("--share", staggered_share(self._sweep.runs.index(run), self._fleet.parallel))
+        own = ("--resume", run.name) if resumed else ("--run", run.name, *share, *self._sweep.flags, *run.flags)
+        place = ("--runs-dir", self._folder.runs_dir, "--connect", self._fleet.local_endpoint, "--json")
+        return command("coordinator", *own, *self._fleet.security, *self._config, *place)
+
+    def _check_coordinators(self) -> None:
+        """Note which runs are over. A coordinator that was killed is started again."""
+        for each in self.progress:
+            process = self._coordinators.get(each.run.name)
+            if process is None or (code := process.exit_code) is None:
+                continue
+            del self._coordinators[each.run.name]
+            process.end()
+            if each.is_over:  # it was ended from here
+                continue
+            if code == 0:
+                each.state, each.text = "finished", ""
+            elif code == StoppedError.exit_code:
+                each.state, each.text = "left open", "it was stopped or drained"
+            elif code < 0 and each.restarts < MOST_RESTARTS:
+                each.state, each.restarts = "waiting", each.restarts + 1
+                each.text = "its coordinator was killed"
+            else:
+                each.state, each.text = "failed", self._describe_failure(process)
+
+    def _describe_failure(self, process: VerbProcess) -> str:
+        """Why a coordinator failed; its log is empty where the disk is full."""
+        full = shutil.disk_usage(self._folder.runs_dir).free < FULL_DISK
+        return f"{'the disk of its folder is full; ' if full else ''}{process.last_line()}"
+
+    def _look(self, client: Client) -> None:
+        """Read how far the open runs are. One that stays paused by itself might wait for ever, so it has failed."""
+        if time.monotonic() - self._looked_at < STATUS_INTERVAL:
+            return
+        statuses: list[dict[str, Any]] = []
+        with suppress(DreamfleetError):  # the router is being started again
+            statuses = client.statuses(STATUS_INTERVAL)
+        self._looked_at = time.monotonic()
+        found = {status.get("run_uid"): status for status in statuses}  # other runs may have equal names
+        for each in self.progress:
+            status = found.get(self._uid_of(each.run.name))
+            if status is None or each.run.name not in self._coordinators:
+                continue
+            each.text = _describe(status)
+            if status.get("state") != "paused" or status.get("pauses") == [PauseKind.BY_HAND]:
+                each.paused_since = None
+            elif each.paused_since is None:
+                each.paused_since = self._looked_at
+            elif self._looked_at - each.paused_since > PAUSE_PATIENCE:
+                each.state, each.text = "failed", f"paused: {status.get('why')}"
+                self._coordinators[each.run.name].ask_to_end()
+
+    def _uid_of(self, name: str) -> str | None:
+        """A run's own name for ever; `None` before it has begun."""
+        if name not in self._uids:
+            with suppress(DreamfleetError):
+                if has_begun(self._folder.runs_dir, name):
+                    with open_run(self._folder.runs_dir, name) as run:
+                        self._uids[name] = run.uid
+        return self._uids.get(name)
+
+    def _check_helpers(self) -> None:
+        """Start a router or worker again that was killed; `DreamfleetError` if one fails."""
+        for name, (words, process, started) in list(self._helpers.items()):
+            code = process.exit_code
+            if code is None:
+                continue
+            if code >= 0 and name == "router":
+                raise DreamfleetError(f"the sweep's router failed: {process.last_line()}")
+            if code >= 0 and not any(each.exit_code is None for each in self._workers):
+                raise DreamfleetError(f"this host's workers failed: {process.last_line()}")
+            if code < 0 and time.monotonic() - started > RESTART_PAUSE:
+                process.end()
+                self._start_helper(name, words)
+
+    @property
+    def _workers(self) -> list[VerbProcess]:
+        return [process for name, (_, process, _) in self._helpers.items() if name != "router"]
+
+    def _start_helper(self, name: str, words: Words) -> None:
+        self._helpers[name] = words, self._start(words, self._folder.path / f"{name}.log"), time.monotonic()
+
+    def _start(self, words: Words, log: Path) -> VerbProcess:
+        alone = ALONE if self._fleet.has_router else {}  # a fleet of the user's has its own
+        environment = {**os.environ, **alone, CHECKED: self._checks}
+        return VerbProcess(*words, log=log, environment=environment, ends_with_parent=True)
+
+    def _end(self) -> None:
+        """End the workers, then the coordinators, which leave their runs open, then the router."""
+        routers = [process for name, (_, process, _) in self._helpers.items() if name == "router"]
+        for together in (self._workers, list(self._coordinators.values()), routers):
+            for each in together:
+                each.ask_to_end()
+            deadline = time.monotonic() + PATIENCE
+            for each in together:
+                each.wait(deadline - time.monotonic())
+            for each in together:
+                each.end()
+
+
+def _describe(status: Mapping[str, Any]) -> str:
+    """How far a run is, in words."""
+    with suppress(KeyError, TypeError, ValueError):  # a coordinator of another version
+        closed, limit = int(status["generations"]), int(status["limits"].get("generations") or 0)
+        state = "" if status["state"] == "running" else f"{status['state']}, "
+        judged = status.get("confirmed") or status.get("best")
+        score = "" if judged is None else f", evaluated {float(judged['mean']):z.4g}"
+        return f"{state}generation {closed}{f' of {limit}' if limit else ''}{score}"
+    return ""

@@ -1,0 +1,265 @@
+"""`dreamfleet compare`: runs or evaluation reports beside each other; the settings of sweeps."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.files.regular_files import is_file
+from dreamfleet.common.printable import format_number, format_setting, plural
+from dreamfleet.common.protocol.function_values import value_of
+from dreamfleet.common.protocol.tasks import is_function_task
+from dreamfleet.common.runs.evaluation_report import EvaluationReport, read_evaluation_report
+from dreamfleet.common.runs.paired_difference import PairedDifference
+from dreamfleet.common.runs.records import count_episodes, format_mean, with_error
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.standard_error import format_with_error
+from dreamfleet.common.worlds.score_words import score_word
+
+if TYPE_CHECKING:
+    from dreamfleet.common.runs.comparison import ComparedRun, EqualBudget, EvaluatedMean
+
+SUMMARY = (
+    "compare runs (settings that differ, scores at equal steps and core-hours, confirmed scores), reports of "
+    "`evaluate --out` (paired differences), or the settings of sweeps"
+)
+EXTRAS = ()
+SAME_SEEDS = (
+    "all runs are judged on the same validation seeds, so their ± are not independent: differences are paired by seed"
+)
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument(
+        "names",
+        metavar="RUN|SWEEP|REPORT",
+        nargs="+",
+        help="names of runs, or files of `evaluate --out`, 2 or more; or names of sweeps, with runs beside them",
+    )
+    add_global_flags(parser, "runs_dir")
+    add_json_flag(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Compare files as reports and other names as runs or sweeps, and note which of them it was."""
+    from dreamfleet.experiments.sweep.folder import find_sweep
+
+    if any(find_sweep(args.runs_dir, name) for name in args.names):
+        return _compare_sweeps(args, list(dict.fromkeys(args.names)))
+    files = [name for name in args.names if is_file(Path(name))]
+    if len(args.names) < 2:
+        raise UsageError("give two runs or more, or two reports or more: each is compared with the first")
+    if files and len(files) < len(args.names):
+        other = next(name for name in args.names if name not in files)
+        raise UsageError(
+            f"{files[0]} is a file and {other} is none: compare runs with runs, or reports with reports; "
+            "`dreamfleet evaluate --controller RUN --out FILE` makes a report of a run"
+        )
+    if not args.json:
+        print(f"comparing {'reports of `evaluate`' if files else 'runs on this disk'}", file=sys.stderr)
+    if files:
+        return _compare_reports(args, [Path(name) for name in args.names])
+    return _compare_runs(args, list(dict.fromkeys(args.names)))
+
+
+def _compare_sweeps(args: argparse.Namespace, names: Sequence[str]) -> int:
+    """Print the mean of each setting over its seeds; a run beside a sweep is a setting of its own."""
+    from dreamfleet.experiments.sweep import summary
+    from dreamfleet.experiments.sweep.folder import find_sweep
+    from dreamfleet.experiments.verbs.sweep import print_settings
+
+    results: list[summary.RunResult] = []
+    for name in names:
+        folder = find_sweep(args.runs_dir, name)
+        if folder is None:
+            results.append(summary.read_result(args.runs_dir, name, name))
+            continue
+        found = summary.read_results(args.runs_dir, folder.read()[0].runs)
+        results += found if len(names) == 1 else [replace(each, setting=f"{name}: {each.setting}") for each in found]
+    kind = summary.judged_by(results)
+    if args.json:
+        settings = [] if kind is None else [asdict(each) for each in summary.means(results, kind)]
+        runs = [{"run": each.name, "setting": each.setting, "ended": each.ended, "scores": each.scores}
+                for each in results]  # fmt: skip
+        equal = [] if kind is None else summary.find_equal(results, kind)
+        print(json.dumps({"judged_by": kind, "settings": settings, "equal": equal, "runs": runs}))
+        return 0
+    if len(tasks := sorted({each.task.task for each in results if each.task is not None})) > 1:
+        print(f"note: these are of different tasks ({', '.join(tasks)}): their scores do not compare", file=sys.stderr)
+    print_settings(results)
+    if open_ones := sum(not each.ended for each in results):
+        print(f"{open_ones} of {plural(len(results), 'run')} not ended, and left out", file=sys.stderr)
+    return 0
+
+
+def _compare_reports(args: argparse.Namespace, paths: Sequence[Path]) -> int:
+    """Print each mean, and its difference from the first on equal seeds."""
+    (first, base), *others = [(path, read_evaluation_report(path)) for path in paths]
+    lines, rows = [_line(first, base)], []
+    for path, each in others:
+        _warn(first, base, path, each)
+        found = PairedDifference.between(base.results, each.results)
+        lines += [_line(path, each), f"{path} less {first}: {found.description}"]
+        rows.append({"report": path, "against": first, **asdict(found), "clear": found.is_significant})
+    print_answer(args, "\n".join(lines), differences=rows)
+    return 0
+
+
+def _line(path: Path, found: EvaluationReport) -> str:
+    score = format_with_error(found.results.mean, found.results.error)
+    failed = f", and {len(found.failed)} failed" if found.failed else ""
+    return f"{path}: {found.name}, {score} on {plural(len(found.drives), score_word(found.world))}{failed}"
+
+
+def _warn(first: Path, base: EvaluationReport, path: Path, other: EvaluationReport) -> None:
+    """Note what besides the controllers may cause a difference."""
+    for what in ("world", "fingerprint"):
+        one, another = getattr(base, what), getattr(other, what)
+        if one != another:
+            print(f"note: {first} and {path} are of different {what}s: {one!r} and {another!r}", file=sys.stderr)
+
+
+def _compare_runs(args: argparse.Namespace, names: Sequence[str]) -> int:
+    """Print settings that differ, scores at equal budgets, and differences from the first run."""
+    from dreamfleet.common.runs.comparison import ComparedRun, are_comparable, at_equal_budget, differing_settings
+
+    if len(names) < 2:
+        raise UsageError(f"{names[0]} is one run: give another to compare it with")
+    sides = []
+    for name in names:
+        with open_run(args.runs_dir, name) as stored:
+            sides.append(ComparedRun.of(stored))
+    settings, worlds = differing_settings(sides), {each.world for each in sides if each.world is not None}
+    comparable = are_comparable(sides)
+    equal = at_equal_budget(sides) if comparable else []
+    found = list(_run_differences(sides, equal)) if comparable else []
+    if args.json:
+        runs = [_run_facts(each) for each in sides]
+        budgets = [_budget_facts(sides, each) for each in equal]
+        print(json.dumps({"runs": runs, "settings": settings, "equal": budgets, "differences": found}, default=str))
+        return 0
+    shown = [each.in_values for each in sides]
+    print_rows([_run_row(each) for each in shown], drop_order=("task", "spent"))
+    print()
+    _print_settings(sides, settings)
+    if len(worlds) > 1:
+        print(f"their evaluations are in different worlds ({', '.join(sorted(worlds))}): scores are not compared")
+    elif sides and not comparable and worlds:
+        print("one is minimised and another is not: their values are not compared")
+    for each in at_equal_budget(shown) if comparable else []:
+        print(_format_budget(sides, each))
+    if found:
+        print(f"\n{SAME_SEEDS}" if any("seeds" in each for each in found) else "")
+        print("\n".join(f"{each['of']}: {each['run']} less {each['against']}: {each['text']}" for each in found))
+    return 0
+
+
+def _run_row(side: ComparedRun) -> dict[str, object]:
+    word = score_word(side.world or "")
+    confirmed, last = side.confirmed, side.evaluated_means[-1].point if side.evaluated_means else None
+    return {
+        "run": side.name,
+        "task": side.settings.task.task,
+        "spent": side.spent,
+        "last evaluation": None if last is None else format_with_error(last.score, last.error),
+        "confirmed": None if confirmed is None else f"{format_mean(confirmed)} on {count_episodes(confirmed, word)}",
+    }  # fmt: skip
+
+
+def _print_settings(sides: Sequence[ComparedRun], settings: Mapping[str, Sequence[Any]]) -> None:
+    if not settings:
+        print("their settings are equal")
+        return
+    rows = [
+        {
+            "setting": name,
+            **{
+                side.name: "default" if value is None else format_setting(value)
+                for side, value in zip(sides, values, strict=True)
+            },
+        }
+        for name, values in settings.items()
+    ]
+    print_rows(rows)
+    print()
+
+
+def _format_budget(sides: Sequence[ComparedRun], equal: EqualBudget) -> str:
+    from dreamfleet.common.runs.comparison import CORE_HOURS
+
+    spent = f"{equal.spent:.3g}" if equal.what == CORE_HOURS else f"{equal.spent:,.0f}"
+    what = _describe_budget(sides, equal)
+    parts = [f"{side.name} {_format_evaluation(look)}" for side, look in zip(sides, equal.evaluated_means, strict=True)]
+    return f"at {spent} {what}: {', '.join(parts)}"
+
+
+def _describe_budget(sides: Sequence[ComparedRun], equal: EqualBudget) -> str:
+    """What was spent, in words: a function has calls, and no steps."""
+    from dreamfleet.common.runs.comparison import STEPS
+
+    is_function = all(is_function_task(each.settings.task.task) for each in sides)
+    return "calls" if is_function and equal.what == STEPS else equal.what
+
+
+def _format_evaluation(look: EvaluatedMean | None) -> str:
+    if look is None:
+        return "without an evaluation"
+    return f"{format_with_error(look.point.score, look.point.error)} (generation {look.generation})"
+
+
+def _run_differences(sides: Sequence[ComparedRun], equal: Sequence[EqualBudget]) -> Iterator[dict[str, Any]]:
+    """Each run less the first: at equal budgets, then of confirmed scores."""
+    from dreamfleet.common.runs.comparison import difference
+
+    def paired(of: str, side: ComparedRun, one: dict[int, float], other: dict[int, float]) -> dict[str, Any]:
+        found = difference(one, other)
+        figures = {**asdict(found), "clear": found.is_significant} if isinstance(found, PairedDifference) else {}
+        if isinstance(found, PairedDifference):
+            text = found.describe(minimised=side.minimised)
+        else:
+            text = _describe_one_call(side, one, other) or found
+        return {"of": of, "run": side.name, "against": sides[0].name, **figures, "text": text}
+
+    for number, side in enumerate(sides[1:], 1):
+        for each in equal:
+            base, look = each.evaluated_means[0], each.evaluated_means[number]
+            if base is not None and look is not None:
+                yield paired(f"at equal {_describe_budget(sides, each)}", side, base.scores, look.scores)
+        if sides[0].confirmed is not None and side.confirmed is not None:
+            yield paired("confirmed", side, sides[0].confirmed_scores, side.confirmed_scores)
+
+
+def _describe_one_call(side: ComparedRun, one: Mapping[int, float], other: Mapping[int, float]) -> str:
+    """The difference of two values of a function without noise, which has one call; empty for anything else."""
+    task = side.settings.task
+    if not is_function_task(task.task) or not len(one) == len(other) == len(one.keys() | other.keys()) == 1:
+        return ""
+    (seed,) = one
+    better = other[seed] - one[seed]
+    verdict = "equal" if not better else "better" if better > 0 else "worse"
+    return f"{format_number(value_of(better, task), '+')} in one call each: {verdict}"
+
+
+def _run_facts(side: ComparedRun) -> dict[str, Any]:
+    confirmed = side.confirmed and with_error(side.confirmed)
+    effort = {**asdict(side.total), "core_hours": side.total.core_hours}
+    inherited = {**asdict(side.inherited), "core_hours": side.inherited.core_hours}
+    facts = {"run": side.name, "world": side.world, "effort": effort, "inherited": inherited}
+    return {**facts, "confirmed": confirmed}
+
+
+def _budget_facts(sides: Sequence[ComparedRun], equal: EqualBudget) -> dict[str, Any]:
+    evaluated_means = [
+        look and {"run": side.name, "generation": look.generation, "score": look.point.score, "error": look.point.error}
+        for side, look in zip(sides, equal.evaluated_means, strict=True)
+    ]
+    return {"what": equal.what, "spent": equal.spent, "looks": evaluated_means}

@@ -1,0 +1,247 @@
+"""`dreamfleet sweep`: many runs that differ in a few settings, on one fleet."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dreamfleet.common.cli.config import add_flags, read_toml
+from dreamfleet.common.cli.global_config import add_global_flags, load_credentials, security_flags
+from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
+from dreamfleet.common.errors import StoppedError, UsageError
+from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_signals
+from dreamfleet.common.printable import plural
+from dreamfleet.coordinator.settings.config import RunConfig
+from dreamfleet.coordinator.settings.limits import LimitsConfig
+from dreamfleet.coordinator.settings.network import NetworkConfig
+from dreamfleet.experiments.sweep.options import PARALLEL, SweepOptions
+
+if TYPE_CHECKING:
+    from dreamfleet.experiments.sweep.folder import SweepFolder
+    from dreamfleet.experiments.sweep.plan import Sweep
+    from dreamfleet.experiments.sweep.runner import RunProgress, SweepFleet
+    from dreamfleet.experiments.sweep.summary import RunResult
+
+SUMMARY = "evolve with several seeds and settings on one fleet, and compare the settings"
+EXTRAS: tuple[str, ...] = ()
+SETTINGS_OF_RUNS = ("beat", "evaluation_share", "failure_limit", "share", "strict")  # of `NetworkConfig`
+LEFT_OPEN = 130
+MOST_EQUAL = 10  # pairs of settings with equal results that are named
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument(
+        "file", nargs="?", type=Path, metavar="FILE.toml",
+        help="a sweep as a file: run, parallel, workers, a table [vary], and a table [flags] of `coordinator`'s",
+    )  # fmt: skip
+    parser.add_argument("--run", dest="run_name", metavar="NAME", help="name of the sweep; its runs are NAME-seed1-...")
+    parser.add_argument(
+        "--vary", nargs="+", action="extend", default=[], metavar="SETTING=VALUES",
+        help="what differs, by `coordinator`'s flags: seed=1..5 population=8,32 are ten runs; runs that differ in the "
+        "seed alone repeat one setting",
+    )  # fmt: skip
+    parser.add_argument("--resume", metavar="NAME", help="continue this sweep: finished runs are not repeated")
+    parser.add_argument("--parallel", type=int, metavar="K", help=f"runs that are open at once (default {PARALLEL})")
+    parser.add_argument(
+        "--workers", type=int, metavar="N",
+        help="workers of one slot on this host (default one a core, or none with --connect); 0: only others'",
+    )  # fmt: skip
+    texts = {
+        "listen": "the sweep's router listens here, so that workers of other hosts may join (default a free port of "
+        "this host alone)",
+        "connect": "use this router, and the workers that it has, instead of an own one",
+    }
+    add_json_flag(parser)
+    add_global_flags(parser, "listen", "connect", "runs_dir", "access_dir", texts=texts)
+    add_flags(parser, NetworkConfig, only=("insecure",))
+    parser.add_argument("--init", metavar="CONTROLLER", help="begin each run with this controller's parameters")
+    add_flags(parser, RunConfig, LimitsConfig)
+    add_flags(parser, NetworkConfig, only=SETTINGS_OF_RUNS)
+
+
+@interrupted_by_signals()
+def run(args: argparse.Namespace) -> int:
+    """Serve a new sweep or resume one, then compare its settings."""
+    from dreamfleet.common.files.locks import folder_lock
+    from dreamfleet.experiments.sweep.check import check_runs
+    from dreamfleet.experiments.sweep.folder import SweepFolder
+
+    file = read_toml(args.file, ("vary", "flags"), ("run", "parallel", "workers", "listen", "connect"))
+    if args.resume:
+        _refuse_settings(args, file)
+        folder = SweepFolder(args.runs_dir, args.resume)
+        sweep, tasks = folder.read()
+        options = _options(args, file, folder.read_options())
+    else:
+        options = _options(args, file, SweepOptions())
+        sweep = _new_sweep(args, file)
+        folder = SweepFolder(args.runs_dir, sweep.name)
+        folder.check_new(sweep)
+        tasks = check_runs(sweep, args.sources)
+    fleet = _fleet(args, options)
+    with folder_lock(folder.lock, "sweep of this name", "--runs-dir"), stop_on_signals() as stop:
+        if not args.resume:
+            folder.check_new(sweep)
+        folder.write(sweep, tasks, options)
+        progress = _serve(args, sweep, tasks, folder, fleet, stop)
+    return _report(args, sweep, folder, progress)
+
+
+def _options(args: argparse.Namespace, file: Mapping[str, Any], kept: SweepOptions) -> SweepOptions:
+    """How to serve the sweep: flags over the file over what is kept of it. A new endpoint replaces both kept ones."""
+    has_endpoint = any(each in args.given or each in file for each in ("listen", "connect"))
+
+    def number(name: str) -> int | None:
+        value = getattr(args, name) if getattr(args, name) is not None else file.get(name, getattr(kept, name))
+        if value is not None and (isinstance(value, bool) or not isinstance(value, int)):
+            raise UsageError(f"{name} in {args.file} must be a whole number, not {value!r}")
+        return value
+
+    def endpoints(name: str) -> tuple[str, ...]:
+        if name in args.given:
+            return tuple(getattr(args.global_config, name))
+        value = file.get(name, [] if has_endpoint else list(getattr(kept, name)))
+        found = [value] if isinstance(value, str) else value
+        if not (isinstance(found, list) and all(isinstance(each, str) for each in found)):
+            raise UsageError(f"{name} in {args.file} must be an endpoint, such as tcp/0.0.0.0:7447")
+        return tuple(found)
+
+    listen, connect = endpoints("listen"), endpoints("connect")
+    insecure = bool(getattr(args, "insecure", False)) or (kept.insecure and not has_endpoint)
+    return SweepOptions(number("parallel") or 0, number("workers"), listen, connect, insecure)
+
+
+def _new_sweep(args: argparse.Namespace, file: Mapping[str, Any]) -> Sweep:
+    from dreamfleet.experiments.started_run import check_settings, flag_words
+    from dreamfleet.experiments.sweep.plan import Sweep, parse_vary, read_vary
+
+    name = args.run_name or file.get("run")
+    if not isinstance(name, str):
+        raise UsageError("name the sweep: give --run NAME, or run = 'NAME' in the file")
+    vary = read_vary(file.get("vary", {})) | parse_vary(args.vary)
+    given = {name: getattr(args, name) for name in _run_settings(args)}
+    flags = (
+        *check_settings({key.replace("-", "_"): value for key, value in file.get("flags", {}).items()}),
+        *(word for key, value in given.items() for word in flag_words(key, value)),
+    )
+    return Sweep(name, vary, flags)
+
+
+def _run_settings(args: argparse.Namespace) -> list[str]:
+    """The settings of runs that are flags of this command line."""
+    known = [each.name for section in (RunConfig, LimitsConfig) for each in fields(section)]
+    return [name for name in (*known, *SETTINGS_OF_RUNS) if name in args.given] + (["init"] if args.init else [])
+
+
+def _refuse_settings(args: argparse.Namespace, file: Mapping[str, Any]) -> None:
+    given = [f"--{name.replace('_', '-')}" for name in _run_settings(args)]
+    given += ["--vary"] if args.vary or "vary" in file or "flags" in file else []
+    if given or args.run_name:
+        raise UsageError(f"{', '.join(given) or '--run'}: a sweep that is resumed keeps its name and its settings")
+
+
+def _fleet(args: argparse.Namespace, options: SweepOptions) -> SweepFleet:
+    from dreamfleet.common.host.resource_limits import usable_cores
+    from dreamfleet.common.transport.network import Network
+    from dreamfleet.experiments.local_run import free_port
+    from dreamfleet.experiments.sweep.runner import SweepFleet
+
+    if options.connect:
+        credentials = load_credentials(args, ("coordinator",))
+        network = Network(connect=options.connect, credentials=credentials)
+        return SweepFleet(network, options.workers or 0, options.parallel, False, security_flags(args))
+    if args.global_config.join is not None:
+        raise UsageError(
+            "a sweep's own router knows no join files: give --connect, a fleet with one, or leave --join out"
+        )
+    network = Network(options.listen or (f"tcp/127.0.0.1:{free_port()}",))
+    network.check_open(insecure=options.insecure)
+    workers = usable_cores() if options.workers is None else options.workers
+    return SweepFleet(network, workers, options.parallel, True, ("--insecure",) if options.insecure else ())
+
+
+def _serve(
+    args: argparse.Namespace, sweep: Sweep, tasks: tuple[str, ...], folder: SweepFolder, fleet: SweepFleet, stop: Any
+) -> list[RunProgress]:
+    from dreamfleet.common.host.processes import shell_command
+    from dreamfleet.experiments.sweep.display import showing
+    from dreamfleet.experiments.sweep.runner import SweepRunner
+
+    runs, workers = plural(len(sweep.runs), "run"), plural(fleet.workers, "worker")
+    join = shell_command("worker", "--any", "--connect", fleet.endpoint)
+    what = f"{runs}, {fleet.parallel} at a time, {workers} here"
+    print(f"sweep {sweep.name}: {what}; more join with: {join}", file=sys.stderr)
+    try:
+        with SweepRunner(sweep, tasks, folder, fleet, args.config) as runner, showing(runner.progress) as update:
+            runner.serve(stop, update)
+            update()
+    except StoppedError as error:
+        joined = () if args.global_config.join is None else ("--join", args.global_config.join)
+        again = shell_command("sweep", "--resume", sweep.name, "--runs-dir", args.runs_dir, *joined)
+        raise StoppedError(f"{error}; finished runs and open ones are kept; continue with: {again}") from error
+    return runner.progress
+
+
+def _report(args: argparse.Namespace, sweep: Sweep, folder: SweepFolder, progress: list[RunProgress]) -> int:
+    """Print the mean of each setting, write the figure, and name what failed."""
+    from dreamfleet.experiments.sweep import summary
+
+    results = summary.read_results(args.runs_dir, sweep.runs)
+    kind = summary.judged_by(results)
+    found = [] if kind is None else summary.means(results, kind)
+    equal = [] if kind is None else summary.find_equal(results, kind)
+    failed = [each for each in progress if each.state == "failed"]
+    left = [each for each in progress if each.state == "left open"]
+    figure = _draw(folder, results)
+    if args.json:
+        print_answer(
+            args, "", sweep=sweep.name, judged_by=kind, settings=[asdict(each) for each in found], figure=figure,
+            equal=equal,
+            runs=[{"run": each.run.name, "setting": each.run.setting, "state": each.state, "why": each.text,
+                   "scores": next((result.scores for result in results if result.name == each.run.name), {})}
+                  for each in progress],
+        )  # fmt: skip
+    else:
+        print_settings(results)
+        if figure is not None:
+            print(f"{figure}: learning curves by setting")
+    for each in (*failed, *left):
+        print(f"run {each.run.name} {each.state}: {each.text}", file=sys.stderr)
+    return 1 if failed else LEFT_OPEN if left else 0
+
+
+def print_settings(results: list[RunResult]) -> None:
+    """Print each setting's mean over its runs, and which settings gave the same."""
+    from dreamfleet.experiments.sweep import summary
+
+    shown = [each.in_values for each in results]
+    if (kind := summary.judged_by(shown)) is None:
+        return
+    heading = summary.describe_kind(kind, shown)
+    print_rows(
+        [{"setting": each.setting, "runs": each.runs, heading: each.text} for each in summary.means(shown, kind)]
+    )
+    print("± is the standard error among runs")
+    equal = summary.find_equal(results, kind)
+    for sentence in equal[:MOST_EQUAL]:
+        print(sentence)
+    if len(equal) > MOST_EQUAL:
+        print(f"and {len(equal) - MOST_EQUAL} more pairs of settings (--json lists them)")
+
+
+def _draw(folder: SweepFolder, results: list[RunResult]) -> Path | None:
+    """The figure's path; `None` if there is nothing to draw, or nothing to draw with."""
+    from dreamfleet.experiments.sweep.folder import FIGURE
+
+    path = folder.path / FIGURE
+    try:
+        from dreamfleet.experiments.sweep.figure import plot_sweep
+    except ModuleNotFoundError:
+        print("no figure: it needs pip install 'dreamfleet[plot]'", file=sys.stderr)
+        return None
+    return path if plot_sweep(results, path) else None

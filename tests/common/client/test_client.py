@@ -1,0 +1,74 @@
+"""What anybody may send a client: it is passed over, or a readable error."""
+
+import json
+from contextlib import contextmanager
+from dataclasses import replace
+from time import monotonic
+
+import pytest
+
+from dreamfleet.common.client.client import Client
+from dreamfleet.common.client.live import LiveView
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.codec import encode_json
+from dreamfleet.common.schema.validation import MalformedError
+from dreamfleet.common.transport.session import Network, open_session
+from tests.support.processes import DEADLINE, free_port
+from tests.support.samples import STATUS
+
+RUN = STATUS.run
+LEFT = replace(STATUS, state="left")
+NO_FINAL_STATUSES = (
+    b"", b"{}", b'{"state": ["ended"]}', encode_json(STATUS), encode_json(LEFT)[:-9],
+    encode_json(replace(LEFT, run_uid="another")),
+)  # fmt: skip
+
+
+@contextmanager
+def serving(**answers):
+    """A router that gives these answers to queries for parts of the status, and a client of it."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with open_session(Network(listen=(endpoint,))) as served:
+        for part, said in answers.items():
+            key = keys.status(RUN, "" if part == "whole" else part)
+            served.declare_queryable(key, lambda query, said=said: query.reply(query.key_expr, said))
+        with Client(endpoint) as client:
+            yield served, client
+
+
+def test_a_watch_ends_with_the_runs_own_last_status_alone():
+    with serving(whole=encode_json(STATUS)) as (served, client):
+        watch = client.watch(RUN, pause=60.0)
+        assert next(watch) == STATUS
+        for said in (*NO_FINAL_STATUSES, encode_json(LEFT)):
+            served.put(keys.event_status(RUN), said)
+        assert list(watch) == [LEFT]
+
+
+def test_a_view_ends_with_the_runs_own_last_status_alone():
+    workers = json.dumps({"workers": [], "total": 0}).encode()
+    with serving(whole=encode_json(STATUS), workers=workers) as (served, client), LiveView(client, RUN) as view:
+        client.status(RUN)  # answered, so the view's subscription has arrived too
+        for said in (*NO_FINAL_STATUSES, encode_json(LEFT)):
+            served.put(keys.event_status(RUN), said)
+        until = monotonic() + DEADLINE
+        while not view.is_over and monotonic() < until:
+            assert view.next(timeout=0.01) is None
+        assert view.status == LEFT
+
+
+@pytest.mark.parametrize(
+    "page",
+    [{}, {"total": 1}, *({"rows": [], "total": odd} for odd in (None, "1", 1.0, True, [])),
+     *({"rows": odd, "total": 1} for odd in (None, 1, "xy", {}, [1], [{}]))],
+    ids=str,
+)  # fmt: skip
+def test_an_odd_page_of_a_list_is_a_readable_error(page):
+    parts = {"workers": Client.workers, "history": Client.history, "evaluations": Client.evaluations,
+             "story": Client.events}  # fmt: skip
+    more = {name: value for name, value in page.items() if name != "rows"}
+    pages = {part: {"run": RUN, **more, **({part: page["rows"]} if "rows" in page else {})} for part in parts}
+    with serving(**{part: json.dumps(each).encode() for part, each in pages.items()}) as (_, client):
+        for fetch in parts.values():
+            with pytest.raises(MalformedError):
+                fetch(client, RUN)

@@ -1,0 +1,204 @@
+"""Estimates of a run's end, and descriptions of its state."""
+
+import dataclasses
+
+import pytest
+
+from dreamfleet.common.client.eta import describe_state, estimate_eta, format_duration
+from dreamfleet.common.client.status import (
+    EpisodeProgress,
+    FailureStatus,
+    GenerationStatus,
+    Throughput,
+    WorkerCount,
+)
+from tests.support.samples import BEST, CLOSED, STATUS
+
+WORKER = STATUS.worker_list[0]
+
+
+def status(limits=(), seconds=0.0, gone=0.0, **changes):
+    recent = tuple(dataclasses.replace(CLOSED, seconds=each) for each in changes.pop("paces", (4.5, 4.6, 900.0)))
+    return dataclasses.replace(
+        STATUS, limits={"generations": 0, "steps": 0, "minutes": 0.0, "target": None, "parted": 0, **dict(limits)},
+        recent=recent, throughput=Throughput(1000.0, changes.pop("steps", 448_000), seconds),
+        **{"generation": GenerationStatus(7, 3, 8, gone, 0.09, None), **changes},
+    )  # fmt: skip
+
+
+def test_a_limit_of_minutes():
+    eta = estimate_eta(status({"minutes": 30.0}, seconds=18 * 60))
+    assert eta.description == "18 of 30 minutes, 4.6 s a generation, about 12 min to go"
+    assert eta.bounds[0].share == pytest.approx(0.6)
+    assert eta.seconds == pytest.approx(12 * 60)
+
+
+def test_a_paused_generation_does_not_change_the_pace():
+    assert estimate_eta(status()).pace == 4.6
+
+
+def test_the_pace_counts_the_evaluations_between():
+    settings = dataclasses.replace(STATUS.settings, evaluate_every=4)
+
+    def pace(seconds):
+        recent = tuple(dataclasses.replace(CLOSED, number=n, seconds=each) for n, each in enumerate(seconds))
+        return estimate_eta(dataclasses.replace(status(), settings=settings, recent=recent)).pace
+
+    assert pace([5.0, 5.0, 5.0, 45.0] * 3) == pytest.approx((45 + 5 + 5 + 5) / 4)
+    assert pace([5.0, 5.0, 5.0, 45.0] * 2 + [5.0, 5.0, 5.0, 9000.0]) == pytest.approx(15.0)
+    assert pace([300.0, 5.0, 5.0, 45.0]) == pytest.approx(25.0), "one interval tells nothing yet"
+    assert pace([300.0, 5.0, 5.0, 45.0, 5.0, 5.0, 5.0, 45.0]) == pytest.approx(15.0)
+    assert pace([5.0] * 12 + [60.0] * 6) == pytest.approx(60.0), "a new stage shows after six generations"
+
+
+def test_the_open_generations_elapsed_time_counts():
+    assert estimate_eta(status({"generations": 9}, gone=1.6)).seconds == pytest.approx(3.0 + 4.6)
+    assert estimate_eta(status({"generations": 8}, gone=99.0)).seconds == 0
+
+
+def test_an_overdue_generation_without_a_step_has_no_estimate():
+    overdue = status({"generations": 9}, gone=69.3)
+    stalled = dataclasses.replace(overdue, throughput=dataclasses.replace(overdue.throughput, steps_per_second=0.0))
+    assert estimate_eta(overdue).seconds is not None
+    assert estimate_eta(stalled).description == "7 of 9 generations, 4.6 s a generation"
+
+
+def test_a_failed_job_that_waits_for_its_next_attempt_counts():
+    failure = FailureStatus("7/1", "score", (1,), {"a": "no memory"}, {"a": 3}, retry_in=64.0)
+    evaluation = dataclasses.replace(failure, kind="evaluate")
+    assert estimate_eta(status({"generations": 8}, failures=(failure,))).seconds == pytest.approx(64.0)
+    assert estimate_eta(status({"generations": 8}, failures=(evaluation,))).seconds == pytest.approx(4.6)
+
+
+def test_steps_are_estimated_from_the_rate_of_closed_generations():
+    eta = estimate_eta(status({"steps": 576_000}, paces=(10.0, 10.0)))  # each of 64,000 steps
+    assert eta.description.startswith("448k of 576k steps")
+    assert eta.seconds == pytest.approx(20.0)
+
+
+def test_the_nearest_of_several_limits_is_first_and_counts():
+    eta = estimate_eta(status({"generations": 1000, "minutes": 30.0}, seconds=18 * 60))
+    assert [each.name for each in eta.bounds] == ["minutes", "generations"]
+    assert eta.seconds == eta.bounds[0].seconds
+
+
+def with_speed(status, candidates=None, evaluations=None):
+    throughput = dataclasses.replace(
+        status.throughput, episodes_per_second=candidates, evaluation_episodes_per_second=evaluations
+    )
+    return dataclasses.replace(status, throughput=throughput)
+
+
+@pytest.mark.parametrize(("rate", "then"), [(None, "then 90 episodes of evaluation"), (0.5, "about 3 min to go")])
+def test_evaluations_and_confirmation_after_the_limit_count(rate, then):
+    ending = status({"minutes": 1.0}, seconds=66.0, gone=40.0, state="evaluating", ending=True, closing=90)
+    eta = estimate_eta(with_speed(ending, evaluations=rate))
+    assert eta.description == f"1.1 of 1 minute, 4.6 s a generation, {then}"
+    before = status({"minutes": 2.0}, seconds=60.0, closing=90)
+    eta = estimate_eta(with_speed(before, evaluations=rate))
+    assert (eta.limit, eta.seconds) == (60.0, None if rate is None else 240.0)
+    assert ("about 1 min to its limit, then 90" in eta.description) == (rate is None)
+
+
+def test_a_limit_that_an_evaluation_reached_is_over_too():
+    eta = estimate_eta(
+        with_speed(status({"target": 900.0}, state="evaluating", ending=True, closing=90), evaluations=9.0)
+    )
+    assert eta.seconds == 10.0
+
+
+def test_a_run_whose_limit_is_not_reached_is_not_about_to_end():
+    quick = estimate_eta(status({"generations": 12}, paces=(0.1,)))
+    assert quick.description.endswith("0.1 s a generation, less than a second to go")
+
+
+def test_after_losing_workers_the_remaining_speed_counts():
+    slowed = with_speed(status({"generations": 10}, gone=99.0), candidates=0.5)  # 5 of 8 episodes are left
+    assert estimate_eta(slowed).seconds == 10 + 16 + 16
+    steps = with_speed(status({"steps": 576_000}, paces=(8.0, 8.0)), candidates=0.5)
+    assert estimate_eta(steps).seconds == pytest.approx(2 * 16.0)
+    first = with_speed(status({"generations": 8}, paces=()), candidates=0.5)
+    assert estimate_eta(first).seconds == 10.0
+
+
+def test_a_target_score_has_no_estimate():
+    eta = estimate_eta(status({"target": 900.0, "parted": 3}, best=BEST))
+    assert eta.description == (
+        "until an evaluation reaches 900 (best 120.5), until 3 evaluations in a row fall behind, 4.6 s a generation"
+    )
+    assert eta.seconds is None
+
+
+def test_without_limits_or_generations_there_is_no_estimate():
+    assert estimate_eta(status(paces=())).description == "no limit: it runs until it is stopped"
+    assert estimate_eta(status({"generations": 9}, paces=())).seconds is None
+
+
+@pytest.mark.parametrize("state", ["paused", "waiting for workers", "ended", "left"])
+def test_inactive_states_have_no_estimate(state):
+    assert estimate_eta(status({"minutes": 30.0}, seconds=60.0, state=state)).seconds is None
+
+
+@pytest.mark.parametrize("strange", ["many", None, [1], float("nan"), -3])
+def test_unknown_limits_are_ignored(strange):
+    eta = estimate_eta(
+        status(dict.fromkeys(("generations", "steps", "minutes", "target", "parted"), strange), seconds=1.0)
+    )
+    assert eta.bounds == ()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, "generation 7: 3 of 8 episodes"),
+        (
+            {"generation": dataclasses.replace(STATUS.generation, episodes_done=0, episodes=0)},
+            "generation 7: all candidates failed",
+        ),
+        ({"state": "paused", "why": "asked for"}, "paused: asked for"),
+        ({"state": "evaluating", "evaluating": EpisodeProgress(3, 16)}, "waiting for an evaluation: 3 of 16 episodes"),
+        (
+            {"state": "evaluating", "confirming": EpisodeProgress(3, 1600)},
+            "confirming its result: 3 of 1,600 episodes",
+        ),
+        ({"state": "waiting for workers"}, "waiting for workers: none is present"),
+        (
+            {"state": "waiting for workers", "workers": WorkerCount(0, 0, 0), "steps": 0},
+            "waiting for workers: none has joined yet",
+        ),
+        ({"state": "waiting for workers", "workers": WorkerCount(0, 0, 0)}, "waiting for workers: none is present"),
+        (
+            {
+                "state": "waiting for workers",
+                "worker_list": (dataclasses.replace(WORKER, state="left", reason="no memory"),),
+            },
+            f"waiting for workers: none is present; {WORKER.worker} left 0.3 s ago: no memory",
+        ),
+        (
+            {"state": "waiting for workers", "refused": {"old-host": "no AVX2"}},
+            "waiting for workers: old-host was refused: no AVX2",
+        ),
+        (
+            {"state": "left"},
+            "its coordinator left; `dreamfleet coordinator --resume night` continues (its log has the full command)",
+        ),
+        (
+            {"state": "ended", "why": "30 minutes", "best": None},
+            "ended: 30 minutes; the last mean; it was not evaluated",
+        ),
+        ({"state": "of a later version"}, "of a later version"),
+    ],
+)
+def test_states_are_described(changes, said):
+    assert describe_state(status(**changes)) == said
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [
+        (0.0, "0 s"), (0.25, "0.25 s"), (4.6, "4.6 s"), (48.2, "48 s"), (59.7, "1 min"), (720, "12 min"),
+        (3599, "1 h"), (12_000, "3 h 20 min"), (439_200, "5 d 2 h"), (86_400 * 3, "3 d"), (float("inf"), "very long"),
+    ],
+)  # fmt: skip
+def test_durations_are_formatted(seconds, said):
+    assert format_duration(seconds) == said

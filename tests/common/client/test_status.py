@@ -1,0 +1,99 @@
+"""The status document: golden file, later versions, and errors."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from dreamfleet.common.client.status import Candidate, read_document, read_status
+from dreamfleet.common.protocol.codec import encode_json
+from dreamfleet.common.protocol.host_classes import HostClasses, HostClassShare
+from dreamfleet.common.schema.validation import MalformedError
+from dreamfleet.coordinator.verbs.status import print_runs
+from tests.support.samples import STATUS
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "status.v2.json"
+
+
+def test_the_golden_status_can_be_read():
+    assert read_status(read_document(GOLDEN.read_bytes())) == STATUS
+
+
+def test_statuses_round_trip():
+    assert read_status(read_document(encode_json(STATUS))) == STATUS
+    assert json.loads(encode_json(STATUS)) == json.loads(GOLDEN.read_bytes())
+
+
+def test_fields_of_later_versions_are_ignored_at_any_depth():
+    document = json.loads(GOLDEN.read_bytes())
+    later = {"later": {"anything": [1]}}
+    document |= later
+    for part in (document["settings"], document["settings"]["task"], document["worker_list"][0], document["waste"],
+                 document["population"], document["recent"][0], document["best"]):  # fmt: skip
+        part.update(later)
+    assert read_status(document) == STATUS
+
+
+@pytest.mark.parametrize("missing", ["waste", "population", "worker_list", "recent"])
+def test_the_error_for_a_missing_field_names_the_version_to_install(missing):
+    document = json.loads(GOLDEN.read_bytes())
+    del document[missing]
+    with pytest.raises(MalformedError, match=r"run night .* install the coordinator's dreamfleet \(0\.1\.0\) here"):
+        read_status(document)
+
+
+def test_the_first_schema_is_refused_with_its_number():
+    with pytest.raises(MalformedError, match=r"schema 1, not 2"):
+        read_status({"schema": 1, "run": "night", "package": "0.0.9", "state": "running"})
+
+
+@pytest.mark.parametrize("payload", [b"", b"[]", b"\xff", b"{" * 20000, b"1"])
+def test_an_invalid_document_is_a_readable_error(payload):
+    with pytest.raises(MalformedError, match="install the same dreamfleet"):
+        read_document(payload)
+
+
+def test_a_population_has_columns_and_rows():
+    population = dataclasses.replace(STATUS.population, offset=4)
+    assert population.candidates[1] == Candidate(7, 5, 1, 2, -3.25)
+    assert population.candidates[2].fitness is None
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("evaluation", "episodes"), 0),
+        (("best", "episodes"), -1),
+        (("population", "done"), [1]),
+    ],
+)
+def test_values_out_of_range_are_malformed(path, value):
+    document = json.loads(GOLDEN.read_bytes())
+    document[path[0]][path[1]] = value
+    with pytest.raises(MalformedError):
+        read_status(document)
+
+
+def test_a_number_with_too_many_digits_is_malformed():
+    with pytest.raises(MalformedError):
+        read_document(b'{"limits": {"generations": 1%s}}' % (b"0" * 400))
+    assert read_document(b'{"limits": {"generations": 18446744073709551615}}')
+
+
+def test_host_classes_without_names_or_results_are_described():
+    assert HostClasses(total=1).description == "no result yet"
+    assert HostClasses(2, (HostClassShare("a" * 16, 0, ()),), 0).description.startswith("mixed: 2 classes")
+
+
+if __name__ == "__main__" and not GOLDEN.exists():
+    GOLDEN.write_bytes(encode_json(STATUS))
+
+
+def test_one_invalid_reply_among_several_runs_is_only_noted(capsys):
+    first, other, liar = (json.loads(encode_json(dataclasses.replace(STATUS, run=run))) for run in ("b", "a", "liar"))
+    print_runs([first, liar | {"evaluations": -1}, other])
+    output = capsys.readouterr()
+    assert [line.split()[0] for line in output.out.splitlines() if line.split()[0] in {"a", "b", "liar"}] == ["a", "b"]
+    assert "liar" in output.err
+    assert "2 live runs" in output.err

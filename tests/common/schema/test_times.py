@@ -1,0 +1,57 @@
+"""Times in journals that no clock should have given: read as unknown, and in no way an error."""
+
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from dreamfleet.common.cli.command_line import main
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.schema.times import elapsed_seconds, format_time
+
+RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
+ENDED = "2026-01-01T00:00:00+00:00"
+
+
+@pytest.mark.parametrize(
+    ("begun", "seconds"),
+    [
+        ("2025-12-31T23:59:00+00:00", 60.0),
+        ("2026-01-01T01:59:00+02:00", 60.0),
+        ("2026-01-02T00:00:00+00:00", None),  # the clock was set back
+        ("9999-12-31T23:59:59-23:00", None),
+        ("", None),
+        ("yesterday", None),
+    ],
+)
+def test_seconds_between_two_moments(begun, seconds):
+    assert elapsed_seconds(begun, ENDED) == seconds
+    assert elapsed_seconds(ENDED, "") is None
+
+
+def test_a_moment_for_people():
+    assert format_time("2026-11-23T19:30:59+02:00") == "2026-11-23 17:30 UTC"
+    assert [format_time(each) for each in ("", "x\x1b", "9999-12-31T23:59:59-23:00")] == [
+        "", "x\\x1b", "9999-12-31T23:59:59-23:00",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("begun", [None, "", "x", "1970-01-01T00:00:00", "9999-12-31T23:59:59-23:00"])
+def test_every_verb_about_a_run_reads_its_odd_times(begun, tmp_path, capsys):
+    runs = shutil.copytree(RUNS, tmp_path / "runs")
+    with closing(sqlite3.connect(runs / "reality" / "journal.sqlite")) as journal, journal:
+        journal.execute("INSERT OR REPLACE INTO run VALUES ('ended_at', ?)", (ENDED,))
+        journal.execute("DELETE FROM run WHERE key = 'created'")
+        if begun is not None:
+            journal.execute("INSERT INTO run VALUES ('created', ?)", (begun,))
+    known = begun == "1970-01-01T00:00:00"
+    with RunFolder(runs / "reality") as run:
+        assert (run.duration_seconds is not None) == known
+    for words in ("list", "show reality", "show reality --json", "receipt reality", "receipt reality --json"):
+        assert main(["runs", *words.split(), "--runs-dir", str(runs)]) == 0
+    printed = capsys.readouterr().out
+    assert ("year = {1970}" in printed) == known
+    assert ("begun at an unknown time" in printed) == (not begun)
+    assert "-2." not in printed.partition("ended_at")[2].partition("\n")[0]

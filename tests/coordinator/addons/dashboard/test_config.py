@@ -1,0 +1,40 @@
+"""The dashboard's address and token."""
+
+import pytest
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.coordinator.addons.dashboard.config import DashboardConfig
+
+TOKEN = "correct horse battery"
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.7", "localhost", "::1"])
+def test_a_loopback_address_needs_no_token(host):
+    assert DashboardConfig(host=host).is_loopback
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "example.org", ""])
+def test_any_other_address_needs_one(host):
+    with pytest.raises(UsageError, match="give a --token"):
+        DashboardConfig(host=host)
+    assert not DashboardConfig(host=host, token=TOKEN).is_loopback
+
+
+def test_a_short_token_is_refused():
+    with pytest.raises(UsageError, match="at least 12 characters"):
+        DashboardConfig(token="short")
+
+
+def test_the_repr_hides_the_token():
+    assert TOKEN not in repr(DashboardConfig(token=TOKEN))
+
+
+@pytest.mark.parametrize("port", [-1, 65536])
+def test_a_port_is_one(port):
+    with pytest.raises(UsageError, match="--port must be"):
+        DashboardConfig(port=port)
+
+
+def test_an_address_can_be_opened():
+    assert DashboardConfig().address(8420) == "http://127.0.0.1:8420/"
+    assert DashboardConfig(host="::1").address(1) == "http://[::1]:1/"

@@ -1,0 +1,116 @@
+"""The page's document of live, lost and ended runs."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+
+from dreamfleet.common.client.equal_fitness import ENOUGH
+from dreamfleet.common.client.status import EpisodeProgress, FailureStatus, WorkerCount
+from dreamfleet.coordinator.addons.dashboard.page_state import RunSnapshot, page_state
+from tests.support.samples import STATUS
+
+
+def look(lost=None, folder=None, **changes):
+    status = replace(STATUS, **changes)
+    lanes = ["9"] * len(status.worker_list)
+    return RunSnapshot(status, status.worker_list, lanes, (status.population,), 100.0, lost, folder)
+
+
+def momentary_values(document):
+    tiles = {each["name"]: each["value"] for each in document["tiles"]}
+    workers = document["workers"]
+    columns = [value for name in ("state", "rate", "leases", "load", "heard") for value in workers[name]]
+    return [tiles["throughput"], tiles["fleet"], *columns]
+
+
+@pytest.mark.parametrize("gone", [{"lost": 101.0}, {"state": "ended"}, {"state": "left"}])
+def test_only_a_live_run_shows_momentary_values(gone):
+    assert not {"-", None} & set(momentary_values(page_state(look())))
+    document = page_state(look(**gone))
+    assert set(momentary_values(document)) == {"-", None}
+    assert "at the last" in next(each["beneath"] for each in document["tiles"] if each["name"] == "fleet")
+    assert document["workers"]["finished"] == page_state(look())["workers"]["finished"], "finished jobs stay"
+
+
+def test_no_generation_is_open_once_a_run_has_ended_or_only_its_mean_is_driven():
+    opened = replace(STATUS.generation, episodes_done=0)
+    assert page_state(look(generation=opened))["candidates"]["total"] > 0
+    for state in ("ended", "evaluating"):
+        assert page_state(look(generation=opened, state=state))["candidates"]["total"] == 0
+    assert page_state(look(state="evaluating"))["candidates"]["total"] > 0, (
+        "it waits for the evaluation of the last mean"
+    )
+
+
+def test_a_lost_run_with_its_journal_here_shows_the_whole_command():
+    assert (
+        f"--resume {STATUS.run} --runs-dir /data/runs, with --join"
+        in (page_state(look(101.0, Path("/data/runs") / STATUS.run))["sentence"])
+    )
+    assert f"--resume {STATUS.run}, with --runs-dir and --join" in page_state(look(101.0))["sentence"]
+
+
+def test_generations_of_one_fitness_are_a_trouble():
+    assert len(page_state(look(failures=(), equal=ENOUGH))["troubles"]) == 1
+    assert page_state(look(failures=(), equal=ENOUGH - 1))["troubles"] == []
+
+
+def test_a_refused_worker_is_told_as_long_as_the_run_goes_on():
+    refused = {"vm": "no gymnasium"}
+    assert page_state(look(refused=refused, failures=()))["troubles"] == ["worker vm was refused: no gymnasium"]
+    assert page_state(look(refused=refused, failures=(), state="ended"))["troubles"] == []
+
+
+def test_failures_and_failed_episodes_are_named():
+    failure = FailureStatus("4/0", "evaluate", (20003,), {"host-a": "no road"}, {"host-a": 2})
+    document = page_state(look(failures=(failure,), best=replace(STATUS.best, failed=1)))
+    assert document["troubles"] == ["the evaluation of generation 4's mean, seed 20003, failed on host-a (2x): no road"]
+    reported = next(each for each in document["tiles"] if each["name"] == "score")
+    assert reported["beneath"] == "provisional, generation 4, 16 seeds; 1 more episode failed"
+
+
+def test_a_running_run_says_each_fact_once():
+    document = page_state(look(state="running"))
+    assert document["sentence"] == "", "the open generation's card says it"
+    assert "a generation" not in document["eta"]["text"], "a tile has the pace"
+    paused = page_state(look(state="paused", why="by hand"))
+    assert (paused["state"], paused["sentence"]) == ("paused", "By hand")
+
+
+def test_redundant_work_is_one_line_unless_it_is_not_zero():
+    zeros = {each.name: 0 for each in fields(STATUS.waste)}
+    nothing = look(waste=replace(STATUS.waste, **zeros), dropped={"malformed": 0})
+    assert page_state(nothing)["redundant"] == {"text": "none", "rows": []}
+    some = page_state(look(waste=replace(STATUS.waste, **{**zeros, "silences": 3}), dropped={"bad\x1b": 2}))[
+        "redundant"
+    ]
+    assert some == {
+        "text": "0.0% of steps",
+        "rows": [("silences of workers", "3"), ("messages dropped: bad\\x1b", "2")],
+    }
+
+
+def test_the_score_before_the_first_evaluation_says_when_it_comes():
+    settings = replace(STATUS.settings, evaluate_every=10)
+    (score,) = (
+        each
+        for each in page_state(look(best=None, confirmed=None, settings=settings))["tiles"]
+        if each["name"] == "score"
+    )
+    assert (score["value"], score["beneath"]) == ("-", "first evaluation after generation 9")
+
+
+def test_episodes_of_a_mean_are_called_as_its_world_calls_them():
+    track = replace(look(evaluating=EpisodeProgress(3, 16)), word="track")
+    document = page_state(track)
+    assert document["evaluation"][0]["of"] == "16 tracks"
+    assert "16 tracks" in next(each["beneath"] for each in document["tiles"] if each["name"] == "score")
+
+
+def test_a_worker_that_left_is_shown_with_its_reason_and_is_not_counted_as_silent():
+    gone = replace(STATUS.worker_list[0], state="left", reason="no memory\x1b")
+    document = page_state(look(worker_list=(gone,), workers=WorkerCount(0, 1, 0, 1)))
+    assert document["workers"]["reason"] == ["no memory\\x1b"]
+    assert "1 left" in document["fleet"]
+    assert "silent" not in document["fleet"]

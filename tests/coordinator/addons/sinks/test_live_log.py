@@ -1,0 +1,249 @@
+"""A run's curves in the records of other programs, as its journal has them.
+Tests sinks.py, coordinator/settings/live_log.py and common/files/tensorboard.py."""
+
+import json
+import sqlite3
+import sys
+from collections import Counter
+from contextlib import closing
+from importlib.util import find_spec
+from multiprocessing import active_children
+
+import pytest
+
+from dreamfleet.common.cli.command_line import main
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.files.tensorboard import EVENTS, read_scalars
+from dreamfleet.common.host.packages import hidden
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.coordinator.addons.sinks.live_log import follow, live_log
+from dreamfleet.coordinator.addons.sinks.sinks import check_sinks
+from dreamfleet.coordinator.settings.live_log import SinkName, parse_sink
+from dreamfleet.coordinator.settings.network import NetworkConfig
+from dreamfleet.coordinator.views.export import scalars_of
+from tests.support.events import scalars
+from tests.support.processes import ROOT
+
+RUN = "dream"
+EXAMPLES = ROOT / "docs" / "how-to"
+BOARD = SinkName("tensorboard", "")
+
+
+def wanted(run):
+    """Every point of the journal."""
+    with RunFolder(run) as stored:
+        return Counter((name.replace("__", "/"), step) for step, each in scalars_of(stored) for name in each)
+
+
+def drawn(folder):
+    return Counter((name, step) for name, points in scalars(folder).items() for step, _ in points)
+
+
+def write(run, name=BOARD, looks=1, between=lambda look: None):
+    """Follow a run for so many looks; what was reported."""
+    done, said = iter(range(1, looks + 1)), []
+
+    def is_over():
+        look = next(done)
+        between(look)
+        return look == looks
+
+    follow(run, name, is_over, said.append)
+    return said
+
+
+def delete_from(run, generation):
+    with closing(sqlite3.connect(run / "journal.sqlite")) as journal, journal:
+        journal.execute("UPDATE generation SET closed = NULL WHERE number >= ?", (generation,))
+
+
+def test_a_record_has_every_point_once(runs):
+    assert write(runs / RUN, looks=3) == []
+    assert drawn(runs / RUN / "tensorboard") == wanted(runs / RUN)
+    assert max(drawn(runs / RUN / "tensorboard").values()) == 1
+
+
+def test_another_run_of_the_same_name_keeps_its_record(runs, tmp_path):
+    name = SinkName("tensorboard", str(tmp_path / "board"))
+    assert write(runs / RUN, name) == []
+    before = drawn(tmp_path / "board" / RUN)
+    with closing(sqlite3.connect(runs / RUN / "journal.sqlite")) as journal, journal:
+        journal.execute("UPDATE run SET value = 'another' WHERE key = 'uid'")
+    (said,) = write(runs / RUN, name)
+    assert "holds the curves of another run of this name" in said
+    assert drawn(tmp_path / "board" / RUN) == before
+
+
+def test_a_process_that_was_killed_holds_up_no_end(runs, caplog):
+    with live_log(runs / RUN, ("tensorboard",)):
+        (child,) = active_children()
+        child.kill()
+        child.join()
+    assert not active_children()
+
+
+def test_a_record_goes_on_where_it_was_left(runs, tmp_path):
+    name = SinkName("tensorboard", str(tmp_path / "board"))
+    whole = wanted(runs / RUN)
+    with closing(sqlite3.connect(runs / RUN / "journal.sqlite")) as journal, journal:
+        (times,) = [dict(journal.execute("SELECT number, closed FROM generation"))]
+    delete_from(runs / RUN, 2)
+    write(runs / RUN, name)
+    (first,) = (tmp_path / "board" / RUN).glob(EVENTS)
+    first.write_bytes(first.read_bytes()[:-5])  # a kill tore the last record
+    with closing(sqlite3.connect(runs / RUN / "journal.sqlite")) as journal, journal:
+        journal.executemany("UPDATE generation SET closed = ? WHERE number = ?", [(at, n) for n, at in times.items()])
+    write(runs / RUN, name)
+    write(runs / RUN, name)
+    found = read_scalars(tmp_path / "board" / RUN)
+    assert Counter((each, step) for each, points in found.items() for step in points) == whole
+    assert sum(len(path.read_bytes()) > 0 for path in (tmp_path / "board" / RUN).glob(EVENTS)) == 3
+
+
+def test_results_that_were_taken_back_are_replaced(runs):
+    folder = runs / RUN / "tensorboard"
+    write(runs / RUN)
+    before = read_scalars(folder)
+    with closing(sqlite3.connect(runs / RUN / "journal.sqlite")) as journal, journal:
+        journal.execute("UPDATE generation SET mean = mean + 100 WHERE number = 1")
+    write(runs / RUN)
+    found = read_scalars(folder)
+    assert found["fitness/mean"][1] == pytest.approx(before["fitness/mean"][1] + 100)
+    assert {name: len(points) for name, points in found.items()} == {name: len(each) for name, each in before.items()}
+
+
+def test_points_of_generations_that_were_dropped_are_taken_back(runs):
+    folder = runs / RUN / "tensorboard"
+    write(runs / RUN)
+    delete_from(runs / RUN, 1)
+    with closing(sqlite3.connect(runs / RUN / "journal.sqlite")) as journal, journal:
+        journal.execute("DELETE FROM evaluation WHERE generation >= 1")
+        journal.execute("DELETE FROM run WHERE key = 'confirmed'")
+    write(runs / RUN)
+    assert {(name, step) for name, points in read_scalars(folder).items() for step in points} == set(wanted(runs / RUN))
+
+
+def test_a_record_that_cannot_be_written_is_reported_once_and_whole_later(runs):
+    obstacle = runs / RUN / "tensorboard"
+    obstacle.write_text("a file where the folder should be")
+    said = write(runs / RUN, looks=4, between=lambda look: obstacle.unlink() if look == 4 else None)
+    assert [text.partition(" (")[0] for text in said] == [
+        "the curves do not go to tensorboard", "the curves go to tensorboard again, and nothing is missing there",
+    ]  # fmt: skip
+    assert drawn(obstacle) == wanted(runs / RUN)
+
+
+def test_a_name_has_a_kind_and_perhaps_a_place():
+    assert parse_sink("tensorboard:/tmp/board") == SinkName("tensorboard", "/tmp/board")
+    assert parse_sink("a.b:Sink") == SinkName("a.b:Sink", "")
+    assert parse_sink("a.b:Sink:http://127.0.0.1:5000") == SinkName("a.b:Sink", "http://127.0.0.1:5000")
+    for wrong in ("comet", "comet:", ":Sink", "a..b:Sink", "../a:Sink", "a:Sink/../b"):
+        with pytest.raises(UsageError):
+            NetworkConfig(log_to=(wrong,))
+    for twice in ("tensorboard", "a:Sink"):
+        with pytest.raises(UsageError):
+            NetworkConfig(log_to=(twice, f"{twice}:mine"))
+
+
+def test_a_missing_package_is_a_users_error(monkeypatch):
+    monkeypatch.delitem(sys.modules, "tensorboardX", raising=False)  # what is loaded cannot be hidden
+    with hidden("tensorboardX"), pytest.raises(UsageError):
+        check_sinks(("tensorboard",))
+
+
+@pytest.fixture
+def own_sink(tmp_path, monkeypatch):
+    """A sink in a module of the user's own, which counts the processes that import it."""
+    folder = tmp_path / "modules"
+    folder.mkdir()
+    (folder / "own_sink.py").write_text(OWN)
+    monkeypatch.setenv("DREAMFLEET_TRUST", "")
+    monkeypatch.syspath_prepend(folder)
+    yield folder
+    sys.modules.pop("own_sink", None)
+
+
+OWN = """
+from pathlib import Path
+from dreamfleet.coordinator.addons.sinks.sinks import TensorBoardSink
+with open(Path(__file__).parent / "imported", "a") as file:
+    print(file=file)
+class Board(TensorBoardSink):
+    pass
+class Half:
+    def log(self, step, numbers):
+        pass
+"""
+
+
+def test_a_sink_of_ones_own_has_every_point(runs, tmp_path, own_sink, monkeypatch):
+    monkeypatch.setenv("DREAMFLEET_TRUST", "own_sink")
+    name = f"own_sink:Board:{tmp_path / 'board'}"
+    check_sinks([name])
+    with live_log(runs / RUN, [name]):
+        pass
+    assert drawn(tmp_path / "board" / RUN) == wanted(runs / RUN)
+
+
+@pytest.mark.parametrize("kind", ["own_sink:Half", "own_sink:Absent", "own_absent:Sink"])
+def test_a_sink_that_cannot_be_is_a_users_error(own_sink, monkeypatch, kind):
+    monkeypatch.setenv("DREAMFLEET_TRUST", "own_sink,own_absent")
+    with pytest.raises(UsageError):
+        check_sinks((kind,))
+
+
+def test_a_runs_folder_chooses_no_module_and_its_user_does(runs, own_sink, monkeypatch, capsys):
+    with closing(sqlite3.connect(runs / RUN / "journal.sqlite")) as journal, journal:
+        journal.execute("REPLACE INTO run VALUES ('network', ?)", (json.dumps({"log_to": ["own_sink:Half"]}),))
+    words = ["coordinator", "--resume", RUN, "--runs-dir", str(runs)]
+    assert main(words) == 2
+    assert "--trust own_sink" in capsys.readouterr().err
+    assert not (own_sink / "imported").exists()
+    monkeypatch.setenv("DREAMFLEET_NETWORK_LOG_TO", "own_sink:Half")
+    assert main(words) == 2
+    assert (own_sink / "imported").exists()
+
+
+@pytest.mark.parametrize("kind", ["wandb", "mlflow"])
+def test_an_example_without_its_package_ends_the_coordinator_before_its_run(kind, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(EXAMPLES)
+    monkeypatch.setenv("DREAMFLEET_TRUST", "")
+    monkeypatch.setenv("DREAMFLEET_NETWORK_LOG_TO", f"{kind}_sink:{kind.capitalize()}Sink")
+    with hidden(kind):
+        assert main(["coordinator", "--runs-dir", str(tmp_path / "runs")]) == 2
+    assert not (tmp_path / "runs" / "run").exists()
+
+
+def test_wandb_offline_has_a_folder_for_each_life(runs, monkeypatch):
+    if find_spec("wandb") is None:
+        pytest.skip("needs the package wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("DREAMFLEET_TRUST", "wandb_sink")
+    monkeypatch.syspath_prepend(EXAMPLES)
+    for _ in range(2):
+        with live_log(runs / "reality", ["wandb_sink:WandbSink"]):
+            pass
+    sizes = [path.stat().st_size for path in (runs / "reality" / "wandb").glob("offline-run-*/*.wandb")]
+    assert len(sizes) == 2
+    assert min(sizes) > len(wanted(runs / "reality"))
+
+
+@pytest.mark.filterwarnings("ignore")  # of its libraries
+def test_mlflow_has_every_point_once_also_in_a_second_life(runs, tmp_path, monkeypatch):
+    mlflow = pytest.importorskip("mlflow")
+    address = f"sqlite:///{tmp_path}/mlflow.db"
+    for _ in range(2):
+        assert write_example(runs, monkeypatch, SinkName("mlflow_sink:MlflowSink", address)) == []
+    client = mlflow.MlflowClient(tracking_uri=address)
+    (run,) = client.search_runs([client.get_experiment_by_name("dreamfleet").experiment_id])
+    found = Counter(
+        (key, each.step) for key in run.data.metrics for each in client.get_metric_history(run.info.run_id, key)
+    )
+    assert found == wanted(runs / "reality")
+
+
+def write_example(runs, monkeypatch, name):
+    monkeypatch.syspath_prepend(EXAMPLES)
+    monkeypatch.setenv("DREAMFLEET_TRUST", name.module)
+    delete_from(runs / "reality", 1)
+    return write(runs / "reality", name)

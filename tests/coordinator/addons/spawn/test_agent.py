@@ -1,0 +1,184 @@
+"""The agent on hosts in unexpected states."""
+
+import json
+import os
+import platform
+import shutil
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from dreamfleet.coordinator.addons.spawn import agent
+from dreamfleet.coordinator.addons.spawn.agent import COMPLETE, CREATED, MARK, STATE, Channel, HostFolder
+from tests.support.processes import ROOT
+
+
+def test_a_missing_file_is_reported_and_the_lock_released(tmp_path, capsys):
+    asked = {"do": "start", "root": str(tmp_path / "place"), "name": "box", "python": str(tmp_path / "gone"),
+             "words": [], "env": {}, "slots": 1, "held": False, "digest": "1"}  # fmt: skip
+    for _ in range(2):
+        agent.handle_request(asked, Channel())
+        said = capsys.readouterr().out
+        assert said.startswith(f'{MARK}{{"failed"'), said
+        assert "No such file" in said
+
+
+def test_a_folder_removed_while_waiting_for_its_lock_is_created_again(tmp_path, monkeypatch):
+    host_folder, take = HostFolder(str(tmp_path / "place"), Channel()), HostFolder._acquire
+
+    def removed(self, lock):
+        monkeypatch.setattr(HostFolder, "_acquire", take)
+        self.remove()
+        take(self, lock)
+
+    monkeypatch.setattr(HostFolder, "_acquire", removed)
+    with host_folder.locked():
+        assert (host_folder.root / "lock").exists()
+
+
+def test_a_foreign_folder_is_left_alone(tmp_path, capsys):
+    kept = [tmp_path / "cache" / "a", tmp_path / "workers" / "mine" / "b", tmp_path / "environments" / "c"]
+    for path in kept:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    agent.handle_request({"do": "end", "root": str(tmp_path), "names": None, "now": False, "keep": False}, Channel())
+    assert '"ok"' in capsys.readouterr().out
+    agent.handle_request({"do": "start", "root": str(tmp_path), "name": "box"}, Channel())
+    assert "of something else: name another --remote-dir" in capsys.readouterr().out
+    assert all(path.exists() for path in kept)
+
+
+def test_a_folder_that_existed_before_stays_with_its_other_files(tmp_path):
+    host_folder = HostFolder(str(tmp_path), Channel())
+    (tmp_path / "notes").touch()
+    with host_folder.locked():
+        (tmp_path / "cache").mkdir()
+    with host_folder.locked():
+        host_folder.remove()
+    assert [path.name for path in tmp_path.iterdir()] == ["notes"]
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_an_environment_without_its_python_is_not_listed(tmp_path, there):
+    folder = tmp_path / "environments" / "one"
+    (folder / "bin").mkdir(parents=True)
+    (folder / COMPLETE).touch()
+    (folder / "bin" / "python").symlink_to(os.devnull if there else tmp_path / "gone")
+    found = agent.inspect_host(HostFolder(str(tmp_path), Channel()))
+    assert found["environments"] == (["one"] if there else [])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["killed", "full"])
+def test_an_agent_that_ends_at_any_step_leaves_what_the_next_one_removes(tmp_path, mode):
+    script = ROOT / "tests" / "support" / "agent_steps.py"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, script, tmp_path, mode], capture_output=True, check=True, env=environment)
+    found = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(found) > 15
+    assert {each["code"] for each in found[:-1]} == {9 if mode == "killed" else 8}
+    assert [each for each in found if not each["ok"] or each["lives"]] == []
+    # Killed between creating a folder and listing it, an agent leaves it empty: it may have been there before.
+    empty = [["share"], ["share", "share/fleet"]]
+    assert [each["left"] for each in found if each["left"] and (mode == "full" or each["left"] not in empty)] == []
+
+
+HOLDER = b'{"pid": 1, "birth": "", "node": "", "digest": "", "slots": 1, "since": 1.0, "holder": "oops"}'
+
+
+@pytest.mark.parametrize("damage", [b"", b"{", b"7", b'"x"', b"[1, [2]]", b'["/"]', HOLDER])
+def test_damaged_files_of_the_agent_are_read_as_nothing(tmp_path, capsys, damage):
+    root = tmp_path / "place"
+    host_folder = HostFolder(str(root), Channel())
+    with host_folder.locked():
+        host_folder.worker("box").mkdir(parents=True)
+    (root / CREATED).write_bytes(damage)
+    (host_folder.worker("box") / STATE).write_bytes(damage)
+    (root / "workers" / ".DS_Store").touch()
+    assert agent.inspect_host(host_folder)["workers"][0]["running"] is False
+    agent.handle_request({"do": "end", "root": str(root), "names": None, "now": True, "keep": False}, Channel())
+    assert '"ok"' in capsys.readouterr().out
+    assert not any(root.glob("*"))
+
+
+def test_what_cannot_be_removed_stays_ours_and_is_named_with_the_command(tmp_path, monkeypatch, capsys):
+    host_folder, remove = HostFolder(str(tmp_path / "place"), Channel()), shutil.rmtree
+    asked = {"do": "end", "root": str(host_folder.root), "names": None, "now": True, "keep": False}
+    with host_folder.locked():
+        (host_folder.environment("one") / "lib").mkdir(parents=True)
+    (host_folder.environment("one") / "lib").chmod(0o500)
+
+    def refused(folder):
+        raise PermissionError(13, os.strerror(13), str(folder))
+
+    monkeypatch.setattr(shutil, "rmtree", refused)
+    agent.handle_request(asked, Channel())
+    said = capsys.readouterr().out
+    assert '"failed"' in said
+    assert f"cd {host_folder.root} && rm -rf environments" in said
+    assert host_folder.is_ours
+    monkeypatch.setattr(shutil, "rmtree", remove)
+    agent.handle_request(asked, Channel())
+    assert not host_folder.root.exists()
+
+
+@pytest.fixture
+def started(tmp_path):
+    """A request to start a worker, the folder in which it runs already, and its process id."""
+    host_folder = HostFolder(str(tmp_path / "place"), Channel())
+    folder = host_folder.worker("box")
+    with host_folder.locked():
+        folder.mkdir(parents=True)
+    words = [sys.executable, "-c", "import time; time.sleep(1000)", "worker"]
+    child = subprocess.Popen(words, cwd=folder, start_new_session=True)
+    state = {"digest": "1", "slots": 1, "since": 0.0, "node": platform.node(), "pid": child.pid,
+             "birth": agent.process_start(child.pid)}  # fmt: skip
+    (folder / STATE).write_text(json.dumps(state))
+    yield {"do": "start", "root": str(host_folder.root), "name": "box", "held": False, "digest": "1"}, folder, child.pid
+    child.kill()
+    child.wait()
+
+
+def answer(asked, capsys):
+    agent.handle_request(asked, Channel())
+    return json.loads(capsys.readouterr().out.splitlines()[-1].removeprefix(MARK))
+
+
+def ending(asked):
+    return {"do": "end", "root": asked["root"], "names": None, "now": True, "keep": False}
+
+
+def test_a_worker_is_this_hosts_after_the_host_is_renamed(started, capsys, monkeypatch):
+    asked, folder, pid = started
+    monkeypatch.setattr(platform, "node", lambda: "renamed")
+    assert answer(asked, capsys)["ok"]["outcome"] == "running"
+    assert [each["running"] for each in answer(ending(asked), capsys)["ok"]["ended"]] == [True]
+    assert agent.process_start(pid) == ""
+    assert not folder.parents[1].exists()
+
+
+def test_a_worker_of_another_host_is_named_with_the_command_that_removes_it(started, capsys):
+    asked, folder, pid = started
+    state = json.loads((folder / STATE).read_text())
+    (folder / STATE).write_text(json.dumps({**state, "node": "other", "birth": "another"}))
+    for request in (asked, ending(asked)):
+        said = answer(request, capsys)["failed"]
+        assert "other" in said
+        assert said.endswith(f"rm -rf {folder}")
+    assert folder.exists()
+    assert agent.process_start(pid)
+
+
+@pytest.mark.parametrize("damage", [None, '{"pid"'])
+def test_a_worker_that_runs_without_its_state_is_named_and_keeps_its_folder(started, capsys, damage):
+    asked, folder, pid = started
+    (folder / STATE).unlink() if damage is None else (folder / STATE).write_text(damage)
+    for request in (asked, ending(asked)):
+        assert f"`kill {pid}`" in answer(request, capsys)["failed"]
+    assert folder.exists()
+    os.kill(pid, signal.SIGKILL)
+    os.waitpid(pid, 0)
+    assert len(answer(ending(asked), capsys)["ok"]["ended"]) == 1
+    assert not folder.parents[1].exists()

@@ -1,0 +1,79 @@
+"""Hosts that answer nonsense, print without end or say nothing: each is one row, and the others go on.
+Tests answers.py, parallel.py and remote_host.py."""
+
+import resource
+import shlex
+import stat
+import sys
+import time
+
+import pytest
+
+from dreamfleet.coordinator.addons.spawn import connection
+from dreamfleet.coordinator.addons.spawn.config import Host, SpawnConfig
+from dreamfleet.coordinator.addons.spawn.parallel import check
+from dreamfleet.coordinator.addons.spawn.remote_host import FAILED, FleetAddress
+from tests.support.processes import DEADLINE
+
+GOOD = 'os.execvp("/bin/sh", ["sh", "-c", sys.argv[-1]])\n'
+READY = 'say("dreamfleet-host " + json.dumps({"ok": {}}))\n'
+MISBEHAVIOUR = {
+    "a-list": ('say("dreamfleet-host []")', "answers in a form"),
+    "no-json": ('say("dreamfleet-host {")', "answers in a form"),
+    "too-deep": ('say("dreamfleet-host " + "[" * 10**5)', "answers in a form"),
+    "another-kind": ("say('dreamfleet-host {\"moon\": 1}')", "answers in a form"),
+    "a-number": ("say('dreamfleet-host {\"say\": 1}')", "answers in a form"),
+    "a-strange-look": (READY + READY + "time.sleep(1000)", "its answer to 'look'"),
+    "an-endless-line": ("while True: os.write(1, b'x' * 65536)", "prints more than 1 MiB that are not an answer"),
+    "an-endless-answer": (
+        "os.write(1, b'dreamfleet-host '); \nwhile True: os.write(1, b'x' * 65536)", "prints more than 1 MiB",
+    ),
+    "an-endless-banner": ("while True: say('welcome')", "prints more than 1 MiB"),
+    "endless-progress": ("while True: say('dreamfleet-host {\"say\": \"on it\"}')", "progress without end"),
+    "slow-progress": ("while True: say('dreamfleet-host {\"say\": \"on it\"}'); time.sleep(1)", "progress without end"),
+    "lines-of-no-log": (
+        "while True: say('dreamfleet-host {\"line\": \"hello\"}'); time.sleep(1)", "answers in a form",
+    ),
+    "lines-amid-a-look": (
+        READY + "\nwhile True: say('dreamfleet-host {\"line\": \"hello\"}'); time.sleep(1)", "answers in a form",
+    ),
+    "endless-errors": ("while True: os.write(2, b'x' * 65536)", "does not answer within"),
+    "silence": ("time.sleep(1000)", "does not answer within"),
+    "what-it-never-reads": (READY + "time.sleep(1000)", "does not answer within"),
+}  # fmt: skip
+
+
+@pytest.fixture
+def fake_ssh(tmp_path):
+    """A program in the place of ssh, that behaves by the host's name."""
+    path = tmp_path / "ssh"
+    branches = "".join(
+        f"if host == {name!r}:\n" + "".join(f"    {line}\n" for line in code.splitlines())
+        for name, (code, _) in MISBEHAVIOUR.items()
+    )
+    path.write_text(
+        f"#!{sys.executable}\nimport json, os, sys, time\n"
+        "def say(text): os.write(1, text.encode() + b'\\n')\n"
+        f"host = sys.argv[-2]\n{branches}{GOOD}"
+    )
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return shlex.quote(str(path))
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pipes of connections that ended
+def test_each_fails_alone_in_little_memory(fake_ssh, tmp_path, monkeypatch):
+    monkeypatch.setattr(connection, "QUICK", 3.0)
+    monkeypatch.setattr("dreamfleet.coordinator.addons.spawn.remote_host.QUICK", 3.0)
+    spawn = SpawnConfig(ssh=fake_ssh, remote_dir=str(tmp_path / "there"), remote_python=sys.executable)
+    names = [*MISBEHAVIOUR, "good"]
+    hosts = [Host(f"h{number}", name, spawn) for number, name in enumerate(names)]
+    before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
+    rows = dict(zip(names, check(hosts, FleetAddress(("tcp/10.0.0.1:7447",))), strict=True))
+    assert time.monotonic() - began < DEADLINE
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KiB
+    assert rows.pop("good").state == "ready"
+    for name, row in rows.items():
+        assert row.state == FAILED, name
+        assert MISBEHAVIOUR[name][1] in row.what, (name, row.what)
+        assert "\n" not in row.what

@@ -1,0 +1,102 @@
+"""What a contrast trains, what it refuses, and what its figures come to. Tests config.py and summary.py."""
+
+from dataclasses import asdict
+
+import pytest
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.experiments.contrast.config import KINDS, Contrast, Trial, parse_kinds
+from dreamfleet.experiments.contrast.summary import (
+    TrialResult,
+    describe_difference,
+    differences,
+    means,
+    rows,
+)
+from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
+from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
+
+
+def test_the_two_kinds_that_ship_have_as_many_parameters():
+    plain, attentive = (
+        sum(each.numel() for each in MDNRNN(config).parameters())
+        for config in (MDNRNNConfig(), MDNRNNConfig(window=8, hidden=236))
+    )
+    assert parse_kinds(()) == KINDS == (("plain", ""), ("attentive", "--set window=8 hidden=236"))
+    assert abs(plain - attentive) < plain / 200
+
+
+def test_kinds_take_turns_and_own_flags_come_last():
+    contrast = Contrast(seeds=(4, 5), mdnrnn_flags="--updates 9 --hidden 8")
+    assert [each.name for each in contrast.trials] == ["plain-4", "attentive-4", "plain-5", "attentive-5"]
+    words = contrast.training_flags(Trial("attentive", 5))
+    assert words == ("--updates", "9", "--hidden", "8", "--set", "window=8", "hidden=236")
+    for world, preset in (("car-racing", "dream"), ("takecover", "takecover"), ("gym:ALE/Pong-v5", "pixels")):
+        assert contrast.run_flags_in(world) == ("--preset", preset, "--generations", "32")
+
+
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [
+        ({"kinds": (("alone", ""),)}, "twice or more"),
+        ({"kinds": (("one", ""), ("one", "--hidden 8"))}, "--kind one is given twice"),
+        ({"kinds": (("../up", ""), ("one", ""))}, "a name has only a-z"),
+        ({"kinds": (("one", "--seed 3"), ("two", ""))}, "omit --seed, which lab contrast sets itself"),
+        ({"kinds": (("one", "--hid 'x"), ("two", ""))}, "No closing quotation"),
+        ({"mdnrnn_flags": "--data elsewhere"}, "omit --data"),
+        ({"seeds": ()}, "one at least"),
+        ({"seeds": (1, 1)}, "different ones"),
+        ({"seeds": (-1,)}, "must be from 0"),
+    ],
+)
+def test_what_is_no_contrast_is_refused(settings, why):
+    with pytest.raises(UsageError, match=why):
+        Contrast(**settings)
+
+
+def test_seeds_and_kinds_may_be_added_but_none_changed():
+    wide = ("wide", "--hidden 512")
+    kept = Contrast(seeds=(4,), kinds=(KINDS[0], wide)).merge_settings(asdict(Contrast()))
+    assert kept["kinds"] == (*KINDS, wide), "one that is not asked for this time is not forgotten"
+    assert kept["seeds"] == (1, 2, 3, 4)
+    former = ("attentive", "--window 8 --hidden 236")  # of folders that were begun before settings were keys of `--set`
+    assert Contrast().merge_settings({"kinds": (KINDS[0], former)})["kinds"] == KINDS
+    with pytest.raises(UsageError, match="other kind attentive"):
+        Contrast(kinds=(KINDS[0], ("attentive", "--window 4"))).merge_settings(kept)
+    with pytest.raises(UsageError, match="other run_flags"):
+        Contrast(run_flags="--generations 3").merge_settings(kept)
+    assert Contrast().merge_settings({}) == asdict(Contrast())
+
+
+def outcome(kind, seed, nats, score):
+    return TrialResult(kind, seed, 1000, {"nats_per_dimension": nats}, score, 5.0, 16, score is not None)
+
+
+def test_kinds_are_compared_seed_by_seed():
+    outcomes = [
+        outcome("plain", 1, 0.96, 700.0), outcome("attentive", 1, 0.95, 720.0),
+        outcome("plain", 2, 0.98, 500.0), outcome("attentive", 2, 0.97, 450.0),
+    ]  # fmt: skip
+    found = {(kind, figure): each for kind, figure, each in differences(outcomes)}
+    nats, score = found["attentive", "nats_per_dimension"], found["attentive", "score"]
+    assert (nats.mean, nats.seeds, nats.is_significant) == (pytest.approx(-0.01), 2, True)
+    assert (score.mean, score.is_significant) == (-15.0, False)
+    assert describe_difference("attentive", "plain", "score", score).endswith(
+        "over 2 seeds: none, for one under 14.0 standard errors of so few seeds is none"
+    )
+    (plain,) = [each for each in means(outcomes) if (each.kind, each.figure) == ("plain", "score")]
+    assert plain.text == "600.0 ± 100.0"
+    assert rows(outcomes)[0]["reality"] == "700.0 ± 5.0 on 16"
+
+
+def test_one_seed_has_no_error_and_no_difference_and_what_was_not_evaluated_no_score():
+    outcomes = [outcome("plain", 1, 0.96, None), outcome("attentive", 1, 0.95, None)]
+    assert list(differences(outcomes)) == []
+    assert {each.figure for each in means(outcomes)} == {"nats_per_dimension"}
+    assert means(outcomes)[0].text == "0.960"
+    assert rows(outcomes)[0]["reality"] == "not evaluated"
+
+
+def test_a_score_of_one_track_has_no_standard_error():
+    (row,) = rows([TrialResult("plain", 1, 10, {}, -80.0, None, 1)])
+    assert row["reality"] == "-80.0 on 1, provisional"

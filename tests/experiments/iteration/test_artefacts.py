@@ -1,0 +1,121 @@
+"""The files of an iteration: missed when they are needed, and undone. Tests layout.py."""
+
+import pytest
+
+from dreamfleet.common.errors import DatasetError
+from dreamfleet.experiments.iteration import artefacts
+from dreamfleet.experiments.iteration.commands import Commands
+from dreamfleet.experiments.iteration.config import IterateConfig
+from dreamfleet.experiments.iteration.layout import IterationFolder
+from dreamfleet.experiments.iteration.phases import PhaseRunner
+from dreamfleet.experiments.iteration.plan import Phase, PhasePlan
+from tests.support.ledgers import entry, ledger
+
+
+def write(path, text="content"):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+@pytest.fixture
+def layout(tmp_path):
+    return IterationFolder(tmp_path / "data")
+
+
+def drive(layout, number):
+    write(layout.root / "encoded" / f"{number:06d}.npz")
+    return write(layout.root / "episodes" / f"{number:06d}.npz", f"drive {number}")
+
+
+@pytest.fixture
+def finished(layout):
+    """The ledger of two rounds: drives 0 and 1 at random, drive 2 by a controller."""
+
+    def made(number, phase, *paths, **figures):
+        return entry(number, phase, artefacts.hash_artefacts(layout, paths), **figures)
+
+    return ledger(
+        made(1, "collect", drive(layout, 0), drive(layout, 1), episodes=2),
+        made(1, "vae", write(layout.checkpoint(1, "vae"))),
+        made(1, "bundle", write(layout.bundle(1))),
+        made(1, "evolve", write(layout.run(1) / "controller.npz")),
+        made(2, "drive", drive(layout, 2), episodes=3),
+        made(2, "vae", write(layout.checkpoint(2, "vae"))),
+        made(2, "bundle", write(layout.bundle(2))),
+    )
+
+
+def test_what_is_there_as_it_was_made_is_no_fault(layout, finished):
+    assert artefacts.check(layout, finished) is None
+
+
+@pytest.mark.parametrize(
+    ("path", "phase"),
+    [("episodes/000001.npz", "1/collect"), ("episodes/000002.npz", "2/drive"), ("rounds/02/round-2.zip", "2/bundle"),
+     ("runs/round-01/controller.npz", "1/evolve")],
+)  # fmt: skip
+def test_damage_names_the_file_and_the_command_that_makes_it_again(layout, finished, path, phase):
+    (layout.root / path).write_text("other")
+    with pytest.raises(DatasetError, match=rf"{path} is not what was made: put it back .* --redo {phase}$"):
+        artefacts.check(layout, finished)
+    (layout.root / path).unlink()
+    with pytest.raises(DatasetError, match=rf"{path} is missing: put it back .* --redo {phase}$"):
+        artefacts.check(layout, finished)
+
+
+def test_models_that_nobody_asks_for_any_more_may_go(layout, finished):
+    later = finished.add(entry(2, "gate", kept=True)).add(entry(2, "evolve")).add(entry(3, "drive", episodes=3))
+    layout.bundle(1).unlink()
+    layout.checkpoint(1, "vae").unlink()
+    artefacts.check(layout, later)
+    refused = finished.add(entry(2, "gate", kept=False)).add(entry(2, "evolve")).add(entry(3, "drive", episodes=3))
+    with pytest.raises(DatasetError, match=r"vae\.safetensors is missing"):
+        artefacts.check(layout, refused)
+
+
+def undo(layout, finished, phase):
+    plan = PhasePlan(IterateConfig(rounds=2))
+    phases = [each for each in plan.phases(1) + plan.phases(2) if each in finished.finished]
+    return artefacts.undo(layout, finished, phases[phases.index(Phase.of(phase)) :])
+
+
+def test_what_is_undone_is_gone_and_what_stood_before_is_not(layout, finished):
+    write(layout.round(2) / "vae.jsonl")
+    before = undo(layout, finished, "2/vae")
+    assert before.finished[-1] == (2, "drive")
+    assert not list(layout.round(2).iterdir())
+    assert len(artefacts.drive_files(layout)) == 3
+    artefacts.check(layout, before)
+
+
+def test_drives_of_controllers_are_undone_with_their_latents(layout, finished):
+    drive(layout, 3)  # begun, and in no ledger
+    before = undo(layout, finished, "1/evolve")
+    assert before.episodes == 2
+    for kind in ("episodes", "encoded"):
+        assert sorted(each.stem for each in (layout.root / kind).iterdir()) == ["000000", "000001"]
+    assert not layout.run(1).exists()
+    assert layout.bundle(1).exists()
+
+
+def test_random_drives_are_driven_again_only_where_they_are_damaged(layout, finished):
+    (layout.root / "episodes" / "000001.npz").write_text("other")
+    before = undo(layout, finished, "1/collect")
+    assert not before.entries
+    assert [each.stem for each in artefacts.drive_files(layout)] == ["000000"]
+
+
+@pytest.mark.parametrize("phase", ["mdnrnn", "bundle"])
+def test_latents_are_made_again_where_they_are_needed(layout, phase):
+    asked = []
+
+    def ask(words, log):
+        asked.append(words)
+        if words[0] != "encode":
+            raise DatasetError("enough")
+
+    commands = Commands(IterateConfig(), layout, ledger())
+    with pytest.raises(DatasetError, match="enough"):
+        PhaseRunner(commands, None, ask, lambda: False).do(Phase(1, phase))
+    assert [words[0] for words in asked] == ["encode", "bundle" if phase == "bundle" else "train"]

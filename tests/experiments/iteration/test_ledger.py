@@ -1,0 +1,90 @@
+"""What is finished, as the folder keeps it."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.experiments.iteration.config import IterateConfig
+from dreamfleet.experiments.iteration.ledger import Artefact, IterationLedger
+from tests.support.ledgers import RUN, entry, ledger
+
+
+def test_it_is_kept_whole(tmp_path):
+    written = ledger(entry(1, "collect", [Artefact("episodes/000000.npz", "ab" * 32)], episodes=1, new=1))
+    written.save(tmp_path / "iteration.json")
+    assert IterationLedger.load(tmp_path / "iteration.json") == written
+    assert IterationLedger.load(tmp_path / "absent.json") is None
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: text[: len(text) // 2],
+        lambda text: text.replace('"format": 1', '"format": 2'),
+        lambda text: text.replace('"noise": 0.3', '"noise": -1'),
+        lambda text: text.replace('"noise": 0.3', '"noise": 0.3, "nosie": 1'),
+        lambda text: text.replace('"seconds": 1.5', '"seconds": "long"'),
+        lambda text: text.replace('"episodes": 1,', '"episodes": "one",'),
+        lambda text: text.replace('"collect"', '"gate"'),
+        lambda text: text.replace('"collect"', '"sing"'),
+        lambda _text: "[" * 100_000,
+    ],
+)
+def test_damage_is_one_line_with_a_remedy(tmp_path, damage):
+    path = tmp_path / "iteration.json"
+    path.write_text(damage(ledger(entry(1, "collect", episodes=1, new=1)).to_json()))
+    with pytest.raises(DatasetError, match=r"iteration\.json is damaged \(.*\); put it back from a copy"):
+        IterationLedger.load(path)
+
+
+def test_the_last_model_that_no_gate_refused_counts():
+    found = ledger(entry(1, "bundle"), entry(2, "bundle"))
+    assert found.model_round(1) == 1
+    refused = found.add(entry(2, "gate", kept=False)).add(entry(3, "bundle"))
+    assert refused.model_round(2) == 1
+    assert refused.add(entry(3, "gate", kept=True)).model_round(3) == 3
+    assert found.add(entry(2, "gate", kept=True)).model_round(2) == 2
+
+
+def test_drives_are_counted_by_the_last_phase_that_made_some():
+    assert ledger().episodes == 0
+    assert ledger(entry(1, "collect", episodes=3), entry(1, "vae"), entry(2, "drive", episodes=5)).episodes == 5
+
+
+def test_other_settings_are_refused_with_what_differs(tmp_path):
+    begun = IterationLedger.from_json(ledger().to_json())
+    with pytest.raises(UsageError, match=r"was begun with noise 0.3, not 0.5; seed 0, not 4; population 64, not 32: "):
+        begun.with_settings(IterateConfig(noise=0.5, seed=4), {**RUN, "population": 32}, tmp_path)
+    assert begun.with_settings(IterateConfig(), json.loads(json.dumps(RUN)), tmp_path) == begun
+
+
+def test_a_ledger_from_before_a_setting_had_its_default(tmp_path):
+    begun = ledger()
+    del begun.settings["noise"]
+    older = IterationLedger.from_json(begun.to_json())
+    run = {name: value for name, value in RUN.items() if name != "population"}
+    assert older.with_settings(IterateConfig(), RUN, tmp_path).settings == ledger().settings
+    before = IterationLedger.from_json(replace(older, run=run).to_json())
+    assert before.with_settings(IterateConfig(), RUN, tmp_path).run == before.run
+    with pytest.raises(UsageError, match=r"begun with noise 0\.3, not 0\.5"):
+        older.with_settings(IterateConfig(noise=0.5), RUN, tmp_path)
+
+
+@pytest.mark.parametrize("changes", [{"rounds": 9}, {"local": 1}, {"jobs": 3}, {"device": "cuda"}])
+def test_what_changes_no_finished_round_is_taken(changes, tmp_path):
+    begun = ledger(entry(1, "collect", episodes=1))
+    taken = begun.with_settings(IterateConfig(**changes), RUN, tmp_path)
+    assert taken.settings == {**begun.settings, **changes}
+    assert taken.entries == begun.entries
+
+
+def test_a_world_that_is_kept_is_the_same_when_it_is_read(tmp_path):
+    config = IterateConfig(task="gym:Some-v0", environment=("mode=1",), skip=4)
+    begun = IterationLedger.from_json(IterationLedger.begin(config, RUN).to_json())
+    again = IterateConfig(**begun.settings)
+    assert again.world_flags == config.world_flags
+    assert begun.with_settings(again, RUN, tmp_path).settings["task"] == "gym:Some-v0"
+    with pytest.raises(UsageError, match="was begun with task gym:Some-v0, not gym:Other-v0"):
+        begun.with_settings(replace(again, task="gym:Other-v0"), RUN, tmp_path)

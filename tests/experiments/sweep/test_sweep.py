@@ -1,0 +1,208 @@
+"""A sweep's plan, what it keeps, and its results, without processes.
+Tests check.py, figure.py, folder.py, options.py, plan.py and summary.py."""
+
+import argparse
+import json
+from dataclasses import replace
+
+import pytest
+
+from dreamfleet.common.cli.command_line import build_parser
+from dreamfleet.common.cli.global_config import complete_arguments
+from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.experiments.local_run import task_flags
+from dreamfleet.experiments.sweep.check import check_runs
+from dreamfleet.experiments.sweep.figure import sweep_figure
+from dreamfleet.experiments.sweep.folder import SETTINGS, SweepFolder
+from dreamfleet.experiments.sweep.options import SweepOptions
+from dreamfleet.experiments.sweep.plan import MOST_RUNS, Sweep, parse_vary, read_vary
+from dreamfleet.experiments.sweep.summary import (
+    CONFIRMED,
+    FITNESS,
+    CurvePoint,
+    RunResult,
+    find_equal,
+    judged_by,
+    mean_curve,
+    means,
+)
+from dreamfleet.experiments.verbs import sweep as sweep_verb
+from dreamfleet.worker.verbs import worker
+
+SOURCES = {"flags": argparse.Namespace(), "environment": {}, "file": {}}
+FLAGS = ("--task=gym:CartPole-v1", "--generations=2")
+
+
+def sweep_of(*vary, flags=FLAGS, name="carts"):
+    return Sweep(name, parse_vary(vary), flags)
+
+
+def test_a_grid_has_every_combination_and_repeats_all_settings_before_the_next_seed():
+    sweep = sweep_of("sigma0=0.05,0.1", "seed=1..3")
+    assert [each.name for each in sweep.runs][:3] == [
+        "carts-sigma0-0-05-seed1", "carts-sigma0-0-1-seed1", "carts-sigma0-0-05-seed2",
+    ]  # fmt: skip
+    assert len(sweep.runs) == 6
+    assert {each.setting for each in sweep.runs} == {"sigma0 0.05", "sigma0 0.1"}
+    assert sweep.runs[0].flags == ("--sigma0=0.05", "--seed=1")
+
+
+def test_runs_that_differ_in_the_seed_alone_are_one_setting():
+    assert {each.setting for each in sweep_of("seed=1..3").runs} == {"all equal"}
+
+
+def test_true_and_false_are_a_flag_and_its_opposite():
+    assert [each.flags for each in sweep_of("racing=true,false").runs] == [("--racing",), ("--no-racing",)]
+
+
+def test_a_file_varies_by_lists_and_by_texts():
+    assert read_vary({"seed": "1..2", "hidden_units": [4, 8]}) == {"seed": ("1", "2"), "hidden-units": ("4", "8")}
+
+
+@pytest.mark.parametrize(
+    ("vary", "says"),
+    [
+        ([], "nothing varies"),
+        (["seed"], "write SETTING=VALUES"),
+        (["seed="], "write SETTING=VALUES"),
+        (["seed=1,,2"], "a value is empty"),
+        (["seed=1-5"], "a range is 1..5"),
+        (["seed=5..1"], "a range goes up"),
+        (["seed=1..1000000000000"], "over 1,000 values at most"),
+        (["seed=1..100", "horizon=1..100"], "10,000 runs are more than the 1,000"),
+        (["seed=1,1"], "seed has the value 1 twice"),
+        (["seed=1", "seed=2"], "seed varies twice"),
+        (["sigma0=0.05,0-05"], "two runs of the sweep would be called"),
+        (["sigma0=" + "1" * 80], "cannot name a run"),
+    ],
+)  # fmt: skip
+def test_what_makes_no_sweep_is_refused(vary, says):
+    with pytest.raises(UsageError, match=says):
+        sweep_of(*vary)
+
+
+def test_as_many_runs_as_are_allowed_are_made():
+    assert len(sweep_of(f"seed=1..{MOST_RUNS}").runs) == MOST_RUNS
+
+
+@pytest.mark.parametrize(
+    ("vary", "flags", "says"),
+    [
+        (["sigma0=0.1,-1"], FLAGS, "run carts-sigma0-1 of the sweep: --sigma0 must be a positive number"),
+        (["population=many"], FLAGS, "--population"),
+        (["bogus=1"], FLAGS, "bogus"),
+        (["optimiser=cma,nobodys"], FLAGS, "unknown optimiser 'nobodys'"),
+        (["seed=1..2"], FLAGS[:1], "it would never end: give a limit"),
+        (["listen=a,b"], FLAGS, "listen is no setting that a sweep can give its runs"),
+        (["seed=1..2"], (*FLAGS, "--run=mine"), "run is no setting"),
+        (["share=1,1000"], FLAGS, r"--share must be from 0\.01 to 100"),
+    ],
+)
+def test_a_value_that_coordinator_refuses_is_refused_before_anything_starts(vary, flags, says):
+    with pytest.raises(UsageError, match=says):
+        check_runs(sweep_of(*vary, flags=flags), SOURCES)
+
+
+def test_the_tasks_of_all_runs_are_announced():
+    sweep = sweep_of("task=gym:CartPole-v1,gym:Acrobot-v1", flags=FLAGS[1:])
+    assert check_runs(sweep, SOURCES) == ("gym:CartPole-v1", "gym:Acrobot-v1")
+
+
+def test_a_worker_announces_all_tasks_that_its_flags_name():
+    parser = build_parser("worker", worker)
+    assert parser.parse_all(task_flags("dream", "gym:mine:Own-v0", "mine:Task")).task == [
+        "gym:mine:Own-v0",
+        "mine:Task",
+    ]
+
+
+def test_a_sweep_is_kept_and_read_as_it_was(tmp_path):
+    sweep, folder = sweep_of("seed=1..2", "sigma0=0.05,0.1"), SweepFolder(tmp_path, "carts")
+    folder.path.mkdir()
+    folder.write(sweep, ("gym:CartPole-v1",), SweepOptions())
+    assert folder.read() == (sweep, ("gym:CartPole-v1",))
+    assert "options" not in json.loads((folder.path / SETTINGS).read_text())
+    with pytest.raises(UsageError, match="--resume carts"):
+        folder.check_new(sweep)
+
+
+def resumed(*words):
+    """How a sweep that was begun with six workers is served when it is resumed with these flags."""
+    parser = build_parser("sweep", sweep_verb)
+    kept = SweepOptions(parallel=2, workers=6, listen=("tcp/0.0.0.0:7447",), insecure=True)
+    args = parser.parse_all(["--resume", "carts", *words])
+    complete_arguments(args, {})
+    return sweep_verb._options(args, {}, kept)
+
+
+def test_a_sweep_is_resumed_as_it_was_served(tmp_path):
+    folder = SweepFolder(tmp_path, "carts")
+    folder.path.mkdir()
+    kept = resumed()
+    assert kept == SweepOptions(2, 6, ("tcp/0.0.0.0:7447",), (), insecure=True)
+    folder.write(sweep_of("seed=1..2"), (), kept)
+    assert folder.read_options() == kept
+    assert resumed("--workers", "0", "--parallel", "1") == replace(kept, workers=0, parallel=1)
+    assert resumed("--connect", "tcp/a:1") == SweepOptions(2, 6, (), ("tcp/a:1",))
+    assert resumed("--listen", "tcp/127.0.0.1:1") == SweepOptions(2, 6, ("tcp/127.0.0.1:1",))
+
+
+def test_a_sweep_that_is_absent_or_damaged_is_named(tmp_path):
+    folder = SweepFolder(tmp_path, "carts")
+    with pytest.raises(UsageError, match="no sweep carts"):
+        folder.read()
+    folder.path.mkdir()
+    for text in ("{", "[]", '{"name": "carts"}', "null"):
+        (folder.path / SETTINGS).write_text(text)
+        with pytest.raises(DreamfleetError, match=r"sweep\.json is damaged"):
+            folder.read()
+
+
+def result(name, setting, scores, *, ended=True):
+    return RunResult(name, setting, ended, scores, (), ())
+
+
+def test_settings_are_compared_by_the_strongest_score_that_all_runs_have():
+    confirmed, other = result("a", "s", {CONFIRMED: 1.0, FITNESS: 5.0}), result("b", "s", {FITNESS: 3.0})
+    assert judged_by([confirmed]) == CONFIRMED
+    assert judged_by([confirmed, other]) == FITNESS
+    assert judged_by([]) is None
+    assert judged_by([result("c", "s", {FITNESS: 1.0}, ended=False)]) is None
+
+
+def test_a_setting_has_the_mean_of_its_finished_runs_and_the_error_among_them():
+    runs = [
+        result("a", "one", {FITNESS: 1.0}), result("b", "one", {FITNESS: 3.0}),
+        result("c", "one", {FITNESS: 99.0}, ended=False), result("d", "two", {FITNESS: 7.0}),
+    ]  # fmt: skip
+    one, two = means(runs, FITNESS)
+    assert (one.setting, one.runs, one.mean, one.error) == ("one", 2, 2.0, 1.0)
+    assert (two.runs, two.mean, two.error) == (1, 7.0, None)
+
+
+def test_settings_that_gave_the_same_are_named():
+    def scored(setting, *means):
+        curve = tuple(CurvePoint(number, 10, mean) for number, mean in enumerate(means))
+        return RunResult(setting, setting, True, {FITNESS: means[-1]}, (), curve)
+
+    runs = [scored("a", 1.0, 5.0), scored("b", 1.0, 5.0), scored("c", 2.0, 5.0), scored("d", 2.0, 4.0)]
+    equal = find_equal(runs, FITNESS)
+    assert [each.partition(":")[0] for each in equal] == ["a and b", "a and c", "b and c"]
+    assert "changed nothing" in equal[0]
+    assert "does not separate them" in equal[1]
+
+
+def test_runs_with_few_evaluations_are_drawn_by_their_generations_and_each_line_has_its_dashes():
+    curve = tuple(CurvePoint(number, 10 * number, 1.0) for number in range(4))
+    for evaluated, label in ((curve[:2], "mean fitness of a generation"), (curve, "score of the evaluated mean")):
+        figure = sweep_figure([RunResult(name, name, True, {}, evaluated, curve) for name in ("one", "two")])
+        axes = figure.axes[0]
+        assert axes.get_ylabel() == label
+        thick = [each for each in axes.lines if each.get_linewidth() == 2]
+        assert len({(each.get_marker(), str(each._dash_pattern)) for each in thick}) == 2
+
+
+def test_a_settings_curve_is_over_the_generations_that_all_its_runs_have():
+    one = [CurvePoint(0, 10, 1.0), CurvePoint(1, 20, 2.0), CurvePoint(2, 30, 9.0)]
+    other = [CurvePoint(0, 12, 3.0), CurvePoint(1, 22, 6.0)]
+    assert mean_curve([one, other]) == [(11, 2.0, 1.0), (21, 4.0, 2.0)]

@@ -1,0 +1,115 @@
+"""The name under which other processes find a function, or what to do if there is none."""
+
+import functools
+import os
+import subprocess
+import sys
+import types
+
+import pytest
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.trusted_modules import PLACES
+from dreamfleet.experiments.function_names import IMPORTED_FOR, environment_for, name_function
+from tests.support import objectives
+from tests.support.processes import ROOT
+
+MODULE = "tests.support.objectives"
+
+
+def test_a_function_of_a_module_travels_by_its_name():
+    found = name_function(objectives.sphere)
+    assert found.task == f"function:{MODULE}:sphere"
+    assert found.folder == ROOT.resolve()
+    assert found.environment[PLACES].split(os.pathsep)[0] == str(found.folder)
+    assert name_function(objectives.Shifted.value).task == f"function:{MODULE}:Shifted.value"
+    assert name_function(objectives.Shifted.of_class).task == f"function:{MODULE}:Shifted.of_class"
+    assert name_function(objectives.steady).task == f"function:{MODULE}:steady"
+    assert name_function(objectives.weighted).task == f"function:{MODULE}:weighted"
+    assert name_function(objectives.weighted.noisy).task == f"function:{MODULE}:weighted.noisy"
+    assert name_function("mine:cost").task == name_function("function:mine:cost").task == "function:mine:cost"
+
+
+@pytest.mark.parametrize(
+    ("function", "says"),
+    [
+        (lambda x: x, "a lambda has no name"),
+        (objectives.outer(), "a function inside of another has no name"),
+        (objectives.Shifted().method, "no module has this object of type Shifted"),
+        (functools.partial(objectives.noisy, seed=1), "no module has this object of type partial"),
+        (objectives.Weighted(2), "no module has this object of type Weighted"),
+        (3, "is no function of a module"),
+    ],
+)
+def test_what_other_processes_would_not_find_is_refused_with_what_to_do(function, says):
+    with pytest.raises(UsageError, match=says) as raised:
+        name_function(function)
+    assert "at the top level of a module" in str(raised.value)
+
+
+def test_a_module_that_searches_as_it_is_imported_is_refused(monkeypatch):
+    monkeypatch.setenv(IMPORTED_FOR, f"function:{MODULE}:sphere")
+    with pytest.raises(UsageError, match="__main__"):
+        name_function(objectives.sphere)
+    assert name_function(objectives.noisy)
+
+
+SCRIPT = """
+import functools
+from dreamfleet.experiments.function_names import name_function
+def cost(x, weight=1): return 0.0
+heavy = functools.partial(cost, weight=9)
+print(name_function(cost).task, name_function(heavy).task)
+"""
+
+
+def test_a_scripts_own_function_is_found_by_the_name_of_its_file(tmp_path):
+    for file, expected in (
+        ("tuning.py", "function:tuning:cost function:tuning:heavy"),
+        ("my-tuning.py", "cannot be imported"),
+    ):
+        (tmp_path / file).write_text(SCRIPT)
+        done = subprocess.run([sys.executable, file], cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert expected in done.stdout + done.stderr
+
+
+def test_a_function_of_a_notebooks_cell_is_to_be_put_into_a_file(monkeypatch):
+    monkeypatch.setitem(sys.modules, "__main__", types.ModuleType("__main__"))  # as a kernel's: it has no file
+    names = {"__name__": "__main__"}
+    exec("def cost(x): return 0.0", names)
+    with pytest.raises(UsageError, match=r"a notebook or a prompt.*objectives\.py.*objectives\.cost"):
+        name_function(names["cost"])
+
+
+def test_a_function_of_a_prompt_is_to_be_put_into_a_file():
+    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False)
+    assert "write it into a file such as objectives.py" in done.stderr
+
+
+def test_a_module_beside_the_script_is_found_though_nothing_imported_it(tmp_path, monkeypatch):
+    (tmp_path / "beside.py").write_text("raise SystemExit('imported')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delenv(PLACES, raising=False)
+    assert environment_for(("gym:beside:Catch-v0", None)) == {PLACES: str(tmp_path)}
+    assert environment_for(("gym:CartPole-v1", "cma", "gym:nowhere:Catch-v0", "function:numpy.linalg:norm")) == {}
+
+
+BESIDE = """
+import dreamfleet.common.host.trusted_modules, statistics, sys, tuning
+print(statistics.fmean([1, 3]), tuning.cost(0))
+"""
+
+
+def test_a_file_called_like_a_module_of_python_replaces_that_in_no_other_process(tmp_path, monkeypatch):
+    (tmp_path / "statistics.py").write_text("raise SystemExit('of the user')\n")
+    (tmp_path / "tuning.py").write_text("def cost(x): return 7\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    variables = {**os.environ, **environment_for(("function:tuning:cost",)), "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-c", BESIDE], env=variables, capture_output=True, text=True, check=False, cwd=ROOT
+    )
+    assert done.stdout.split() == ["2.0", "7"], done.stderr
+    monkeypatch.delitem(sys.modules, "statistics")
+    with pytest.raises(UsageError, match=r"module 'statistics' in .* is called like one of Python's own"):
+        environment_for(("function:statistics:cost",))
+    assert name_function("math:fsum").task == "function:math:fsum"

@@ -1,0 +1,253 @@
+"""Searching a function's minimum on processes of this host. Tests search_arguments.py."""
+
+import numpy as np
+import pytest
+
+import dreamfleet
+from dreamfleet.common.client.client import Client
+from dreamfleet.common.errors import StoppedError, UsageError
+from dreamfleet.common.protocol.stop_kind import StopKind
+from dreamfleet.experiments import minimise as module
+from dreamfleet.experiments.search_arguments import read_bounds, read_objective
+from tests.support import objectives
+from tests.support.access import until
+from tests.support.processes import free_port
+
+FEW = {"workers": 1, "popsize": 8}
+
+
+def stop_kind(found, runs_dir):
+    with dreamfleet.open_run(found.run, runs_dir) as run:
+        return run.stop_kind
+
+
+@pytest.mark.slow
+def test_it_finds_the_minimum_and_the_run_can_be_read(tmp_path):
+    seen = []
+    found = dreamfleet.minimise(
+        objectives.sphere, [0, 3], 0.5, bounds=[(None, 5), (0, 4)], ftarget=1e-6, callback=seen.append,
+        run="mine", runs_dir=tmp_path, **FEW,
+    )  # fmt: skip
+    assert found.success
+    assert found.fun == objectives.sphere(found.x) <= 1e-6
+    assert found.history == tuple(seen)
+    assert [each.fun for each in seen] == sorted((each.fun for each in seen), reverse=True)
+    with dreamfleet.open_run(found.run, tmp_path) as run:
+        assert found.nfev == run.result_count() >= 8 * found.nit
+        assert -run.history()[-1].best == objectives.sphere(found.xbest) >= found.fun
+        assert run.spec.horizon == 1
+        assert run.stop_kind is StopKind.CANDIDATE_TARGET
+
+
+@pytest.mark.slow
+def test_a_noisy_function_gives_the_mean_that_was_judged(tmp_path):
+    found = dreamfleet.minimise(
+        objectives.noisy, [1, 1], 0.3, generations=6, evaluate_every=3, evaluation_episodes=4, confirm_episodes=4,
+        runs_dir=tmp_path, **FEW,
+    )  # fmt: skip
+    assert np.array_equal(found.x, found.xfavorite)
+    assert not np.array_equal(found.x, found.xbest)
+    assert not found.success
+    assert stop_kind(found, tmp_path) is StopKind.GENERATIONS
+
+
+@pytest.mark.slow
+def test_a_noisy_search_has_no_more_calls_than_maxfevals(tmp_path):
+    found = dreamfleet.minimise(objectives.noisy, [1, 1], 0.3, maxfevals=400, run="mine", runs_dir=tmp_path, **FEW)
+    assert not found.success
+    assert "maxfevals=400" in found.message
+    with dreamfleet.open_run("mine", tmp_path) as run:
+        assert run.stop_kind is StopKind.STEPS
+        generation = run.settings.population * run.settings.episodes
+        assert len(run.evaluations()) > 1
+        assert run.confirmation() is not None
+        assert 400 - 2 * generation - run.settings.evaluation_episodes < found.nfev == run.result_count() <= 400
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "success", "function", "given"),
+    [
+        (StopKind.ONE_POINT, True, objectives.sphere, {"stagnation": 0, "popsize": 16}),
+        (StopKind.ONE_POINT, False, objectives.sphere, {"stagnation": 0, "popsize": 16, "ftarget": -1.0}),
+        (StopKind.STAGNATION, True, objectives.flat, {"stagnation": 2}),
+        (StopKind.TARGET, True, objectives.noisy, {"ftarget": 100.0, "evaluate_every": 1, "confirm_episodes": 0}),
+        (StopKind.MINUTES, False, objectives.flat, {"minutes": 0.001}),
+    ],
+)
+def test_a_search_succeeds_where_it_converged_or_reached_its_target(kind, success, function, given, tmp_path):
+    found = dreamfleet.minimise(function, [1.5, 2], 0.1, runs_dir=tmp_path, **{**FEW, **given})
+    assert found.success is success
+    assert stop_kind(found, tmp_path) is kind
+    assert "--" not in found.message, "it is read in a program"
+
+
+@pytest.mark.slow
+def test_a_search_that_somebody_stops_raises(tmp_path):
+    address = f"tcp/127.0.0.1:{free_port()}"
+
+    def stop(progress):
+        if progress.generation == 0:
+            with Client(address) as client:
+                client.control(progress.run, "stop")
+
+    with pytest.raises(StoppedError):
+        dreamfleet.minimise(objectives.flat, [0, 0], 1.0, callback=stop, listen=address, runs_dir=tmp_path, **FEW)
+
+
+@pytest.mark.slow
+def test_restarts_are_runs_of_larger_populations_and_share_the_budget(tmp_path):
+    found = dreamfleet.maximise(
+        objectives.sphere, [0, 0], 1.0, bounds=(-2, 2), maxfevals=60, restarts=3, generations=2, runs_dir=tmp_path,
+        run="mine", **FEW,
+    )  # fmt: skip
+    assert found.runs == ("mine", "mine-restart-1", "mine-restart-2")
+    sizes = []
+    for name in found.runs:
+        with dreamfleet.open_run(name, tmp_path) as run:
+            sizes.append((run.settings.population, len(run.history())))
+    assert sizes == [(8, 2), (16, 2), (32, 1)]
+    assert found.fun == max(each.fun for each in found.history) > 2
+
+
+@pytest.mark.slow
+def test_a_function_that_varies_without_a_seed_is_warned_of_whatever_the_log_looks_like(tmp_path, monkeypatch):
+    monkeypatch.setenv("DREAMFLEET_LOG_FORMAT", "json")
+    with pytest.warns(RuntimeWarning, match="varying") as warned:
+        dreamfleet.minimise(objectives.varying, [0, 0], 1.0, generations=1, runs_dir=tmp_path, **FEW)
+    assert {each.filename for each in warned} == {__file__}
+
+
+@pytest.mark.slow
+def test_failed_candidates_are_tried_in_a_fresh_process_and_said_once(tmp_path):
+    with pytest.warns(RuntimeWarning, match="holed returned nan") as warned:
+        found = dreamfleet.minimise(
+            objectives.holed, [1, 1], 1.0, generations=4, run="mine", runs_dir=tmp_path, **FEW
+        )  # fmt: skip
+    assert [each.filename for each in warned] == [__file__]
+    with dreamfleet.open_run("mine", tmp_path) as run:
+        failed, failures = sum(each.failed for each in run.history()), run.failures()
+    assert len(failures) == failed > 1
+    assert {each.attempts for each in failures} == {2}  # what a process did before may be the reason
+    says = f"{failed} candidates failed, first: holed returned nan"
+    assert found.message.startswith(f"4 generations; {says}")
+    assert says in (tmp_path / "mine" / "coordinator.log").read_text()
+
+
+@pytest.mark.slow
+def test_a_search_without_any_value_ends_with_its_first_failure(tmp_path):
+    with pytest.raises(UsageError, match="no candidate has a value, first: narrow raised ZeroDivisionError"):
+        dreamfleet.minimise(objectives.narrow, [0, 0], 30.0, runs_dir=tmp_path, **FEW)
+
+
+@pytest.mark.slow
+def test_a_search_that_loses_all_values_returns_what_it_found(tmp_path, monkeypatch):
+    lost = tmp_path / "lost"
+    monkeypatch.setenv("LOST", str(lost))
+    with pytest.warns(RuntimeWarning, match="losing returned nan"):
+        found = dreamfleet.minimise(
+            objectives.losing, [0, 0], 1.0, callback=lambda _: lost.touch(), runs_dir=tmp_path / "runs", workers=1,
+            popsize=4,
+        )  # fmt: skip
+    # On a busy host several generations close before the first call, and a mean that is evaluated may be better.
+    assert found.fun <= found.history[-1].fun
+    assert not found.success
+    assert stop_kind(found, tmp_path / "runs") is None, "it was left open"
+
+
+@pytest.mark.slow
+def test_a_fixed_parameter_stays_and_an_object_is_a_function(tmp_path):
+    bounds = [(0, 4), (2, 2)]
+    found = dreamfleet.minimise(objectives.weighted, [3, 2], bounds=bounds, generations=3, runs_dir=tmp_path, **FEW)
+    assert {float(each.x[1]) for each in found.history} == {2.0}
+    assert found.fun == objectives.weighted(found.x) < objectives.weighted(np.array([3, 2]))
+
+
+@pytest.mark.slow
+def test_a_callback_ends_the_search_and_all_numbers_are_of_one_moment(tmp_path):
+    seen = []
+
+    def stop(progress):
+        seen.append(progress)
+        with dreamfleet.open_run(progress.run, tmp_path) as run:
+            if progress.generation == 1:
+                until(lambda: len(run.history()) >= 4, "the search goes on meanwhile")
+                raise StopIteration
+
+    found = dreamfleet.minimise(objectives.sphere, [0, 0], 1.0, callback=stop, restarts=2, runs_dir=tmp_path, **FEW)
+    assert (len(found.runs), found.success) == (1, False)
+    assert found.history[:2] == tuple(seen)
+    with dreamfleet.open_run(found.run, tmp_path) as run:
+        assert (run.stop_kind, run.state) == (None, "open"), "it was left open"
+        history = run.history()
+        assert found.nit == len(found.history) == len(history) >= 4
+        assert found.history[-1].nfev == sum(each.steps for each in history)
+        assert found.nfev == run.result_count()
+        assert objectives.sphere(found.xbest) == -max(each.best for each in history)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"bounds": [(0, 1)]}, "a pair"),
+        ({"bounds": (3, 4)}, "outside of its bounds"),
+        ({"restart": "cma"}, "'ipop' or 'bipop'"),
+        ({"sigma0": 0}, "sigma0 must be above 0"),
+        ({"sigma0": None}, "sigma0 is missing.* parameter 0 has none"),
+        ({"bounds": (0.2, 0.8), "x0": [0.5, 0.5], "integer": True}, "no whole number is within"),
+        ({"nothing": 3}, "unknown setting 'nothing'"),
+        ({"budget": 3}, "unknown setting 'budget': did you mean 'maxfevals'?"),
+        ({"evaluations": 3}, "did you mean 'maxfevals'?"),
+        ({"maxiter": 3}, "did you mean 'generations'?"),
+        ({"maxfun": 3}, "did you mean 'maxfevals'?"),
+        ({"n_calls": 3}, "did you mean 'maxfevals'?"),
+        ({"maxfeval": 3}, "did you mean 'maxfevals'?"),
+        ({"call_back": print}, "did you mean 'callback'?"),
+        ({"sigma": 3}, "did you mean 'sigma0'?"),
+        ({"n_jobs": 3}, "did you mean 'workers'?"),
+        ({"args": (3,)}, r"functools\.partial"),
+        ({"bounds": [(0, 0), (0, 0)]}, "every parameter"),
+        ({"tol": 3}, "'ftarget' ends it by a value"),
+        ({"disp": True}, "`callback=print` prints each generation"),
+        ({"seed": "x"}, "seed must be a whole number, not 'x'"),
+        ({"function": objectives.raising}, "raising raised ZeroDivisionError"),
+        ({"function": "tests.support.objectives:nowhere"}, "no function nowhere"),
+    ],
+)
+def test_what_cannot_be_searched_is_said_before_a_run_exists(change, says, tmp_path):
+    given = {"function": objectives.sphere, "x0": [0, 0], "sigma0": 1.0, "runs_dir": tmp_path, **FEW, **change}
+    with pytest.raises(UsageError, match=says):
+        dreamfleet.minimise(given.pop("function"), given.pop("x0"), given.pop("sigma0"), **given)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_first_step_is_a_share_of_the_range_where_bounds_are_finite():
+    given = {"integer": (), "log": [1]}
+    found = read_objective([1, 1], None, [(0, 10), (np.exp(-1), np.exp(1))], given)
+    assert found.scale == pytest.approx((3.0, 0.6))
+    with pytest.raises(UsageError, match="parameter 1 has none"):
+        read_objective([1, 1], None, [(0, 10), (0, None)], given)
+
+
+def test_bounds_are_scipys_or_one_pair():
+    class Bounds:
+        lb, ub = np.array([0.0, -np.inf]), np.array([1.0, 2.0])
+
+    assert read_bounds(Bounds(), 2) == ([0.0, None], [1.0, 2.0])
+    assert read_bounds((0, None), 2) == ([0.0, 0.0], [None, None])
+    assert read_bounds([(0, 1), (2, 3)], 2) == ([0.0, 2.0], [1.0, 3.0])
+    assert read_bounds(None, 2) == (None, None)
+
+
+def test_bipop_alternates_large_populations_and_small_ones_of_as_many_calls():
+    objective = module.Objective.of({"x0": [0.0]})
+    searches = module._Searches(module.FunctionName("function:m:f", None), objective, False, None, None, None, 1, None)
+    plans = []
+    for plan in searches._plans(8, 1, 6, "bipop"):
+        plans.append(plan)
+        searches._calls += plan.popsize * 10 if not plan.calls else min(plan.calls, plan.popsize * 10)
+    assert [each.popsize for each in plans[:2]] == [8, 16]
+    assert len({each.seed for each in plans}) == 7
+    small = [each for each in plans if each.calls]
+    assert small
+    assert all(each.sigma < 1 for each in small)

@@ -1,0 +1,212 @@
+"""A run that a program starts: real coordinator and workers on this host, which end with it in every case.
+Tests run_arguments.py."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from pathlib import Path
+
+import pytest
+
+from dreamfleet.common.client.client import Client
+from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
+from dreamfleet.coordinator.views.stored_run import open_run
+from dreamfleet.experiments.started_run import (
+    RunPausedError,
+    _claim,
+    _free_name,
+    check_settings,
+    evolve,
+    start_run,
+)
+from tests.support.processes import DEADLINE, ROOT, environment
+from tests.support.tasks import RAISING
+
+SMALL = {"task": "gym:CartPole-v1", "population": 4, "episodes": 2, "evaluate_every": 0, "workers": 1}
+MARK = "MARK_OF_A_TEST"
+
+
+@pytest.fixture
+def alive(monkeypatch):
+    """A function: the processes that this test started, and those that they started."""
+    mark = f"{MARK}={uuid.uuid4().hex}"
+    monkeypatch.setenv(*mark.split("="))
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    yield lambda: _processes_with(mark)
+    for pid in _processes_with(mark):
+        os.kill(pid, signal.SIGKILL)
+
+
+def _processes_with(mark):
+    found = []
+    for path in Path("/proc").glob("[0-9]*/environ"):
+        try:
+            pid, variables = int(path.parent.name), path.read_bytes().split(b"\0")
+        except OSError:  # it has ended, or is another user's
+            continue
+        if mark.encode() in variables and pid != os.getpid():
+            found.append(pid)
+    return found
+
+
+def wait_until(reached):
+    deadline = time.monotonic() + DEADLINE
+    while not reached():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+@pytest.mark.slow
+def test_generations_come_as_they_close_and_the_journal_stays(alive, tmp_path):
+    with start_run(run="pole", generations=40, runs_dir=tmp_path, **SMALL) as run:
+        assert alive()
+        with Client(run.address) as client:
+            assert client.runs() == ["pole"]
+        assert run.address in run._repr_html_()
+        seen = [next(iter(run)).number]
+        seen += [generation.number for generation in run]  # goes on where the first loop stopped
+    assert seen == list(range(40))
+    wait_until(lambda: not alive())
+    assert (run.state, len(run.history()), run.controller().task) == ("ended: 40 generations", 40, "gym:CartPole-v1")
+    assert {each.name for each in tmp_path.joinpath("pole").glob("*.log")} == {"coordinator.log", "core-0.log"}
+    run.close()
+    with evolve(resume="pole", generations=42, workers=1, runs_dir=tmp_path) as run:
+        assert [each.number for each in run.history()] == list(range(42))
+    assert evolve(resume="pole", workers=1, runs_dir=tmp_path).ended == "42 generations"  # nothing was left to do
+
+
+def leave(_generation, _run):
+    return False
+
+
+def fail(_generation, _run):
+    raise LookupError("of the callback")
+
+
+def interrupt(_generation, _run):
+    signal.raise_signal(signal.SIGINT)
+
+
+def end(_generation, run):
+    run.end()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("callback", "error"), [(leave, None), (end, None), (fail, LookupError), (interrupt, KeyboardInterrupt)]
+)
+def test_a_run_that_is_left_early_ends_its_processes_and_stays_open(alive, tmp_path, callback, error):
+    if error is None:
+        evolve(callback, run="pole", runs_dir=tmp_path, **SMALL)
+    else:
+        with pytest.raises(error):
+            evolve(callback, run="pole", runs_dir=tmp_path, **SMALL)
+    assert not alive()
+    with open_run("pole", tmp_path) as run:
+        assert (run.state, len(run.history()) > 0) == ("open", True)
+
+
+@pytest.mark.slow
+def test_a_run_that_nothing_refers_to_ends(alive, tmp_path):
+    run = start_run(runs_dir=tmp_path, **SMALL)
+    assert alive()
+    del run
+    assert not alive()
+
+
+PARENT = """
+import os, signal, sys, dreamfleet
+with dreamfleet.start_run(task="gym:CartPole-v1", evaluate_every=0, workers=2, runs_dir=sys.argv[1]) as run:
+    for generation in run:
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends children with a killed parent")
+def test_a_parent_that_is_killed_leaves_no_process(alive, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", PARENT, tmp_path], env=environment(tmp_path), check=False, timeout=DEADLINE
+    )
+    assert done.returncode == -signal.SIGKILL
+    wait_until(lambda: not alive())
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_is_named_and_so_is_a_stop_from_elsewhere(alive, tmp_path):
+    with start_run(run="pole", runs_dir=tmp_path, **SMALL) as run:
+        (worker,) = run._processes._workers
+        worker.popen.kill()
+        with pytest.raises(DreamfleetError, match="this host's worker failed: killed by signal 9"):
+            run.wait()
+    with start_run(resume="pole", runs_dir=tmp_path, workers=1) as run:
+        run.client.control("pole", "stop")
+        with pytest.raises(StoppedError, match="run pole was left open"):
+            run.wait()
+    assert not alive()
+
+
+@pytest.mark.slow
+def test_a_pause_is_no_endless_wait(alive, tmp_path, random_bundle):
+    rough = {"task": RAISING, "bundle": random_bundle.path, "on_failure": "pause", "population": 3, "episodes": 1}
+    with (
+        start_run(runs_dir=tmp_path, **{**SMALL, **rough}) as run,
+        pytest.raises(RunPausedError) as paused,
+    ):
+        run.wait()
+    assert paused.value.errors
+
+
+@pytest.mark.slow
+def test_a_wrong_setting_starts_nothing(alive, tmp_path):
+    for settings, says in (
+        ({"tsak": "gym:CartPole-v1"}, "unknown setting 'tsak': did you mean 'task'?"),
+        ({"population": "many"}, "argument --population: invalid int value: 'many'"),
+        ({"workers": -1}, "workers must be a whole number from 0 to 1024, not -1"),
+        ({"join": "me.join"}, "unknown setting 'join'"),
+        ({"run": "No Name"}, "cannot name a run"),
+        ({"task": "gym:Nowhere-v1"}, "gymnasium makes no environment 'Nowhere-v1'"),  # the coordinator's words
+    ):
+        with pytest.raises(UsageError, match=says.replace("?", r"\?")):
+            start_run(runs_dir=tmp_path / "runs", **settings)
+    assert not alive()
+    assert not list(tmp_path.glob("runs/*"))
+
+
+def test_a_name_that_a_run_has_is_refused(tmp_path):
+    (tmp_path / "pole").mkdir()
+    (tmp_path / "pole" / "journal.sqlite").touch()
+    with pytest.raises(UsageError, match=r"run 'pole' exists in .*: continue it with resume='pole'"):
+        start_run(run="pole", runs_dir=tmp_path, **SMALL)
+
+
+@pytest.mark.slow
+def test_two_programs_that_start_one_name_at_once_share_nothing(alive, tmp_path):
+    with start_run(run="pole", generations=10**6, runs_dir=tmp_path, **SMALL) as run:
+        log = (tmp_path / "pole" / "coordinator.log").read_text()
+        for again in ({"run": "pole"}, {"resume": "pole"}):
+            with pytest.raises(UsageError, match=r"another program has started run pole|run 'pole' exists"):
+                start_run(runs_dir=tmp_path, **{**SMALL, **again})
+        assert (tmp_path / "pole" / "coordinator.log").read_text().startswith(log)
+        next(iter(run))
+    with _claim(tmp_path / "new"), pytest.raises(UsageError, match="another program has started run new"):
+        start_run(run="new", generations=1, runs_dir=tmp_path, **SMALL)
+    assert evolve(run="new", generations=1, runs_dir=tmp_path, **SMALL).ended == "1 generation"
+    assert len({_free_name(tmp_path) for _ in range(3)}) == 3
+
+
+def test_settings_are_the_flags_of_the_coordinator():
+    given = {
+        "task": "gym:CartPole-v1", "environment": {"sutton_barto_reward": True, "render_mode": "rgb_array"},
+        "optimiser_options": ("a=1", "b=2"), "normalise": True, "racing": False, "target": -5.5, "patience": None,
+        "run": "pole", "listen": "tcp/127.0.0.1:1",
+    }  # fmt: skip
+    assert check_settings(given) == (
+        "--task=gym:CartPole-v1",
+        *("--environment", "sutton_barto_reward=true", "render_mode=rgb_array"),
+        *("--optimiser-options", "a=1", "b=2"),
+        *("--normalise", "--no-racing", "--target=-5.5"),
+    )

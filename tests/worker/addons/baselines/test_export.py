@@ -1,0 +1,268 @@
+"""An exported agent drives like the trained network, without torch; any other file is refused.
+Tests policies.py and common/artifacts/trained_agent.py."""
+
+import hashlib
+import json
+import pickle
+import subprocess
+import sys
+import zipfile
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+import torch
+
+from dreamfleet.common.artifacts.bundle import DREAM_GRAPH
+from dreamfleet.common.artifacts.trained_agent import MANIFEST, NETWORK, TrainedAgent
+from dreamfleet.common.cli.command_line import main
+from dreamfleet.common.errors import ControllerError, DatasetError
+from dreamfleet.common.runs.evaluation_report import read_evaluation_report
+from dreamfleet.common.runs.lookup import find_agent, find_controller
+from dreamfleet.worker.addons.baselines.agent_config import AgentConfig
+from dreamfleet.worker.addons.baselines.export import export_agent, export_network
+from dreamfleet.worker.addons.baselines.learning_config import LearningConfig
+from dreamfleet.worker.addons.baselines.network import Networks
+from dreamfleet.worker.addons.baselines.policies import QPolicy
+from dreamfleet.worker.addons.baselines.train import CHECKPOINT, train_drqn
+from dreamfleet.worker.scoring.agents import make_agent
+from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
+from dreamfleet.worker.tasks.policy import NO_PARAMETERS
+from dreamfleet.worker.tools import agent_evaluator, evaluation
+from dreamfleet.worker.training.checkpoint import save_checkpoint
+from dreamfleet.worker.worldmodel.inference import open_graph
+from dreamfleet.worker.worlds.car_racing.agents import NetworkPolicy
+from dreamfleet.worker.worlds.car_racing.native_check import make_car_racing
+
+SEED, STEPS = 20_000, 8
+LAYERS = AgentConfig(channels=(4, 4), kernels=(8, 4), strides=(4, 2), hidden=8, frame_skip=3)
+LEARNING = LearningConfig(episodes=2, random_episodes=1, steps=12, batch=2, report_every=1, learn_every=1)
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    monkeypatch.setattr(agent_evaluator, "EpisodeConfig", lambda seed, _horizon: EpisodeConfig(seed, STEPS))
+    monkeypatch.setattr(evaluation, "evaluate_in_processes", evaluation.evaluate)  # a child would not know it
+
+
+def networks_of(layers, seed=0):
+    """Networks with weights so large that pictures make a difference."""
+    torch.manual_seed(seed)
+    networks = Networks(layers).eval()
+    for each in networks.online.parameters():
+        each.data *= 3
+    return networks
+
+
+def keep(folder, networks, episodes=()):
+    optimiser = torch.optim.Adam(networks.parameters())
+    save_checkpoint(folder / CHECKPOINT, networks, optimiser, {"update": 7, "oldest": 0, "episodes": list(episodes)})
+    return folder
+
+
+@pytest.fixture
+def trained(tmp_path):
+    return keep(tmp_path / "training", networks_of(LAYERS))
+
+
+@pytest.fixture
+def file(trained, tmp_path):
+    path = tmp_path / "driver.zip"
+    export_agent(trained).save(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    "layers", [LAYERS, AgentConfig(picture=96, choices="notebook", heads="softmax", channels=(4,), kernels=(8,),
+                                   strides=(8,), hidden=16)]
+)  # fmt: skip
+@pytest.mark.slow
+def test_it_chooses_what_the_network_chooses_all_episode_long(layers, tmp_path):
+    networks = networks_of(layers, 1)
+    agent = make_agent(export_agent(keep(tmp_path, networks)))
+    environment = make_car_racing(preprocessing=agent.preprocessing)
+    torchs, exported = QPolicy(networks.online), agent.make_policies()(SEED)
+    chosen = []
+    for each in (torchs, exported):
+        each.begin(NO_PARAMETERS)
+    for moment in run_episode(environment, torchs, EpisodeConfig(SEED, 1000)):
+        chosen.append(torchs.choice)
+        assert exported.act(moment.seen).tolist() == moment.action.tolist()
+        assert exported.is_new_decision == torchs.is_new_decision
+    assert len(chosen) > 100
+    assert len(set(chosen)) > 1
+    environment.close()
+
+
+def test_it_gives_the_same_worth_through_time():
+    networks = networks_of(LAYERS)
+    weights = {name: tensor.numpy() for name, tensor in networks.online.state_dict().items()}
+    run = open_graph(export_network(weights, LAYERS), threads=1).run
+    pictures = np.random.default_rng(0).integers(0, 256, (6, 64, 64, 3)).astype(np.uint8)
+    with torch.no_grad():
+        wanted = networks.online(networks.online.features(torch.from_numpy(pictures[None])))[0][0].numpy()
+    state = np.zeros((1, 16), np.float32)
+    for picture, row in zip(pictures, wanted, strict=True):
+        worth, state = run(["worth", "next_state"], {"picture": picture[None], "state": state})
+        assert worth[0] == pytest.approx(row, abs=1e-4)
+
+
+@pytest.mark.slow
+def test_a_file_describes_its_training_and_is_reproducible(tmp_path, capsys):
+    train_drqn(tmp_path / "training", LAYERS, LEARNING)
+    words = ["baseline", "export", "drqn", "--data", str(tmp_path / "training"), "--json", "--out"]
+    assert main([*words, str(tmp_path / "one.zip")]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert main([*words, str(tmp_path / "other.zip")]) == 0
+    assert (tmp_path / "one.zip").read_bytes() == (tmp_path / "other.zip").read_bytes()
+    agent = TrainedAgent.load(tmp_path / "one.zip")
+    assert (found["sha256"], found["episodes"], found["steps"]) == (agent.sha256, 2, 24)
+    made = agent.manifest.provenance
+    assert made["learning"] == asdict(LEARNING)
+    assert made["layers"]["hidden"] == LAYERS.hidden
+    assert (made["decisions"], made["updates"] > 0) == (8, True)
+    assert (agent.manifest.frame_skip, len(agent.manifest.choices), agent.task) == (3, 5, "car-racing")
+
+
+def test_a_training_and_its_file_give_the_same_report_and_compare_takes_both(trained, file, tmp_path, capsys):
+    drives = ["--episodes", "3", "--first-seed", str(SEED), "--out"]
+    one, other = str(tmp_path / "one.json"), str(tmp_path / "other.json")
+    assert main(["evaluate", "--controller", str(file), "--jobs", "1", *drives, one]) == 0
+    assert main(["evaluate", "--controller", str(trained), "--jobs", "1", *drives, other]) == 0
+    found = [read_evaluation_report(tmp_path / name) for name in ("one.json", "other.json")]
+    assert replace(found[0], name="", seconds=0) == replace(found[1], name="", seconds=0)
+    assert {each.steps for each in found[0].drives} == {STEPS}
+    assert all(each.speed is not None for each in found[0].drives)
+    assert "torch" not in found[0].fingerprint
+    capsys.readouterr()
+    assert main(["compare", one, other, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["differences"][0]["mean"] == 0
+    assert main(["verify", "report", one, "--jobs", "1"]) == 0
+
+
+def test_it_goes_to_other_processes(file):
+    agent = make_agent(TrainedAgent.load(file))
+    again = pickle.loads(pickle.dumps(agent))
+    assert agent_evaluator.AgentEvaluator(again).drive(SEED) == agent_evaluator.AgentEvaluator(agent).drive(SEED)
+
+
+@pytest.mark.slow
+def test_a_video_shows_the_same_drive(trained, file, tmp_path, capsys):
+    drive = ["--seed", str(SEED), "--steps", str(STEPS), "--json", "--out", str(tmp_path / "drive.mp4")]
+    assert main(["record", "--controller", str(file), *drive]) == 0
+    assert main(["record", "--controller", str(trained), *drive]) == 0
+    scores = [json.loads(line)["score"] for line in capsys.readouterr().out.splitlines()]
+    assert scores == [agent_evaluator.AgentEvaluator(make_agent(TrainedAgent.load(file))).drive(SEED).score] * 2
+
+
+def test_neither_torch_nor_onnx_is_needed_to_drive(file):
+    script = f"""
+import sys
+sys.modules.update(torch=None, onnx=None, safetensors=None)
+import dreamfleet
+agent = dreamfleet.find_agent({str(file)!r})
+environment, policy = dreamfleet.make_environment(agent), dreamfleet.make_policy(agent)
+observation, _ = environment.reset(seed={SEED})
+for _ in range(5):
+    observation, *_ = environment.step(policy.act(observation))
+print(observation.shape)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.splitlines()[-1:]) == (0, ["(64, 64, 3)"]), done.stderr
+
+
+def test_where_parameters_are_needed_an_agent_is_refused(file, tmp_path):
+    with pytest.raises(
+        ControllerError, match="is a trained agent, which `evaluate`, `record` and `verify report` take"
+    ):
+        find_controller(str(file), tmp_path)
+
+
+def rewritten(file, change=lambda about: about, network=None):
+    """The file with another manifest or network."""
+    with zipfile.ZipFile(file) as archive:
+        about, found = json.loads(archive.read(MANIFEST)), archive.read(NETWORK)
+    if network is not None:
+        about["network"] = hashlib.sha256(network).hexdigest()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr(MANIFEST, json.dumps(change(about)))
+        archive.writestr(NETWORK, found if network is None else network)
+    return file
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda _about: [], "is not a JSON object"),
+        (lambda about: about | {"format": 9}, "has format 9; this version reads 1"),
+        (lambda about: about | {"network": "ab" * 32}, "is not the one in its manifest"),
+        (lambda about: about | {"frame_skip": 0}, "frame_skip"),
+        (lambda about: about | {"frame_skip": True}, "frame_skip"),
+        (lambda about: about | {"state": 10**9}, "state"),
+        (lambda about: about | {"choices": []}, "choices"),
+        (lambda about: about | {"choices": [[float("nan"), 0, 0]] * 5}, "finite"),
+        (lambda about: {name: value for name, value in about.items() if name != "choices"}, "choices"),
+        (lambda about: about | {"more": 1}, "more"),
+        (lambda about: about | {"choices": [[1e9, 0, 0]] * 5}, "is not steering, gas and brake"),
+        (lambda about: about | {"choices": [[0, 0]] * 5}, "is not steering, gas and brake"),
+        (lambda about: about | {"choices": [[0, 0, 0]] * 4}, "for 4 choices"),
+        (lambda about: about | {"state": 4}, "cannot be run"),
+        (lambda about: about | {"preprocessing": "raw-96"}, "cannot be run"),
+        (lambda about: about | {"preprocessing": "sharp-7"}, "car-racing gives box-64 or raw-96"),
+        (lambda about: about | {"task": "moon"}, "sees 'box-64' of 'moon'"),
+    ],
+)
+def test_a_wrong_manifest_is_one_line(file, tmp_path, change, says):
+    with pytest.raises(ControllerError, match=says) as caught:
+        make_agent(find_agent(str(rewritten(file, change)), tmp_path)[0])
+    assert "\n" not in str(caught.value)
+
+
+def test_a_wrong_network_is_one_line(file, tmp_path, random_bundle):
+    whole, content = file.read_bytes(), TrainedAgent.load(file).network
+    weights = networks_of(LAYERS).online.state_dict()
+    spoilt = {name: tensor.numpy() * np.float32("nan") for name, tensor in weights.items()}
+    wrong = {
+        "empty graph": b"",
+        "cannot be run": random_bundle.read(DREAM_GRAPH),
+        "cannot be run ": content[: len(content) // 2],
+        "NaN or infinite": export_network(spoilt, LAYERS),
+        "cannot be run  ": b"no network at all",
+    }
+    for says, network in wrong.items():
+        file.write_bytes(whole)
+        with pytest.raises(ControllerError, match=says.strip()) as caught:
+            make_agent(find_agent(str(rewritten(file, network=network)), tmp_path)[0])
+        assert "\n" not in str(caught.value)
+
+
+def test_what_is_no_whole_file_is_one_line(file, tmp_path, capsys):
+    whole = file.read_bytes()
+    for content in (b"", whole[:-30], whole[: len(whole) // 2], b"\0" * 100):
+        file.write_bytes(content)
+        assert main(["evaluate", "--controller", str(file), "--episodes", "1"]) == 1
+        assert len(capsys.readouterr().err.splitlines()) == 1
+    with pytest.raises(ControllerError, match="is not an agent's file"):
+        TrainedAgent.load(tmp_path)
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 1
+    file.write_bytes(flipped)
+    with pytest.raises(ControllerError, match="is not a whole agent's file"):
+        find_agent(str(file), tmp_path)
+
+
+def test_a_network_that_gives_nan_ends_the_drive(file):
+    agent = TrainedAgent.load(file)
+    policy = NetworkPolicy(agent)
+    policy._state = np.full_like(policy._state, np.nan)
+    with pytest.raises(ControllerError, match="or NaN"):
+        policy.choose(np.zeros((64, 64, 3), np.uint8))
+
+
+def test_what_cannot_be_exported_is_one_line(trained, tmp_path, capsys):
+    assert main(["baseline", "export", "random", "--data", str(tmp_path), "--out", str(tmp_path / "a.zip")]) == 2
+    assert "random learns nothing" in capsys.readouterr().err
+    networks = networks_of(LAYERS)
+    networks.online.value.weight.data[:] = float("nan")
+    with pytest.raises(DatasetError, match="holds NaN or infinity"):
+        export_agent(keep(tmp_path / "spoilt", networks))

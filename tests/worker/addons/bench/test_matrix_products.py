@@ -1,0 +1,51 @@
+"""The lower bounds of `lab bench policy` and `lab bench dream` ignore slow libraries and inherited settings.
+Tests measurement.py and verb.py."""
+
+import os
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.host.resource_limits import POOLS
+from dreamfleet.worker.addons.bench.matrix_products import LIBRARIES, fastest, product_cases, product_graph
+from dreamfleet.worker.addons.bench.verb import measure_on_one_thread
+from dreamfleet.worker.worldmodel.inference import open_graph
+
+
+def inherited(_bundle):
+    """The environment of a measurement's process."""
+    return {name: value for name, value in os.environ.items() if "BLAS" in name or name.startswith("ATEN_")}
+
+
+def test_no_librarys_setting_reaches_a_measurement(monkeypatch):
+    settings = {"OPENBLAS_CORETYPE": "Prescott", "OPENBLAS_L2_SIZE": "1", "ATEN_CPU_CAPABILITY": "default"}
+    for name, value in {**settings, **dict.fromkeys(POOLS, "2")}.items():
+        monkeypatch.setenv(name, value)
+    environment = measure_on_one_thread(inherited, "tiny")
+    assert not settings.keys() & environment.keys()
+    assert environment["OPENBLAS_NUM_THREADS"] == "1"
+
+
+def test_a_floor_is_each_product_by_the_library_that_is_fastest_at_it():
+    seconds = {
+        "product 0 by numpy": 2.0, "product 0 by torch": 3.0, "product 0 by onnxruntime": 1.0,
+        "product 1 by numpy": 4.0, "product 1 by onnxruntime": 5.0, "step": 0.1,
+    }  # fmt: skip
+    assert fastest(seconds, 2) == (5.0, ("onnxruntime", "numpy"))
+
+
+def test_numpy_and_the_runtime_are_always_asked():
+    cases = product_cases([((3, 4), (4, 5)), ((2, 3, 4), (2, 4, 1))])
+    for index in range(2):
+        assert {f"product {index} by numpy", f"product {index} by onnxruntime"} <= cases.keys()
+    assert len(cases) <= 2 * len(LIBRARIES)
+    for call in cases.values():
+        call()
+
+
+@pytest.mark.parametrize(("left", "right"), [((3, 4), (4, 5)), ((2, 3, 200), (2, 200, 1))])
+def test_the_runtimes_product_is_one(left, right):
+    random = np.random.default_rng(0)
+    first, second = (random.normal(size=shape).astype(np.float32) for shape in (left, right))
+    (product,) = open_graph(product_graph(left, second), threads=1).run(["out"], {"left": first})
+    assert np.allclose(product, first @ second, atol=1e-5)

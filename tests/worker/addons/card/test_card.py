@@ -1,0 +1,192 @@
+"""`dreamfleet card`: the folder, and its script without dreamfleet.
+
+Tests card_page.py, score_chart.py, verb.py, worker/worlds/car_racing/standalone_drive.py and
+worker/worlds/gym/standalone_play.py.
+"""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import av
+import numpy as np
+import onnx
+import pytest
+import yaml
+from markdown_it import MarkdownIt
+
+from dreamfleet import evaluate
+from dreamfleet.common.artifacts.controller import IMPORTED, Controller, ControllerShape
+from dreamfleet.common.cli.command_line import main
+from dreamfleet.common.printable import one_line
+from dreamfleet.common.runs.evaluation_report import read_evaluation_report
+from dreamfleet.common.runs.standard_error import format_with_error
+from dreamfleet.common.worlds.known_score import find_known_score
+from dreamfleet.worker.addons.card.card_page import CardContents, describe_card
+from dreamfleet.worker.addons.card.score_chart import draw_scores
+from dreamfleet.worker.tasks.registry import find_task
+from tests.support.processes import ROOT
+
+REPORT = ROOT / "docs" / "lab" / "results" / "real.json"
+WITHOUT_DREAMFLEET = (
+    "import runpy, sys; sys.modules['dreamfleet'] = None; runpy.run_path('drive.py', run_name='__main__')"
+)
+
+
+@pytest.fixture(scope="module")
+def card(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("card") / "real"
+    assert main(["card", "real", str(REPORT), "--steps", "20", "--out", str(folder)]) == 0
+    return folder
+
+
+def run_script(folder, *seeds):
+    """The scores that the folder's script prints in a process without dreamfleet, by seed."""
+    words = [sys.executable, "-c", WITHOUT_DREAMFLEET, *map(str, seeds)]
+    lines = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=True).stdout.splitlines()
+    return {int(seed): float(score) for seed, score in (line.split() for line in lines)}
+
+
+@pytest.mark.slow
+def test_the_folder_holds_what_its_card_names(card):
+    text = (card / "README.md").read_text()
+    names = {each.name for each in card.iterdir()}
+    assert names == {
+        "README.md", "bundle.zip", "controller.npz", "controller.onnx", "drive.py", "evaluation.json", "replay.mp4",
+        "scores.png",
+    }  # fmt: skip
+    assert all(f"`{name}`" in text for name in names - {"README.md"})
+    assert "915.2" in text
+    assert "are bit-identical" in text
+    assert read_evaluation_report(card / "evaluation.json") == read_evaluation_report(REPORT)
+    assert Controller.load(card / "controller.npz").sha256 in text
+
+
+def test_a_hub_reads_the_metadata(card):
+    head = yaml.safe_load((card / "README.md").read_text().split("---")[1])
+    assert head["license"] == "other"
+    assert {"reinforcement-learning", "car-racing", "world-models", "onnx"} <= set(head["tags"])
+    (result,) = head["model-index"][0]["results"]
+    assert result["dataset"] == {"name": "car-racing", "type": "car-racing"}
+    (metric,) = result["metrics"]
+    assert (metric["type"], metric["value"]) == ("mean_reward", "915.19 +/- 29.51")
+
+
+def test_the_video_is_a_drive_and_the_picture_a_picture(card):
+    with av.open(str(card / "replay.mp4")) as video:
+        assert sum(1 for _ in video.decode(video=0)) >= 20
+    assert "in its first 20 steps." in (card / "README.md").read_text()
+    assert (card / "scores.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_graph_needs_no_other_file(card):
+    graph = onnx.load(card / "controller.onnx", load_external_data=False).graph
+    assert [each.name for each in graph.input] == ["picture", "state"]
+    assert not any(each.external_data for each in graph.initializer)
+
+
+@pytest.mark.slow
+def test_the_script_scores_as_evaluate_does(card):
+    """To the bit, on a seed that the report has; without dreamfleet."""
+    found = run_script(card, 10001)[10001]
+    wanted = {each["seed"]: each["score"] for each in json.loads(REPORT.read_text())["drives"]}
+    assert found == pytest.approx(wanted[10001], abs=30)  # another processor may round otherwise
+    out = card.parent / "one.json"
+    assert (
+        main(["evaluate", "--controller", "real", "--episodes", "1", "--first-seed", "10001", "--out", str(out)]) == 0
+    )
+    assert found == json.loads(out.read_text())["drives"][0]["score"]
+
+
+@pytest.mark.parametrize(
+    ("task", "hidden", "options"),
+    [
+        ("gym:CartPole-v1", 4, {"normalise": True, "seed": 3}),
+        ("gym:Pendulum-v1", 0, {"environment": {"g": 9.0}}),
+        ("gym:Blackjack-v1", 0, {}),
+    ],
+)
+def test_the_script_plays_any_environment_as_evaluate_does(tmp_path, task, hidden, options):
+    described = find_task(task).describe(options)
+    shape = ControllerShape(described.observations, described.outputs, hidden)
+    parameters = np.random.default_rng(5).normal(0, 0.5, shape.size).astype(np.float32)
+    controller = Controller(shape, parameters, task, "", {}, described.options, described.version)
+    controller.save(tmp_path / "own.npz")
+    assert main(["card", str(tmp_path / "own.npz"), "--steps", "0", "--out", str(tmp_path / "card")]) == 0
+    assert {each.name for each in (tmp_path / "card").iterdir()} == {"README.md", "controller.npz", "drive.py"}
+    results = evaluate(controller, episodes=3, first_seed=10000, jobs=1)
+    assert run_script(tmp_path / "card", *results.seeds) == dict(zip(results.seeds, results.scores, strict=True))
+
+
+def test_a_controller_that_the_script_cannot_drive_has_none(tmp_path):
+    assert main(["card", "takecover", "--steps", "0", "--out", str(tmp_path / "cover")]) == 0
+    assert not (tmp_path / "cover" / "drive.py").exists()
+    assert (tmp_path / "cover" / "controller.onnx").exists()
+    known = find_known_score(Controller.load(tmp_path / "cover" / "controller.npz"))
+    scores = (tmp_path / "cover" / "README.md").read_text().partition("## Scores")[2]
+    assert format_with_error(known.mean, known.error) in scores.partition("## Use")[0]
+
+
+def test_a_report_of_another_controller_is_refused(tmp_path, capsys):
+    assert main(["card", "tiny", str(REPORT), "--out", str(tmp_path / "tiny")]) == 2
+    assert "the report is of" in capsys.readouterr().err
+
+
+def test_a_folder_in_use_is_refused(tmp_path, capsys):
+    (tmp_path / "mine").write_text("")
+    assert main(["card", "real", "--out", str(tmp_path)]) == 2
+    assert "choose an empty --out" in capsys.readouterr().err
+
+
+def test_an_imported_controller_has_a_card(tmp_path):
+    np.save(tmp_path / "v.npy", np.zeros(867))
+    assert main(["import", str(tmp_path / "v.npy"), "--like", "tiny", "--out", str(tmp_path / "zeros.npz")]) == 0
+    assert main(["card", str(tmp_path / "zeros.npz"), "--steps", "0", "--out", str(tmp_path / "card")]) == 0
+    assert (tmp_path / "card" / "drive.py").exists()
+    assert "`v.npy`" in (tmp_path / "card" / "README.md").read_text()
+
+
+NAMES = [
+    "# <b>x</b>",
+    "[x](javascript:1)",
+    "a`b``c",
+    "1. x*y*_z_",
+    "- x\n# y",
+    "<script>&amp;",
+    "$\\frac$ ~~x~~",
+    "\u202eé",
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_card_shows_each_name_as_it_is(name):
+    controller = Controller(ControllerShape(1, 1), np.zeros(2, np.float32), f"gym:{name}", "", {IMPORTED: name})
+    report = replace(read_evaluation_report(REPORT), judge=name, version=name)
+    text = "\n".join(describe_card(CardContents(controller, None, report, name), []))
+    _, head, page = text.split("---\n", 2)
+    found = yaml.safe_load(head)
+    shown = one_line(name)
+    assert found["tags"][2] == found["model-index"][0]["results"][0]["dataset"]["name"] == shown
+    assert found["model-index"][0]["name"] == shown
+    page = page.split("```json")[0]
+    title, *elements = ElementTree.fromstring(f"<page>{MarkdownIt('commonmark').render(page)}</page>")
+    assert (title.tag, title.text, len(title)) == ("h1", shown, 0)
+    assert {each.tag for element in elements for each in element.iter()} <= {
+        "h2", "p", "ul", "li", "img", "pre", "code", "video",
+    }  # fmt: skip
+    assert [each.text for each in elements[0].iter("code")] == [f"gym:{shown}", "dreamfleet", shown]
+    scores = "".join(elements[2].itertext())
+    assert f"judged in {shown}" in scores
+    assert f"dreamfleet {shown}" in scores
+    assert draw_scores(report, name)
+
+
+def test_what_draws_no_pictures_has_a_card_without_a_video_that_says_why(tmp_path, capsys):
+    shape = ControllerShape(1, 1)
+    name = "tests.support.tasks:Toy"
+    Controller(shape, np.zeros(shape.size, np.float32), name, "").save(tmp_path / "toy.npz")
+    assert main(["card", str(tmp_path / "toy.npz"), "--out", str(tmp_path / "card")]) == 0
+    assert "without replay.mp4: task tests.support.tasks:Toy draws no pictures" in capsys.readouterr().out
+    assert "<video" not in (tmp_path / "card" / "README.md").read_text()

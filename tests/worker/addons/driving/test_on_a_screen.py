@@ -1,0 +1,57 @@
+"""The verb `drive` in a window on a virtual screen, with keys of a virtual keyboard.
+Tests worker/worlds/car_racing/scene.py and verb.py."""
+
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+
+from dreamfleet.worker.worlds.car_racing.native_check import make_car_racing
+from tests.support.processes import DEADLINE, environment
+
+SEED, STEPS = 20_003, 60
+pytestmark = pytest.mark.needs_programs("Xvfb", "xdotool")
+
+
+@pytest.fixture
+def screen():
+    """The number of a virtual X screen."""
+    read, write = os.pipe()
+    command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x1024x24", "-nolisten", "tcp"]
+    with subprocess.Popen(command, pass_fds=[write], stderr=subprocess.DEVNULL) as server:
+        os.close(write)
+        with os.fdopen(read) as pipe:
+            number = pipe.readline().strip()
+        yield f":{number}"
+        server.terminate()
+
+
+def standing_still():
+    environment = make_car_racing(preprocessing="box-64")
+    environment.reset(seed=SEED)
+    score = sum(float(environment.step([0.0, 0.0, 0.0])[1]) for _ in range(STEPS))
+    environment.close()
+    return score
+
+
+@pytest.mark.slow
+def test_a_person_drives_and_quits(screen, tmp_path):
+    seen = {**environment(tmp_path), "DISPLAY": screen, "SDL_VIDEODRIVER": "x11"}
+
+    def hand(*arguments):
+        subprocess.run(["xdotool", *arguments], env=seen, check=True, timeout=DEADLINE, stdout=subprocess.DEVNULL)
+
+    command = [sys.executable, "-m", "dreamfleet", "drive", "--seed", str(SEED), "--steps", str(STEPS)]
+    with subprocess.Popen([*command, "--scale", "0.3"], env=seen, stdout=subprocess.PIPE, text=True) as driving:
+        try:
+            hand("search", "--sync", "--onlyvisible", "--class", ".", "windowfocus", "--sync", "keydown", "Up")
+            said = driving.stdout.readline()  # printed at the episode's end
+            hand("keyup", "Up", "key", "q")
+            assert driving.wait(DEADLINE) == 0
+        finally:
+            driving.kill()
+    score, steps = re.search(r"score (\S+) in (\d+) steps, seed 20003", said).groups()
+    assert int(steps) == STEPS
+    assert float(score) > standing_still() + 5, "the car did not move"

@@ -1,0 +1,186 @@
+"""Files of `torch.save` are read as data; hostile ones are refused, and nothing in them is executed."""
+
+import io
+import os
+import pickle
+import struct
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+
+from dreamfleet.common.cli.command_line import main
+from dreamfleet.common.errors import DatasetError
+from dreamfleet.worker.addons.importing.torch_files import array_of, read_torch_file
+
+LEGACY = [False, True]
+
+
+def save(path, value, *, legacy=False):
+    torch.save(value, path, _use_new_zipfile_serialization=not legacy)
+    return path
+
+
+class Calls:
+    """Unpickling this would call a function."""
+
+    def __init__(self, function, *arguments):
+        self._called = function, arguments
+
+    def __reduce__(self):
+        return self._called
+
+
+@pytest.mark.parametrize("legacy", LEGACY)
+def test_numbers_of_torch_and_numpy(legacy, tmp_path):
+    base = torch.arange(24, dtype=torch.float64).reshape(4, 6)
+    values = {"state_dict": {"part": base.T[1:3]}, "reward": np.float64(3.5), "precision": np.float32(2), "epoch": 4}
+    found = read_torch_file(save(tmp_path / "x.tar", values, legacy=legacy))
+    assert np.array_equal(array_of(found["state_dict"]["part"], tmp_path), base.T[1:3].numpy())
+    assert (found["reward"], found["precision"], found["epoch"]) == (3.5, 2, 4)
+
+
+@pytest.mark.parametrize("legacy", LEGACY)
+@pytest.mark.parametrize("function", [open, exec, eval, print, __import__])
+def test_code_is_not_executed(function, legacy, tmp_path, capsys):
+    mark = tmp_path / "executed"
+    arguments = (str(mark), "w") if function is open else (f"open({str(mark)!r}, 'w')",)
+    (tmp_path / "ctrl").mkdir()
+    path = save(tmp_path / "ctrl" / "best.tar", {"state_dict": Calls(function, *arguments)}, legacy=legacy)
+    assert main(["import", str(path), "--bundle", "tiny", "--out", str(tmp_path / "x.npz")]) == 1
+    assert "no checkpoint of numbers holds. Nothing was executed" in capsys.readouterr().err
+    assert not mark.exists()
+    assert not (tmp_path / "x.npz").exists()
+
+
+def test_a_plain_pickle_is_refused(tmp_path):
+    (tmp_path / "x.tar").write_bytes(pickle.dumps({"state_dict": {}}, protocol=2))
+    with pytest.raises(DatasetError, match=r"can be read|was not read"):
+        read_torch_file(tmp_path / "x.tar")
+    (tmp_path / "x.tar").write_bytes(pickle.dumps(Calls(print, "hello"), protocol=0))
+    with pytest.raises(DatasetError, match=r"was not read|can be read"):
+        read_torch_file(tmp_path / "x.tar")
+
+
+@pytest.mark.parametrize("legacy", LEGACY)
+def test_a_file_cut_anywhere_is_refused(legacy, tmp_path):
+    data = save(tmp_path / "x.tar", {"state_dict": {"a": torch.ones(50)}}, legacy=legacy).read_bytes()
+    for length in range(0, len(data), max(1, len(data) // 60)):
+        (tmp_path / "x.tar").write_bytes(data[:length])
+        with pytest.raises(DatasetError):
+            read_torch_file(tmp_path / "x.tar")
+
+
+@pytest.mark.parametrize("legacy", LEGACY)
+def test_any_changed_byte_is_refused_or_harmless(legacy, tmp_path):
+    data = bytearray(save(tmp_path / "x.tar", {"state_dict": {"a": torch.ones(4)}}, legacy=legacy).read_bytes())
+    random = np.random.default_rng(1)
+    for place in random.integers(0, len(data), 400):
+        changed = data.copy()
+        changed[place] = random.integers(256)
+        (tmp_path / "x.tar").write_bytes(changed)
+        try:
+            file = read_torch_file(tmp_path / "x.tar")
+            state = file.get("state_dict") if isinstance(file, dict) else None
+            tensors = state.values() if isinstance(state, dict) else ()
+            assert all(array_of(each, tmp_path).size < 1000 for each in tensors if isinstance(each, torch.Tensor))
+        except DatasetError:
+            pass
+
+
+def tampered(path, old, new):
+    """The same zip with bytes of its pickle replaced."""
+    with zipfile.ZipFile(path) as archive:
+        members = {each: archive.read(each) for each in archive.namelist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(name, data.replace(old, new) if name.endswith("data.pkl") else data)
+    return path
+
+
+def test_huge_tensors_are_refused_before_memory_is_taken(tmp_path):
+    path = save(tmp_path / "x.tar", {"state_dict": {"a": torch.ones(77)}})
+    with pytest.raises(DatasetError, match="can be read"):
+        read_torch_file(tampered(path, b"K\x4d", b"J\xff\xff\xff\x7f"))
+
+
+def test_a_tensor_that_repeats_few_numbers_often_is_refused(tmp_path):
+    found = read_torch_file(save(tmp_path / "x.tar", {"a": torch.ones(1).expand(2**20, 2**19)}))
+    with pytest.raises(DatasetError, match="more numbers than the file"):
+        array_of(found["a"], tmp_path)
+
+
+@pytest.mark.parametrize(
+    "tensor", [torch.ones(2, 2).to_sparse(), torch.empty(2, 2, device="meta"), torch.ones(2, dtype=torch.cfloat).conj()]
+)
+def test_tensors_that_are_no_plain_numbers_are_refused(tensor, tmp_path):
+    with pytest.raises(DatasetError):
+        array_of(tensor, tmp_path)
+
+
+def test_a_zip_bomb_is_refused(tmp_path):
+    with zipfile.ZipFile(tmp_path / "x.tar", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data.pkl", bytes(513 << 20), compresslevel=1)
+    with pytest.raises(DatasetError, match="at most 512 are read"):
+        read_torch_file(tmp_path / "x.tar")
+
+
+def test_a_legacy_file_with_a_storage_of_a_false_length_is_refused(tmp_path):
+    data = save(tmp_path / "x.tar", {"a": torch.ones(4)}, legacy=True).read_bytes()
+    at = data.rindex(struct.pack("<q", 4))
+    for length in (2**62, -1, 2**31):
+        (tmp_path / "x.tar").write_bytes(data[:at] + struct.pack("<q", length) + data[at + 8 :])
+        with pytest.raises(DatasetError):
+            read_torch_file(tmp_path / "x.tar")
+
+
+@pytest.mark.parametrize(
+    "pickled",
+    [
+        b"\x80\x02" + b"(" * 1000 + b".",
+        b"\x80\x02X\xff\xff\xff\x7fabc",
+        b"\x80\x02\x8b\xff\xff\xff\x7fabc",
+        b"cos\nsystem\n(S'true'\ntR.",
+        b"\x80\x02cos\nsystem\nX\x04\x00\x00\x00true\x85R.",
+        b"\x80\x04\x8c\x02os\x8c\x06system\x93\x8c\x04true\x85R.",
+        b"\x80\x02K\x01Q.",
+        b"",
+    ],
+)
+def test_damaged_and_hostile_pickles_are_refused(pickled, tmp_path):
+    (tmp_path / "x.tar").write_bytes(pickled)
+    with zipfile.ZipFile(tmp_path / "y.tar", "w") as archive:
+        archive.writestr("archive/data.pkl", pickled)
+    for name in ("x.tar", "y.tar"):
+        with pytest.raises(DatasetError, match=r"can be read|was not read"):
+            read_torch_file(tmp_path / name)
+
+
+def test_what_is_no_checkpoint_is_refused(tmp_path, capsys):
+    for content in (
+        torch.ones(3),
+        {"state_dict": 3},
+        {"state_dict": {"a": 1}},
+        {"state_dict": {1: torch.ones(2)}},
+        [1, 2],
+        {"weights": {}},
+    ):
+        path = save(tmp_path / "x.tar", content)
+        assert main(["import", str(path), "--bundle", "tiny", "--out", str(tmp_path / "x.npz")]) == 1
+        assert "holds no state_dict of tensors" in capsys.readouterr().err
+    buffer = io.BytesIO()
+    np.savez(buffer, a=np.ones(3))
+    (tmp_path / "x.tar").write_bytes(buffer.getvalue())
+    assert main(["import", str(tmp_path / "x.tar"), "--bundle", "tiny", "--out", str(tmp_path / "x.npz")]) == 1
+    assert "without the data.pkl" in capsys.readouterr().err
+
+
+def test_only_regular_files_of_a_bounded_size_are_read(tmp_path):
+    (tmp_path / "folder.tar").mkdir()
+    os.mkfifo(tmp_path / "pipe.tar")
+    with (tmp_path / "large.tar").open("wb") as file:
+        file.truncate((512 << 20) + 1)
+    for name in ("folder.tar", "pipe.tar", "large.tar", "none.tar"):
+        with pytest.raises(DatasetError, match=name):
+            read_torch_file(tmp_path / name)

@@ -1,0 +1,359 @@
+"""Vectors of parameters, and drives, of other programs. Tests drives.py and vectors.py."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cma
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.controller import Controller, ControllerShape
+from dreamfleet.common.cli.command_line import main
+from dreamfleet.common.errors import ControllerError, DatasetError
+from dreamfleet.common.runs.records import RunSettings
+from dreamfleet.coordinator.storage.journal import Journal
+from dreamfleet.worker.addons.importing.drives import read_drive
+from dreamfleet.worker.addons.importing.vectors import read_vector, to_parameters
+from dreamfleet.worker.training.data.dataset import (
+    episode_paths,
+    find_world,
+    load_pictures,
+    load_steps,
+    preprocessing_of,
+)
+from tests.support.foreign_drives import ctallec_drive
+from tests.support.samples import SPEC
+
+
+def test_orders():
+    shape = ControllerShape(features=2, actions=3)
+    weights, biases = np.arange(6.0).reshape(3, 2), np.array([7.0, 8, 9])
+    wanted = [*weights.ravel(), *biases]
+    assert to_parameters(np.array(wanted), "dreamfleet", shape).tolist() == wanted
+    assert to_parameters(np.array([*biases, *weights.T.ravel()]), "wme", shape).tolist() == wanted
+    assert to_parameters(np.array([*weights.T.ravel(), *biases]), "article", shape).tolist() == wanted
+
+
+def test_a_vector_that_does_not_fit_is_refused():
+    with pytest.raises(ControllerError, match="5 parameters does not fit"):
+        to_parameters(np.zeros(5), "wme", ControllerShape(2, 3))
+    with pytest.raises(ControllerError, match="hidden units"):
+        to_parameters(np.zeros(12), "wme", ControllerShape(2, 2, hidden=2))
+
+
+def test_files_of_vectors(tmp_path):
+    vector = np.array([0.5, -1.25, 3.0])
+    np.save(tmp_path / "v.npy", vector)
+    (tmp_path / "v.csv").write_text("0.5,-1.25,\n3\n")
+    (tmp_path / "v.json").write_text(json.dumps([vector.tolist(), 900.0]))
+    (tmp_path / "flat.json").write_text(json.dumps(vector.tolist()))
+    for name in ("v.npy", "v.csv", "v.json", "flat.json"):
+        assert read_vector(tmp_path / name).tolist() == vector.tolist()
+
+
+def test_what_pycma_wrote(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    strategy = cma.CMAEvolutionStrategy([1.0] * 4, 0.5, {"seed": 1, "verbose": -9, "maxiter": 5})
+    logger = cma.CMADataLogger("outcmaes/").register(strategy)
+    for _ in range(5):
+        candidates = strategy.ask()
+        strategy.tell(candidates, [float(np.square(each).sum()) for each in candidates])
+        logger.add()
+    assert read_vector(tmp_path / "outcmaes") == pytest.approx(strategy.mean, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("x.csv", "1, two", "no list of numbers"),
+        ("x.csv", "", "not one vector"),
+        ("x.json", "[NaN]", "NaN"),
+        ("x.json", '{"a": 1}', "no list of numbers"),
+        ("x.dat", "% nothing", "no row of numbers"),
+        ("x.exe", "", "a vector is a file"),
+        ("x.npy", "no array", "no array of numbers"),
+        ("x.json", "[1" + "0" * 400 + "]", "beyond double precision"),
+        ("x.json", '["1"]', "no list of numbers"),
+    ],
+)
+def test_what_is_no_vector_is_refused(name, content, message, tmp_path):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(DatasetError, match=message):
+        read_vector(tmp_path / name)
+
+
+def test_a_pickled_array_is_not_executed(tmp_path):
+    np.save(tmp_path / "x.npy", np.array([{}], dtype=object), allow_pickle=True)
+    with pytest.raises(DatasetError, match="no array of numbers"):
+        read_vector(tmp_path / "x.npy")
+
+
+def test_a_vector_like_a_controller_that_ships(tmp_path):
+    np.save(tmp_path / "v.npy", np.zeros(867))
+    out = tmp_path / "zeros.npz"
+    assert main(["import", str(tmp_path / "v.npy"), "--like", "tiny", "--out", str(out)]) == 0
+    assert Controller.load(out).bundle == Controller.load(out).bundle != ""
+
+
+@pytest.mark.parametrize("name", ["v.json", "v.npy"])
+@pytest.mark.parametrize("optimiser", ["external", "cma"])
+def test_a_vector_like_a_run_lies_as_the_runs_own_and_needs_no_torch(name, optimiser, tmp_path, monkeypatch):
+    spec = replace(SPEC, task="gym:CartPole-v1", bundle="", options='{"x": 1}', controller=ControllerShape(4, 2))
+    settings = RunSettings(spec, ControllerShape(4, 2), 4, 1, 0.1, "diagonal", 1, 0, 1, optimiser=optimiser)
+    (tmp_path / "mine").mkdir()
+    Journal.create(tmp_path / "mine", settings, None).close()
+    vector = [float(each) for each in range(10)]
+    (tmp_path / "v.json").write_text(json.dumps(vector))
+    np.save(tmp_path / "v.npy", vector)
+    monkeypatch.setitem(sys.modules, "torch", None)  # not installed
+    monkeypatch.delitem(sys.modules, "dreamfleet.worker.addons.importing.checkpoints", raising=False)
+    words = ["--like", "mine", "--runs-dir", str(tmp_path), "--out", str(tmp_path / "best.npz")]
+    assert main(["import", str(tmp_path / name), *words]) == 0
+    found = Controller.load(tmp_path / "best.npz")
+    assert (found.parameters.tolist(), found.task, found.options) == (vector, spec.task, spec.options)
+    assert main(["import", str(tmp_path / name), *words, "--layout", "wme"]) == 0
+    assert Controller.load(tmp_path / "best.npz").parameters.tolist() == [2, 4, 6, 8, 3, 5, 7, 9, 0, 1]
+
+
+def test_a_vector_alone_controls_nothing(tmp_path, capsys):
+    np.save(tmp_path / "v.npy", np.zeros(867))
+    assert main(["import", str(tmp_path / "v.npy"), "--out", str(tmp_path / "x.npz")]) == 2
+    assert "--like CONTROLLER" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["weights.h5", "controller.pkl"])
+def test_what_cannot_be_read_is_refused_with_the_reason(name, tmp_path, capsys):
+    (tmp_path / name).write_bytes(b"\x80\x04cos\nsystem\n")
+    assert main(["import", str(tmp_path / name), "--out", str(tmp_path / "x.npz")]) == 1
+    assert "cannot be imported" in capsys.readouterr().err
+
+
+def drives_of(folder, count, **arrays):
+    for number in range(count):
+        np.savez_compressed(folder / f"{number}.npz", **arrays)
+
+
+def test_drives_of_wme(tmp_path):
+    pictures = np.random.default_rng(1).integers(0, 256, (6, 64, 64, 3), dtype=np.uint8)
+    source = tmp_path / "record"
+    source.mkdir()
+    drives_of(source, 2, obs=pictures, action=np.zeros((6, 3), np.float16))
+    assert main(["import", str(source), "--out", str(tmp_path / "data")]) == 0
+    first = episode_paths(tmp_path / "data")[0]
+    assert np.array_equal(load_pictures(first), pictures + np.uint8(1))
+    assert load_steps(first)["reward"].tolist() == [0] * 6
+
+
+PROGRAMS = {
+    # hardmaru/WorldModelsExperiments, carracing/extract.py: white is 254 there, and black 255
+    "wme": ("1466665.npz", 254, {"obs": np.uint8, "action": np.float16}),
+    # zacwellmer/WorldModels, WorldModels/extract.py
+    "dreamfleet": ("1001466665.npz", 255, {"obs": np.uint8, "action": np.float16, "reward": np.float16, "done": bool,
+                                           "N": np.uint16}),
+    # ctallec/world-models, data/carracing.py
+    "ctallec": ("rollout_0.npz", 255, {"observations": np.uint8, "actions": np.float32, "rewards": float,
+                                       "terminals": bool}),
+    # AppliedDataSciencePartners/WorldModels, 01_generate_data.py
+    "article": ("735.npz", 1.0, {"obs": np.float32, "action": np.float32, "reward": float, "done": bool}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("layout", PROGRAMS)
+def test_white_stays_white_in_the_drives_of_each_public_program(layout, tmp_path):
+    name, white, types = PROGRAMS[layout]
+    shapes = {"obs": (4, 64, 64, 3), "observations": (4, 96, 96, 3), "action": (4, 3), "actions": (4, 3)}
+    arrays = {each: np.zeros(shapes.get(each, 4), kind) for each, kind in types.items()}
+    arrays["obs" if "obs" in types else "observations"][:] = white
+    if layout == "article":
+        arrays["reward"][0] = -0.1
+    np.savez_compressed(tmp_path / name, **arrays)
+    drive = read_drive(tmp_path / name)
+    assert drive.layout == layout
+    assert (drive.arrays["picture"] == 255).all()
+
+
+@pytest.mark.parametrize(
+    ("white", "pictures", "actions"),
+    [(1.0, np.float32, np.float16), (255, np.float32, np.float16), (255, np.int64, np.float16),
+     (255, np.uint8, np.float32), (1.0, float, float)],
+)  # fmt: skip
+def test_drives_without_rewards_are_not_wmes_by_that_alone(white, pictures, actions, tmp_path):
+    arrays = {"obs": np.full((3, 64, 64, 3), white, pictures), "action": np.zeros((3, 3), actions)}
+    np.savez(tmp_path / "x.npz", **arrays)
+    drive = read_drive(tmp_path / "x.npz")
+    assert (drive.layout, drive.has_rewards) == ("dreamfleet", False)
+    assert (drive.arrays["picture"] == 255).all()
+
+
+def test_named_as_wmes_pictures_must_be_what_that_program_writes(tmp_path):
+    arrays = {"obs": np.ones((3, 64, 64, 3)), "action": np.zeros((3, 3))}
+    np.savez(tmp_path / "x.npz", **arrays)
+    with pytest.raises(DatasetError):
+        read_drive(tmp_path / "x.npz", layout="wme")
+    np.savez(tmp_path / "x.npz", **arrays | {"obs": np.full((3, 64, 64, 3), 254, np.uint8)})
+    assert (read_drive(tmp_path / "x.npz", layout="wme").arrays["picture"] == 255).all()
+
+
+@pytest.mark.parametrize(
+    "names", [("obs", "action", "reward", "done"), ("observations", "actions", "rewards", "terminals")]
+)
+def test_drives_with_rewards_and_ends(names, tmp_path):
+    pictures = np.random.default_rng(1).random((5, 64, 64, 3)).astype(np.float32)
+    source = tmp_path / "rollout"
+    source.mkdir()
+    done = np.array([False] * 4 + [True])
+    arrays = (pictures, np.zeros((5, 3)), np.arange(5.0), done)
+    drives_of(source, 2, **dict(zip(names, arrays, strict=True)))
+    assert main(["import", str(source), "--out", str(tmp_path / "data")]) == 0
+    first = episode_paths(tmp_path / "data")[0]
+    assert np.array_equal(load_pictures(first), np.round(pictures * 255).astype(np.uint8))
+    steps = load_steps(first)
+    assert steps["reward"].tolist() == [0, 1, 2, 3, 4]
+    assert bool(steps["ended"])
+
+
+def test_whole_observations_are_cut_and_shrunk(tmp_path):
+    from dreamfleet.worker.worlds.car_racing.preprocessing import BOX
+
+    whole = np.random.default_rng(1).integers(0, 256, (3, 96, 96, 3), dtype=np.uint8)
+    source = tmp_path / "drives"
+    source.mkdir()
+    drives_of(source, 2, observations=whole, actions=np.zeros((3, 3)), rewards=np.zeros(3), terminals=np.zeros(3, bool))
+    assert main(["import", str(source), "--out", str(tmp_path / "data")]) == 0
+    assert np.array_equal(load_pictures(episode_paths(tmp_path / "data")[0]), [BOX.picture(each) for each in whole])
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"obs": np.zeros((3, 64, 64, 3), np.uint8)}, "lacks action"),
+        ({"obs": np.zeros((3, 32, 32, 3), np.uint8), "action": np.zeros((3, 3))}, "pictures are"),
+        ({"obs": np.zeros((3, 64, 64, 3), np.uint8), "action": np.zeros((2, 3))}, "do not fit"),
+        ({"obs": np.full((3, 64, 64, 3), np.nan), "action": np.zeros((3, 3))}, "NaN"),
+        ({"obs": np.zeros((3, 64, 64, 3), np.uint8), "action": np.full((3, 3), np.inf)}, "NaN"),
+        ({"obs": np.array([{}], object), "action": np.zeros((3, 3))}, "no drive"),
+        ({"obs": np.zeros((3, 64, 64, 3), np.uint8), "action": np.full((3, 3), "left")}, "not numbers"),
+        ({"obs": np.full((3, 64, 64, 3), 300), "action": np.zeros((3, 3))}, "from 0 to 255"),
+        (
+            {"obs": np.zeros((3, 64, 64, 3), np.uint8), "action": np.zeros((3, 3)), "done": np.full(3, np.nan)},
+            "not numbers",
+        ),
+        ({"obs": np.zeros((30_000, 64, 64, 3), np.uint8), "action": np.zeros((30_000, 3))}, "at most 20,000 steps"),
+    ],
+)
+def test_what_is_no_drive_is_refused(arrays, message, tmp_path, capsys):
+    np.savez(tmp_path / "x.npz", **arrays)
+    assert main(["import", str(tmp_path / "x.npz"), "--out", str(tmp_path / "data")]) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_a_folder_with_drives_is_not_added_to(tmp_path, capsys):
+    source = tmp_path / "record"
+    source.mkdir()
+    drives_of(source, 2, obs=np.zeros((2, 64, 64, 3), np.uint8), action=np.zeros((2, 3)))
+    assert main(["import", str(source), "--out", str(tmp_path / "data")]) == 0
+    assert main(["import", str(source), "--out", str(tmp_path / "data")]) == 2
+    assert "empty --out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["evaluate", "--controller", "theirs.json"],
+        ["record", "--controller", "theirs.json", "--out", "x.mp4"],
+        ["coordinator", "--run", "x", "--init", "theirs.json"],
+        ["lab", "refit", "theirs.json", "--to", "tiny", "--data", ".", "--out", "x.npz"],
+        ["evaluate", "--controller", "theirs.tar"],
+        ["coordinator", "--run", "x", "--task", "dream", "--bundle", "theirs.json"],
+        ["train", "vae", "--data", "drives"],
+    ],
+)
+def test_what_a_user_of_another_project_types_first_names_the_verb(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name in ("theirs.json", "theirs.tar"):
+        (tmp_path / name).write_text("[[1, 2, 3], 900]")
+    (tmp_path / "drives").mkdir()
+    drives_of(tmp_path / "drives", 2, obs=np.zeros((2, 64, 64, 3), np.uint8), action=np.zeros((2, 3)))
+    assert main(words) in (1, 2)
+    assert "dreamfleet import" in capsys.readouterr().err
+
+
+def test_the_writer_of_the_page_makes_a_data_set(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = (Path(__file__).parents[4] / "docs" / "reference" / "import.md").read_text()
+    exec(page.split("```python\n")[1].split("```")[0], {})
+    assert main(["import", "drives", "--out", "data"]) == 0
+    assert len(load_pictures(episode_paths(Path("data"))[0])) == 20
+
+
+@pytest.mark.parametrize("size", [64, 96])
+def test_drives_of_ctallec_are_shifted_by_a_step(size, tmp_path, capsys):
+    source = tmp_path / "carracing"
+    first, _ = (ctallec_drive(source / f"thread_{each}", each, size=size) for each in range(2))
+    assert main(["import", str(source), "--out", str(tmp_path / "data")]) == 0
+    assert "2 drives, 10 steps, read as layout ctallec" in capsys.readouterr().out
+    path = episode_paths(tmp_path / "data")[0]
+    whole = find_world().preprocessings["whole-64"]
+    pictures = [whole.picture(each) if size == 96 else each for each in first["observations"]]
+    assert np.array_equal(load_pictures(path), pictures[:-1])
+    steps = load_steps(path)
+    assert np.array_equal(steps["action"], first["actions"][1:6].astype(np.float32))
+    assert np.array_equal(steps["reward"], first["rewards"][1:].astype(np.float32))
+    assert bool(steps["ended"])
+
+
+def test_drives_of_the_article_have_the_reward_of_the_step_before(tmp_path, capsys):
+    random = np.random.default_rng(1)
+    source = tmp_path / "rollout"
+    source.mkdir()
+    reward = np.array([-0.1, 7.0, -0.1, 3.0, -0.1])
+    pictures = random.integers(0, 256, (5, 64, 64, 3)).astype(np.float32) / 255
+    action = random.random((5, 3))
+    drives_of(source, 2, obs=pictures, action=action, reward=reward, done=np.array([False] * 4 + [True]))
+    assert main(["import", str(source), "--out", str(tmp_path / "data")]) == 0
+    assert "layout article" in capsys.readouterr().out
+    path = episode_paths(tmp_path / "data")[0]
+    assert preprocessing_of(path) == "whole-64"
+    assert np.array_equal(load_pictures(path), np.round(pictures[:-1] * 255).astype(np.uint8))
+    steps = load_steps(path)
+    assert np.array_equal(steps["reward"], reward[1:].astype(np.float32))
+    assert np.array_equal(steps["action"], action[:-1].astype(np.float32))
+
+
+def test_one_drive_is_no_drives(tmp_path, capsys):
+    np.savez(tmp_path / "x.npz", obs=np.zeros((1, 64, 64, 3)), action=np.zeros((1, 3)))
+    assert main(["import", str(tmp_path / "x.npz"), "--out", str(tmp_path / "data")]) == 0
+    assert "1 drive, 1 step," in capsys.readouterr().out
+
+
+def test_a_layout_may_be_named(tmp_path):
+    np.savez(tmp_path / "x.npz", **ctallec_drive(tmp_path / "thread_0", 0))
+    with pytest.raises(DatasetError, match="do not fit"):
+        read_drive(tmp_path / "x.npz")
+    assert len(read_drive(tmp_path / "x.npz", layout="ctallec").arrays["picture"]) == 5
+
+
+@pytest.mark.slow
+def test_a_world_model_is_trained_on_drives_of_ctallec(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for each in range(3):
+        ctallec_drive(tmp_path / "carracing" / "thread_0", each, steps=30)
+    assert main(["import", "carracing", "--out", "data"]) == 0
+    few = ["--preset", "paper", "--updates", "2"]
+    assert main(["train", "vae", "--data", "data", *few]) == 0
+    assert main(["encode", "--data", "data"]) == 0
+    assert "mirrored_mu" not in np.load(episode_paths(Path("data"), "encoded")[0]).files
+    assert main(["train", "mdnrnn", "--data", "data", "--set", "joint=true", "done=true", *few]) == 0
+    assert main(["bundle", "--data", "data", "--out", "world.zip"]) == 0
+    assert Bundle.open(Path("world.zip")).manifest.preprocessing == "whole-64"
+
+
+def test_other_pictures_are_not_collected_into_imported_drives(tmp_path, capsys):
+    for each in range(2):
+        ctallec_drive(tmp_path / "carracing", each)
+    assert main(["import", str(tmp_path / "carracing"), "--out", str(tmp_path / "data")]) == 0
+    assert main(["collect", "--data", str(tmp_path / "data"), "--preset", "paper", "--episodes", "3"]) == 1
+    assert "whole-64" in capsys.readouterr().err

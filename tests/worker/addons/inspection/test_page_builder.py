@@ -1,0 +1,169 @@
+"""Tests page_builder.py, charts.py, encoded_rollout.py, mdnrnn_sections.py and page.py."""
+
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import torch
+
+from dreamfleet.common.artifacts.bundle import write_bundle
+from dreamfleet.common.errors import BundleError, DatasetError, UsageError
+from dreamfleet.worker.addons.inspection import mdnrnn_sections
+from dreamfleet.worker.addons.inspection.encoded_rollout import DriveConfig, record_drive
+from dreamfleet.worker.addons.inspection.page import Page, Section
+from dreamfleet.worker.addons.inspection.page_builder import InspectionSubject, find_subject, manifest_facts, write_page
+from dreamfleet.worker.worldmodel.inference import DreamStep
+from dreamfleet.worker.worldmodel.mdnrnn import MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae import VAEConfig
+from tests.support.bundles import write_random_bundle
+from tests.support.models import random_models
+
+PNG = b"\x89PNG\r\n\x1a\n"
+VAE = VAEConfig(latent=5, channels=(4, 4, 4, 8))
+ATTENTIVE = MDNRNNConfig(latent=5, hidden=8, mixtures=2, window=3, attention_units=4)
+SHORT = DriveConfig(steps=12)
+LOOKS = ["reconstructions", "traversals", "latents", "samples"]
+
+
+class Links(HTMLParser):
+    """Collects the addresses that a browser would fetch, and the ids of the sections."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.addresses, self.sections, self.tags = [], [], set()
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        named = dict(attributes)
+        self.tags.add(tag)
+        self.addresses += [value for name, value in attributes if name in ("src", "href", "srcset", "data", "action")]
+        if tag == "section":
+            self.sections.append(named["id"])
+
+
+def write_curves(folder):
+    for name, parts in (("vae", ("error", "kl")), ("mdnrnn", ("latent", "reward"))):
+        points = [{"update": update, **dict.fromkeys(parts, 100.0 / update)} for update in range(1, 60)]
+        (folder / f"{name}.jsonl").write_text("\n".join(json.dumps(point) for point in points))
+
+
+@pytest.fixture
+def attentive(tmp_path):
+    return write_random_bundle(tmp_path / "attentive.zip", vae=VAE, rnn=ATTENTIVE)
+
+
+def test_the_pages_drive_can_be_one_action_alone(attentive):
+    driven = record_drive(attentive, None, DriveConfig(steps=12, action=(-0.01, 1.0, 0.0)))
+    assert driven.action.tolist() == [np.array((-0.01, 1, 0), np.float32).tolist()] * 12
+    assert driven.description == "a fresh drive by one action alone, -0.01 1 0"
+
+
+@pytest.mark.parametrize(
+    ("action", "says"),
+    [
+        ((1.0,), "takes steer, gas, brake: 3 numbers, not 1"),
+        ((0.0, 2.0, 0.0), "takes steer from -1 to 1, gas from 0 to 1, brake from 0 to 1, not 0 2 0"),
+        ((0.0, float("nan"), 0.0), "not 0 nan 0"),
+        ((0.0, 1e40, 0.0), r"not 0 1e\+40 0"),
+    ],
+)
+def test_what_is_no_action_of_the_world_is_refused(attentive, action, says):
+    with pytest.raises(UsageError, match=says):
+        record_drive(attentive, None, DriveConfig(action=action))
+
+
+@pytest.mark.slow
+def test_a_page_has_every_section_and_needs_nothing_else(attentive, tmp_path):
+    write_curves(tmp_path)
+    sections = []
+    page = write_page(
+        InspectionSubject(attentive),
+        tmp_path / "out",
+        SHORT,
+        [tmp_path],
+        lambda done, name: sections.append((done, name)),
+    )
+    found = Links(page.read_text())
+    names = [*LOOKS, "dream", "rewards", "attention", "loss-vae", "loss-mdnrnn"]
+    assert found.sections == names
+    assert sections == list(enumerate(names, 1))
+    assert all(address.startswith("data:image/png;base64,") for address in found.addresses)
+    assert len(found.addresses) == len(names)
+    assert not found.tags & {"script", "link", "iframe", "object"}
+    assert "url(" not in re.sub(r"data:[^\"]*", "", page.read_text())
+    for name in names:
+        assert (page.parent / f"{name}.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.slow
+def test_what_a_bundle_cannot_do_is_left_out(tmp_path):
+    rnn = MDNRNNConfig(latent=5, hidden=8, reward="none")
+    plain = write_random_bundle(tmp_path / "plain.zip", vae=VAE, rnn=rnn)
+    page = write_page(InspectionSubject(plain), tmp_path / "plain", SHORT)
+    assert Links(page.read_text()).sections == [*LOOKS, "dream"]
+
+
+def test_the_table_has_sizes_and_quality(tmp_path, attentive):
+    provenance = {"quality": {"reward_auc": 0.9}, "held_out_episodes": 7}
+    manifest = attentive.manifest.__class__(**{**vars(attentive.manifest), "provenance": provenance})
+    parts = {name: attentive.read(name) for name in attentive.manifest.parts}
+    rows = dict(manifest_facts(write_bundle(tmp_path / "b.zip", manifest, parts)))
+    assert rows["quality: reward auc"] == "0.9 (0.5 is chance, 1 exact)"
+    assert (rows["latents"], rows["attention window"], rows["held out episodes"]) == ("5", "3", "7")
+
+
+def test_a_page_escapes_what_a_stranger_named():
+    page = Page("<b>", "&", [("<i>", "<script>")], [Section('a"b', "<h>", "<p>")]).html()
+    assert Links(page).tags <= {"html", "head", "meta", "title", "style", "body", "h1", "p", "table", "tr", "th", "td",
+                                "section", "h2"}  # fmt: skip
+
+
+def test_a_drive_is_a_function_of_its_seed(attentive):
+    one, other = (record_drive(attentive, None, SHORT) for _ in range(2))
+    assert len(one) == SHORT.steps
+    assert np.array_equal(one.picture, other.picture)
+    assert not np.array_equal(one.picture, record_drive(attentive, None, DriveConfig(20_001, 12)).picture)
+    assert list(one.nats[one.most_active]) == sorted(one.nats, reverse=True)
+
+
+def test_dreams_begin_at_the_drives_first_latent_and_take_its_actions(attentive):
+    driven = record_drive(attentive, None, SHORT)
+    dreamt = mdnrnn_sections.dream_latents(attentive, driven, 1.0)
+    assert dreamt.shape == driven.mu.shape
+    assert np.array_equal(dreamt[0], driven.mu[0])
+    assert not np.array_equal(dreamt[1], mdnrnn_sections.dream_latents(attentive, driven, 1.0, seed=1)[1])
+    driven.action[:] = driven.action[::-1].copy()
+    assert not np.array_equal(dreamt, mdnrnn_sections.dream_latents(attentive, driven, 1.0))
+
+
+def test_attention_is_that_of_the_trained_model(attentive):
+    _, model = random_models(0, VAE, ATTENTIVE)
+    random = np.random.default_rng(1)
+    latent, action = random.normal(size=(2, 5)).astype(np.float32), random.normal(size=(2, 3)).astype(np.float32)
+    state = random.normal(size=(2, ATTENTIVE.state)).astype(np.float32)
+    window = np.concatenate([state[:, 2 * 8 + 8 :], latent, action], axis=1).reshape(2, 3, 8)
+    with torch.no_grad():
+        query = model.query(torch.from_numpy(state[:, :8]))[:, None]
+        expected = torch.softmax(model.score(torch.tanh(model.keys(torch.from_numpy(window)) + query)), dim=1)[..., 0]
+    np.testing.assert_allclose(DreamStep(attentive).attend(latent, action, state), expected.numpy(), atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_drive_is_seen_as_its_bundle_sees(tmp_path):
+    whole = VAEConfig(picture=96, padding="same", latent=5, channels=(2, 2, 2, 2))
+    bundle = write_random_bundle(tmp_path / "whole.zip", vae=whole, rnn=MDNRNNConfig(latent=5, hidden=4))
+    assert record_drive(bundle, None, SHORT).picture.shape == (12, 96, 96, 3)
+    page = write_page(InspectionSubject(bundle), tmp_path / "out", SHORT)
+    assert Links(page.read_text()).sections == [*LOOKS, "dream", "rewards"]
+
+
+def test_what_is_missing_is_reported_before_anything_is_driven(tmp_path, attentive):
+    with pytest.raises(BundleError, match=r"no bundle 'nosuch'.*no run 'nosuch'"), find_subject("nosuch", tmp_path):
+        pass
+    with pytest.raises(DatasetError, match="no folder"):
+        write_page(InspectionSubject(attentive), tmp_path / "out", SHORT, [tmp_path / "nowhere"])
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DatasetError, match="choose another --out"):
+        write_page(InspectionSubject(attentive), tmp_path / "file" / "out", SHORT)

@@ -1,0 +1,178 @@
+"""Dreams begun before real losses of the road, judged by probes on the dream.
+Tests knowledge.py, likeness.py and tables.py."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.addons.inspection import likeness, probe
+from dreamfleet.worker.addons.inspection.disturbed_rollouts import OFF, DisturbedDriveConfig, record_disturbed_drives
+from dreamfleet.worker.addons.inspection.drive_dreams import DreamSegment, DriveDreamer
+from dreamfleet.worker.addons.inspection.knowledge import cross_validate_probes
+from dreamfleet.worker.addons.inspection.road_losses import (
+    CALM,
+    RoadLossConfig,
+    RoadOutcome,
+    RoadProbe,
+    collect_losing_drives,
+    compare_losses,
+)
+from dreamfleet.worker.addons.inspection.tables import knowledge_rows, loss_rows
+from dreamfleet.worker.scoring.actors import ControllerActor
+from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
+
+CONFIG, DRIVEN = RoadLossConfig(losses=6, before=(20, 0), dreams=2), DisturbedDriveConfig(opening=50)
+
+
+@pytest.fixture(scope="module")
+def drives(tiny, controller):
+    recurrent = RecurrentState(tiny)
+    actor = ControllerActor(controller, tiny, recurrent)
+    return collect_losing_drives(record_disturbed_drives(tiny, recurrent, lambda _seed: actor, DRIVEN), CONFIG, DRIVEN)
+
+
+@pytest.mark.slow
+def test_as_many_losses_are_gathered_as_are_wanted(drives):
+    lost = [each for each in drives if each.lost is not None]
+    assert len(lost) >= CONFIG.losses
+    assert drives[-1].lost is not None
+    for each in lost:
+        assert each.truth[OFF][each.lost : each.lost + DRIVEN.lasting].all()
+
+
+@pytest.mark.slow
+def test_too_few_losses_are_reported(drives):
+    calm = [replace(each, lost=None) for each in drives]
+    with pytest.raises(UsageError, match=r"lost the road 0 times, not 6: raise --noise"):
+        collect_losing_drives(iter(calm), CONFIG, DRIVEN)
+    blind = [replace(each, truth={"speed": each.truth["speed"]}) for each in drives]
+    with pytest.raises(UsageError, match="lacks lateral_offset and off_road"):
+        collect_losing_drives(iter(blind), CONFIG, DRIVEN)
+
+
+@pytest.mark.slow
+def test_reality_loses_the_road_and_the_probe_sees_it_and_nothing_where_all_is_calm(drives, tiny, controller):
+    compared = {each.begun: each for each in compare_losses(drives, tiny, controller, CONFIG, DRIVEN)}
+    assert list(compared) == ["20 steps before", "0 steps before", CALM]
+    for begun in ("20 steps before", "0 steps before"):
+        lost = compared[begun].figures["lost"]
+        assert compared[begun].count == CONFIG.losses
+        assert lost["reality"].value == 1
+        assert lost["foreseen"].value >= 0.75
+        assert 0 <= lost["dream"].value <= 1
+    assert compared[CALM].figures["lost"]["reality"].value == 0
+    assert compared[CALM].figures["lost"]["foreseen"].value <= 0.25
+    assert len(loss_rows(list(compared.values()))) == 3 * 4
+
+
+def test_a_dream_begins_at_its_real_step_and_is_a_function_of_seed_and_step(drives, tiny, controller):
+    dreamer, begun = DriveDreamer(tiny, controller, 1.0, 3), DreamSegment(drives[0], 120, 15)
+    features, rewards = dreamer.dream(begun, own=True)
+    assert features.shape == (3, 15, 288)
+    assert rewards.shape == (3, 15)
+    assert (features[:, 0] == drives[0].features[120]).all()
+    assert not np.array_equal(features[0, 1:], features[1, 1:])
+    assert np.array_equal(features, dreamer.dream(begun, own=True)[0])
+    assert not np.array_equal(features, dreamer.dream(DreamSegment(drives[0], 121, 15), own=True)[0])
+
+
+def test_in_a_dream_of_the_same_actions_nobody_chooses(drives, tiny, controller):
+    other = replace(controller, parameters=-controller.parameters)
+    begun = DreamSegment(drives[0], 120, 15)
+    one, another = (DriveDreamer(tiny, each, 1.0, 2) for each in (controller, other))
+    assert np.array_equal(one.dream(begun, own=False)[0], another.dream(begun, own=False)[0])
+    assert not np.array_equal(one.dream(begun, own=True)[0], another.dream(begun, own=True)[0])
+
+
+def test_the_controllers_dream_is_pushed_as_reality_was(drives, tiny, controller):
+    calm = replace(drives[0], push=np.zeros_like(drives[0].push))
+    dreamer = DriveDreamer(tiny, controller, 1.0, 2)
+    found = [dreamer.dream(DreamSegment(each, 120, 15), own=True)[0] for each in (drives[0], calm)]
+    assert not np.array_equal(*found)
+
+
+def test_what_is_foreseen_has_the_memory_of_reality(drives, tiny, controller):
+    features, rewards = DriveDreamer(tiny, controller, 1.0, 1).predict_next(drives[0])
+    assert features.shape == drives[0].features.shape
+    assert rewards.shape == drives[0].reward.shape
+    assert np.array_equal(features[:, 32:], drives[0].features[:, 32:])
+    assert np.array_equal(features[0], drives[0].features[0])
+    near = [np.corrcoef(features[50:, row], drives[0].features[50:, row])[0, 1] for row in range(32)]
+    assert max(near) > 0.8
+
+
+def test_a_probe_estimates_off_the_road_from_features(drives, tiny, controller):
+    dreamer = DriveDreamer(tiny, controller, 1.0, 1)
+    foreseen = [dreamer.predict_next(each)[0] for each in drives]
+    road_probe = RoadProbe(drives[:-1], foreseen[:-1], DRIVEN.opening)
+    outcome = road_probe.outcome(foreseen[-1][None, 50:], drives[-1].reward[None, 50:])
+    off = drives[-1].truth[OFF][50:] > 0
+    assert outcome.off[0][off].mean() > 0.5
+    assert outcome.off[0][~off].mean() < 0.1
+    assert outcome.offset[0][off].mean() > outcome.offset[0][~off].mean() + 3
+
+
+def test_an_outcome_is_summarised_over_dreams():
+    off = np.zeros((2, 20), bool)
+    off[0, 5:10] = True
+    off[1, 17:] = True
+    found = RoadOutcome(off, np.where(off, 8.0, 2.0), np.full((2, 20), 0.5)).summarise(lasting=4)
+    assert found == {"lost": 0.5, "off_at_end": 3 / 8, "offset_at_end": 2 + 6 * 3 / 8, "reward": 10}
+
+
+def test_a_world_model_knows_yaw_from_what_it_remembers_not_from_a_picture(drives, monkeypatch):
+    monkeypatch.setattr(probe, "UPDATES", 30)  # the network's, which is not looked at
+    knowledge = cross_validate_probes(drives, DRIVEN.opening)
+    known = {each.quantity: each.found for each in knowledge.known}
+    assert OFF not in known
+    assert known["yaw_rate"]["zh_linear"].value > 0.8 > known["yaw_rate"]["z_linear"].value + 0.2
+    assert known["lateral_offset"]["z_linear"].value > 0.5
+    assert [row["quantity"] for row in knowledge_rows(knowledge)] == list(known)
+
+
+@pytest.mark.slow
+def test_a_dream_is_held_to_what_is_rare_in_reality(drives, tiny, controller):
+    found = {
+        each.quantity: each for each in likeness.compare_frequencies(drives, tiny, controller, DRIVEN.opening, 2, 1.0)
+    }
+    assert OFF not in found
+    for each in found.values():
+        assert each.found["reality"].value == pytest.approx(0.1, abs=0.05)  # over drives of unequal lengths
+        assert 0 <= each.found["dream"].value <= 1
+    assert found["yaw_rate"].found["foreseen"].value == pytest.approx(0.1, abs=0.05)
+    assert found["speed"].rare > 20
+    with pytest.raises(UsageError, match="two drives at least that stay on the road for 100 steps"):
+        likeness.compare_frequencies(drives[:1], tiny, controller, DRIVEN.opening, 2, 1.0)
+
+
+@pytest.mark.slow
+def test_dreams_that_all_end_as_they_begin_are_refused(drives, tiny, controller, monkeypatch):
+    monkeypatch.setattr(likeness, "_before_ends", lambda features: features[0, :0])
+    with pytest.raises(UsageError, match="end as they begin"):
+        likeness.compare_frequencies(drives, tiny, controller, DRIVEN.opening, 2, 1.0)
+
+
+def test_steps_behind_a_dreams_end_do_not_count():
+    features = np.arange(24.0).reshape(2, 4, 3)
+    features[1, 2:] = features[1, 1]
+    assert likeness._before_ends(features).tolist() == [*features[0, 1:].tolist(), features[1, 1].tolist()]
+
+
+def test_one_drive_is_too_few_to_fit_and_judge(drives):
+    with pytest.raises(UsageError, match="two drives on the road"):
+        cross_validate_probes(drives[:1], DRIVEN.opening)
+    with pytest.raises(UsageError, match="two drives on the road"):
+        cross_validate_probes([], DRIVEN.opening)
+    with pytest.raises(UsageError, match="two drives on the road"):
+        cross_validate_probes(drives, max(len(each) for each in drives))
+
+
+def test_a_drive_that_ended_in_the_opening_is_no_drive_to_judge(drives, monkeypatch):
+    monkeypatch.setattr(probe, "UPDATES", 30)
+    short = replace(drives[0], truth={name: column[:20] for name, column in drives[0].truth.items()},
+                    action=drives[0].action[:20])  # fmt: skip
+    one, other = (cross_validate_probes(each, DRIVEN.opening) for each in ([short, *drives[:2], short], drives[:2]))
+    assert one.known == other.known
+    assert (one.drives, one.steps) == (other.drives, other.steps)

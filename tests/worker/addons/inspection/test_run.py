@@ -1,0 +1,94 @@
+"""A run's page: its own world model under its own controller."""
+
+import argparse
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.runs.lookup import find_controller
+from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
+from dreamfleet.common.runs.run_paths import CONTROLLER, run_paths
+from dreamfleet.coordinator.jobs.evaluation import Evaluation
+from dreamfleet.coordinator.jobs.work import vector_bytes
+from dreamfleet.coordinator.storage.journal import Journal
+from dreamfleet.worker.addons.inspection import measurements, verb
+from dreamfleet.worker.addons.inspection.encoded_rollout import DriveConfig, record_drive
+from dreamfleet.worker.addons.inspection.page_builder import find_subject, write_page
+from dreamfleet.worker.addons.inspection.probe import Estimate
+from dreamfleet.worker.addons.inspection.road_losses import LossReport, RoadLossComparison
+from tests.support.samples import SPEC
+
+COMPARED = RoadLossComparison("40 steps before", 30, {"lost": {"reality": Estimate(1.0, 0.0)}})
+
+
+@pytest.fixture
+def runs_dir(tmp_path, random_bundle):
+    path = tmp_path / "runs" / "night"
+    path.mkdir(parents=True)
+    shape = random_bundle.controller_shape
+    settings = RunSettings(
+        replace(SPEC, bundle=random_bundle.sha256, temperature=1.25), shape, 2, 1, 0.1, "diagonal", 1, 1, 2
+    )
+    journal = Journal.create(path, settings, random_bundle.path)
+    vectors = [vector_bytes(np.full(shape.size, value)) for value in (0.5, 1.5)]
+    for number in range(3):
+        journal.open_generation(number, b"", 0.1, [7], vectors)
+        closed = StoredGeneration(number, number, 1.0, number + 1, 0.0, 0.1, 20, 1.0)
+        journal.close_generation(closed, np.array([0.0, 1.0]))
+        journal.schedule_evaluation(Evaluation(number, vectors[0], 2))
+        journal.finish_evaluation(number, StoredEvaluation(number, 4, 100.0 * number, 5.0), 0)
+    journal.commit()
+    journal.close()
+    return tmp_path / "runs"
+
+
+@pytest.mark.slow
+def test_a_run_that_goes_on_is_driven_at_random_and_shows_its_fitness(runs_dir, tmp_path):
+    with find_subject("night", runs_dir) as subject:
+        page = write_page(subject, tmp_path / "out", DriveConfig(steps=4)).read_text()
+    assert 'id="fitness"' in page
+    assert "a fresh drive by a random driver" in page
+
+
+@pytest.mark.slow
+def test_a_run_that_has_ended_is_driven_by_its_controller(runs_dir, random_bundle, tmp_path):
+    shape = random_bundle.controller_shape
+    parameters = np.random.default_rng(0).normal(size=shape.size).astype(np.float32)
+    Controller(shape, parameters, "dream", random_bundle.sha256).save(next(run_paths(runs_dir)) / CONTROLLER)
+    with find_subject("night", runs_dir) as subject:
+        assert np.array_equal(subject.controller.parameters, parameters)
+        page = write_page(subject, tmp_path / "out", DriveConfig(steps=4)).read_text()
+    assert "a fresh drive by the controller" in page
+
+
+def test_a_bundle_is_shown_a_drive_of_another_ones_controller(random_bundle, tmp_path):
+    controller, _ = find_controller("tiny", tmp_path)
+    own = find_bundle("tiny")
+    seen, driven = (record_drive(each, controller, DriveConfig(steps=30), own) for each in (random_bundle, own))
+    assert np.array_equal(seen.action, driven.action)
+    assert seen.mu.shape != driven.mu.shape or not np.array_equal(seen.mu, driven.mu)
+
+
+def test_a_runs_own_controller_is_measured_at_the_runs_temperature(runs_dir, random_bundle, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        measurements,
+        "measure_dream_losses",
+        lambda *given: asked.append(given) or LossReport(1, 8, 1.0, 10, (COMPARED,)),
+    )
+    shape = random_bundle.controller_shape
+    Controller(shape, np.zeros(shape.size, np.float32), "dream", random_bundle.sha256).save(
+        next(run_paths(runs_dir)) / CONTROLLER
+    )
+    for flags, temperature in ((), 1.25), (("--temperature", "1.5"), 1.5):
+        parser = argparse.ArgumentParser()
+        verb.configure(parser)
+        args = parser.parse_args(["night", "--losses", *flags])
+        args.runs_dir = runs_dir
+        assert verb.run(args) == 0
+        bundle, driving, _, losses, _ = asked.pop()
+        assert bundle.sha256 == driving.controller.bundle == random_bundle.sha256
+        assert losses.temperature == temperature

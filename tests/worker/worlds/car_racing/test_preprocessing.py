@@ -1,0 +1,74 @@
+import numpy as np
+import pytest
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.worker.training.data.dataset import preprocessing_of_size
+from dreamfleet.worker.worlds.car_racing.preprocessing import BOX, RAW, WHOLE, find_preprocessing
+
+
+def overlap(target, step, source, unit):
+    """How much of source cell `source` (of `unit`) lies in target cell `target` (of `step`)."""
+    return max(0, min((target + 1) * step, (source + 1) * unit) - max(target * step, source * unit))
+
+
+def slow_picture(observation):
+    rows = np.array([[overlap(i, 21, r, 16) for r in range(84)] for i in range(64)])
+    columns = np.array([[overlap(j, 3, c, 2) for c in range(96)] for j in range(64)])
+    assert (rows.sum(axis=1) == 21).all()
+    assert (columns.sum(axis=1) == 3).all()
+    sums = np.einsum("ir,rcx,jc->ijx", rows, observation[:84].astype(np.int64), columns)
+    return ((sums + 31) // 63).astype(np.uint8)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_picture_is_the_exact_integer_box_filter(seed):
+    observation = np.random.default_rng(seed).integers(0, 256, (96, 96, 3), dtype=np.uint8)
+    assert np.array_equal(BOX.picture(observation), slow_picture(observation))
+
+
+@pytest.mark.parametrize("value", [0, 1, 127, 254, 255])
+def test_a_plain_colour_stays(value):
+    assert (BOX.picture(np.full((96, 96, 3), value, np.uint8)) == value).all()
+
+
+def test_the_indicator_bar_is_not_seen():
+    observation = np.zeros((96, 96, 3), np.uint8)
+    observation[84:] = 255
+    assert (BOX.picture(observation) == 0).all()
+
+
+def test_the_raw_picture_is_the_whole_observation():
+    observation = np.random.default_rng(0).integers(0, 256, (96, 96, 3), dtype=np.uint8)
+    assert np.array_equal(RAW.picture(observation), observation)
+
+
+def test_a_preprocessing_is_found_by_name_and_by_size():
+    for each in (BOX, RAW):
+        assert find_preprocessing(each.name) is preprocessing_of_size(each.size) is each
+        assert each.picture(np.zeros((96, 96, 3), np.uint8)).shape == each.shape
+    with pytest.raises(UsageError, match=r"'bilinear-64'.*box-64, raw-96"):
+        find_preprocessing("bilinear-64")
+    with pytest.raises(UsageError, match="64 or 96 pixels wide, not 32"):
+        preprocessing_of_size(32)
+
+
+@pytest.mark.parametrize("levels", [256, 2])
+def test_the_whole_picture_is_pillows_to_the_bit(levels):
+    image = pytest.importorskip("PIL.Image")
+    random = np.random.default_rng(levels)
+    for _ in range(20):
+        observation = (random.integers(0, levels, (96, 96, 3)) * (255 // (levels - 1))).astype(np.uint8)
+        wanted = image.fromarray(observation).resize((64, 64), image.Resampling.BILINEAR)
+        assert np.array_equal(WHOLE.picture(observation), np.asarray(wanted))
+
+
+def test_the_environment_draws_the_whole_picture():
+    from dreamfleet.worker.worlds.car_racing.environment import CarRacing
+
+    seen = []
+    for name in (RAW.name, WHOLE.name):
+        environment = CarRacing(preprocessing=name)
+        observation, _ = environment.reset(seed=3)
+        seen.append(observation)
+        environment.close()
+    assert np.array_equal(WHOLE.picture(seen[0]), seen[1])

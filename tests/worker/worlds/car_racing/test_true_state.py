@@ -1,0 +1,145 @@
+"""The true state of car and road: on roads of a known shape, and in the real environment."""
+
+import math
+
+import numpy as np
+import pytest
+from gymnasium.envs.box2d.car_dynamics import Car
+
+from dreamfleet.worker.tasks.api import TaskWithTrueState
+from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.worlds.car_racing.native_check import make_car_racing
+from dreamfleet.worker.worlds.car_racing.true_state import LOOK_AHEAD, CentreLine, read_true_state, wrap_angle
+
+BENDS = [f"curvature_{distance}m" for distance in LOOK_AHEAD]
+
+
+def circle(radius, count=200):
+    """A track driven counter-clockwise; at an angle of 0 it heads along y, which is a heading of 0."""
+    angles = 2 * np.pi * np.arange(count) / count
+    return CentreLine.of(np.stack([angles, angles, radius * np.cos(angles), radius * np.sin(angles)], axis=1))
+
+
+def stadium(straight=200.0, radius=50.0, step=2.0):
+    """Two straights along y, the first from the origin upwards, and two half circles to the left."""
+    rows = [(0, 0, 0, y) for y in np.arange(0, straight, step)]
+    turns = np.arange(0, math.pi, step / radius)
+    rows += [(0, t, -radius + radius * math.cos(t), straight + radius * math.sin(t)) for t in turns]
+    rows += [(0, math.pi, -2 * radius, y) for y in np.arange(straight, 0, -step)]
+    rows += [(0, math.pi + t, -radius - radius * math.cos(t), -radius * math.sin(t)) for t in turns]
+    return CentreLine.of(rows)
+
+
+def test_a_straight_road_bends_nowhere_and_a_turn_by_its_radius():
+    line = stadium()
+    np.testing.assert_allclose(line.curvature([20, 100, 180]), 0, atol=1e-12)
+    np.testing.assert_allclose(line.curvature([230, 280, 330]), 1 / 50, rtol=1e-3)
+
+
+def test_a_circle_bends_alike_everywhere_also_over_its_seam():
+    line = circle(50)
+    np.testing.assert_allclose(line.curvature(np.linspace(0, 1000, 77)), 1 / 50, rtol=1e-3)
+
+
+def test_left_of_a_road_is_positive():
+    line = stadium()
+    right, middle, left = (line.nearest_position(x, 60.0) for x in (3.0, 0.0, -3.0))
+    assert [each.offset for each in (right, middle, left)] == pytest.approx([-3, 0, 3])
+    assert left.along == pytest.approx(60)
+    assert left.heading == pytest.approx(0)
+    assert line.nearest_position(-100 + 3, 60).offset == pytest.approx(3)  # the straight back, towards the inside
+
+
+@pytest.mark.parametrize(
+    ("angle", "same"), [(0.1, 0.1), (2 * math.pi + 0.1, 0.1), (-4 * math.pi - 1, -1), (4, 4 - 2 * math.pi)]
+)
+def test_an_angle_is_wrapped(angle, same):
+    assert wrap_angle(angle) == pytest.approx(same)
+
+
+@pytest.fixture
+def environment():
+    made = make_car_racing(preprocessing="box-64")
+    made.reset(seed=20_003)
+    yield made
+    made.close()
+
+
+def put(environment, tile, aside=0.0, turn=0.0):
+    """Move the car beside a track's point, standing still."""
+    inner = environment.unwrapped
+    _, beta, x, y = inner.track[tile]
+    inner.car.destroy()
+    inner.car = Car(inner.world, beta + turn, x - aside * math.cos(beta), y - aside * math.sin(beta))
+    return read_true_state(inner)
+
+
+@pytest.mark.parametrize("tile", [0, 1, 40, 100, -1])
+def test_a_car_on_a_tile_is_on_the_centre_line(environment, tile):
+    truth = put(environment, tile)
+    assert truth["lateral_offset"] == pytest.approx(0, abs=1e-5)
+    assert truth["heading_error"] == pytest.approx(0, abs=1e-5)
+    assert truth["speed"] == truth["yaw_rate"] == truth["side_slip"] == 0
+
+
+def test_a_car_beside_and_turned_to_the_left_says_so_and_to_the_right_too(environment):
+    for sign in (1, -1):
+        truth = put(environment, 50, aside=4 * sign, turn=0.3 * sign)
+        assert truth["lateral_offset"] == pytest.approx(4 * sign, rel=0.1)
+        assert truth["heading_error"] == pytest.approx(0.3 * sign, abs=0.15)
+
+
+def test_bends_ahead_are_those_of_the_tracks_own_points(environment):
+    track = np.array(environment.unwrapped.track)
+    turned = wrap_angle(track[2:, 1] - track[:-2, 1]) / 7.0  # two steps of 3.5 metres
+    curvature = np.array([put(environment, tile)["curvature_5m"] for tile in range(len(track) - 2)])
+    assert np.corrcoef(curvature[:-2], turned[1:-1])[0, 1] > 0.95
+    assert curvature.mean() > 0  # a lap turns to the left as a whole
+
+
+def drive(environment, actions):
+    """The true states of a drive from the start, after the opening zoom."""
+    states = []
+    for action in actions:
+        environment.step(np.array(action, np.float32))
+        states.append(read_true_state(environment.unwrapped))
+    return states
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_steering_turns_wheels_car_and_offset_to_one_side(environment, side):
+    put(environment, 5)
+    states = drive(environment, [(0, 0.5, 0)] * 20 + [(-0.4 * side, 0.2, 0)] * 25)  # negative steering is left
+    last = states[-1]
+    assert last["speed"] > 5
+    for name in ("wheel_angle", "yaw_rate", "heading_error", "lateral_offset"):
+        assert last[name] * side > 0, name
+
+
+def test_side_slip_is_speed_to_the_left(environment):
+    put(environment, 30)
+    hull = environment.unwrapped.car.hull
+    hull.linearVelocity = (10 * -math.sin(hull.angle) - 3 * math.cos(hull.angle),
+                           10 * math.cos(hull.angle) - 3 * math.sin(hull.angle))  # fmt: skip
+    truth = read_true_state(environment.unwrapped)
+    assert truth["side_slip"] == pytest.approx(3, rel=1e-5)
+    assert truth["speed"] == pytest.approx(math.hypot(10, 3), rel=1e-5)
+
+
+def test_full_gas_straight_on_leaves_the_road_for_good(environment):
+    states = drive(environment, [(0, 1, 0)] * 200)
+    off = [each["off_road"] for each in states]
+    assert off[:20] == [0] * 20
+    assert off[-1] == 1
+    assert abs(states[-1]["lateral_offset"]) > 40 / 6  # half a road's width
+
+
+def test_every_step_has_the_same_names_in_both_environments(environment):
+    task = find_task("car-racing")
+    assert isinstance(task, TaskWithTrueState)
+    assert not isinstance(find_task("gym:CartPole-v1"), TaskWithTrueState)
+    judge = make_car_racing(preprocessing="raw-96")
+    judge.reset(seed=20_003)
+    assert task.truth(judge) == task.truth(environment)
+    assert set(BENDS) < set(task.truth(judge))
+    judge.close()

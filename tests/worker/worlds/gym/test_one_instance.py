@@ -1,0 +1,82 @@
+"""Environments of which a process can hold one: whatever drives them, there is one instance at a time."""
+
+import json
+
+import numpy as np
+import pytest
+
+from dreamfleet.common.artifacts.controller import Controller, ControllerShape
+from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.worker.scoring.agents import make_agent
+from dreamfleet.worker.scoring.rollout import DataWorld
+from dreamfleet.worker.scoring.scorer import Scorer
+from dreamfleet.worker.scoring.task_check import dry_run
+from dreamfleet.worker.tools.evaluation import evaluate
+from dreamfleet.worker.tools.recording import record
+from dreamfleet.worker.training.data.collect import drive_episode
+from dreamfleet.worker.training.data.collect_config import CollectConfig
+from dreamfleet.worker.worlds.gym.task import GymTask
+from tests.support.bundles import write_world_bundle
+from tests.support.single_environments import MODULE
+
+KINDS = pytest.mark.parametrize("kind", ["Single", "Shared"])
+SHAPE = ControllerShape(2, 1)
+
+
+def name_of(kind):
+    return f"gym:{MODULE}:{kind}-v0"
+
+
+class Watching(list):
+    """An observer of every step."""
+
+    def is_due(self):
+        return True
+
+    def observe(self, episode, look):
+        self.append(look().step)
+
+
+@KINDS
+def test_a_slot_scores_and_is_watched(kind):
+    scorer = Scorer(TaskSpec(name_of(kind), "", 1000, 0, SHAPE))
+    assert scorer.host_class
+    assert scorer.together == 1
+    parameters = np.array([0.5, -0.5, 0.1], np.float32)
+    plain = scorer.score("score", parameters, 7)
+    scorer.observer = Watching()
+    assert scorer.score("score", parameters, 7) == plain
+    assert len(scorer.observer) == plain.steps == 20
+    scorer.close()
+
+
+@KINDS
+def test_the_check_before_a_run_finds_nothing(kind):
+    *_, found = dry_run(name_of(kind), {"normalise": True}, lambda _step: None, thorough=True)
+    assert found.episode == found.repeated != ""
+    assert "normal" in json.loads(found.description.options)
+    assert found.warnings == ()
+
+
+@KINDS
+def test_a_controller_is_evaluated_and_recorded(kind, tmp_path):
+    controller = Controller(SHAPE, np.zeros(3, np.float32), name_of(kind), "")
+    agent = make_agent(controller)
+    (episode,) = evaluate(agent, (7,), jobs=1)
+    assert episode.steps == 20
+    score = record(agent, 7, 20, tmp_path / "drive.mp4")
+    assert score == episode.score
+
+
+@KINDS
+def test_pictures_are_collected_and_a_world_model_scores(kind, tmp_path):
+    options = '{"observation": "render"}'
+    task = GymTask(f"{MODULE}:{kind}-v0").with_options(options)
+    arrays = drive_episode(CollectConfig(episodes=1, steps=10, anywhere=0), 0, world=DataWorld(task.name, options))
+    assert arrays["picture"].shape == (10, 64, 64, 3)
+    facts = task.world.facts(RewardFacts("survival"), EndRule(), task.options)
+    bundle = write_world_bundle(tmp_path / "world.zip", facts, task.name)
+    scorer = Scorer(TaskSpec(task.name, bundle.sha256, horizon=10, patience=0), bundle)
+    assert scorer.score("score", np.zeros(bundle.controller_shape.size, np.float32), 7).steps == 10
+    scorer.close()

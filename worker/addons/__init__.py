@@ -1,0 +1,1 @@
+"""What scoring and training can do without: each add-on registers itself by entry points."""

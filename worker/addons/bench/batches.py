@@ -1,0 +1,88 @@
+"""Benchmark submitted batches: how many evaluations a second a caller reaches over Zenoh and over HTTP."""
+
+from __future__ import annotations
+
+import base64
+import http.client
+import json
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from dreamfleet.common.client.remote_scorer import RemoteScorer
+from dreamfleet.common.host.processes import VerbProcess
+from dreamfleet.common.host.reports import ADDRESS
+from dreamfleet.worker.addons.bench.dispatch import BenchRun, Figures
+from dreamfleet.worker.addons.bench.sleep_tasks import NULL_TASK
+
+BLOCKS = 9  # of each kind, in turn; the first of each is not counted
+POPULATIONS = (1, 64, 1024)
+EPISODES = 1
+
+
+def bench_batches() -> Figures:
+    """Evaluations a second of empty jobs on two simulated workers of 32 slots each, by population: medians.
+
+    An evaluation is one episode of one vector of 867 numbers. The caller waits for each batch before the next.
+    """
+    with BenchRun(NULL_TASK, 64, EPISODES, external=True) as run, run.crowd(2, 32):
+        run.coordinator.wait_for_report(ADDRESS)
+        with (
+            RemoteScorer(run.endpoint, "bench") as scorer,
+            VerbProcess("serve", "--connect", run.endpoint, "--port", 0) as bridge,
+        ):
+            address = bridge.wait_for_report(ADDRESS)
+            ways: dict[str, Callable[[np.ndarray[Any, Any], list[int]], None]] = {
+                "zenoh": lambda vectors, seeds: _score(scorer, vectors, seeds),
+                "http": HttpCaller(address, packed=False).score, "http_base64": HttpCaller(address, packed=True).score,
+            }  # fmt: skip
+            rates: Figures = {}
+            seeds = iter(range(10**9))
+            for population in POPULATIONS:
+                vectors = np.random.default_rng(1).normal(size=(population, scorer.size)).astype(np.float32)
+                seconds: dict[str, list[float]] = {way: [] for way in ways}
+                for _ in range(BLOCKS):
+                    for way, score in ways.items():
+                        own = [next(seeds) for _ in range(EPISODES)]
+                        started = time.perf_counter()
+                        score(vectors, own)
+                        seconds[way].append(time.perf_counter() - started)
+                rates[f"population_{population}"] = {
+                    way: round(population * EPISODES / statistics.median(each[1:])) for way, each in seconds.items()
+                }
+            return {"evaluations_per_second": rates, "numbers_per_vector": scorer.size}
+
+
+def _score(scorer: RemoteScorer, vectors: np.ndarray[Any, Any], seeds: list[int]) -> None:
+    assert np.isfinite(scorer.score(vectors, seeds=seeds)).all()
+
+
+class HttpCaller:
+    """A caller with one connection, as a program in any language would have it."""
+
+    def __init__(self, address: str, *, packed: bool) -> None:
+        self._packed = packed  # send the numbers in base64, not as text
+        host, _, port = address.removeprefix("http://").rpartition(":")
+        self._connection = http.client.HTTPConnection(host, int(port), timeout=60)
+
+    def score(self, vectors: np.ndarray[Any, Any], seeds: list[int]) -> None:
+        """Submit a batch, follow its events to the end, and read its scores."""
+        base = "/v1/runs/bench/batches"
+        if self._packed:
+            packed = base64.b64encode(vectors.astype("<f4").tobytes()).decode()
+            body = json.dumps({"vectors": {"float32": packed, "size": vectors.shape[1]}, "seeds": seeds})
+        else:
+            body = json.dumps({"vectors": vectors.tolist(), "seeds": seeds})
+        batch = self._ask("POST", base, body)["id"]
+        self._connection.request("GET", f"{base}/{batch}/events")
+        self._connection.getresponse().read()
+        found = self._ask("GET", f"{base}/{batch}")
+        assert None not in found["fitness"]
+
+    def _ask(self, method: str, path: str, body: str | None = None) -> dict[str, Any]:
+        self._connection.request(method, path, body, {"Content-Type": "application/json"})
+        answer: dict[str, Any] = json.loads(self._connection.getresponse().read())
+        return answer

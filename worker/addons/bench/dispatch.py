@@ -1,0 +1,233 @@
+"""Benchmark the coordinator: how close to ideal it keeps its slots busy, and how many jobs per second it handles."""
+
+from __future__ import annotations
+
+import queue
+import socket
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from importlib import import_module
+from importlib.util import find_spec
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.host.child import FunctionChild
+from dreamfleet.common.host.processes import VerbProcess
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.worker.addons.bench.simulated_workers import run_simulated_workers
+from dreamfleet.worker.addons.bench.sleep_tasks import NULL_TASK, SLEEP_SECONDS, SLEEP_TASK
+
+SLOTS = 8
+CANDIDATES = 200
+GENERATIONS = 6  # the first is not counted: workers join during it
+NULL_JOBS = 4096  # per generation: 64 candidates x 64 episodes
+CROWD_SLOTS, CROWD_ROUNDS = 64, 8  # slots of a simulated worker, and jobs of each slot in a generation
+MOST_EPISODES = 10_000  # of a candidate
+RUN_SECONDS = 300.0
+PEER_SECONDS = 120.0
+ROUNDS = -(-CANDIDATES // SLOTS)
+Figures = dict[str, Any]
+
+
+def bench_dispatch(crowd: int) -> Figures:
+    """Measure 50 ms jobs on 8 real slots, null jobs on simulated workers, and installed peers (pool, Dask, Ray).
+
+    `crowd` is a number of simulated workers for a third run; 0: none.
+    """
+    naps, null = measure_sleep_jobs(), measure_null_jobs()
+    peers: dict[str, Figures | None] = {}
+    for name, run in (("pool", pool_peer), ("dask", dask_peer), ("ray", ray_peer)):
+        if name == "pool" or find_spec({"dask": "distributed"}.get(name, name)):
+            peers[name] = run_peer(run)
+    figures: Figures = {
+        "efficiency_50ms": round(naps, 4),
+        "null_jobs_per_second": round(null["jobs_per_second"]),
+        "coordinator_rss_mb": round(null["rss_mb"], 1),
+        "peers": peers,
+    }
+    if crowd:
+        figures["crowd"] = measure_crowd(crowd)
+    return figures
+
+
+def measure_sleep_jobs() -> float:
+    """The ideal makespan of a generation of 50 ms jobs divided by the measured one, on a real worker."""
+    with BenchRun(SLEEP_TASK, CANDIDATES, 1) as run, run.workers("--task", SLEEP_TASK, "--slots", SLOTS):
+        run.finish()
+        return ROUNDS * SLEEP_SECONDS / run.generation_seconds()
+
+
+def measure_null_jobs() -> Figures:
+    """Jobs per second of empty jobs on two simulated workers of 32 slots each, and the coordinator's peak memory."""
+    with BenchRun(NULL_TASK, 64, NULL_JOBS // 64) as run, run.crowd(2, 32):
+        run.finish()
+        return {"jobs_per_second": NULL_JOBS / run.generation_seconds(), "rss_mb": run.peak_mb}
+
+
+def measure_crowd(count: int) -> Figures:
+    """Figures of two runs in which simulated workers join, work and leave, with `count` slots in all.
+
+    Null jobs on workers of one slot each; and how close jobs of a second come to the ideal on workers of up to
+    `CROWD_SLOTS` slots.
+    """
+    started = time.monotonic()
+    with BenchRun(NULL_TASK, 64, NULL_JOBS // 64) as run, run.crowd(count, 1):
+        run.finish()
+        crowd = {
+            "workers": count,
+            "seconds_in_all": round(time.monotonic() - started, 1),
+            "null_jobs_per_second": round(NULL_JOBS / run.generation_seconds()),
+            "coordinator_rss_mb": round(run.peak_mb, 1),
+        }
+    return {**crowd, "efficiency_1s": round(measure_long_jobs(count), 4)}
+
+
+def measure_long_jobs(slots: int) -> float:
+    """The ideal makespan of a generation of jobs of a second divided by the measured one, on `slots` or a few more."""
+    workers = -(-slots // CROWD_SLOTS)
+    slots = workers * CROWD_SLOTS
+    parts = -(-slots // MOST_EPISODES)
+    with (
+        BenchRun(NULL_TASK, CROWD_ROUNDS * parts, slots // parts) as run,
+        run.crowd(workers, CROWD_SLOTS, seconds=1.0),
+    ):
+        run.finish()
+        return CROWD_ROUNDS / run.generation_seconds()
+
+
+class BenchRun:
+    """A real coordinator in its own process and folder: a run of `GENERATIONS` generations, or an external one."""
+
+    def __init__(self, task: str, population: int, episodes: int, *, external: bool = False) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+        self.peak_mb = 0.0
+        self._arguments = (
+            "--listen", self.endpoint, "--task", task, "--population", population, "--episodes", episodes,
+            *(("--optimiser", "external") if external else ("--generations", GENERATIONS, "--evaluate-every", 0)),
+        )  # fmt: skip
+
+    def __enter__(self) -> BenchRun:
+        with ExitStack() as stack:
+            self._runs = stack.enter_context(tempfile.TemporaryDirectory())
+            self.coordinator = stack.enter_context(
+                VerbProcess("coordinator", "--run", "bench", "--runs-dir", self._runs, *self._arguments)
+            )
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._stack.close()
+
+    def workers(self, *arguments: object) -> AbstractContextManager[object]:
+        """Start a real worker; the context manager stops it."""
+        return VerbProcess("worker", "--connect", self.endpoint, *arguments)
+
+    @contextmanager
+    def crowd(self, count: int, slots: int, seconds: float = 0.0) -> Iterator[None]:
+        """Start `count` simulated workers in one process, whose jobs take so many `seconds`."""
+        arguments = self.endpoint, count, slots, seconds
+        with FunctionChild(_run_simulated_workers, *arguments, on_message=lambda _message: None, is_own=True):
+            yield
+
+    def finish(self) -> None:
+        """Wait until the run ends; `DreamfleetError` if it fails or takes too long."""
+        deadline = time.monotonic() + RUN_SECONDS
+        while self.coordinator.exit_code is None:
+            self.peak_mb = max(self.peak_mb, self.coordinator.memory / 1e6)
+            if time.monotonic() > deadline:
+                raise DreamfleetError(f"the run did not end within {RUN_SECONDS:g} s")
+            time.sleep(0.1)
+        if self.coordinator.exit_code:
+            raise DreamfleetError("the run's coordinator failed")
+
+    def generation_seconds(self) -> float:
+        """The median makespan of a generation, in seconds; the first one, in which workers join, is left out."""
+        with open_run(Path(self._runs), "bench") as run:
+            return statistics.median(each.seconds for each in run.history()[1:])
+
+
+def _run_simulated_workers(_pipe: Connection[Any, Any], *arguments: Any) -> None:
+    run_simulated_workers(*arguments)
+
+
+# ---- peers: the same work ----
+
+
+def sleep_job(_index: int) -> int:
+    """Sleep for 50 ms."""
+    time.sleep(SLEEP_SECONDS)
+    return 0
+
+
+def null_job(_index: int) -> int:
+    """Do nothing."""
+    return 0
+
+
+Mapper = Callable[[Callable[[int], int], int], object]
+Peer = Callable[[], AbstractContextManager[Mapper]]
+
+
+def run_peer(peer: Peer) -> Figures | None:
+    """Measure a peer in its own process; `None` if it hangs or fails."""
+    answers: queue.SimpleQueue[Figures | None] = queue.SimpleQueue()
+    with FunctionChild(_send_figures, peer, on_message=answers.put), suppress(queue.Empty):
+        return answers.get(timeout=PEER_SECONDS)
+    return None
+
+
+def _send_figures(pipe: Connection[Figures, Any], peer: Peer) -> None:
+    pipe.send(peer_figures(peer))
+
+
+def peer_figures(peer: Peer) -> Figures:
+    """Measure the same two figures of a peer with 8 processes."""
+    with peer() as run:
+        run(null_job, 100)  # starts its processes
+        started = time.perf_counter()
+        run(sleep_job, CANDIDATES)
+        makespan = time.perf_counter() - started
+        started = time.perf_counter()
+        run(null_job, NULL_JOBS)
+        null = time.perf_counter() - started
+    return {
+        "efficiency_50ms": round(ROUNDS * SLEEP_SECONDS / makespan, 4),
+        "null_jobs_per_second": round(NULL_JOBS / null),
+    }
+
+
+@contextmanager
+def pool_peer() -> Iterator[Mapper]:
+    """The standard library's pool, one job per message."""
+    with get_context("spawn").Pool(SLOTS) as pool:
+        yield lambda work, count: pool.map(work, range(count), chunksize=1)
+
+
+@contextmanager
+def dask_peer() -> Iterator[Mapper]:
+    """A local Dask cluster."""
+    dask: Any = import_module("distributed")
+    with (
+        dask.LocalCluster(n_workers=SLOTS, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+        dask.Client(cluster) as client,
+    ):
+        yield lambda work, count: client.gather(client.map(work, range(count), pure=False))
+
+
+@contextmanager
+def ray_peer() -> Iterator[Mapper]:
+    """A local Ray cluster."""
+    ray: Any = import_module("ray")
+    ray.init(num_cpus=SLOTS, include_dashboard=False, log_to_driver=False)
+    try:
+        yield lambda work, count: ray.get([ray.remote(work).remote(index) for index in range(count)])
+    finally:
+        ray.shutdown()

@@ -1,0 +1,174 @@
+"""`dreamfleet lab bench PART`: how fast the parts are."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from dreamfleet.common.cli.output import add_json_flag
+from dreamfleet.common.errors import UsageError
+
+if TYPE_CHECKING:
+    from dreamfleet.common.artifacts.bundle import Bundle
+
+SUMMARY = "measure how fast a part is: policy, dream, env, live, dispatch or batches"
+EXTRAS = ("worker",)
+BUNDLE, EPISODES = "tiny", 3
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    texts = ". ".join(f"`{name}`: {part.text}" for name, part in PARTS.items())
+    parser.add_argument("part", metavar="PART", choices=tuple(PARTS), help=texts)
+    parser.add_argument("--bundle", help=f"the world model of policy, dream, env and live (default {BUNDLE})")
+    parser.add_argument(
+        "--workers", type=int, metavar="N", help="of dispatch: let N simulated workers join and work too"
+    )
+    parser.add_argument("--episodes", type=int, metavar="N", help=f"of env: episodes of each kind (default {EPISODES})")
+    parser.add_argument(
+        "--exact", action="store_true", default=None,
+        help="of env: compare with gymnasium's over whole episodes instead, which takes about ten minutes",
+    )  # fmt: skip
+    add_json_flag(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure the part, and print the figures."""
+    part = PARTS[args.part]
+    given = [name for name in ("bundle", "workers", "episodes", "exact") if getattr(args, name) is not None]
+    if foreign := [name for name in given if name not in part.flags]:
+        raise UsageError(f"--{foreign[0]} is of {', '.join(n for n, p in PARTS.items() if foreign[0] in p.flags)}")
+    args.bundle = args.bundle or BUNDLE
+    return part.measure(args)
+
+
+def measure_policy(args: argparse.Namespace) -> int:
+    """Measure a policy step on one thread."""
+    from dreamfleet.worker.addons.bench.policy import bench_policy
+
+    return _print_figures(args, measure_on_one_thread(bench_policy, args.bundle))
+
+
+def measure_dream(args: argparse.Namespace) -> int:
+    """Measure dreamed steps on one thread."""
+    from dreamfleet.worker.addons.bench.dream import bench_dream
+
+    return _print_figures(args, measure_on_one_thread(bench_dream, args.bundle))
+
+
+def measure_dispatch(args: argparse.Namespace) -> int:
+    """Measure how fast a coordinator dispatches."""
+    from dreamfleet.worker.addons.bench.dispatch import bench_dispatch
+
+    return _print_figures(args, bench_dispatch(max(0, args.workers or 0)))
+
+
+def measure_batches(args: argparse.Namespace) -> int:
+    """Measure how fast submitted batches are scored."""
+    from dreamfleet.worker.addons.bench.batches import bench_batches
+
+    return _print_figures(args, bench_batches())
+
+
+def measure_live(args: argparse.Namespace) -> int:
+    """Measure what the live view costs each task."""
+    from dreamfleet.common.artifacts.bundle_store import find_bundle
+    from dreamfleet.common.host.resource_limits import pin_thread_pools
+
+    pin_thread_pools()
+    from dreamfleet.worker.addons.bench.live import bench_live
+
+    return _print_figures(args, bench_live(find_bundle(args.bundle)))
+
+
+def measure_env(args: argparse.Namespace) -> int:
+    """Measure the environment on one thread, or compare it with gymnasium's; exit 1 if anything differs."""
+    if args.exact:
+        return _compare(args)
+    from dreamfleet.worker.addons.bench.environment import bench_env
+
+    figures = measure_on_one_thread(
+        bench_env, args.bundle, max(1, EPISODES if args.episodes is None else args.episodes)
+    )
+    _print_figures(args, figures)
+    return 0 if figures["exact"] else 1
+
+
+def _compare(args: argparse.Namespace) -> int:
+    from dreamfleet.common.artifacts.bundle_store import find_bundle
+
+    bundle = find_bundle(args.bundle)
+    _pin_libraries()
+    from dreamfleet.worker.addons.bench.environment import check_exact
+
+    differences, compared = 0, []
+    for what, difference in check_exact(bundle):
+        differences += difference is not None
+        compared.append(what)
+        outcome = "the same" if difference is None else f"DIFFERS at step {difference.step}: {difference.what}"
+        print(f"{what}: {outcome}", file=sys.stderr)
+    if args.json:
+        print(json.dumps({"exact": not differences, "compared": compared, "differences": differences}))
+    return 1 if differences else 0
+
+
+def measure_on_one_thread(measure: Callable[..., dict[str, Any]], bundle_name: str, *more: object) -> dict[str, Any]:
+    """The figures of `measure(bundle, *more)`, called in a child process whose libraries use one thread."""
+    from concurrent.futures.process import BrokenProcessPool
+    from functools import partial
+    from operator import call
+
+    from dreamfleet.common.artifacts.bundle_store import find_bundle
+    from dreamfleet.common.errors import DreamfleetError
+    from dreamfleet.common.host.process_pool import map_in_processes
+    from dreamfleet.common.host.resource_limits import pin_thread_pools
+
+    bundle: Bundle = find_bundle(bundle_name)
+    _pin_libraries()
+    # A child: numpy's library reads its thread count once, when loaded, and this process has loaded it.
+    try:
+        (figures,) = map_in_processes(1, pin_thread_pools, (), call, [partial(measure, bundle, *more)])
+    except BrokenProcessPool as error:
+        raise DreamfleetError("the process that measured has crashed; is memory short?") from error
+    return figures
+
+
+def _pin_libraries() -> None:
+    from dreamfleet.common.host.resource_limits import clear_library_settings, pin_thread_pools
+
+    clear_library_settings()
+    pin_thread_pools()
+
+
+def _print_figures(args: argparse.Namespace, figures: Mapping[str, Any]) -> int:
+    if args.json:
+        print(json.dumps(figures))
+    else:
+        for name, value in figures.items():
+            print(f"{name:>22}  {value}")
+    return 0
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part that can be measured: what about it, by which function, and the flags that it takes."""
+
+    text: str
+    measure: Callable[[argparse.Namespace], int]
+    flags: tuple[str, ...] = ("bundle",)
+
+
+PARTS = {
+    "policy": Part("a policy step, against this core's matrix rate and against torch", measure_policy),
+    "dream": Part("dreamed steps a second, against their matrix products alone and against torch", measure_dream),
+    "env": Part("the environment against gymnasium's own", measure_env, ("bundle", "episodes", "exact")),
+    "live": Part("what the live view costs a slot, unwatched and watched", measure_live),
+    "dispatch": Part("jobs a second through real Zenoh, beside Dask and Ray where installed", measure_dispatch,
+                     ("workers",)),
+    "batches": Part("evaluations a second that a search elsewhere reaches, over Zenoh and over HTTP",
+                     measure_batches),
+}  # fmt: skip

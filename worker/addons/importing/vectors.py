@@ -1,0 +1,101 @@
+"""Parameter vectors of other programs: JSON of the paper's and the article's code, NumPy, text, pycma's output."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.errors import ControllerError, DatasetError
+from dreamfleet.common.files.archives import DamagedArchiveError, parse_array
+from dreamfleet.common.files.regular_files import read_regular, read_text
+from dreamfleet.worker.addons.importing.json_weights import read_json
+
+MOST_BYTES = 512 << 20
+MOST_TEXT = 64 << 20
+CMA_COLUMNS = 5  # generation, evaluations, and three figures, before the vector in `xrecentbest.dat` and `xmean.dat`
+CMA_FILES = ("xmean.dat", "xrecentbest.dat")
+
+
+def read_vector(path: Path) -> NDArray[np.float64]:
+    """The flat vector of a file or of pycma's output folder; `DatasetError` says why there is none.
+
+    `.json`: a list of numbers, or one whose first element is that. `.npy`: one axis. `.csv`, `.txt`: numbers separated
+    by commas or blanks. A folder, or a `.dat` of it: the last row that pycma's logger wrote.
+    """
+    if path.is_dir():
+        found = next((path / name for name in CMA_FILES if (path / name).is_file()), None)
+        if found is None:
+            raise DatasetError(f"{path} holds none of {', '.join(CMA_FILES)}, which pycma's logger writes")
+        path = found
+    readers = {".json": _from_json, ".npy": _from_npy, ".csv": _from_text, ".txt": _from_text, ".dat": _from_pycma}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise DatasetError(f"{path}: a vector is a file {', '.join(readers)}, or a folder that pycma wrote")
+    vector = reader(path)
+    if vector.ndim != 1 or not len(vector):
+        raise DatasetError(f"{path} holds an array of shape {vector.shape}, not one vector")
+    if not np.isfinite(vector).all():
+        raise DatasetError(f"{path} holds NaN or infinity")
+    return vector
+
+
+def to_parameters(vector: NDArray[Any], layout: str, shape: ControllerShape) -> NDArray[np.float32]:
+    """The parameters `(size,)` of a controller whose vector has this layout; `ControllerError` if it cannot fit.
+
+    The layout is `dreamfleet`, `wme`, `article` or `ctallec`, as docs/reference/import.md says.
+
+    >>> to_parameters(np.array([9.0, 1, 2, 3]), "wme", ControllerShape(features=3, actions=1)).tolist()
+    [1.0, 2.0, 3.0, 9.0]
+    """
+    vector = vector.astype(np.float32)
+    shape.check(vector)
+    if layout in ("dreamfleet", "ctallec"):
+        return vector
+    if shape.hidden:
+        raise ControllerError(
+            f"the layout {layout} is of linear controllers, and this one has {shape.hidden} hidden units"
+        )
+    count = shape.actions
+    biases, weights = (vector[:count], vector[count:]) if layout == "wme" else (vector[-count:], vector[:-count])
+    return np.concatenate([weights.reshape(shape.features, count).T.ravel(), biases])
+
+
+def _from_json(path: Path) -> NDArray[np.float64]:
+    value = read_json(path)
+    if isinstance(value, list) and value and isinstance(value[0], list):
+        value = value[0]  # the vector, then what it scored
+    if not isinstance(value, list) or not all(type(each) in (int, float) for each in value):
+        raise DatasetError(f"{path} is no list of numbers")
+    try:
+        return np.array(value, np.float64)
+    except OverflowError as error:
+        raise DatasetError(f"{path} holds a number beyond double precision") from error
+
+
+def _from_npy(path: Path) -> NDArray[np.float64]:
+    try:
+        found = parse_array(read_regular(path, MOST_BYTES), path.name)
+    except (OSError, DamagedArchiveError) as error:
+        raise DatasetError(f"{path} is no array of numbers ({error})") from error
+    if found.dtype.kind not in "iuf":
+        raise DatasetError(f"{path} is no array of numbers, but of type {found.dtype}")
+    return found.astype(np.float64)
+
+
+def _from_text(path: Path) -> NDArray[np.float64]:
+    try:
+        return np.array([float(each) for each in read_text(path, MOST_TEXT).replace(",", " ").split()])
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{path} is no list of numbers ({error})") from error
+
+
+def _from_pycma(path: Path) -> NDArray[np.float64]:
+    try:
+        lines = [line for line in read_text(path, MOST_BYTES).splitlines() if line.strip() and line[0] not in "%#"]
+        return np.array([float(each) for each in lines[-1].split()[CMA_COLUMNS:]])
+    except (OSError, ValueError, IndexError) as error:
+        raise DatasetError(f"{path} has no row of numbers as pycma's logger writes it ({error})") from error

@@ -1,0 +1,141 @@
+"""Sections on the VAE: reconstructions of a drive and of the user's own pictures, and the meaning of its latents."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pygame
+from numpy.typing import NDArray
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.files.regular_files import open_regular
+from dreamfleet.common.printable import plural, truncate
+from dreamfleet.worker.addons.inspection.charts import FONT, draw_heatmap, new_figure, picture_grid, render_png
+from dreamfleet.worker.addons.inspection.encoded_rollout import EncodedRollout
+from dreamfleet.worker.addons.inspection.page import Section
+from dreamfleet.worker.addons.inspection.vae_view import VAEView
+from dreamfleet.worker.tasks.api import Preprocessing
+
+SHOWN = 8  # pictures per row, latents per table
+TRAVERSED = np.linspace(-3, 3, 7)
+NOISE = (-2, -1, 0, 1, 2)  # means of the random latents
+MOST, MOST_BYTES = 8, 50_000_000  # own pictures, bytes of a file
+NAME = 16  # characters of a heading
+Pictures = NDArray[np.uint8]
+
+
+def reconstructions(drive: EncodedRollout, vae_view: VAEView) -> Section:
+    """Draw pictures of the drive above the decoder's pictures of their mean latents."""
+    steps = np.linspace(0, len(drive) - 1, SHOWN).astype(int)
+    decoded = vae_view.decode(drive.mu)
+    difference = decoded.astype(np.float64) - drive.picture
+    error = (np.square(difference / 255)).sum(axis=(1, 2, 3)).mean()
+    rows = [("seen", drive.picture[steps]), ("decoded", decoded[steps])]
+    return Section(
+        "reconstructions", "What it sees, and what it keeps",
+        f"Pictures of {drive.description}, and the decoder's picture of each one's mean latent. "
+        f"Summed squared error a picture over all {plural(len(drive), 'step')}: {error:.1f}.",
+        picture_grid(rows, [f"step {step}" for step in steps]),
+    )  # fmt: skip
+
+
+def traversals(drive: EncodedRollout, vae_view: VAEView) -> Section:
+    """Draw pictures in which one of the most active latents varies, around a picture of the drive."""
+    step = drive.most_informative_step
+    base = drive.mu[step]
+    rows = []
+    for latent in drive.most_active[:SHOWN]:
+        moved = np.tile(base, (len(TRAVERSED), 1))
+        moved[:, latent] = TRAVERSED
+        rows.append((f"z{latent}\n{drive.nats[latent]:.1f} nats", vae_view.decode(moved)))
+    return Section(
+        "traversals", "What a latent means",
+        "The latents that carry most on this drive, in nats. In each row one of them is set to -3 to 3, the others "
+        f"stay those of step {step}.",
+        picture_grid(rows, [f"{value:+.0f}" if value else "0" for value in TRAVERSED]),
+    )  # fmt: skip
+
+
+def latent_moments(drive: EncodedRollout) -> Section:
+    """Draw the mean and the log variance of each latent over the drive."""
+    order, height = drive.most_active, 1.2 + 0.075 * drive.mu.shape[1]
+    figure, axes = new_figure(2 * height, 2, sharex=True)
+    most = float(np.abs(drive.mu).max())
+    draw_heatmap(axes[0, 0], drive.mu[:, order].T, "mean", cmap="RdBu_r", vmin=-most, vmax=most)
+    draw_heatmap(axes[1, 0], drive.logvar[:, order].T, "log variance", cmap="viridis")
+    for each in axes[:, 0]:
+        rows = range(0, len(order), max(1, len(order) // 16))
+        each.set_yticks(rows, [f"z{order[row]}" for row in rows], fontsize=FONT - 1)
+    axes[1, 0].set_xlabel("step of the drive", fontsize=FONT)
+    return Section(
+        "latents", "The latents of the drive",
+        "Mean and log variance that the encoder gives each latent at each step, the most active latent on top. A log "
+        "variance near 0 with a mean near 0 says nothing of the picture.",
+        render_png(figure),
+    )  # fmt: skip
+
+
+def samples(vae_view: VAEView) -> Section:
+    """Draw the decoder's pictures of random latents."""
+    normal = np.random.default_rng(0).standard_normal((SHOWN, vae_view.latent)).astype(np.float32)
+    rows = [(f"N({mean}, 1)", vae_view.decode(normal + np.float32(mean))) for mean in NOISE]
+    return Section(
+        "samples", "Latents out of nothing",
+        "The decoder's pictures of random latents: where the latents of real pictures lie, N(0, 1) looks like the "
+        "world; far from them it need not.",
+        picture_grid(rows, [""] * SHOWN),
+    )  # fmt: skip
+
+
+def own_pictures(vae_view: VAEView, paths: Sequence[Path], known: Collection[Preprocessing] = ()) -> Section:
+    """Draw the user's own pictures as the VAE sees and decodes them; `UsageError` for an unreadable file.
+
+    `known` are the preprocessings of the VAE's world.
+    """
+    if len(paths) > MOST:
+        raise UsageError(f"--picture takes {MOST} files at most, not {len(paths)}")
+    seen = np.stack([fit_picture(_read(path), vae_view.side, known) for path in paths])
+    decoded = vae_view.decode(vae_view.encode(seen)[0])
+    error = np.square((decoded.astype(np.float64) - seen) / 255).sum(axis=(1, 2, 3))
+    named = ", ".join(f"{truncate(path.name, 60)} {each:.1f}" for path, each in zip(paths, error, strict=True))
+    rows = [("seen", seen), ("decoded", decoded)]
+    return Section(
+        "own", "Pictures of your own",
+        "Each as the model sees it, and the decoder's picture of its mean latent. An observation of the world is "
+        "prepared as on a drive, any other picture cut to its middle square and scaled. "
+        f"Summed squared error: {named}.",
+        picture_grid(rows, [truncate(path.name, NAME) for path in paths]),
+    )  # fmt: skip
+
+
+def fit_picture(picture: Pictures, side: int, known: Collection[Preprocessing] = ()) -> Pictures:
+    """Fit a picture `(height, width, 3)` to a VAE's `(side, side, 3)`; `known` as in `own_pictures`."""
+    if picture.shape[:2] == (side, side):
+        return picture
+    observed = max((each.shape for each in known), default=None)  # the largest is the raw observation
+    wanted = next((each for each in known if each.size == side), None)
+    if picture.shape == observed and wanted is not None:
+        return wanted.picture(picture)
+    height, width, _ = picture.shape
+    edge = min(height, width)
+    top, left = (height - edge) // 2, (width - edge) // 2
+    surface = pygame.surfarray.make_surface(picture[top : top + edge, left : left + edge].swapaxes(0, 1))
+    return _surface_to_array(pygame.transform.smoothscale(surface, (side, side)))
+
+
+def _read(path: Path) -> Pictures:
+    try:
+        with open_regular(path, MOST_BYTES) as file:
+            return _surface_to_array(pygame.image.load(file, path.name))
+    except (OSError, pygame.error) as error:
+        raise UsageError(f"--picture {path} cannot be read ({error}): give a PNG or a JPEG") from error
+
+
+def _surface_to_array(surface: Any) -> Pictures:
+    """Convert a surface of any kind to pixels `(height, width, 3)`, on black where it is transparent."""
+    plain = pygame.Surface(surface.get_size(), depth=24)
+    plain.blit(surface, (0, 0))
+    return np.ascontiguousarray(pygame.surfarray.array3d(plain).swapaxes(0, 1))

@@ -1,0 +1,1 @@
+"""The worlds that ship; each is a task, registered by its entry point."""

@@ -1,0 +1,30 @@
+"""CarRacing with gymnasium's physics: one with a natively drawn, bit-exact picture, one seen through a frozen encoder.
+
+Importing this registers `dreamfleet/CarRacing-v3` and `dreamfleet/CarRacingLatent-v0` with gymnasium.
+
+>>> import gymnasium, dreamfleet.worker.worlds.car_racing
+>>> environment = gymnasium.make("dreamfleet/CarRacing-v3")
+"""
+
+from __future__ import annotations
+
+import gymnasium
+
+from dreamfleet.common.host.swig_types import allow_swig_types
+
+ENVIRONMENT = "dreamfleet/CarRacing-v3"
+LATENT = "dreamfleet/CarRacingLatent-v0"
+
+allow_swig_types()  # before Box2D is imported
+gymnasium.register(
+    id=ENVIRONMENT,
+    entry_point="dreamfleet.worker.worlds.car_racing.environment:CarRacing",
+    max_episode_steps=1000,
+    reward_threshold=900,
+)
+gymnasium.register(
+    id=LATENT,
+    entry_point="dreamfleet.worker.worlds.car_racing.latent:CarRacingLatent",
+    reward_threshold=900,
+    kwargs={"bundle": "tiny"},
+)

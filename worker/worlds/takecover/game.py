@@ -1,0 +1,102 @@
+"""Take Cover as a gymnasium environment on ViZDoom's `DoomGame`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.packages import install_command_for
+from dreamfleet.common.runs.seeds import fold_seed
+from dreamfleet.worker.worlds.takecover.process import start_game
+
+HEIGHT, WIDTH = 120, 160  # of the game's picture
+TICS_PER_SECOND = 35
+LIMIT = 2100  # tics of an episode at most: a minute
+SKILL = 4  # the one to which published scores fit
+STAY, LEFT, RIGHT = range(3)
+BUTTONS = ([0, 0], [1, 0], [0, 1])  # pressed for each action
+Pixels = NDArray[np.uint8]
+
+
+class TakeCover(gymnasium.Env[Pixels, int]):
+    """Observes uint8 `(120, 160, 3)`; an action stays, goes left or goes right for `tics` tics; +1 for each tic lived.
+
+    `terminated` is a death, `truncated` the limit of 2,100 tics. The picture after a death is the one before it: the
+    game itself shows a black one. Equal seeds and actions give equal bits, whatever was played before. A seed of more
+    than 31 bits is folded. The game's process starts with the first reset, and again after it crashed.
+
+    `UsageError` without the package vizdoom.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": TICS_PER_SECOND}  # noqa: RUF012 - gymnasium's own form
+    observation_space = spaces.Box(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+    action_space = spaces.Discrete(len(BUTTONS))  # type: ignore[assignment] # its numbers are NumPy's
+    render_mode = "rgb_array"
+    drawn_by = "vizdoom"
+
+    def __init__(self, tics: int = 1) -> None:
+        try:
+            import vizdoom
+        except ModuleNotFoundError as error:
+            remedy = install_command_for("vizdoom")
+            raise UsageError(f"Take Cover needs the package vizdoom, which is not here: {remedy}") from error
+        self._vizdoom: Any = vizdoom
+        self._tics = tics
+        self._game: Any = None
+        self._lived = 0
+        self._picture: Pixels = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None  # noqa: ARG002 - there are none
+    ) -> tuple[Pixels, dict[str, Any]]:  # fmt: skip
+        """Begin the episode of this seed, or without one an episode that follows from the last seed."""
+        super().reset(seed=seed)
+        if self._game is None or not self._game.is_running():
+            self.close()
+            self._game = self._start()
+        self._game.set_seed(int(self.np_random.integers(2**31)) if seed is None else fold_seed(seed))
+        self._game.new_episode()
+        self._lived = 0
+        return self._observe(), {}
+
+    def step(self, action: int) -> tuple[Pixels, float, bool, bool, dict[str, Any]]:
+        """Hold the action for `tics` tics, fewer at the end of the episode."""
+        held = min(self._tics, LIMIT - self._lived)
+        reward = float(self._game.make_action(BUTTONS[action], held))
+        self._lived += held
+        died = bool(self._game.is_episode_finished())
+        return self._observe(), reward, died, not died and self._lived >= LIMIT, {}
+
+    def render(self) -> Any:
+        """The last picture, uint8 `(120, 160, 3)`."""
+        return self._picture
+
+    def close(self) -> None:
+        """End the game's process."""
+        if self._game is not None:
+            self._game.close()
+            self._game = None
+
+    def _observe(self) -> Pixels:
+        if (state := self._game.get_state()) is not None:
+            self._picture = state.screen_buffer
+        return self._picture
+
+    def _start(self) -> Any:
+        vizdoom = self._vizdoom
+        game = vizdoom.DoomGame()
+        game.load_config(str(Path(vizdoom.scenarios_path) / "take_cover.cfg"))
+        game.set_doom_skill(SKILL)
+        game.set_living_reward(1)
+        game.set_window_visible(False)
+        game.set_screen_resolution(vizdoom.ScreenResolution.RES_160X120)
+        game.set_screen_format(vizdoom.ScreenFormat.RGB24)
+        game.set_render_hud(False)
+        start_game(game, Path(vizdoom.__file__).with_name("vizdoom"))
+        return game

@@ -1,0 +1,158 @@
+"""Take Cover as a task. This module needs no vizdoom, so that every worker can name the task."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.artifacts.actions import Continuous, Mirror, one_hot
+from dreamfleet.worker.tasks.api import (
+    Assignment,
+    Description,
+    DreamReward,
+    Driver,
+    Policy,
+    Preprocessing,
+    Task,
+    World,
+)
+from dreamfleet.worker.tasks.drivers import HeldActions, UniformActions
+from dreamfleet.worker.tasks.pictures import CropAndResize, VectorActions
+from dreamfleet.worker.tasks.policy import DriverPolicy, FlatPolicy
+from dreamfleet.worker.tasks.registry import preprocessing_for
+from dreamfleet.worker.worldmodel.policy import ModelPolicy
+from dreamfleet.worker.worlds.takecover.game import LEFT, RIGHT, STAY, TakeCover
+from dreamfleet.worker.worlds.takecover.options import TakeCoverOptions
+from dreamfleet.worker.worlds.takecover.picture import BAND, ObserveBand, make_preprocessings
+
+PACKAGES = ("numpy", "onnxruntime", "vizdoom")
+SOLVED = 750.0  # tics, the mean of 100 episodes: OpenAI Gym's DoomTakeCover-v0
+CHOICES, THIRDS = one_hot(3), Continuous.between([-1], [1])
+
+
+def cut_in_thirds(action: NDArray[np.float32]) -> int:
+    """The game's action for a number `(1,)` from -1 to 1: left below -1/3, right above 1/3.
+
+    >>> [cut_in_thirds(np.array([number], np.float32)) for number in (-1, 0, 1)]
+    [1, 0, 2]
+    """
+    if 3 * action[0] < -1:
+        return LEFT
+    return RIGHT if 3 * action[0] > 1 else STAY
+
+
+def pick_choice(action: NDArray[np.float32]) -> int:
+    """The game's action for a one-hot row `(3,)`: stay, left, right."""
+    return int(np.argmax(action))
+
+
+def actions_of(options: TakeCoverOptions) -> Continuous:
+    """Three outputs, of which the largest is done, or one that is cut in thirds."""
+    return CHOICES if options.actions == "choices" else THIRDS
+
+
+def make_world(options: TakeCoverOptions) -> World:
+    """The world under these options.
+
+    >>> make_world(TakeCoverOptions(tics=1)).horizon
+    2100
+    """
+    actions = actions_of(options)
+    return World(
+        actions=actions,
+        packages=PACKAGES,
+        horizon=options.horizon,
+        frames_per_second=options.frames_per_second,
+        action_names=("stay", "left", "right") if actions.choices else ("aside",),
+        dream_reward=DreamReward(gain=float(options.tics), source="survival"),
+        threshold=SOLVED,
+        score_word="game",
+        marks=(SOLVED,),
+        mirror=Mirror((0, 2, 1), (1, 1, 1)) if actions.choices else Mirror((0,), (-1,)),
+        preset="takecover",
+    )
+
+
+class TakeCoverTask(Task):
+    """The task `takecover`: on a world model's latent state, or without one on the brightness of a band of pixels."""
+
+    name = "takecover"
+    world = make_world(TakeCoverOptions())
+
+    def __init__(self, options: TakeCoverOptions | None = None) -> None:
+        self._options = options or TakeCoverOptions()
+        self.world = make_world(self._options)
+        actions = actions_of(self._options)
+        self.drivers: Mapping[str, Callable[[np.random.Generator], Driver]] = {
+            "held": lambda random: HeldActions(random, actions)  # the article's
+        }
+        self.policies: Mapping[str, Callable[[np.random.Generator], Policy]] = {
+            "uniform": lambda random: DriverPolicy(UniformActions(random, actions))
+        }
+        self.preprocessings: Mapping[str, Preprocessing] = make_preprocessings(self._options)
+
+    def with_options(self, options: str) -> TakeCoverTask:
+        """The same task under the options in a JSON object; `UsageError` for unknown ones."""
+        return TakeCoverTask(TakeCoverOptions.parse(options))
+
+    def parse_options(self, arguments: Mapping[str, Any]) -> str:
+        """The canonical text of options as flags give them; `UsageError` for unknown ones."""
+        return TakeCoverOptions.of(arguments).text
+
+    def describe(self, options: Mapping[str, Any]) -> Description:
+        """Sizes, packages and options of a run without a world model, whose controllers see a band of pixels."""
+        text = self.parse_options(options)
+        world = self.with_options(text).world
+        return Description(BAND, world.actions.outputs, world.packages, world.version, text, world.horizon)
+
+    def world_of(self, assignment: Assignment) -> World:
+        """The world under the options of the world model, or of a run without one."""
+        return self._bound_to(assignment).world
+
+    def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
+        """The game in the world model's pictures, or without a world model as a band of pixels."""
+        task = self._bound_to(assignment)
+        if assignment.bundle is None:
+            return task._with_actions(ObserveBand(task._make_game()))
+        return task.make_recorded(preprocessing_for(assignment.bundle, task).name)
+
+    def make_recorded(self, preprocessing: str) -> gymnasium.Env[Any, Any]:
+        """The game in the preprocessing of this name."""
+        pictures = CropAndResize(self._make_game(), self.preprocessings[preprocessing].size, self._options.part)
+        return self._with_actions(pictures)
+
+    def make_evaluation_environment(
+        self, assignment: Assignment, render_mode: str | None = None  # noqa: ARG002 - the game always draws
+    ) -> gymnasium.Env[Any, Any]:  # fmt: skip
+        """The same: a score is in tics of the game, and to draw it costs nothing."""
+        return self.make_environment(assignment)
+
+    def make_watched_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
+        """Another of the same, whose `render` gives the game's own picture."""
+        return self.make_environment(assignment)
+
+    def make_policy(self, assignment: Assignment) -> Policy:
+        """A controller on a world model's latent state, or on the band; `BundleError` for other pictures."""
+        task = self._bound_to(assignment)
+        if assignment.bundle is None:
+            return FlatPolicy(assignment.controller, task.world.actions)
+        preprocessing_for(assignment.bundle, task)
+        return ModelPolicy(assignment.world_model)
+
+    def _bound_to(self, assignment: Assignment) -> TakeCoverTask:
+        """The task under the options of the world model, or of a run without one."""
+        if assignment.bundle is None:
+            return self.with_options(assignment.spec.options)
+        manifest = assignment.bundle.manifest
+        return self if manifest.task != self.name else self.with_options(manifest.facts.options)
+
+    def _make_game(self) -> TakeCover:
+        return TakeCover(self._options.tics)
+
+    def _with_actions(self, environment: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+        actions = actions_of(self._options)
+        return VectorActions(environment, actions, pick_choice if actions.choices else cut_in_thirds)
