@@ -10,7 +10,7 @@ SOURCES := pyproject.toml constraints.txt $(wildcard worker/worlds/car_racing/na
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test test-doom test-newest short slow setup check long box2d-py simulate chaos weekend fuzz sanitize bundle worker-size \
-  stranger reproduce reproduce-evolution lock audit sbom structure words site reference clean
+  stranger reproduce reproduce-evolution messages keyed lock audit sbom structure words site reference clean
 
 demo: $(VENV)/.demo $(if $(filter takecover,$(WORLD)),$(VENV)/.demo-doom)  ## evolve a controller here (WORLD=takecover: there), judge it, plot it, record it
 	$(BIN)/dreamfleet demo $(if $(WORLD),--world $(WORLD)) $(ARGS)
@@ -142,6 +142,13 @@ sbom: $(SUPPLY)/.done  ## build/worker.cdx.json: what a worker's environment is 
 	$(SUPPLY)/bin/python -m pip --disable-pip-version-check --python build/locked/bin/python install --quiet --no-deps .
 	$(SUPPLY)/bin/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible --validate \
 	  --output-file build/worker.cdx.json build/locked/bin/python
+
+messages:  ## tests/golden/messages.txt: every message of the product, as it stands in the code
+	@mkdir -p build tests/golden
+	$(PYTHON) deploy/messages.py > build/messages.txt && mv build/messages.txt tests/golden/messages.txt
+
+keyed: $(VENV)/.dev  ## the tests with a key in place of each message: one that fails reads a sentence. ARGS='tests/common'
+	PYTHONPATH=$(CURDIR)/tests/support/keyed $(BIN)/pytest -m "not slow and not long and not wording" --numprocesses 3 --dist worksteal $(ARGS)
 
 structure:  ## figures of the structure: rooms, floors, imports between rooms, files a folder, class names, wording
 	$(PYTHON) deploy/structure.py $(ARGS)

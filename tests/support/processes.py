@@ -38,7 +38,7 @@ def environment(cache, root=ROOT):
     inherited = {name: value for name, value in os.environ.items() if name != "SDL_VIDEODRIVER"}  # as in a user's shell
     return {
         **inherited,
-        "PYTHONPATH": str(root),
+        "PYTHONPATH": os.pathsep.join(filter(None, (str(root), os.environ.get("PYTHONPATH")))),
         "DREAMFLEET_CACHE": str(cache),
         "PYTHONUNBUFFERED": "1",
         "COLUMNS": "120",
