@@ -107,7 +107,8 @@ class Messages(ast.NodeTransformer):
         if isinstance(node.func, ast.Attribute):
             node.func = self._visit_value(node.func, speaks=False)
         speaks = name in SPEAKERS or name.endswith("Error")
-        node.args = [self._visit_value(each, speaks=speaks) for each in node.args]
+        has_code = name.endswith("Error") and len(node.args) > 1  # an error's text, and what kind it is
+        node.args = [self._visit_value(each, speaks=speaks and not (has_code and _is_code(each))) for each in node.args]
         for keyword in node.keywords:
             if keyword.arg not in {"help", "metavar", "description"}:
                 keyword.value = self._visit_value(keyword.value, speaks=False)
@@ -136,6 +137,10 @@ class Messages(ast.NodeTransformer):
         else:
             new = ast.Constant("".join(str(template(each)) for each in values))
         return ast.fix_missing_locations(ast.copy_location(new, node))
+
+
+def _is_code(node: ast.expr) -> bool:
+    return isinstance(node, ast.Constant) and str(node.value).count(" ") < 2
 
 
 def keyed(tree: ast.Module, module: str) -> ast.Module:

@@ -30,6 +30,9 @@ from dreamfleet.common.schema.validation import (
 log = logging.getLogger(__name__)
 M = TypeVar("M", bound=Message)
 
+OVERSIZE, NO_MESSAGE, UNKNOWN_VERSION = "oversize", "not a message", "unknown version"  # reasons, which are counted
+NOT_MSGPACK, NOT_JSON = "not msgpack", "not JSON"
+
 
 def encoding(kind: type[Any]) -> str:
     """The Zenoh encoding string of a message type."""
@@ -44,7 +47,7 @@ def encode(message: Message) -> bytes:
     except (TypeError, UnicodeEncodeError) as error:  # a value that is no plain data, or half a surrogate pair
         raise MalformedError(str(error), SCHEMA) from error
     if len(payload) > MAX_MESSAGE:
-        raise MalformedError("oversize")
+        raise MalformedError(OVERSIZE)
     return payload
 
 
@@ -57,15 +60,15 @@ def _to_builtins(message: Message) -> dict[str, Any]:
 def decode(kind: type[M], payload: bytes) -> M:
     """Decode a message; `MalformedError` if the payload does not fit the schema."""
     if len(payload) > MAX_MESSAGE:
-        raise MalformedError("oversize")
+        raise MalformedError(OVERSIZE)
     try:
         raw = msgpack.unpackb(payload, raw=False, strict_map_key=True, use_list=True)
     except Exception as error:  # msgpack raises a dozen types of error, some built-in
-        raise MalformedError("not msgpack") from error
+        raise MalformedError(NOT_MSGPACK) from error
     if not isinstance(raw, dict):
-        raise MalformedError("not a message")
+        raise MalformedError(NO_MESSAGE)
     if raw.pop("v", None) != PROTOCOL_VERSION:
-        raise MalformedError("unknown version")
+        raise MalformedError(UNKNOWN_VERSION)
     return convert(kind, raw)
 
 
@@ -79,13 +82,13 @@ def encode_json(document: Any) -> bytes:
 def decode_json(kind: type[T], payload: bytes) -> T:
     """Decode a JSON document; unknown fields are ignored, so that later versions can add some to `hello`."""
     if len(payload) > MAX_MESSAGE:
-        raise MalformedError("oversize")
+        raise MalformedError(OVERSIZE)
     try:
         raw = json.loads(payload)
     except (ValueError, RecursionError) as error:
-        raise MalformedError("not JSON") from error
+        raise MalformedError(NOT_JSON) from error
     if not isinstance(raw, dict):
-        raise MalformedError("not a message")
+        raise MalformedError(NO_MESSAGE)
     return from_plain_lenient(kind, raw)
 
 

@@ -77,8 +77,8 @@ class Credentials:
 
 def issue_command(role: str, name: str) -> str:
     """The command by which a join file of this role is issued, in full; a listener is reached by names."""
-    reached = "--host HOST" if role in LISTENERS else "--connect tls/HOST:7447"
-    return f"dreamfleet access issue {role} {name} {reached} --out FILE"
+    reached = ("--host", "HOST") if role in LISTENERS else ("--connect", "tls/HOST:7447")
+    return " ".join(("dreamfleet", "access", "issue", role, name, *reached, "--out", "FILE"))
 
 
 def identity(role: str, seat: int) -> str:
@@ -176,8 +176,9 @@ def _parse_credentials(path: Path, document: dict[str, Any]) -> Credentials:
 
 def format_join_file(credentials: Credentials) -> str:
     """Format credentials as the text of a join file."""
+    note = f"this file is the secret of {credentials.role} {credentials.name}. Do not share it."
     lines = [
-        f"# dreamfleet: this file is the secret of {credentials.role} {credentials.name}. Do not share it.",
+        f"# dreamfleet: {note}",
         f"version = {VERSION}",
         f'role = "{credentials.role}"',
         f"seat = {credentials.seat}",
