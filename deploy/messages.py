@@ -34,7 +34,7 @@ NO_PROSE = re.compile(
 )
 # What is data within a sentence: flags, numbers, names in backquotes, places that values come to, ends of lines.
 DATA = re.compile(
-    r"`[^`]*`|--[a-z][a-z-]*|(?<!\w)\d[\d.,]*(?!\w)|%\(\w+\)[#0-9.+-]*[a-zA-Z]|%[#0-9.+-]*[a-zA-Z]|\{[^{}]*\}|\n"
+    r"`[^`]*`|--[a-z][a-z0-9-]*|(?<!\w)\d[\d.,]*(?!\w)|%\(\w+\)[#0-9.+-]*[a-zA-Z]|%[#0-9.+-]*[a-zA-Z]|\{[^{}]*\}|\n"
 )
 
 
@@ -59,6 +59,11 @@ def template(node: ast.expr) -> str | None:
 def template_of_part(part: ast.expr) -> str:
     """A part of an f-string: its text, or its expression in braces."""
     return f"{{{ast.unparse(part.value)}}}" if isinstance(part, ast.FormattedValue) else str(template(part))
+
+
+def own_words(node: ast.JoinedStr) -> str:
+    """An f-string without the code of its expressions."""
+    return "".join(str(part.value) if isinstance(part, ast.Constant) else "{}" for part in node.values)
 
 
 class Messages(ast.NodeTransformer):
@@ -117,7 +122,8 @@ class Messages(ast.NodeTransformer):
         text = template(node)
         if text is None or not self._place or NO_PROSE.search(text):
             return node
-        if not (self._speaks and re.search(r"[a-z]{2,}", text)) and not PROSE.search(text):
+        own = text if isinstance(node, ast.Constant) else own_words(node)
+        if not (self._speaks and re.search(r"[a-z]{2,}", own)) and not PROSE.search(own):
             return node
         self.found.append((".".join((self._module, *self._place)), text))
         if not self._replace:
