@@ -5,6 +5,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from tests.support.bundles import write_random_bundle
 from tests.support.doom import require_doom
@@ -19,6 +20,9 @@ if (
 ):  # as in a script's background job: all that is started inherits it
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+
+settings.register_profile("dreamfleet", deadline=None)  # no test is timed: a busy machine is no counterexample
+settings.load_profile("dreamfleet")
 
 EXACT = re.compile(r"(^|_)(bits?|same|equals?|identical|replay\w*|reproduc\w*|determin\w*|exact\w*)(_|$)")
 

@@ -371,4 +371,4 @@ class AnyOrder(RuleBasedStateMachine):
 
 LOSSLESS = [lossless(number) for number in range(GENERATIONS)]
 TestAnyOrder = AnyOrder.TestCase
-TestAnyOrder.settings = settings(max_examples=100, stateful_step_count=80, deadline=None)
+TestAnyOrder.settings = settings(max_examples=100, stateful_step_count=80)

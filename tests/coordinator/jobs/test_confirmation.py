@@ -146,7 +146,7 @@ def test_the_luckiest_evaluation_is_found_out():
     assert np.mean(worth) > 50, "which the best evaluation has"
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(count=st.integers(1, FINALISTS), episodes=st.integers(2, 40), seed=st.integers(0, 99), known=st.floats(0.0, 1.0))
 def test_in_any_order_and_whatever_is_known_already_the_outcome_is_the_same(count, episodes, seed, known):
     finalists = [Finalist(each, bytes([each]) * 16, 4, 500.0 + each) for each in range(count)]
@@ -187,7 +187,7 @@ def lived(path, bundle, kills):
 
 
 @pytest.mark.slow
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(kills=st.sets(st.integers(40, 74), min_size=1, max_size=5))  # from the last generations to the end
 def test_killed_anywhere_it_confirms_to_the_bit(tmp_path_factory, random_bundle, undisturbed, kills):
     assert lived(tmp_path_factory.mktemp("run") / "night", random_bundle, kills) == undisturbed

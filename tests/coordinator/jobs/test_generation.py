@@ -163,7 +163,7 @@ def test_equal_candidates_have_equal_scores_on_both_sides_of_the_barrier():
 SCORES = st.one_of(st.sampled_from([1.0, 2.0, 3.0]), st.just(nan))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.data())
 def test_a_generation_that_recalls_any_results_in_any_order_is_one_that_was_scored_afresh(data):
     population, episodes = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 4))

@@ -178,7 +178,7 @@ def test_a_run_that_is_not_strict_accepts_all_classes_and_records_each_results_c
 
 
 @pytest.mark.slow
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     order=st.lists(
         st.tuples(st.sampled_from(["give", "hello", "find out", "restart"]), st.sampled_from([A, B])), max_size=30

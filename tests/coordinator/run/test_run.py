@@ -158,7 +158,7 @@ STEPS = st.one_of(
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(steps=st.lists(STEPS, max_size=40))
 def test_under_loss_duplication_late_parts_and_restarts_each_rollout_is_kept_whole_once(
     tmp_path_factory, random_bundle, steps
