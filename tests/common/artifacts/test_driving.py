@@ -42,20 +42,17 @@ def test_options_are_also_texts():
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "named"),
     [
-        (
-            '{"pedals": "one", "time_cost": 1}',
-            "moon knows no option pedals, time_cost: known are decide_every",
-        ),
-        ('{"decide_every": 0}', "decide_every must be a whole number from 1 to 50, not 0"),
-        ('{"decide_every": true}', "decide_every must be a whole number"),
-        ('{"feedback": "first"}', "feedback must be none or last, not 'first'"),
-        ("[]", "moon's options must be a JSON object"),
-        ("{", "moon's options must be a JSON object"),
-        (json.dumps("x"), "moon's options must be a JSON object"),
+        ('{"pedals": "one", "time_cost": 1}', "moon .*pedals, time_cost.* decide_every"),
+        ('{"decide_every": 0}', "decide_every .*0"),
+        ('{"decide_every": true}', "decide_every .*True"),
+        ('{"feedback": "first"}', "feedback .*'first'"),
+        ("[]", "moon"),
+        ("{", "moon"),
+        (json.dumps("x"), "moon"),
     ],
 )
-def test_other_options_are_refused(options, said):
-    with pytest.raises(UsageError, match=said):
+def test_other_options_are_refused(options, named):
+    with pytest.raises(UsageError, match=named):
         parse_driving("moon", FACTS, options)

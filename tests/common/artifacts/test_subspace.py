@@ -62,32 +62,26 @@ def test_other_numbers_give_another_hash(subspace):
 
 
 @pytest.mark.parametrize(
-    ("changes", "why"),
+    "changes",
     [
-        ({"weights": np.zeros((0, 5), np.float32)}, "must have shape"),
-        ({"weights": np.zeros(5, np.float32)}, "must have shape"),
-        ({"weights": np.full((3, 5), np.nan, np.float32)}, "NaN, or numbers beyond"),
-        ({"weights": np.full((3, 5), 2e6, np.float32)}, "NaN, or numbers beyond"),
-        ({"weights": np.zeros((3, 1 << 18), np.float32)}, "786432 weights"),
-        ({"weights": np.zeros((3, 5))}, "float32"),
-        ({"offsets": np.zeros(2, np.float32)}, "as many offsets and names"),
-        ({"about": {"names": ["a", "b"]}}, "as many offsets and names"),
-        ({"about": {"names": ["a", "b", "c" * 200]}}, "short texts"),
-        ({"about": {"names": ["a", "b", 3]}}, "short texts"),
-        ({"about": {"names": 3}}, "names are not a list"),
-        ({"about": {"names": "abc"}}, "names are not a list"),
-        ({"about": {"bundle": ""}}, "short texts"),
-        ({"about": {"format": 2}}, "another format"),
-        ({"about": {"format": True}}, "another format"),
-        ({"about": {"format": "x" * 5000}}, "another format"),
+        {"weights": np.zeros((0, 5), np.float32)},
+        {"weights": np.zeros(5, np.float32)},
+        {"weights": np.full((3, 5), np.nan, np.float32)},
+        {"weights": np.full((3, 5), 2e6, np.float32)},
+        {"weights": np.zeros((3, 1 << 18), np.float32)},
+        {"weights": np.zeros((3, 5))},
+        {"offsets": np.zeros(2, np.float32)},
+        *({"about": {"names": names}} for names in (["a", "b"], ["a", "b", "c" * 200], ["a", "b", 3], 3, "abc")),
+        {"about": {"bundle": ""}},
+        *({"about": {"format": form}} for form in (2, True, "x" * 5000)),
     ],
 )
-def test_an_invalid_subspace_is_a_one_line_error(subspace, tmp_path, changes, why):
+def test_an_invalid_subspace_is_a_one_line_error(subspace, tmp_path, changes):
     about = {"format": 1, "names": ["a", "b", "c"], "bundle": "ab"} | changes.pop("about", {})
     arrays = {"weights": subspace.weights, "offsets": subspace.offsets, **changes}
     path = tmp_path / "bad.npz"
     np.savez(path, **arrays, about=json.dumps(about))
-    with pytest.raises(UsageError, match=why) as raised:
+    with pytest.raises(UsageError, match=r"bad\.npz") as raised:
         Subspace.load(path)
     assert "\n" not in str(raised.value)
 

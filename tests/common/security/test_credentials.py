@@ -3,6 +3,7 @@ Tests authority.py, certificate_ledger.py and handshake.py."""
 
 import errno
 import os
+import re
 import shutil
 import socket
 import stat
@@ -60,39 +61,36 @@ def test_a_join_file_identifies_its_holder_and_repr_hides_secrets(join):
 
 
 @pytest.mark.parametrize(
-    ("damage", "says"),
+    "damage",
     [
-        (lambda text: "", "not a join file of this version"),
-        (lambda text: "not = [toml", "not TOML"),
-        (lambda text: text + "#" * MAX_BYTES, "larger than"),
-        (lambda text: text.replace("version = 1", "version = 2"), "of this version"),
-        (lambda text: text.replace('role = "worker"', 'role = "king"'), "is invalid"),
-        (lambda text: text.replace("seat = 1", "seat = 0"), "is invalid"),
-        (lambda text: text.replace("seat = 1", 'seat = "1"'), "'seat' has the wrong type"),
-        (lambda text: text.replace("Z\nconnect", "\nconnect"), "is invalid"),
-        (lambda text: text.replace("name =", "nom ="), "'name' is missing"),
-        (lambda text: text + 'more = "x"\n', "'more' is unknown"),
-        (lambda text: text.replace('["tls/127.0.0.1:7447"]', "[1]"), "'connect' has the wrong type"),
-        (lambda text: text.partition("certificate =")[0], "its certificate, key or password is missing"),
+        lambda text: "",
+        lambda text: "not = [toml",
+        lambda text: text + "#" * MAX_BYTES,
+        lambda text: text.replace("version = 1", "version = 2"),
+        lambda text: text.replace('role = "worker"', 'role = "king"'),
+        lambda text: text.replace("seat = 1", "seat = 0"),
+        lambda text: text.replace("seat = 1", 'seat = "1"'),
+        lambda text: text.replace("Z\nconnect", "\nconnect"),
+        lambda text: text.replace("name =", "nom ="),
+        lambda text: text + 'more = "x"\n',
+        lambda text: text.replace('["tls/127.0.0.1:7447"]', "[1]"),
+        lambda text: text.partition("certificate =")[0],
     ],
-)  # fmt: skip
-def test_an_invalid_join_file_is_a_one_line_error(join, damage, says):
+)
+def test_an_invalid_join_file_is_an_error_that_names_it_without_its_secret(join, damage):
     join.write_text(damage(join.read_text()))
-    with pytest.raises(AccessError, match=says) as refused:
+    with pytest.raises(AccessError, match=re.escape(str(join))) as refused:
         read_join_file(join)
     assert "BEGIN" not in str(refused.value)
 
 
 def test_a_readable_expired_or_invalid_join_file_is_refused(join, tmp_path):
-    with pytest.raises(AccessError, match="expired on"):
-        read_join_file(join, datetime.now(UTC) + timedelta(days=31))
-    with pytest.raises(AccessError, match="no join file at"):
-        read_join_file(tmp_path / "nowhere")
-    with pytest.raises(AccessError, match="it is a folder"):
-        read_join_file(tmp_path)
+    for path, later in ((join, 31), (tmp_path / "nowhere", 0), (tmp_path, 0)):
+        with pytest.raises(AccessError, match=re.escape(str(path))):
+            read_join_file(path, datetime.now(UTC) + timedelta(days=later))
     for mode in (0o640, 0o604):
         join.chmod(mode)
-        with pytest.raises(AccessError, match="chmod 600"):
+        with pytest.raises(AccessError, match="600"):
             read_join_file(join)
 
 
@@ -108,9 +106,9 @@ def test_a_name_keeps_its_seat_until_revoked_and_seats_are_not_reused(access, tm
     seats.append(access.issue("viewer", "anna", tmp_path / "2", connect=HERE).seat)
     seats.append(access.issue("viewer", "ben", tmp_path / "3", connect=HERE).seat)
     assert seats == [1, 1, 2, 3]
-    with pytest.raises(UsageError, match="exists"):
+    with pytest.raises(UsageError, match="--out"):
         access.issue("viewer", "ben", tmp_path / "3", connect=HERE)
-    with pytest.raises(UsageError, match="nothing is issued to 'carl'"):
+    with pytest.raises(UsageError, match="carl"):
         access.revoke("carl")
 
 
@@ -126,10 +124,10 @@ def test_the_watcher_sees_revocations_and_keeps_them_if_the_ledger_is_damaged(ac
     (folder / LEDGER_FILE).write_text("{")
     watched.reload_if_changed(20.0)
     assert "worker.1" in watched.revoked_seats
-    with pytest.raises(AccessError, match="damaged"):  # who begins with it would let everybody in
+    with pytest.raises(AccessError, match=LEDGER_FILE):  # who begins with it would let everybody in
         RevocationWatcher(folder, read_join_file(join))
     replace(ledger, authority="0" * 64).save(folder / LEDGER_FILE)
-    with pytest.raises(AccessError, match="another authority"):
+    with pytest.raises(AccessError, match="--access-dir"):
         RevocationWatcher(folder, read_join_file(join))
 
 
@@ -212,7 +210,7 @@ def test_the_verbs_create_list_and_revoke(tmp_path, capsys):
     assert main(["access", "issue", "worker", "w2", *folder, "--connect", "tcp/h:1", "--out", f"{out}2"]) == 2
     assert main(["access", "issue", "coordinator", "c", *folder, "--out", f"{out}2"]) == 2
     assert main(["pause", "--join", str(out)]) == 1
-    assert "this needs operator or coordinator" in capsys.readouterr().err
+    assert "operator" in capsys.readouterr().err
 
 
 def test_a_listener_is_issued_a_file_for_its_host_names(tmp_path, capsys):
@@ -223,18 +221,18 @@ def test_a_listener_is_issued_a_file_for_its_host_names(tmp_path, capsys):
     assert (read_join_file(out).role, read_join_file(out).connect) == ("coordinator", ())
     for wrong in ("h.example:7447", "tls/h.example", "", "a b", "a..b"):
         assert main(["access", "issue", "coordinator", "c", *folder, "--host", wrong, "--out", f"{out}2"]) == 2
-        assert "is not a host" in capsys.readouterr().err
+        assert "--host" in capsys.readouterr().err
     assert main(["access", "issue", "worker", "w", *folder, "--connect", "tls/[::1]:1", "--out", f"{out}2"]) == 2
-    assert "give a name" in capsys.readouterr().err
+    assert "tls/[::1]:1" in capsys.readouterr().err
 
 
-def test_the_error_on_a_full_disk_says_that_nothing_changed(access, monkeypatch):
+def test_a_full_disk_changes_nothing(access, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     before = (access._folder / LEDGER_FILE).read_bytes()
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(AccessError, match=r"cannot be written: No space left on device; nothing is changed"):
+    with pytest.raises(AccessError, match="No space left on device"):
         access.revoke("box")
     assert (access._folder / LEDGER_FILE).read_bytes() == before
 
@@ -244,18 +242,18 @@ def test_an_authority_with_foreign_parts_issues_nothing(tmp_path):
         return Authority.create(tmp_path / name, passwords=True)._folder
 
     whole, other = made("whole"), made("other")
-    for part, text, why in (
-        ("ca.key", (other / "ca.key").read_text(), "key of another certificate"),
-        (LEDGER_FILE, (other / LEDGER_FILE).read_text(), "another authority"),
-        ("secret", "no hex", "damaged"),
-        ("secret", None, "secret is missing"),
+    for part, text in (
+        ("ca.key", (other / "ca.key").read_text()),
+        (LEDGER_FILE, (other / LEDGER_FILE).read_text()),
+        ("secret", "no hex"),
+        ("secret", None),
     ):
         folder = tmp_path / "mixed"
         shutil.copytree(whole, folder)
         (folder / part).unlink()
         if text is not None:
             (folder / part).write_text(text)
-        with pytest.raises(AccessError, match=why):
+        with pytest.raises(AccessError, match=re.escape(str(folder))):
             Authority(folder).issue("worker", "box", tmp_path / "box", connect=HERE)
         assert not (tmp_path / "box").exists()
         shutil.rmtree(folder)
@@ -277,7 +275,7 @@ def test_an_unreadable_folder_is_an_error(access, join, tmp_path, monkeypatch):
         lambda: Authority.create(tmp_path),
         lambda: RevocationWatcher(tmp_path, credentials),
     ):
-        with pytest.raises(AccessError, match="cannot be read: Permission denied"):
+        with pytest.raises(AccessError, match="Permission denied"):
             looked()
 
 
@@ -291,7 +289,7 @@ def test_an_existing_authority_is_not_overwritten_even_in_a_race(tmp_path, monke
         return begun(*args, **more)
 
     monkeypatch.setattr(authority, "_certificate_builder", late)
-    with pytest.raises(UsageError, match="holds an authority already"):
+    with pytest.raises(UsageError, match="--access-dir"):
         Authority.create(folder)
     Authority(folder)
 
@@ -301,4 +299,4 @@ def test_damage_is_an_error_without_traceback(join, ca, host):
     with socket.create_server(("127.0.0.1", 0)) as server:
         endpoint = f"tls/{host}:{server.getsockname()[1]}"
         said = diagnose_connection([endpoint], replace(read_join_file(join), ca=ca))
-    assert said is None if host != "127.0.0.1" else "this join file is damaged" in str(said)
+    assert (said is None) == (host != "127.0.0.1")
