@@ -80,6 +80,7 @@ def folder(agent, tmp_path, monkeypatch):
 STARTS_A_RUN = re.compile(r"\b(start_run|evolve|minimise|maximise)\(")
 
 
+@pytest.mark.wording
 @pytest.mark.parametrize(
     "name",
     [

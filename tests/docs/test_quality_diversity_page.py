@@ -12,7 +12,6 @@ SHARES = {"--population 48 --episodes 2 --generations 40": "--population 12 --ep
 @pytest.mark.timeout(WHOLE + 60)
 def test_its_commands_work_as_they_stand(tmp_path):
     printed = run_page("how-to/quality-diversity.md", SHARES, tmp_path)
-    assert "of 144 cells filled, QD score" in printed
+    assert " of 144 cells filled" in printed
     assert (tmp_path / "swing-archive.png").stat().st_size > 10_000
     assert (tmp_path / "swing-csv" / "elites.npz").exists()
-    assert printed.count("400 environment steps in") == 2

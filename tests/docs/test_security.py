@@ -5,7 +5,8 @@ import sys
 
 import pytest
 
-from tests.support.processes import ROOT, free_port
+from dreamfleet.common.host.reports import ADDRESS
+from tests.support.processes import DEADLINE, ROOT, free_port
 
 HOST = "127.0.0.2"  # in no certificate by default
 
@@ -25,5 +26,5 @@ def test_five_commands_make_a_fleet(processes, tmp_path, monkeypatch):
     for each in words[:3]:
         code, _, err = processes.call(*each)
         assert code == 0, err
-    processes.start(*words[3]).wait_for("incarnation")
-    processes.start(*words[4], "--slots", 1).wait_for("joined run night")
+    processes.start(*words[3]).wait_for_report(ADDRESS, DEADLINE)
+    processes.start(*words[4], "--slots", 1).wait_for("1 slot")

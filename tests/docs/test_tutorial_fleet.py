@@ -63,6 +63,7 @@ def on_page(text):
 
 
 @pytest.mark.slow
+@pytest.mark.wording
 @pytest.mark.needs_programs("ip")
 @pytest.mark.timeout(WHOLE)
 @pytest.mark.skipif(os.geteuid() != 0, reason="network namespaces need root")

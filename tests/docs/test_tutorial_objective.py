@@ -8,8 +8,5 @@ from tests.docs.tutorial import WHOLE, run_tutorial
 @pytest.mark.slow
 @pytest.mark.timeout(WHOLE + 60)
 def test_its_commands_work_as_they_stand(tmp_path):
-    printed = run_tutorial("own-objective.md", "tune.py", {}, tmp_path)
-    assert "evaluations" in printed
-    assert "reported x" in printed
-    assert "the function's own; smaller ones are better" in printed
+    run_tutorial("own-objective.md", "tune.py", {}, tmp_path)
     assert (tmp_path / "tune.png").stat().st_size > 1000

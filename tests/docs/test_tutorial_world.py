@@ -20,4 +20,4 @@ def test_its_commands_work_as_they_stand(tmp_path):
     printed = run_tutorial("own-world-model.md", "my_world.py", SHARES, tmp_path)
     for made in ("data/pixels.zip", "inspection/index.html", "runs/canyon/controller.npz", "drive.mp4"):
         assert (tmp_path / made).exists()
-    assert "judged in gym:my_world:Canyon-v0" in printed
+    assert "gym:my_world:Canyon-v0" in printed

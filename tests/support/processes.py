@@ -13,6 +13,7 @@ from dreamfleet.common.cli import command_line
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.host.processes import VerbProcess, command
+from dreamfleet.common.host.reports import ADDRESS
 
 ROOT = Path(__file__).parents[2]
 DEADLINE = 300  # seconds to wait for an event: many times the usual, since a machine may be busy
@@ -108,7 +109,7 @@ class Processes:
             *arguments,
             root=root,
         )
-        process.wait_for("incarnation")
+        process.wait_for_report(ADDRESS, DEADLINE)
         return process
 
     def worker(self, *arguments, endpoint=None, inside=(), root=ROOT):
