@@ -12,6 +12,7 @@ from dreamfleet.coordinator.jobs.work import Work
 LONGEST_ERROR = 300  # characters of a worker's error that are shown
 MAX_NAMED = 4  # workers that a failure names
 LONGEST_PAUSE = 120.0  # seconds between two attempts
+WORKER_ENDED = Failure.of_host("its worker was lost")
 
 
 def host_of(worker: str) -> str:
@@ -44,6 +45,11 @@ class JobFailure:
     def errors(self) -> dict[str, str]:
         """The last error of each worker, in words."""
         return {each.worker: each.error.text for each in self.history}
+
+    @property
+    def is_loss(self) -> bool:
+        """Whether each attempt ended with its worker, without a word of why."""
+        return all(each.error == WORKER_ENDED for each in self.history)
 
     @property
     def attempts(self) -> dict[str, int]:

@@ -10,14 +10,13 @@ from enum import Enum, auto
 from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.messages import TAG_BYTES, Kind, Result
 from dreamfleet.coordinator.dispatch.deficit_round_robin import DeficitCounter
-from dreamfleet.coordinator.dispatch.failures import Attempt, JobFailure, host_of, pause_before_retry
+from dreamfleet.coordinator.dispatch.failures import WORKER_ENDED, Attempt, JobFailure, host_of, pause_before_retry
 from dreamfleet.coordinator.jobs.checks import Check
 from dreamfleet.coordinator.jobs.work import Work
 
 MAX_FAILED = 64  # failed attempts of a job that are remembered
 MAX_HOLDERS = 2  # workers that a job is leased to at a time
 SUSPECT_LOSSES = 2  # workers that ended while they held a job: it may be what ended them
-WORKER_ENDED = Failure.of_host("its worker was lost")
 NO_REASON = Failure("no fitness and no reason", "no reason")
 
 

@@ -16,6 +16,7 @@ from math import nan
 from msgspec.structs import replace
 
 from dreamfleet.common.errors import NotWritableNowError
+from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.messages import Job, Result
 from dreamfleet.common.protocol.pause_kind import PauseKind
@@ -45,6 +46,7 @@ from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 
 OTHER_SEEDS = "; if the seeds of the first generation are bad for every candidate, begin a run with another --seed"
+LOST_WORKERS = "; the last lines of these workers, and `dmesg` on their hosts, may say what ended them"
 PAUSED = "paused"  # the fact that somebody paused the run
 BY_HAND = Pause(PauseKind.BY_HAND, "by hand")
 WRITE_RETRY = 2.0  # seconds until a full disk or a locked journal is tried again
@@ -346,11 +348,14 @@ class Run:
         if is_judged and (failure := judge.find_broken_fleet(at_once=self.failure_limit.share < 1)) is not None:
             proof = self.generations.find_scored(self.generation)
             if proof is None or judge.has_failed_proof or not self.fleet.jobs.offer_proof(proof):
+                hint = LOST_WORKERS if failure.is_loss else OTHER_SEEDS if proof is None else ""
+                jobs, until_host = self.fleet.jobs, not judge.has_hope
                 why = (
-                    f"no present host has ever scored a job, and all its jobs failed, such as {failure}; "
-                    f"another host, or `dreamfleet resume`, tries them again{OTHER_SEEDS if proof is None else ''}"
+                    f"no present host has ever scored a job, and {len(jobs.failures)} of "
+                    f"{plural(len(jobs) + jobs.unmade, 'open job')} failed, such as {failure}; "
+                    f"the run continues {'when another host joins, or ' * until_host}with `dreamfleet resume`{hint}"
                 )
-                self.pause(Pause(PauseKind.NO_ABLE_HOST, why, until_host=not judge.has_hope))
+                self.pause(Pause(PauseKind.NO_ABLE_HOST, why, until_host=until_host))
         elif not is_judged and (failure := judge.find_pausing()) is not None:
             self.pause(Pause(PauseKind.FAILED_JOB, f"{failure}; `dreamfleet resume` tries it again"))
         elif judge.awaits_proof:

@@ -435,6 +435,11 @@ class Lethal(Failing):
         self.lives = itertools.count(16)
         super().begin()
 
+    def handle_heartbeat(self, name, **more):
+        super().handle_heartbeat(name, **more)
+        if not self.new_names:  # else each new host ends the pause
+            self.run.advance(self.now)  # as the service does: the run sees the new life before it gets jobs
+
     def answer_one(self, name, job):
         if name not in self.hosts:  # it ended on a job before
             return
@@ -466,6 +471,32 @@ def test_an_episode_that_ends_workers_on_hosts_of_ever_new_names_counts_as_faile
     bench.serve(turns=3000)
     assert bench.run.state.ended
     assert [each.failed for each in bench.run.history.rows] == [1] * GENERATIONS
+    bench.journal.close()
+
+
+@pytest.mark.parametrize("has_scored", [False, True])
+def test_fifty_kills_on_one_host_pause_only_a_run_that_it_never_scored(tmp_path, random_bundle, has_scored):
+    """Ten jobs that fail before the first score pause it: it says how many, and what ends the pause."""
+    settings = replace(SETTINGS, population=16)
+    bench = Lethal(tmp_path / "night", random_bundle.path, settings, fails=lambda job: False)
+    bench.hosts = [A]
+    bench.run.fleet.handle_departure(B, bench.now)
+    if has_scored:
+        bench.serve(stop=lambda run: run.fleet.counts["accepted"] > 3)
+    kills = iter(range(50))
+    bench.fails = lambda job: next(kills, None) is not None
+    bench.serve(turns=3000)
+    if not has_scored:
+        (pause,) = bench.run.state.paused.pauses
+        failed = len(bench.run.fleet.jobs.failures)
+        assert (pause.kind, pause.until_host, failed) == (PauseKind.NO_ABLE_HOST, True, 10)
+        assert {"10", "32"} <= set(pause.text.split())
+        assert all(each in pause.text for each in ("`dreamfleet resume`", "`dmesg`"))
+        bench.fails = lambda job: False
+        bench.run.resume()
+        bench.serve()
+    assert bench.run.state.ended
+    assert [each.failed for each in bench.run.history.rows] == [0] * GENERATIONS
     bench.journal.close()
 
 
