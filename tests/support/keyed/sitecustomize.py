@@ -7,10 +7,12 @@ import ast
 import sys
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
+from zlib import crc32
 
 ROOT = Path(__file__).resolve().parents[3]
 PARTS = ("common", "coordinator", "worker", "dreamfleet")
-sys.pycache_prefix = str(ROOT / "build" / "keyed")
+MESSAGES = crc32((ROOT / "deploy" / "messages.py").read_bytes())  # what it changes is compiled anew
+sys.pycache_prefix = str(ROOT / "build" / "keyed" / f"{MESSAGES:08x}")
 sys.dont_write_bytecode = False
 plain = SourceFileLoader.source_to_code
 
