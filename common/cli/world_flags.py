@@ -10,6 +10,7 @@ from dreamfleet.common.cli.key_values import ENVIRONMENT_EXAMPLE, parse_argument
 from dreamfleet.common.worlds.shipped import WORLDS
 
 ENVIRONMENT = "environment"
+OPTIONS = (ENVIRONMENT, "observation", "crop", "size", "skip", "difference")
 
 
 def add_world_flags(parser: argparse.ArgumentParser) -> None:
@@ -34,8 +35,7 @@ def add_world_flags(parser: argparse.ArgumentParser) -> None:
 
 def world_arguments(args: argparse.Namespace) -> dict[str, Any]:
     """The given options of the world by name, as a task's `parse_options` takes them."""
-    names = (ENVIRONMENT, "observation", "crop", "size", "skip", "difference")
-    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    given = {name: getattr(args, name) for name in OPTIONS if getattr(args, name) is not None}
     if ENVIRONMENT in given:
         given[ENVIRONMENT] = parse_arguments(f"--{ENVIRONMENT}", given[ENVIRONMENT], ENVIRONMENT_EXAMPLE)
     return given

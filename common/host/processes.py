@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import queue
 import shlex
@@ -13,7 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any
 
@@ -42,20 +41,6 @@ def shell_command(*words: object) -> str:
     else:
         program = [str(started)]
     return shlex.join([*program, *map(str, words)])
-
-
-def run_verb_to_end(*words: object) -> None:
-    """Run a verb in this terminal and wait; `DreamfleetError` if it fails."""
-    if subprocess.run(command(*words), check=False).returncode != 0:  # noqa: S603 - our own interpreter and verb
-        raise DreamfleetError(f"dreamfleet {words[0]} failed")
-
-
-def run_verb_for_json(*words: object) -> Any:
-    """Run a verb and return the JSON that it prints; `DreamfleetError` if it fails. Its stderr is this terminal."""
-    done = subprocess.run(command(*words), check=False, stdout=subprocess.PIPE)  # noqa: S603 - our own interpreter
-    if done.returncode != 0:
-        raise DreamfleetError(f"dreamfleet {words[0]} failed")
-    return json.loads(done.stdout)
 
 
 class VerbProcess(CommandChild):
@@ -107,14 +92,6 @@ class VerbProcess(CommandChild):
                 raise DreamfleetError(f"ended before printing {text!r}:\n{''.join(self.lines)}")
             times -= text in line
         return line or ""
-
-    def new_lines(self) -> list[str]:
-        """The lines of stderr that neither `wait_for` nor an earlier call consumed."""
-        lines: list[str] = []
-        with suppress(queue.Empty):
-            while (line := self._new_lines.get_nowait()) is not None:
-                lines.append(line)
-        return lines
 
     def reports(self, name: str) -> list[Any]:
         """What it reported under this name so far, the oldest first."""

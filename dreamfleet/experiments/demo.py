@@ -11,6 +11,7 @@ import time
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import fmean
@@ -21,18 +22,15 @@ from rich.live import Live
 from rich.text import Text
 
 from dreamfleet.common.artifacts.driving import FIRST_WORLD
-from dreamfleet.common.cli import model_commands
 from dreamfleet.common.cli.config import option
-from dreamfleet.common.cli.model_commands import options
 from dreamfleet.common.cli.output import print_rows
+from dreamfleet.common.cli.progress import progress_bar
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.client.eta import summarise_status
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
 from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.host.processes import (
     VerbProcess,
-    run_verb_for_json,
-    run_verb_to_end,
     shell_command,
 )
 from dreamfleet.common.host.reports import ADDRESS
@@ -42,11 +40,13 @@ from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL, resume_command
+from dreamfleet.common.runs.seeds import TEST
 from dreamfleet.common.runs.standard_error import format_with_error, standard_error
 from dreamfleet.common.worlds.profile import DemoPlan
 from dreamfleet.common.worlds.score_words import profile_of
 from dreamfleet.coordinator.settings.run_checks import NO_SUBSPACE
 from dreamfleet.coordinator.views.status_panel import RunPanel
+from dreamfleet.experiments import command_lines
 from dreamfleet.experiments.demo_plans import PLANS, find_plan, plan_defaults
 from dreamfleet.experiments.local_run import START_SECONDS, LocalRun, has_begun
 
@@ -154,8 +154,7 @@ class Demo:
         why = " (the higher confirmed score)" if len(drives) > 1 else ""
         what = f"{self._profile.score_word} {seed}, its median: {self._profile.format_score(score)}"
         self._print(f"recording run {best.run}'s controller{why} on {what}")
-        steps = self._plan.video_steps
-        run_verb_to_end("record", "--controller", controller, "--out", folder / VIDEO, "--steps", steps, "--seed", seed)
+        self._record(controller, seed, folder / VIDEO)
         self._print_next_steps(folder)
 
     @property
@@ -194,8 +193,25 @@ class Demo:
         seeds = plural(self._plan.tracks, f"unseen {self._profile.score_word}")
         self._print(f"judging run {demo_run.run}'s controller on {seeds}, in {self._plan.judge}")
         controller = self._runs_dir / demo_run.run / CONTROLLER
-        report = run_verb_for_json(*model_commands.evaluate(controller, self._plan.tracks, "--json"))
-        return dict(zip(report["seeds"], report["scores"], strict=True))
+        from dreamfleet.worker.tools.drivers import find_driver
+        from dreamfleet.worker.tools.evaluation import judge
+
+        tracks = tuple(range(TEST.start, TEST.start + self._plan.tracks))
+        report = judge(str(controller), find_driver(str(controller), self._runs_dir), tracks, usable_cores())
+        return {each.seed: each.score for each in report.drives}
+
+    def _record(self, controller: Path, seed: int, video: Path) -> None:
+        from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
+        from dreamfleet.worker.tools.drivers import find_driver
+        from dreamfleet.worker.tools.recording import record, record_in_process
+
+        agent, steps = find_driver(str(controller), self._runs_dir), self._plan.video_steps
+        film = partial(record, agent, steps=steps, dreaming=ParallelDreamConfig())
+        with progress_bar("record", min(steps, agent.world.horizon), "steps") as bar:
+            score, driven = record_in_process(film, seed, video, bar.update, never_stop)
+            bar.end(driven)
+        words = f"{video}: {self._profile.format_score(score)} on {self._profile.score_word} {seed}"
+        self._console.print(words, markup=False)
 
     def _print_scores(self, drives: Mapping[str, Mapping[int, float]]) -> None:
         """Print a row for each controller: where it evolved, its confirmed score, and that on unseen tracks."""
@@ -225,13 +241,13 @@ class Demo:
             logs.mkdir(parents=True, exist_ok=True)
             (logs / SCHEDULE).write_text(demo_run.schedule, encoding="utf-8")
             flags = {**flags, "schedule": logs / SCHEDULE}
-        words = model_commands.begin_run(
-            demo_run.run, self._runs_dir, (self._endpoint,), *options(**flags), world_model=self._plan.bundle,
-            as_json=False,
+        words = command_lines.begin_run(
+            demo_run.run, self._runs_dir, (self._endpoint,), *command_lines.options(**flags),
+            world_model=self._plan.bundle, as_json=False,
         )  # fmt: skip
         with LocalRun(demo_run.run, words, logs) as run, run.connect(self._endpoint) as client:
             for name in (f"core-{number}" for number in range(workers)):
-                run.start_worker(name, model_commands.worker(demo_run.run, self._endpoint, 1, "--name", name))
+                run.start_worker(name, command_lines.worker(demo_run.run, self._endpoint, 1, "--name", name))
             with Live(console=self._console, refresh_per_second=4) as live:
 
                 def look() -> None:
@@ -264,7 +280,7 @@ class Demo:
         self._console.print(Text.assemble("\n", (f"In {folder}", "bold"), files))
         for command in (
             shell_command("verify", "candidate", folder.name, "--candidate", "0/0", "--runs-dir", self._runs_dir),
-            shell_command(*model_commands.evaluate(controller, 100)),
+            shell_command("evaluate", "--controller", controller, "--episodes", 100),
             shell_command(
                 "coordinator",
                 "--run",

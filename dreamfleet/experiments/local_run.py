@@ -13,7 +13,6 @@ from pathlib import Path
 from random import SystemRandom
 from typing import Any
 
-from dreamfleet.common.cli import model_commands
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, StoppedError, UsageError
 from dreamfleet.common.files.regular_files import path_exists
@@ -25,11 +24,12 @@ from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.common.transport.network import wait_for_listener
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.limits import LimitsConfig
-from dreamfleet.experiments.verb_runner import POLL_INTERVAL, wait_for_end
+from dreamfleet.experiments import command_lines
 
 # Variables of a process that stays on this host, even if its user is in a fleet.
 ALONE = {"DREAMFLEET_JOIN": "", "DREAMFLEET_CONNECT": ""}
 CONNECT_INTERVAL = 0.05  # seconds between two attempts to reach a coordinator that listens and does not answer yet
+POLL_INTERVAL = 0.2  # seconds between two looks whether to stop
 START_SECONDS = 180.0  # a coordinator that ends earlier is seen at once; a busy host takes its time
 PORTS = range(20_000, 32_000)
 ANY_ADDRESS = re.compile(r"/(0\.0\.0\.0|\[::\]):")  # an endpoint that listens on all of this host's addresses
@@ -145,7 +145,11 @@ class LocalRun:
 
         `StoppedError` if `stop` is true or the run was left open, `DreamfleetError` if the coordinator failed.
         """
-        wait_for_end(self.coordinator, stop, on_poll, interval)
+        while not self.coordinator.wait(0):
+            if stop():
+                raise StoppedError("stopped")
+            on_poll()
+            self.coordinator.wait(interval)
         self.check_end()
 
     def check_end(self) -> None:
@@ -163,7 +167,7 @@ def evolve(name: str, words: Sequence[str], local_fleet: LocalFleet, logs: Path,
         if local_fleet.slots:
             flags = ("--exit-when-done", *local_fleet.worker)
             run.start_worker(
-                "worker", model_commands.worker(name, local_fleet.local_endpoint, local_fleet.slots, *flags)
+                "worker", command_lines.worker(name, local_fleet.local_endpoint, local_fleet.slots, *flags)
             )
         run.wait(stop, run.check_workers)
 

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Self, Unpack
 from weakref import finalize
 
-from dreamfleet.common.cli import model_commands
 from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.common.cli.config import suggestion
 from dreamfleet.common.cli.parser import Parser
@@ -37,10 +36,10 @@ from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import default_runs_dir
 from dreamfleet.coordinator.settings import run_setup
 from dreamfleet.coordinator.views.stored_run import StoredRun
+from dreamfleet.experiments import command_lines
 from dreamfleet.experiments.function_names import environment_for
-from dreamfleet.experiments.local_run import ALONE, LocalFleet, LocalRun, has_begun, task_flags
+from dreamfleet.experiments.local_run import ALONE, POLL_INTERVAL, LocalFleet, LocalRun, has_begun, task_flags
 from dreamfleet.experiments.run_arguments import RunArguments
-from dreamfleet.experiments.verb_runner import POLL_INTERVAL
 
 MOST_WORKERS = 1024  # processes of one slot
 STARTING = "starting.lock"  # held while a program starts and serves a run
@@ -250,7 +249,7 @@ def _needed_flags(run: StartedRun) -> tuple[str, ...]:
 def _start_workers(processes: LocalRun, name: str, endpoint: str, count: int, flags: tuple[str, ...]) -> None:
     for worker in (f"core-{number}" for number in range(count)):
         more = ("--name", worker, "--exit-when-done", *flags)
-        processes.start_worker(worker, model_commands.worker(name, endpoint, 1, *more))
+        processes.start_worker(worker, command_lines.worker(name, endpoint, 1, *more))
 
 
 def evolve(
@@ -315,11 +314,11 @@ def flag_words(name: str, value: Any) -> tuple[str, ...]:
 def _coordinator_words(settings: Mapping[str, Any], folder: Path, fleet: LocalFleet) -> tuple[str, tuple[str, ...]]:
     """The run's name, and the command line of its coordinator."""
     if resumed := settings.get("resume"):
-        return resumed, model_commands.resume_run(check_run_name(resumed), folder, fleet.listen, *fleet.coordinator)
+        return resumed, command_lines.resume_run(check_run_name(resumed), folder, fleet.listen, *fleet.coordinator)
     name = check_run_name(settings.get("run") or _free_name(folder))
     if has_begun(folder, name):
         raise UsageError(f"run {name!r} exists in {folder}: continue it with resume={name!r}, or choose another name")
-    return name, model_commands.begin_run(name, folder, fleet.listen, *fleet.coordinator, as_json=False)
+    return name, command_lines.begin_run(name, folder, fleet.listen, *fleet.coordinator, as_json=False)
 
 
 def _free_name(folder: Path) -> str:

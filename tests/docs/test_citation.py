@@ -12,8 +12,8 @@ from packaging.version import Version
 
 from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.coordinator.views.citation import AUTHORS
-from dreamfleet.experiments.verb_runner import find_verb
 from tests.support.processes import DEADLINE, ROOT
+from tests.support.verbs import find_verb
 
 CITATION = ROOT / "CITATION.cff"
 TEMPLATES = sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.md"))

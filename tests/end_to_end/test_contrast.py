@@ -16,8 +16,8 @@ RUN = (
     " --confirm-episodes 0"
 )
 SMALL = (
-    "--mdnrnn-flags", "--updates 3 --batch 2 --latent 4 --hidden 4 --validate-every 1", "--run-flags", RUN,
-    "--kind", "plain", "", "--kind", "attentive", "--window 2 --attention-units 2", "--local", 1,
+    "--mdnrnn-flags", "--updates 3 --batch 2 --set latent=4 hidden=4 validate_every=1", "--run-flags", RUN,
+    "--kind", "plain", "", "--kind", "attentive", "--set window=2 attention_units=2", "--local", 1,
 )  # fmt: skip
 
 

@@ -20,13 +20,13 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.host.stop_signals import never_stop
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.experiments.iteration.commands import Commands
+from dreamfleet.experiments.isolated import run_isolated
 from dreamfleet.experiments.iteration.config import IterateConfig
 from dreamfleet.experiments.iteration.layout import IterationFolder
 from dreamfleet.experiments.iteration.ledger import FinishedPhase, IterationLedger
 from dreamfleet.experiments.iteration.phases import PhaseRunner
 from dreamfleet.experiments.iteration.plan import Phase
-from dreamfleet.experiments.verb_runner import ProcessRunner
+from dreamfleet.experiments.iteration.requests import Requests
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
@@ -43,8 +43,8 @@ RUN = (
 )
 SMALL = (
     "--rounds", 2, "--drives", 3, "--drive-steps", 12, "--own-drives", 2, "--means", 2, "--jobs", 1, "--local", 1,
-    "--vae-flags", "--updates 3 --batch 8 --latent 4 --channels 2 2 2 2 --validate-every 1", "--vae-updates", 2,
-    "--mdnrnn-flags", "--updates 3 --batch 2 --latent 4 --hidden 4 --validate-every 1", "--mdnrnn-updates", 2,
+    "--vae-flags", "--updates 3 --batch 8 --set latent=4 channels=2,2,2,2 validate_every=1", "--vae-updates", 2,
+    "--mdnrnn-flags", "--updates 3 --batch 2 --set latent=4 hidden=4 validate_every=1", "--mdnrnn-updates", 2,
     "--run-flags", f"{RUN} --collect-every 2 --collect-episodes 1",
     "--gate-drives", 2, "--gate-losses", 0,
 )  # fmt: skip
@@ -141,8 +141,9 @@ def test_the_encoder_stays_and_what_evolved_drives_for_the_next_model(undisturbe
         pilot = Controller.load(layout.means(1) / f"{row}.npz")
         assert (pilot.parameters == vector).all()
         assert pilot.bundle == one.sha256
-    (words,) = IterationLedger.load(layout.ledger).entry(2, "drive").commands
-    assert f"--noise 0.3 --controller {layout.means(1) / '0.npz'} {layout.means(1) / '1.npz'} " in " ".join(words)
+    (asked,) = IterationLedger.load(layout.ledger).entry(2, "drive").requests
+    assert asked["settings"]["noise"] == 0.3
+    assert asked["controllers"] == [str(layout.means(1) / f"{row}.npz") for row in range(2)]
 
 
 def test_a_gate_that_can_measure_nothing_refuses_nothing_and_says_so(undisturbed):
@@ -169,8 +170,7 @@ def gate(layout, new, drives=write_drives, **changes):
         .add(FinishedPhase(1, "bundle", 0, 0.0, ""))
         .add(FinishedPhase(2, "bundle", 0, 0.0, ""))
     )
-    runner = ProcessRunner(never_stop)
-    phases = PhaseRunner(Commands(config, layout, ledger), None, runner.run_for_json, never_stop)
+    phases = PhaseRunner(Requests(config, layout, ledger), None, run_isolated, never_stop)
     return phases.do(Phase(2, "gate")).figures
 
 
@@ -259,7 +259,7 @@ def pilot(tmp_path_factory):
 def test_an_iteration_goes_on_from_a_controller_and_its_world_model(processes, pilot):
     layout = IterationFolder(processes.folder / "data")
     flags = ("--rounds", 1, "--init", pilot, "--vae", "keep", "--go-on")
-    mdnrnn = "--updates 3 --batch 2 --latent 4 --hidden 4 --validate-every 1 --done --lost 4"
+    mdnrnn = "--updates 3 --batch 2 --set latent=4 hidden=4 validate_every=1 done=true lost=4"
     words_of_it = words(layout.root, *flags, "--mdnrnn-flags", mdnrnn, "--json")
     code, out, err = processes.call(*words_of_it)
     assert code == 0, err
@@ -287,10 +287,10 @@ def test_an_iteration_goes_on_from_a_controller_and_its_world_model(processes, p
 
 def test_until_it_has_what_it_goes_on_from_flags_may_be_mended(pilot, tmp_path):
     root = tmp_path / "data"
-    wrong = ("--mdnrnn-flags", "--latent 4 --hidden 5", "--vae-flags", "--latent 4 --channels 2 2 2 2")
+    wrong = ("--mdnrnn-flags", "--set latent=4 hidden=5", "--vae-flags", "--set latent=4 channels=2,2,2,2")
     code, _, err = call_here("iterate", "--data", root, "--init", pilot, *wrong)
     assert (code, "to another model: hidden 4, not 5" in err) == (1, True), err
-    code, _, err = call_here("iterate", "--data", root, "--mdnrnn-flags", "--latent 4 --hidden 4 --nonsense 3")
+    code, _, err = call_here("iterate", "--data", root, "--mdnrnn-flags", "--set latent=4 hidden=4 nonsense=3")
     assert "begun with" not in err
     assert "nonsense" in err
     inside = root / "pilot.npz"
@@ -314,7 +314,7 @@ def test_a_controller_that_cannot_be_fitted_is_refused_at_once(pilot, tmp_path):
     [
         (("--init", "absent.npz"), "no controller 'absent.npz'"),
         (("--init", "tiny", "--go-on", "--run-flags", "--generations 1 --features z"), "has 867 parameters"),
-        (("--init", "tiny", "--mdnrnn-flags", "--hidden 8"), "0/init: .*to another model: hidden 256, not 8"),
+        (("--init", "tiny", "--mdnrnn-flags", "--set hidden=8"), "0/init: .*to another model: hidden 256, not 8"),
         (("--init", "tiny", "--preset", "article", "--vae", "whole"), "0/init: .*to another model: channels"),
     ],
 )
@@ -335,7 +335,7 @@ def test_what_cannot_be_gone_on_from_is_refused_before_anything_is_driven(tmp_pa
         (("--bundle-flags", "--reward luck"), "argument --reward: invalid choice: 'luck'"),
         (("--bundle-flags", "--end 7"), "a dream ends at a probability from 0 to 1"),
         (
-            ("--vae-flags", "--error-factor 4", "--mdnrnn-flags", "--z-factor 0"),
+            ("--vae-flags", "--set error_factor=4", "--mdnrnn-flags", "--set z_factor=0"),
             "--mdnrnn-flags: z_factor must be from",
         ),
         (("--local", 0), "no worker would score"),

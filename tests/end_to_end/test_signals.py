@@ -34,7 +34,7 @@ def words(processes, random_bundle, encoded, tmp_path):
         "pipeline": ("pipeline", *drives, "--preset", "tiny", "--collect-flags", "--episodes 10000 --steps 20"),
         "contrast": (
             "lab", "contrast", "--data", tmp_path / "encoded", "--out", tmp_path / "out", "--local", 1, "--run-flags",
-            RUN, "--mdnrnn-flags", "--updates 1000000 --batch 2 --latent 4 --hidden 4 --validate-every 1000000",
+            RUN, "--mdnrnn-flags", "--updates 1000000 --batch 2 --set latent=4 hidden=4 validate_every=1000000",
         ),
     }  # fmt: skip
 

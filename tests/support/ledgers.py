@@ -8,7 +8,7 @@ RUN = {"task": "dream", "population": 64, "collect_every": 0, "stages": ()}
 
 def entry(number, phase, made=(), **figures):
     return FinishedPhase(
-        number, phase, 0, 1.5, "2026-01-01T00:00:00+00:00", (("encode", "--json"),), figures, tuple(made)
+        number, phase, 0, 1.5, "2026-01-01T00:00:00+00:00", ({"request": "EncodeRequest"},), figures, tuple(made)
     )
 
 

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from time import perf_counter
 from typing import ClassVar
 
-from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.errors import DreamfleetError, StoppedError
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.host.process_pool import count_step, map_in_processes
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.stall_watch import STALL_SECONDS
 from dreamfleet.common.host.unseen_drawing import draw_offscreen, draw_unseen
+from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.result_bounds import rejection_reason
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.common.runs.evaluation_report import EvaluationReport
+from dreamfleet.common.runs.standard_error import format_with_error, standard_error
 from dreamfleet.worker.scoring.agents import Agent
 from dreamfleet.worker.scoring.failure_cause import crash, failure_of
 from dreamfleet.worker.tools.agent_evaluator import AgentEvaluator
 
 Episode = EpisodeResult | FailedEpisode
+log = logging.getLogger(__name__)
 FIRST_LOSSES = 3  # processes lost before any episode has ended, after which the evaluation ends
 
 
@@ -95,6 +99,34 @@ def run_evaluation(
         results.drives, judge=world.judge or agent.reality, threshold=agent.threshold, failed=results.failed,
         marks=tuple(map(float, world.marks)), options=agent.options,
     )  # fmt: skip
+
+
+def judge(
+    name: str, agent: Agent, seeds: tuple[int, ...], jobs: int, note: Callable[[str], object] = log.warning
+) -> EvaluationReport:
+    """Drive one whole episode per seed, with a progress bar on stderr; `note` gets a line for each that fails.
+
+    `StoppedError` for a Ctrl-C once an episode has a score: it says the mean of those that have.
+    """
+    from dreamfleet.common.cli.progress import progress_bar
+
+    def move(episodes: list[Episode]) -> None:
+        so_far[:] = episodes
+        scores = [each.score for each in episodes if isinstance(each, EpisodeResult)]
+        bar.update(len(episodes), f"mean {format_with_error(sum(scores) / len(scores), None)}" if scores else "")
+        if not isinstance(last := episodes[-1], EpisodeResult):
+            note(f"an episode failed: {last}")
+
+    so_far: list[Episode] = []
+    with progress_bar("evaluate", len(seeds), "episodes") as bar:
+        try:
+            return run_evaluation(name, agent, seeds, jobs, move)
+        except KeyboardInterrupt:
+            scores = [each.score for each in so_far if isinstance(each, EpisodeResult)]
+            if not scores:
+                raise
+            mean = format_with_error(sum(scores) / len(scores), standard_error(scores))
+            raise StoppedError(f"interrupted after {len(scores)} of {plural(len(seeds), 'episode')}: {mean}") from None
 
 
 class _Driver:

@@ -6,7 +6,6 @@ import argparse
 from pathlib import Path
 
 from dreamfleet.common.artifacts.world_facts import EndRule
-from dreamfleet.common.cli.model_commands import use_bundle
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path
@@ -75,6 +74,11 @@ def make_request(args: argparse.Namespace) -> BundleRequest:
     return BundleRequest(
         args.data, args.out, bool(args.with_weights), recorded, tuple(args.measured), args.reward, args.end
     )
+
+
+def use_bundle(path: Path) -> tuple[tuple[object, ...], tuple[object, ...]]:
+    """What to do with a world model: look into it, and evolve in it; the coordinator says how a worker joins."""
+    return ("inspect", path), ("coordinator", "--run", "mine", "--bundle", path)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
 from dreamfleet.common.cli.key_values import ENVIRONMENT_EXAMPLE, parse_arguments
-from dreamfleet.common.cli.model_commands import Words, options
 from dreamfleet.common.cli.output import print_next
-from dreamfleet.common.errors import StoppedError, UsageError
+from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, open_output
 from dreamfleet.common.host.resource_limits import pin_thread_pools, usable_cores
-from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.seeds import TEST
 
 if TYPE_CHECKING:
-    from dreamfleet.common.runs.evaluation_report import EvaluationReport
     from dreamfleet.worker.scoring.agents import Agent
-    from dreamfleet.worker.tools.evaluation import Episode
 
 SUMMARY = "judge a controller on unseen seeds, in whole episodes of the world itself"
 EXTRAS = ("worker",)
@@ -80,17 +77,19 @@ def named_agent(args: argparse.Namespace) -> Agent:
     return agent
 
 
-def agent_flags(args: argparse.Namespace) -> Words:
+def agent_flags(args: argparse.Namespace) -> tuple[object, ...]:
     """The flags of the same agent for `evaluate` and `record`."""
     runs_dir = args.runs_dir if "runs_dir" in getattr(args, "given", ()) else None
-    found = options(controller=args.controller, bundle=args.bundle, task=args.task, runs_dir=runs_dir)
-    return (*found, "--environment", *args.environment) if args.environment else found
+    values = {"controller": args.controller, "bundle": args.bundle, "task": args.task, "runs-dir": runs_dir}
+    found = (word for name, value in values.items() if value is not None for word in (f"--{name}", value))
+    return (*found, *(("--environment", *args.environment) if args.environment else ()))
 
 
 def run(args: argparse.Namespace) -> int:
     """Drive, and print the scores."""
     pin_thread_pools()  # of NumPy, which is not loaded yet: its threads take three times the time of a drive otherwise
     from dreamfleet.common.runs.evaluation_report import check_seed_range
+    from dreamfleet.worker.tools.evaluation import judge
 
     if args.episodes < 1 or args.first_seed < 0 or args.jobs < 1:
         raise UsageError("--episodes and --jobs must be at least 1, --first-seed at least 0")
@@ -99,10 +98,11 @@ def run(args: argparse.Namespace) -> int:
         check_output_path(args.out)
     name, agent = _choose_agent(args)
     seeds = tuple(range(args.first_seed, args.first_seed + args.episodes))
+    note = partial(print, file=sys.stderr)
     if seeds[0] not in TEST or seeds[-1] not in TEST:
         some = "some" if seeds[0] < TEST.stop and seeds[-1] >= TEST.start else "none"
-        print(f"note: test seeds are {TEST.start} to {TEST.stop - 1}; {some} of these are among them", file=sys.stderr)
-    judgement = judge(name, agent, seeds, args.jobs)
+        note(f"note: test seeds are {TEST.start} to {TEST.stop - 1}; {some} of these are among them")
+    judgement = judge(name, agent, seeds, args.jobs, note)
     print(judgement.to_json() if args.json else judgement.describe(agent.world.score_word), flush=True)
     if args.out:
         with open_output(args.out) as file:
@@ -110,32 +110,6 @@ def run(args: argparse.Namespace) -> int:
     if args.controller and args.cell is None:  # a live run's controller, and a cell's, are no file here
         print_next(args, ("record", *agent_flags(args)))
     return 0
-
-
-def judge(name: str, agent: Agent, seeds: tuple[int, ...], jobs: int) -> EvaluationReport:
-    """Drive one whole episode per seed, with a progress bar and a line on stderr for each that fails."""
-    from dreamfleet.common.cli.progress import progress_bar
-    from dreamfleet.common.runs.episode_results import EpisodeResult
-    from dreamfleet.common.runs.standard_error import format_with_error, standard_error
-    from dreamfleet.worker.tools.evaluation import run_evaluation
-
-    def move(episodes: list[Episode]) -> None:
-        so_far[:] = episodes
-        scores = [each.score for each in episodes if isinstance(each, EpisodeResult)]
-        bar.update(len(episodes), f"mean {format_with_error(sum(scores) / len(scores), None)}" if scores else "")
-        if not isinstance(last := episodes[-1], EpisodeResult):
-            print(f"an episode failed: {last}", file=sys.stderr)
-
-    so_far: list[Episode] = []
-    with progress_bar("evaluate", len(seeds), "episodes") as bar:
-        try:
-            return run_evaluation(name, agent, seeds, jobs, move)
-        except KeyboardInterrupt:
-            scores = [each.score for each in so_far if isinstance(each, EpisodeResult)]
-            if not scores:
-                raise
-            mean = format_with_error(sum(scores) / len(scores), standard_error(scores))
-            raise StoppedError(f"interrupted after {len(scores)} of {plural(len(seeds), 'episode')}: {mean}") from None
 
 
 def _choose_agent(args: argparse.Namespace) -> tuple[str, Agent]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -52,10 +54,11 @@ def run(args: argparse.Namespace) -> int:
 def _reproduce(args: argparse.Namespace, path: Path, recorded: EvaluationReport) -> Reproduction:
     """Drive one report's controller again."""
     from dreamfleet.common.runs.reproduction import Reproduction
-    from dreamfleet.worker.verbs.evaluate import judge
+    from dreamfleet.worker.tools.evaluation import judge
 
     agent = _find_recorded_agent(args, path, recorded)
-    again = judge(recorded.name, agent, recorded.results.seeds[: args.episodes], args.jobs)
+    seeds, note = recorded.results.seeds[: args.episodes], partial(print, file=sys.stderr)
+    again = judge(recorded.name, agent, seeds, args.jobs, note)
     return Reproduction(recorded, again)
 
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from dreamfleet.common.cli.model_commands import Words, split_flags, with_settings
 from dreamfleet.common.cli.presets import default_run_preset
 from dreamfleet.common.errors import UsageError
+from dreamfleet.experiments.command_lines import Words, split_flags
 from dreamfleet.experiments.iteration.config import RESERVED_FLAGS
 
 # Equal parameters: 422,625 and 421,277 of 32 latents and three actions.
@@ -85,22 +85,11 @@ class Contrast:
         differing: list[str] = [
             name for name in ("mdnrnn_flags", "run_flags") if name in kept and kept[name] != mine[name]
         ]
-        differing += [
-            f"kind {name}" for name, flags in known.items() if _settings(kinds.get(name, flags)) != _settings(flags)
-        ]
+        differing += [f"kind {name}" for name, flags in known.items() if kinds.get(name, flags) != flags]
         if differing:
             raise UsageError(f"it was begun with other {', '.join(differing)}: omit that, or begin in another --out")
         seeds = tuple(dict.fromkeys((*kept.get("seeds", ()), *self.seeds)))
         return {**mine, "kinds": tuple((known | kinds).items()), "seeds": seeds}
-
-
-def _settings(flags: str) -> Words:
-    """What a kind's flags set, in whichever of their two forms.
-
-    >>> _settings("--window 8 --hidden 236") == _settings("--set window=8 hidden=236")
-    True
-    """
-    return tuple(word for word in with_settings(split_flags("--kind", flags)) if word != "--set")
 
 
 def parse_kinds(given: Sequence[Sequence[str]]) -> tuple[tuple[str, str], ...]:

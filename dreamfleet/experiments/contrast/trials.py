@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.cli import model_commands
-from dreamfleet.common.cli.model_commands import Words
 from dreamfleet.common.cli.presets import default_run_preset
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write
@@ -18,10 +16,15 @@ from dreamfleet.common.files.regular_files import is_folder, path_exists, read_t
 from dreamfleet.common.host.stop_signals import Stop
 from dreamfleet.common.runs.records import best_evaluation
 from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.experiments import command_lines
+from dreamfleet.experiments.command_lines import Words
 from dreamfleet.experiments.contrast.config import Contrast, Trial
 from dreamfleet.experiments.contrast.summary import TrialResult
+from dreamfleet.experiments.isolated import run_isolated
 from dreamfleet.experiments.local_run import LocalFleet, evolve, has_begun, has_ended, task_flags
-from dreamfleet.experiments.verb_runner import ProcessRunner
+from dreamfleet.experiments.stage_flags import read_training
+from dreamfleet.worker.training.stages.bundle import BundleRequest, build_bundle
+from dreamfleet.worker.training.stages.train import TrainRequest, summarise, train_model
 
 # Parts of the data set that trials link to. Its preset is none: a kind's flags change the preset of its world.
 SHARED = ("episodes", "encoded", "vae.safetensors")
@@ -37,7 +40,7 @@ class Trials:
         self, contrast: Contrast, data: Path, folder: Path, local_fleet: Callable[[], LocalFleet], stop: Stop
     ) -> None:
         self._contrast, self._data, self._folder = contrast, data, folder
-        self._local_fleet, self._stop, self._runner = local_fleet, stop, ProcessRunner(stop)
+        self._local_fleet, self._stop = local_fleet, stop
         self._runs = folder / "runs"
         self._parameters: dict[Trial, int] = {}
 
@@ -62,10 +65,10 @@ class Trials:
         model = self._model_path(trial)
         if not path_exists(model):
             on_step(f"{trial.name}: train mdnrnn")
-            self._runner.run_for_json(self._training_command(trial), self._log_path(trial, "mdnrnn"))
+            run_isolated(train_model, self._training(trial), self._log_path(trial, "mdnrnn"), self._stop)
             on_step(f"{trial.name}: bundle")
-            words = model_commands.bundle(self._trial_folder(trial), model)
-            self._runner.run_for_json(words, self._log_path(trial, "bundle"))
+            request = BundleRequest(self._trial_folder(trial), model)
+            run_isolated(build_bundle, request, self._log_path(trial, "bundle"), self._stop)
         if not has_ended(self._runs, trial.name):
             local_fleet = self._local_fleet()
             world = Bundle.open(model).manifest.task
@@ -78,8 +81,8 @@ class Trials:
     def _count_parameters(self, trial: Trial) -> int:
         """How many parameters its model has; `UsageError` for wrong training flags."""
         self._link_data(trial)
-        words = (*self._training_command(trial), "--summary")
-        return int(self._runner.run_for_json(words, self._log_path(trial, "summary"))["parameters"])
+        log = self._log_path(trial, "summary")
+        return run_isolated(summarise, self._training(trial), log, self._stop).parameters
 
     def _trial_folder(self, trial: Trial) -> Path:
         return self._folder / trial.name
@@ -99,15 +102,14 @@ class Trials:
             if source.exists() and not path_exists(folder / name):
                 (folder / name).symlink_to(source, target_is_directory=is_folder(source))
 
-    def _training_command(self, trial: Trial) -> Words:
-        return model_commands.train(
-            "mdnrnn", self._trial_folder(trial), *self._contrast.training_flags(trial), seed=trial.seed
-        )
+    def _training(self, trial: Trial) -> TrainRequest:
+        flags = self._contrast.training_flags(trial)
+        return read_training("mdnrnn", self._trial_folder(trial), trial.seed, *flags)
 
     def _run_command(self, trial: Trial, local_fleet: LocalFleet, world: str) -> Words:
         if has_begun(self._runs, trial.name):
-            return model_commands.resume_run(trial.name, self._runs, local_fleet.listen)
-        return model_commands.begin_run(
+            return command_lines.resume_run(trial.name, self._runs, local_fleet.listen)
+        return command_lines.begin_run(
             trial.name, self._runs, local_fleet.listen, *local_fleet.coordinator, *self._contrast.run_flags_in(world),
             world_model=self._model_path(trial), seed=trial.seed,
         )  # fmt: skip

@@ -7,9 +7,9 @@ from typing import Literal
 
 from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli.config import option
-from dreamfleet.common.cli.model_commands import WORLD_FLAGS, Words, split_flags, world_flags
 from dreamfleet.common.cli.presets import NAMES, check_preset, default_training_preset
 from dreamfleet.common.errors import UsageError
+from dreamfleet.experiments.command_lines import Words, split_flags
 
 # They change no round that is finished, nor what it means; what `--run-flags` lead to is compared instead of them.
 CHANGEABLE = frozenset({"rounds", "local", "jobs", "device", "run_flags"})
@@ -26,6 +26,8 @@ RESERVED_FLAGS = (
     "--summary",
     "--json",
     "--out",
+    "--extract",
+    "--from",
 )
 SURVIVAL_EPISODES = 40
 LEAST = {
@@ -129,11 +131,6 @@ class IterateConfig:
     def survival_episodes(self) -> int:
         """Episodes of each policy by which a gate measures survival; 0: it does not."""
         return (SURVIVAL_EPISODES if self.task else 0) if self.gate_lives is None else self.gate_lives
-
-    @property
-    def world_flags(self) -> Words:
-        """The flags of `collect` that say which world the data are of."""
-        return world_flags({name: getattr(self, name) for name in WORLD_FLAGS})
 
     def is_from_scratch(self, number: int) -> bool:
         """Whether a round has nothing before it: no world model, no controller."""

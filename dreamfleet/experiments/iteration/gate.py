@@ -65,39 +65,38 @@ def judge(old: Figures, new: Figures) -> GateDecision:
 
 
 def figures(measured: Mapping[str, Any]) -> dict[str, Figure | None]:
-    """The figures of a model from the answers of `inspect --probe`, `--losses` and `--survival`, where it has them."""
+    """The figures of a model from what was measured of it: its probe, losses and survival, where it has them."""
     found = {KNOWS: knows(measured.get("probe")), LOSES: loses(measured.get("losses"))}
     return {**found, SURVIVES: survives(measured["survival"])} if "survival" in measured else found
 
 
-def knows(probe: Mapping[str, Any] | None) -> Figure | None:
-    """Of `inspect --probe --json`; a quantity below 0 is not known. The error is the mean, as if all erred together."""
-    if not probe or "probe" not in probe:
+def knows(probe: Any | None) -> Figure | None:
+    """Of a `Knowledge`; a quantity below 0 is not known. The error is the mean, as if all erred together."""
+    if probe is None:
         return None
-    known = [each["found"]["zh_linear"] for each in probe["probe"]["known"]]
-    found = [Figure(**each) if each["value"] > 0 else NOTHING for each in known]
+    known = [each.found["zh_linear"] for each in probe.known]
+    found = [Figure(each.value, each.error) if each.value > 0 else NOTHING for each in known]
     return Figure(_mean(each.value for each in found), _mean(each.error for each in found))
 
 
-def loses(losses: Mapping[str, Any] | None) -> Figure | None:
-    """Of `inspect --losses --json`: of the dreams that begin furthest before a loss; `None` without calm ones.
+def loses(losses: Any | None) -> Figure | None:
+    """Of a `LossReport`: of the dreams that begin furthest before a loss; `None` without calm ones.
 
     One beginning of a kind has no standard error, so that it decides nothing: `None` too.
     """
-    if not losses or "losses" not in losses:
+    if losses is None:
         return None
-    begun = {each["begun"]: each["figures"]["lost"]["dream"] for each in losses["losses"]["begun"]}
+    begun = {each.begun: each.figures["lost"]["dream"] for each in losses.begun}
     before = next((each for name, each in begun.items() if name != CALM), None)
-    if before is None or CALM not in begun:
+    if before is None or CALM not in begun or None in (before.error, begun[CALM].error):
         return None
-    errors = before["error"], begun[CALM]["error"]
-    return None if None in errors else Figure(before["value"] - begun[CALM]["value"], math.hypot(*errors))
+    return Figure(before.value - begun[CALM].value, math.hypot(before.error, begun[CALM].error))
 
 
-def survives(survival: Mapping[str, Any]) -> Figure | None:
-    """Of `inspect --survival --json`; `None` of one episode, which has no standard error."""
-    found = survival.get("survival", {}).get("agreement")
-    return None if found is None or found["error"] is None else Figure(**found)
+def survives(survival: Any | None) -> Figure | None:
+    """Of a `Survival`; `None` of one episode, which has no standard error."""
+    found = survival and survival.agreement
+    return None if found is None or found.error is None else Figure(found.value, found.error)
 
 
 def _mean(values: Iterable[float]) -> float:

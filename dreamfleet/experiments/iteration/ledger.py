@@ -1,4 +1,4 @@
-"""The finished phases of an iteration, in one file: files made, figures, commands and seed of each."""
+"""The finished phases of an iteration, in one file: files made, figures, requests and seed of each."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class FinishedPhase:
     seed: int
     seconds: float
     at: str
-    commands: tuple[tuple[str, ...], ...] = ()
+    requests: tuple[dict[str, Any], ...] = ()
     figures: dict[str, Any] = field(default_factory=dict)
     made: tuple[Artefact, ...] = ()
 
@@ -153,6 +153,13 @@ class IterationLedger:
             return None
         except (OSError, ValueError, TypeError, RecursionError, MalformedError, UsageError) as error:
             raise DatasetError(f"{path} is damaged ({error}); put it back from a copy") from error
+
+
+def as_data(request: Any) -> dict[str, Any]:
+    """What a phase asked for: the fields of a request, or the words of a coordinator's command."""
+    if isinstance(request, tuple):
+        return {"command": list(request)}
+    return {"request": type(request).__name__, **_plain(asdict(request))}
 
 
 def _check(entry: FinishedPhase) -> None:

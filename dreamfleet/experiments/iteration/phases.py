@@ -1,4 +1,4 @@
-"""Run a phase: its verbs, then its figures and files. A killed phase resumes to the same end."""
+"""Run a phase: its stages, then its figures and files. A killed phase resumes to the same end."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.bundle import SINGLE_PRECISION, WEIGHTS, Bundle
 from dreamfleet.common.artifacts.bundle_store import describe_bundle
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.cli.model_commands import Model, Words
+from dreamfleet.common.cli.add_ons import add_on
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import path_exists
@@ -25,8 +25,8 @@ from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
 from dreamfleet.common.runs.records import StoredEvaluation, best_evaluation
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import BUNDLE as RUN_BUNDLE
+from dreamfleet.experiments.command_lines import Words
 from dreamfleet.experiments.iteration import artefacts, gate
-from dreamfleet.experiments.iteration.commands import Commands
 from dreamfleet.experiments.iteration.layout import ENCODED, EPISODES
 from dreamfleet.experiments.iteration.plan import (
     BUNDLE,
@@ -41,29 +41,44 @@ from dreamfleet.experiments.iteration.plan import (
     VAE,
     Phase,
 )
+from dreamfleet.experiments.iteration.requests import Requests
 from dreamfleet.experiments.local_run import LocalFleet, evolve, has_begun, has_ended
+from dreamfleet.worker.training.stages.bundle import ExtractRequest, build_bundle, extract_models
+from dreamfleet.worker.training.stages.collect import CollectReport, collect_drives, import_kept
+from dreamfleet.worker.training.stages.encode import EncodeRequest, encode_drives
+from dreamfleet.worker.training.stages.refit import refit_controller
+from dreamfleet.worker.training.stages.subspace import fit_subspace
+from dreamfleet.worker.training.stages.train import MODELS, Model, summarise, train_model
 
 log = logging.getLogger("dreamfleet.coordinator.iterate")
 
 
+Request = TypeVar("Request")
+Report = TypeVar("Report")
+
+
+class RunStage(Protocol):
+    """Runs a stage to its end in a process of its own, which logs to a file."""
+
+    def __call__(self, function: Callable[[Request, Stop], Report], request: Request, log: Path) -> Report:
+        """The stage's report; its errors."""
+
+
 @dataclass(frozen=True)
 class PhaseResult:
-    """The commands that a phase ran, its figures, and the files that it made."""
+    """What a phase asked for, its figures, and the files that it made."""
 
-    commands: tuple[Words, ...] = ()
+    requests: tuple[Any, ...] = ()
     figures: dict[str, Any] | None = None
     made: tuple[Path, ...] = ()
 
 
 class PhaseRunner:
-    """Runs phases of an iteration; `commands` knows what is finished."""
+    """Runs phases of an iteration; `requests` knows what is finished."""
 
-    def __init__(
-        self, commands: Commands, local_fleet: Callable[[], LocalFleet], ask: Callable[[Words, Path], Any], stop: Stop
-    ):
-        """`ask` runs a verb to its end, logging to a path, and returns its JSON answer."""
-        self._commands, self._local_fleet, self._ask, self._stop = commands, local_fleet, ask, stop
-        self._layout, self._ledger, self._config = commands.layout, commands.ledger, commands.config
+    def __init__(self, requests: Requests, local_fleet: Callable[[], LocalFleet], run: RunStage, stop: Stop):
+        self._requests, self._local_fleet, self._run, self._stop = requests, local_fleet, run, stop
+        self._layout, self._ledger, self._config = requests.layout, requests.ledger, requests.config
 
     def do(self, phase: Phase) -> PhaseResult:
         """Run a phase, or what is left of it."""
@@ -84,39 +99,42 @@ class PhaseRunner:
             if not path_exists(folder / name):
                 (folder / name).symlink_to(Path("..", "..", name), target_is_directory=True)
 
-    def _call(self, number: int, name: str, words: Words) -> Any:
-        return self._ask(words, self._layout.log(number, name))
+    def _call(self, number: int, name: str, stage: Callable[[Request, Stop], Report], request: Request) -> Report:
+        return self._run(stage, request, self._layout.log(number, name))
 
     def _init(self, number: int) -> PhaseResult:
         """Copy `--init`'s controller and world model, and write the checkpoints that training continues from."""
-        layout, words = self._layout, self._commands.unbundle()
+        layout = self._layout
+        request = ExtractRequest(str(layout.bundle(number)), layout.round(number))
         controller, bundle = find_init(self._config.init, layout.runs)
         checkpoints = [layout.checkpoint(number, model) for model in (VAE, MDNRNN)]
         for path in checkpoints:  # of an attempt that was killed
             path.unlink(missing_ok=True)
         _copy(bundle.path, layout.bundle(number))
-        self._call(number, INIT, words)
-        for tried in self._commands.check_trainings():
-            self._call(number, INIT, tried)
+        self._call(number, INIT, extract_models, request)
+        for model in MODELS:
+            self._call(number, INIT, summarise, self._requests.train(1, model))
         controller.save(layout.optimum(number))
         pilots = self._save_pilots(controller, [controller.parameters], layout.means(number), layout.bundle(number))
         figures = {"sha256": bundle.sha256, "controller": self._config.init}
-        return PhaseResult((words,), figures, (layout.bundle(number), *checkpoints, layout.optimum(number), *pilots))
+        return PhaseResult((request,), figures, (layout.bundle(number), *checkpoints, layout.optimum(number), *pilots))
 
     def _collect(self, number: int) -> PhaseResult:
-        return self._drives(number, COLLECT, self._commands.collect(number))
+        return self._drives(number, COLLECT, collect_drives, self._requests.collect(number))
 
     def _import_kept(self, number: int) -> PhaseResult:
-        return self._drives(number, TAKE, self._commands.import_kept(number))
+        return self._drives(number, TAKE, import_kept, self._requests.import_kept(number))
 
     def _drive(self, number: int) -> PhaseResult:
         pilots = sorted(self._layout.means(number - 1).glob("[0-9]*.npz"))
-        return self._drives(number, DRIVE, self._commands.drive(pilots))
+        return self._drives(number, DRIVE, collect_drives, self._requests.drive(pilots))
 
-    def _drives(self, number: int, name: str, words: Words) -> PhaseResult:
-        answer, known = self._call(number, name, words), self._ledger.files
+    def _drives(
+        self, number: int, name: str, stage: Callable[[Request, Stop], CollectReport], request: Request
+    ) -> PhaseResult:
+        report, known = self._call(number, name, stage, request), self._ledger.files
         new = [path for path in artefacts.drive_files(self._layout) if self._layout.relative(path) not in known]
-        return PhaseResult((words,), {"episodes": answer["episodes"], "new": len(new)}, tuple(new))
+        return PhaseResult((request,), {"episodes": report.episodes, "new": len(new)}, tuple(new))
 
     def _vae(self, number: int) -> PhaseResult:
         if self._config.is_from_scratch(number) or self._config.vae != "keep":
@@ -130,59 +148,63 @@ class PhaseRunner:
         return self._train(number, MDNRNN)
 
     def _train(self, number: int, model: Model) -> PhaseResult:
-        words = self._commands.train(number, model)
-        return PhaseResult((words,), self._call(number, model, words), (self._layout.checkpoint(number, model),))
+        request = self._requests.train(number, model)
+        report = self._call(number, model, train_model, request)
+        return PhaseResult((request,), report.facts, (self._layout.checkpoint(number, model),))
 
     def _encode(self, number: int) -> PhaseResult:
-        words = self._commands.encode(number)
-        self._call(number, ENCODE, words)
-        return PhaseResult((words,))
+        request = EncodeRequest(self._layout.round(number))
+        self._call(number, ENCODE, encode_drives, request)
+        return PhaseResult((request,))
 
     def _bundle(self, number: int) -> PhaseResult:
         self._encode(number)  # as before the training: recorded states need latents too
-        words = self._commands.bundle(number)
-        answer = self._call(number, BUNDLE, words)
-        provenance = Bundle.open(self._layout.bundle(number)).manifest.provenance
+        request = self._requests.bundle(number)
+        report = self._call(number, BUNDLE, build_bundle, request)
+        provenance = Bundle.open(report.bundle).manifest.provenance
         facts = {name: provenance[name] for name in ("frames", "quality")}
-        return PhaseResult((words,), {"sha256": answer["sha256"], **facts}, (self._layout.bundle(number),))
+        return PhaseResult((request,), {"sha256": report.sha256, **facts}, (report.bundle,))
 
     def _gate(self, number: int) -> PhaseResult:
         refitted, gate_file = self._layout.refitted(number), self._layout.gate_file(number)
-        commands = self._commands.gate(number)
-        fitting = self._commands.refit(number, refitted) if self._config.gate_losses else ()
-        unfitted = self._refit(number, fitting) if fitting else {}
-        if unfitted:
-            del commands["new"]["losses"]
-        answers = {side: {what: self._measure(number, f"{side}-{what}", words) for what, words in each.items()}
-                for side, each in commands.items()}  # fmt: skip
-        if unfitted:
-            answers["new"]["losses"] = unfitted
-        _write_json(gate_file, answers)
-        figures = {side: gate.figures(each) for side, each in answers.items()}
+        asked, measured = self._requests.gate(number), dict[str, dict[str, Any]]()
+        fitting = (self._requests.refit(number, refitted),) if self._config.gate_losses else ()
+        unfitted = fitting and self._try(number, "gate-refit", refit_controller, fitting[0])[1]
+        for side, requests in asked.items():
+            measured[side] = {}
+            for what, request in requests.items():
+                if (side, what) == ("new", "losses") and unfitted:
+                    found: tuple[Any, str] = (None, unfitted)
+                else:
+                    found = self._try(number, f"gate-{side}-{what}", add_on("measure"), request)
+                measured[side][what] = found
+        plain = {
+            side: {what: report.facts if report else {"failed": why} for what, (report, why) in each.items()}
+            for side, each in measured.items()
+        }
+        _write_json(gate_file, plain)
+        figures = {
+            side: gate.figures({what: report and report.found[what] for what, (report, _) in each.items()})
+            for side, each in measured.items()
+        }
         verdict = gate.judge(figures["old"], figures["new"])
-        plain = {side: {name: each and asdict(each) for name, each in found.items()} for side, found in figures.items()}
-        words = tuple(words for each in commands.values() for words in each.values())
+        known = {side: {name: each and asdict(each) for name, each in found.items()} for side, found in figures.items()}
+        every = (request for each in asked.values() for request in each.values())
         made = (refitted, gate_file) if fitting and not unfitted else (gate_file,)
-        return PhaseResult((fitting, *words) if fitting else words, {**plain, **asdict(verdict)}, made)
+        return PhaseResult((*fitting, *every), {**known, **asdict(verdict)}, made)
 
-    def _refit(self, number: int, words: Words) -> dict[str, Any]:
-        """Refit the last optimum to the new model; empty, or why that failed."""
+    def _try(
+        self, number: int, name: str, stage: Callable[[Request, Stop], Report], request: Request
+    ) -> tuple[Report | None, str]:
+        """A stage's report, or why it has none: drives may lose too few roads, or all at once."""
         try:
-            self._call(number, "gate-refit", words)
+            return self._call(number, name, stage, request), ""
         except UsageError as error:
-            return {"failed": str(error)}
-        return {}
-
-    def _measure(self, number: int, name: str, words: Words) -> dict[str, Any]:
-        """The answer of `inspect`, or why it has none: drives may lose too few roads, or all at once."""
-        try:
-            return dict(self._call(number, f"gate-{name}", words))
-        except UsageError as error:
-            return {"failed": str(error)}
+            return None, str(error)
 
     def _evolve(self, number: int) -> PhaseResult:
         layout, name = self._layout, self._layout.run_name(number)
-        words: tuple[Words, ...] = ()
+        words: tuple[Any, ...] = ()
         if not has_ended(layout.runs, name):
             local_fleet = self._local_fleet()
             log.info("run %s is reached at %s", name, ", ".join(local_fleet.listen))
@@ -196,13 +218,13 @@ class PhaseRunner:
 
     def _run_command(self, number: int, local_fleet: LocalFleet) -> Words:
         if has_begun(self._layout.runs, self._layout.run_name(number)):
-            return self._commands.resume_run(number, local_fleet.listen, local_fleet.security)
+            return self._requests.resume_run(number, local_fleet.listen, local_fleet.security)
         start, subspace = None, None
         if self._config.go_on and not self._config.is_from_scratch(number):
             start = self._layout.start(number)
             self._write_start(number, start)
             subspace = self._find_subspace(number) if self._config.subspace else None
-        return self._commands.begin_run(
+        return self._requests.begin_run(
             number, local_fleet.listen, (*local_fleet.coordinator, *local_fleet.security), start, subspace
         )
 
@@ -210,7 +232,7 @@ class PhaseRunner:
         """The subspace that a round searches; None if its model predicts nothing of the last drives."""
         path = self._layout.subspace(number)
         try:
-            self._call(number, "subspace", self._commands.subspace(number, path))
+            self._call(number, "subspace", fit_subspace, self._requests.subspace(number, path))
         except UsageError as error:
             log.warning("round %d searches all parameters: %s", number, error)
             return None
@@ -224,7 +246,7 @@ class PhaseRunner:
         elif path_exists(layout.refitted(number)):
             shutil.copyfile(layout.refitted(number), path)
         else:
-            self._call(number, "refit", self._commands.refit(number, path))
+            self._call(number, "refit", refit_controller, self._requests.refit(number, path))
 
     def _pilots(self, run: RunFolder, folder: Path) -> tuple[list[Path], list[int]]:
         """Save the means that drive for the next round, beside a link to their world model; paths and generations."""

@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from functools import partial
-from pathlib import Path
-from typing import Any
 
-from dreamfleet.common.cli.command_line import parse_flags
-from dreamfleet.common.cli.model_commands import MODELS, Model, Words
 from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
 from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.host.stop_signals import Stop
+from dreamfleet.experiments.command_lines import Words
+from dreamfleet.experiments.isolated import run_isolated
 from dreamfleet.experiments.iteration import artefacts
-from dreamfleet.experiments.iteration.commands import Commands
 from dreamfleet.experiments.iteration.config import IterateConfig
 from dreamfleet.experiments.iteration.layout import IterationFolder
-from dreamfleet.experiments.iteration.ledger import FinishedPhase, IterationLedger
+from dreamfleet.experiments.iteration.ledger import FinishedPhase, IterationLedger, as_data
 from dreamfleet.experiments.iteration.phases import PhaseRunner
 from dreamfleet.experiments.iteration.plan import Phase, PhasePlan
+from dreamfleet.experiments.iteration.requests import Requests
 from dreamfleet.experiments.local_run import LocalFleet
-from dreamfleet.experiments.verb_runner import ProcessRunner, find_verb
-
-log = logging.getLogger("dreamfleet.coordinator.iterate")
+from dreamfleet.worker.training.stages.train import MODELS, Model, summarise
 
 
 class Iteration:
@@ -45,7 +40,6 @@ class Iteration:
         self.ledger = ledger
         self._resume_command = shell_command("iterate", "--data", layout.root, *network_flags)
         self._layout, self._config, self._local_fleet, self._stop = layout, config, local_fleet, stop
-        self._runner = ProcessRunner(stop)
         self._plan = PhasePlan(config, bool(ledger.run.get("collect_every")))
 
     def redo(self, phase: Phase) -> None:
@@ -60,14 +54,14 @@ class Iteration:
         With `init` the first phase checks the flags, because they must fit the model that is there. Those of another
         world than the first are checked once there are data of it, which presets must fit.
         """
-        commands = Commands(self._config, self._layout, self.ledger)
-        parse_flags(*find_verb(commands.bundle(1)))
+        requests = Requests(self._config, self._layout, self.ledger)
+        requests.bundle(1)  # reads them
         artefacts.check(self._layout, self.ledger)
         if self.ledger.entries or self._config.init or self._config.task:
             return
         for model in MODELS:
             if getattr(self._config, f"{model}_flags"):
-                self._check_flags(commands.check_training(model), model)
+                self._check_flags(requests, model)
 
     def run_remaining(
         self,
@@ -87,13 +81,14 @@ class Iteration:
             on_finished(entry)
 
     def _run_phase(self, phase: Phase, on_line: Callable[[str], None]) -> FinishedPhase:
-        commands, begun = Commands(self._config, self._layout, self.ledger), time.monotonic()
+        requests, begun = Requests(self._config, self._layout, self.ledger), time.monotonic()
         with self._explain_errors(phase):
-            done = PhaseRunner(commands, self._local_fleet, partial(self._ask, on_line), self._stop).do(phase)
+            run = partial(run_isolated, stop=self._stop, on_line=on_line)
+            done = PhaseRunner(requests, self._local_fleet, run, self._stop).do(phase)
             made = artefacts.hash_artefacts(self._layout, done.made)
         seconds, at = round(time.monotonic() - begun, 1), datetime.now(UTC).isoformat(timespec="seconds")
-        seed = commands.seed(phase)
-        return FinishedPhase(phase.round, phase.name, seed, seconds, at, done.commands, done.figures or {}, made)
+        asked, seed = tuple(map(as_data, done.requests)), requests.seed(phase)
+        return FinishedPhase(phase.round, phase.name, seed, seconds, at, asked, done.figures or {}, made)
 
     @contextmanager
     def _explain_errors(self, phase: Phase) -> Iterator[None]:
@@ -107,12 +102,9 @@ class Iteration:
         except DreamfleetError as error:
             raise type(error)(f"{phase}: {error}") from error
 
-    def _ask(self, on_line: Callable[[str], None], words: Words, path: Path) -> Any:
-        log.debug("dreamfleet %s", " ".join(words))
-        return self._runner.run_for_json(words, path, on_line)
-
-    def _check_flags(self, words: Words, model: Model) -> None:
+    def _check_flags(self, requests: Requests, model: Model) -> None:
+        """Check flags and layers of the first round's training, of which nothing is trained."""
         try:
-            self._runner.run(words, self._layout.root / "logs" / f"{model}.log")
+            run_isolated(summarise, requests.train(1, model), self._layout.root / "logs" / f"{model}.log", self._stop)
         except UsageError as error:
             raise UsageError(f"--{model}-flags: {error}") from error

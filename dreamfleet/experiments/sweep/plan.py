@@ -10,10 +10,10 @@ from itertools import product
 from math import prod
 from typing import Any
 
-from dreamfleet.common.cli.model_commands import Words
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.keys import check_run_name
+from dreamfleet.experiments.command_lines import Words
 
 MOST_RUNS = 1000  # of one sweep
 _RANGE = re.compile(r"(-?\d+)\.\.(-?\d+)")

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from dreamfleet.common.cli.model_commands import Words, command
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, StoppedError
 from dreamfleet.common.host.child import PATIENCE
@@ -22,9 +21,11 @@ from dreamfleet.common.protocol.pause_kind import PauseKind
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.settings.environment_check import CHECKED
+from dreamfleet.experiments.command_lines import Words, command
 from dreamfleet.experiments.local_run import (
     ALONE,
     ANY_ADDRESS,
+    POLL_INTERVAL,
     START_SECONDS,
     has_begun,
     has_ended,
@@ -32,7 +33,6 @@ from dreamfleet.experiments.local_run import (
 )
 from dreamfleet.experiments.sweep.folder import SweepFolder
 from dreamfleet.experiments.sweep.plan import Sweep, SweepRun, staggered_share
-from dreamfleet.experiments.verb_runner import POLL_INTERVAL
 
 STATUS_INTERVAL = 2.0  # seconds between two looks at all runs
 RESTART_PAUSE = 5.0  # seconds of life after which a worker or router that was killed is started again

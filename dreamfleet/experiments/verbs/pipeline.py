@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.command_line import parse_flags
-from dreamfleet.common.cli.model_commands import split_flags, use_bundle
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
 from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.cli.world_flags import add_world_flags, world_arguments
@@ -18,10 +17,13 @@ from dreamfleet.common.files.atomic_write import check_output_path
 from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import stop_on_signals
+from dreamfleet.experiments.command_lines import split_flags
 from dreamfleet.experiments.pipeline import PipelineRequest, make_world_model
+from dreamfleet.experiments.stage_flags import read_bundle, read_training
 from dreamfleet.worker.training.stages import StageReport
 from dreamfleet.worker.training.stages.train import Model, TrainRequest
-from dreamfleet.worker.verbs import bundle, collect, train
+from dreamfleet.worker.verbs import collect
+from dreamfleet.worker.verbs.bundle import use_bundle
 
 if TYPE_CHECKING:
     from dreamfleet.worker.training.presets import TrainConfig
@@ -82,9 +84,8 @@ def make_request(args: argparse.Namespace) -> PipelineRequest:
     def training(model: Model, config: TrainConfig) -> TrainRequest:
         # Updates, and those between checks on held-out drives, by scale: so there are as many checks at any scale.
         amounts = ("--updates", scale(config.updates), "--set", f"validate_every={scale(config.validate_every)}")
-        words = (model, "--data", data, "--device", args.device, *amounts, *flags(model))
-        request = train.make_request(parse_flags("train", train, words))
-        return replace(request, preset=preset.name, settings={**request.settings, "seed": args.seed})
+        words = ("--device", args.device, *amounts, *flags(model))
+        return replace(read_training(model, data, args.seed, *words), preset=preset.name)
 
     episodes = scale(preset.collect.episodes, LEAST_DRIVES)
     words = ("--data", data, "--jobs", max(1, args.jobs), "--episodes", episodes, *flags("collect"))
@@ -92,7 +93,7 @@ def make_request(args: argparse.Namespace) -> PipelineRequest:
     driven = replace(driven, preset=preset.name, task=driven.task or args.task, world={**world, **driven.world},
                      settings={**driven.settings, "seed": args.seed})  # fmt: skip
     out = args.out or data / f"{preset.name}.zip"
-    made = bundle.make_request(parse_flags("bundle", bundle, ("--data", data, "--out", out, *flags("bundle"))))
+    made = read_bundle(data, out, *flags("bundle"))
     return PipelineRequest(driven, training("vae", preset.vae), training("mdnrnn", preset.mdnrnn), made, args.yes)
 
 

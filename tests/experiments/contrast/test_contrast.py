@@ -27,10 +27,10 @@ def test_the_two_kinds_that_ship_have_as_many_parameters():
 
 
 def test_kinds_take_turns_and_own_flags_come_last():
-    contrast = Contrast(seeds=(4, 5), mdnrnn_flags="--updates 9 --hidden 8")
+    contrast = Contrast(seeds=(4, 5), mdnrnn_flags="--updates 9 --set hidden=8")
     assert [each.name for each in contrast.trials] == ["plain-4", "attentive-4", "plain-5", "attentive-5"]
     words = contrast.training_flags(Trial("attentive", 5))
-    assert words == ("--updates", "9", "--hidden", "8", "--set", "window=8", "hidden=236")
+    assert words == ("--updates", "9", "--set", "hidden=8", "--set", "window=8", "hidden=236")
     for world, preset in (("car-racing", "dream"), ("takecover", "takecover"), ("gym:ALE/Pong-v5", "pixels")):
         assert contrast.run_flags_in(world) == ("--preset", preset, "--generations", "32")
 
@@ -59,8 +59,6 @@ def test_seeds_and_kinds_may_be_added_but_none_changed():
     kept = Contrast(seeds=(4,), kinds=(KINDS[0], wide)).merge_settings(asdict(Contrast()))
     assert kept["kinds"] == (*KINDS, wide), "one that is not asked for this time is not forgotten"
     assert kept["seeds"] == (1, 2, 3, 4)
-    former = ("attentive", "--window 8 --hidden 236")  # of folders that were begun before settings were keys of `--set`
-    assert Contrast().merge_settings({"kinds": (KINDS[0], former)})["kinds"] == KINDS
     with pytest.raises(UsageError, match="other kind attentive"):
         Contrast(kinds=(KINDS[0], ("attentive", "--window 4"))).merge_settings(kept)
     with pytest.raises(UsageError, match="other run_flags"):

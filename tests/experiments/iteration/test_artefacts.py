@@ -3,12 +3,14 @@
 import pytest
 
 from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.host.stop_signals import never_stop
 from dreamfleet.experiments.iteration import artefacts
-from dreamfleet.experiments.iteration.commands import Commands
 from dreamfleet.experiments.iteration.config import IterateConfig
 from dreamfleet.experiments.iteration.layout import IterationFolder
 from dreamfleet.experiments.iteration.phases import PhaseRunner
 from dreamfleet.experiments.iteration.plan import Phase, PhasePlan
+from dreamfleet.experiments.iteration.requests import Requests
+from dreamfleet.worker.training.stages.encode import encode_drives
 from tests.support.ledgers import entry, ledger
 
 
@@ -110,12 +112,12 @@ def test_random_drives_are_driven_again_only_where_they_are_damaged(layout, fini
 def test_latents_are_made_again_where_they_are_needed(layout, phase):
     asked = []
 
-    def ask(words, log):
-        asked.append(words)
-        if words[0] != "encode":
+    def run(stage, request, log):
+        asked.append(stage.__name__)
+        if stage is not encode_drives:
             raise DatasetError("enough")
 
-    commands = Commands(IterateConfig(), layout, ledger())
-    with pytest.raises(DatasetError, match="enough"):
-        PhaseRunner(commands, None, ask, lambda: False).do(Phase(1, phase))
-    assert [words[0] for words in asked] == ["encode", "bundle" if phase == "bundle" else "train"]
+    requests = Requests(IterateConfig(), layout, ledger())
+    with pytest.raises(DatasetError):
+        PhaseRunner(requests, None, run, never_stop).do(Phase(1, phase))
+    assert asked == ["encode_drives", "build_bundle" if phase == "bundle" else "train_model"]

@@ -3,6 +3,10 @@
 import pytest
 
 from dreamfleet.experiments.iteration.gate import KNOWS, LOSES, SURVIVES, Figure, figures, judge
+from dreamfleet.worker.addons.inspection.knowledge import Knowledge, KnownQuantity
+from dreamfleet.worker.addons.inspection.probe import Estimate
+from dreamfleet.worker.addons.inspection.road_losses import LossReport, RoadLossComparison
+from dreamfleet.worker.addons.inspection.survival import Survival
 
 
 def both(knows=(0.8, 0.01), loses=(0.1, 0.02)):
@@ -39,35 +43,36 @@ def test_what_could_not_be_measured_of_both_refuses_nothing():
 
 
 def known(value, error):
-    return {"quantity": "speed", "deviation": 1.0, "found": {"zh_linear": {"value": value, "error": error},
-                                                            "z_linear": {"value": 0.0, "error": 9.0}}}  # fmt: skip
+    return KnownQuantity("speed", 1.0, {"zh_linear": Estimate(value, error), "z_linear": Estimate(0.0, 9.0)})
 
 
-def begun(name, lost, error):
-    return {"begun": name, "count": 4, "figures": {"lost": {"dream": {"value": lost, "error": error}}}}
+def losses(*begun):
+    return LossReport(4, 8, 1.0, 10, tuple(RoadLossComparison(name, 4, {"lost": {"dream": Estimate(*lost)}})
+                                           for name, *lost in begun))  # fmt: skip
 
 
-def test_the_figures_are_those_that_inspect_answers():
-    probe = {"probe": {"known": [known(0.5, 0.1), known(0.7, 0.3), known(-9.0, 8.0)]}}
-    kinds = [begun("40 steps before", 0.4, 0.03), begun("at the loss", 0.9, 0.5), begun("no loss", 0.1, 0.04)]
-    found = figures({"probe": probe, "losses": {"losses": {"begun": kinds}}})
+def test_the_figures_are_of_what_was_measured():
+    probe = Knowledge(3, 90, (known(0.5, 0.1), known(0.7, 0.3), known(-9.0, 8.0)))
+    kinds = losses(("40 steps before", 0.4, 0.03), ("at the loss", 0.9, 0.5), ("no loss", 0.1, 0.04))
+    found = figures({"probe": probe, "losses": kinds})
     assert (found[KNOWS].value, found[KNOWS].error) == pytest.approx((0.4, 0.4 / 3))
     assert (found[LOSES].value, found[LOSES].error) == pytest.approx((0.3, 0.05))
 
 
 @pytest.mark.parametrize(
-    "losses",
-    [None, {"failed": "drives lost the road 0 times"}, {"losses": {"begun": [begun("40 steps before", 0.4, 0.1)]}},
-     {"losses": {"begun": [begun("no loss", 0.4, 0.1)]}}],
+    "found",
+    [None, losses(("40 steps before", 0.4, 0.1)), losses(("no loss", 0.4, 0.1)),
+     losses(("40 steps before", 0.4, None), ("no loss", 0.1, 0.04))],
 )  # fmt: skip
-def test_a_figure_without_both_kinds_of_beginnings_is_none(losses):
-    assert figures({"losses": losses}) == {KNOWS: None, LOSES: None}
+def test_a_figure_without_both_kinds_of_beginnings_or_errors_is_none(found):
+    assert figures({"losses": found}) == {KNOWS: None, LOSES: None}
 
 
 def test_a_model_whose_dreams_live_less_as_reality_does_is_refused():
-    answers = [{"survival": {"survival": {"agreement": {"value": value, "error": 0.01}}}} for value in (-0.1, -0.7)]
-    better, worse = (figures(each) for each in answers)
+    better, worse = (
+        figures({"survival": Survival(40, 1.0, 300, "drawn", (), Estimate(value, 0.01))}) for value in (-0.1, -0.7)
+    )
     assert better[SURVIVES] == Figure(-0.1, 0.01)
     assert judge(worse, better).kept
     assert judge(better, worse).why == "survives -0.10 ± 0.01 -> -0.70 ± 0.01: refused, clearly worse in survives"
-    assert figures({"survival": {"failed": "it predicts no ends"}})[SURVIVES] is None
+    assert figures({"survival": None})[SURVIVES] is None

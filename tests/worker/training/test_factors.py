@@ -1,7 +1,6 @@
 """Factors weight the parts of a loss; the default 1 is not serialised, and reported losses are unweighted.
 Tests worker/worldmodel/loss_factors.py."""
 
-import argparse
 import json
 from dataclasses import replace
 
@@ -10,20 +9,19 @@ import pytest
 import torch
 
 from dreamfleet.common.errors import DatasetError, UsageError
-from dreamfleet.experiments.iteration.config import IterateConfig
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble, make_manifest
 from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights
 from dreamfleet.worker.training.data.rollouts import load_rollouts
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.presets import TrainConfig
-from dreamfleet.worker.verbs import train as verb
+from dreamfleet.worker.training.stages.train import train_model
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae import VAE, PixelWeights
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.drives import write_drives
-from tests.support.phase_commands import commands
+from tests.support.phase_requests import requests
 
 LAYERS, RNN = VAEConfig(latent=4, channels=(4, 4, 8, 8)), MDNRNNConfig(latent=4, hidden=8, mixtures=2)
 SHORT = TrainConfig(updates=2, batch=8, rate=1e-3, validate_every=1)
@@ -142,12 +140,8 @@ def test_a_factor_that_weighs_nothing_or_all_is_refused(value):
 
 def test_flags_pass_through_an_iteration_to_the_training(trained, tmp_path):
     linked(trained, tmp_path, "episodes")
-    assert IterateConfig(vae_flags="--error-factor 4").vae_flags
-    words = commands(vae_flags="--error-factor 4").train(1, "vae")
-    parser = argparse.ArgumentParser()
-    verb.configure(parser)
-    given = [str(tmp_path) if word == "data/rounds/01" else word for word in words[1:]]
-    assert verb.run(parser.parse_args([*given, "--updates", "1", "--set", "channels=2,2,4,4"])) == 0
+    asked = requests(vae_flags="--updates 1 --set error_factor=4 channels=2,2,4,4").train(1, "vae")
+    train_model(replace(asked, data=tmp_path))
     assert load_config(tmp_path / train_vae.CHECKPOINT, VAEConfig).error_factor == 4.0
 
 

@@ -6,8 +6,8 @@ import pytest
 
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.cli.command_line import parse_flags
-from dreamfleet.experiments.verb_runner import find_verb
 from tests.support.drives import write_drives
+from tests.support.verbs import find_verb
 
 SHORT = {"train vae": ["--updates", "1"], "train mdnrnn": ["--updates", "1"], "bundle": ["--recorded", "0"]}
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.files.locks import folder_lock
@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from dreamfleet.worker.training.presets import TrainConfig
 
 Model = Literal["vae", "mdnrnn"]
-VAE, MDNRNN = MODELS = ("vae", "mdnrnn")
+VAE: Final = "vae"
+MDNRNN: Final = "mdnrnn"
+MODELS: tuple[Model, ...] = (VAE, MDNRNN)
 SPOKEN = {VAE: "VAE", MDNRNN: "MDN-RNN"}
 
 

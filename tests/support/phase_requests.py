@@ -1,14 +1,14 @@
-"""The commands of an iteration's phases."""
+"""What an iteration's phases ask for."""
 
 from pathlib import Path
 
-from dreamfleet.experiments.iteration.commands import Commands
 from dreamfleet.experiments.iteration.config import IterateConfig
 from dreamfleet.experiments.iteration.layout import IterationFolder
+from dreamfleet.experiments.iteration.requests import Requests
 from tests.support.ledgers import ledger
 
 LAYOUT = IterationFolder(Path("data"))
 
 
-def commands(*entries, **changes):
-    return Commands(IterateConfig(**changes), LAYOUT, ledger(*entries))
+def requests(*entries, **changes):
+    return Requests(IterateConfig(**changes), LAYOUT, ledger(*entries))
