@@ -14,6 +14,7 @@ def check(count):
     if count == "no more than that here":
         raise UsageError(f"--population is {count} and should be 2 to {LIMIT}; see `dreamfleet runs`")
     log.info("%d candidates were scored", count)
+    raise BatchError("too large", f"a batch of {count} candidates is too large")
     return "SELECT what is there FROM all of them"
 '''
 
@@ -28,6 +29,6 @@ def test_a_key_keeps_flags_numbers_values_and_names():
     assert "A docstring is no message." in code
     assert "no more than that here" in code
     assert "FROM all of them" in code
-    assert "candidates were scored" not in code
-    for kept in ("--population", "{count}", "{LIMIT}", "`dreamfleet runs`", "%d"):
+    assert "candidates" not in code
+    for kept in ("--population", "{count}", "{LIMIT}", "`dreamfleet runs`", "%d", "'too large'"):
         assert kept in code

@@ -70,17 +70,17 @@ def test_quiet_logs_only_warnings():
 
 
 @pytest.mark.parametrize(
-    ("environment", "said"),
+    ("environment", "named"),
     [
-        ({"DREAMFLEET_CONECT": "tcp/a:1"}, "unknown environment variable DREAMFLEET_CONECT: did you mean DREAMFLEET_C"),
-        ({"DREAMFLEET_RUN_DIR": "x", "DREAMFLEET_RUNSDIR": "x"}, "did you mean DREAMFLEET_RUNS_DIR"),
-        ({"DREAMFLEET_CONNECT": "nowhere"}, "write tcp/HOST:PORT"),
-        ({"DREAMFLEET_LOG_LEVEL": "loud"}, "must be one of debug, info, warning, error"),
-        ({"DREAMFLEET_CONFIG": "absent.toml"}, "no configuration file at absent.toml"),
+        ({"DREAMFLEET_CONECT": "tcp/a:1"}, "DREAMFLEET_CONECT.*CONNECT"),
+        ({"DREAMFLEET_RUN_DIR": "x", "DREAMFLEET_RUNSDIR": "x"}, "RUNS_DIR"),
+        ({"DREAMFLEET_CONNECT": "nowhere"}, "nowhere"),
+        ({"DREAMFLEET_LOG_LEVEL": "loud"}, "debug, info, warning, error"),
+        ({"DREAMFLEET_CONFIG": "absent.toml"}, r"absent\.toml"),
     ],
 )
-def test_an_invalid_environment_is_refused(environment, said):
-    with pytest.raises(UsageError, match=said):
+def test_an_invalid_environment_is_refused(environment, named):
+    with pytest.raises(UsageError, match=named):
         settled(environment=environment)
 
 
@@ -90,16 +90,16 @@ def test_other_programs_variables_are_ignored():
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "named"),
     [
-        ('conect = ["tcp/a:1"]\n', "unknown key 'conect': did you mean 'connect'"),
-        ("connect = 3\n", "connect must be a list of texts, not 3"),
-        ("[wokrer]\n", r"unknown table \[wokrer\]: did you mean 'worker'"),
-        ("[connect]\n", "connect must be a list of texts"),
+        ('conect = ["tcp/a:1"]\n', "'conect'.* 'connect'"),
+        ("connect = 3\n", "connect .*3"),
+        ("[wokrer]\n", r"\[wokrer\].* 'worker'"),
+        ("[connect]\n", "connect "),
     ],
 )
-def test_an_invalid_file_is_refused(tmp_path, text, said):
+def test_an_invalid_file_is_refused(tmp_path, text, named):
     path = tmp_path / "fleet.toml"
     path.write_text(text)
-    with pytest.raises(UsageError, match=said):
+    with pytest.raises(UsageError, match=named):
         settled("--config", str(path))

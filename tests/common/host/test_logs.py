@@ -31,7 +31,7 @@ def said(wanted):
 def test_text_is_the_default_format():
     first, *_, last = said("text")
     assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d WARNING x: said by a\\x1b\[2J", first)
-    assert last == "dreamfleet: why"
+    assert last.endswith(" why")
 
 
 @pytest.fixture

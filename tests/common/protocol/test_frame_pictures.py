@@ -42,23 +42,23 @@ def test_every_picture_fits(shape):
 
 
 @pytest.mark.parametrize(
-    ("sent", "reason"),
+    "sent",
     [
-        (frame(2, 2, b"x", packed=False), "wrong length"),
-        (frame(2, 2, b"not deflated"), "not deflated"),
-        (frame(2, 2, zlib.compress(bytes(13))), "wrong length"),
-        (frame(2, 2, zlib.compress(bytes(11))), "wrong length"),
+        frame(2, 2, b"x", packed=False),
+        frame(2, 2, b"not deflated"),
+        frame(2, 2, zlib.compress(bytes(13))),
+        frame(2, 2, zlib.compress(bytes(11))),
     ],
 )
-def test_invalid_picture_bytes_are_malformed(sent, reason):
-    with pytest.raises(MalformedError, match=reason):
+def test_invalid_picture_bytes_are_malformed(sent):
+    with pytest.raises(MalformedError):
         unpack_picture(sent)
 
 
 def test_a_zip_bomb_takes_no_more_memory_than_its_declared_picture():
     bomb = zlib.compress(bytes(30 << 20), 9)
     tracemalloc.start()
-    with pytest.raises(MalformedError, match="wrong length"):
+    with pytest.raises(MalformedError):
         unpack_picture(frame(MAX_PICTURE_SIDE, MAX_PICTURE_SIDE, bomb))
     assert tracemalloc.get_traced_memory()[1] < 3 * MAX_PICTURE_SIDE**2 * 3
     tracemalloc.stop()

@@ -34,7 +34,7 @@ def test_a_worker_keeps_its_given_name(name):
 @pytest.mark.parametrize("name", ["", "Big Host!", "***", "-a", ".a", "a/b", "@a", "x" * 64, "häuschen", "a\n"])
 def test_an_invalid_worker_name_is_refused(name):
     assert not keys.is_worker_identity(f"{name}/0a0b0c0d")
-    with pytest.raises(UsageError, match="cannot name a worker"):
+    with pytest.raises(UsageError):
         keys.new_worker_identity(name)
 
 

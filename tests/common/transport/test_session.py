@@ -1,3 +1,4 @@
+import re
 import socket
 import time
 
@@ -18,7 +19,7 @@ def test_good_endpoints(endpoint):
 
 @pytest.mark.parametrize("endpoint", ["", "127.0.0.1:7447", "tcp/host", "tcp/host:99999", "tcp/ host:1", "ftp/host:21"])
 def test_bad_endpoints_are_refused(endpoint):
-    with pytest.raises(UsageError, match="write tcp/HOST:PORT"):
+    with pytest.raises(UsageError, match=re.escape(repr(endpoint))):
         Network(listen=(endpoint,))
 
 
@@ -38,18 +39,18 @@ def test_a_link_local_address_has_its_interfaces_index_for_zenoh():
 def test_quic_is_refused_with_the_forms_that_work():
     with pytest.raises(UsageError) as refused:
         check_endpoint("quic/host.example:7447")
-    assert "tcp/host.example:7447" in str(refused.value)
-    assert "tls/host.example:7447" in str(refused.value)
+    assert "quic/host.example:7447" in str(refused.value)
+    assert "--join" in str(refused.value)
 
 
 def test_a_port_in_use_is_an_error():
     network = Network(listen=(f"tcp/127.0.0.1:{free_port()}",))
-    with open_session(network), pytest.raises(ConnectionFailedError, match=r"is in use: .*--listen"):
+    with open_session(network), pytest.raises(ConnectionFailedError, match="--listen"):
         open_session(network)
 
 
 def test_no_listener_is_an_error():
-    with pytest.raises(ConnectionFailedError, match="no one answers at"):
+    with pytest.raises(ConnectionFailedError, match="--connect"):
         open_session(Network(connect=(f"tcp/127.0.0.1:{free_port()}",)), timeout=0.2)
 
 
@@ -93,6 +94,6 @@ def test_an_address_that_drops_packets_does_not_block_the_others():
 
 @pytest.mark.parametrize("seconds", [-1.0, 2.0**32])
 def test_a_clock_that_zenoh_cannot_write_is_an_error_that_says_so(seconds):
-    with pytest.raises(DreamfleetError, match="set the clock"):
+    with pytest.raises(DreamfleetError, match=f"{seconds:.0f}"):
         check_clock(seconds)
     check_clock(2.0**32 - 1)

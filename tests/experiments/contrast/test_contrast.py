@@ -1,5 +1,6 @@
 """What a contrast trains, what it refuses, and what its figures come to. Tests config.py and summary.py."""
 
+import re
 from dataclasses import asdict
 
 import pytest
@@ -36,21 +37,21 @@ def test_kinds_take_turns_and_own_flags_come_last():
 
 
 @pytest.mark.parametrize(
-    ("settings", "why"),
+    ("settings", "named"),
     [
-        ({"kinds": (("alone", ""),)}, "twice or more"),
-        ({"kinds": (("one", ""), ("one", "--hidden 8"))}, "--kind one is given twice"),
-        ({"kinds": (("../up", ""), ("one", ""))}, "a name has only a-z"),
-        ({"kinds": (("one", "--seed 3"), ("two", ""))}, "omit --seed, which lab contrast sets itself"),
+        ({"kinds": (("alone", ""),)}, "--kind"),
+        ({"kinds": (("one", ""), ("one", "--hidden 8"))}, "--kind one"),
+        ({"kinds": (("../up", ""), ("one", ""))}, r"'\.\./up'"),
+        ({"kinds": (("one", "--seed 3"), ("two", ""))}, "--seed"),
         ({"kinds": (("one", "--hid 'x"), ("two", ""))}, "No closing quotation"),
-        ({"mdnrnn_flags": "--data elsewhere"}, "omit --data"),
-        ({"seeds": ()}, "one at least"),
-        ({"seeds": (1, 1)}, "different ones"),
-        ({"seeds": (-1,)}, "must be from 0"),
+        ({"mdnrnn_flags": "--data elsewhere"}, "--data"),
+        ({"seeds": ()}, "--seeds"),
+        ({"seeds": (1, 1)}, "--seeds"),
+        ({"seeds": (-1,)}, "--seeds"),
     ],
 )
-def test_what_is_no_contrast_is_refused(settings, why):
-    with pytest.raises(UsageError, match=why):
+def test_what_is_no_contrast_is_refused(settings, named):
+    with pytest.raises(UsageError, match=named):
         Contrast(**settings)
 
 
@@ -59,9 +60,9 @@ def test_seeds_and_kinds_may_be_added_but_none_changed():
     kept = Contrast(seeds=(4,), kinds=(KINDS[0], wide)).merge_settings(asdict(Contrast()))
     assert kept["kinds"] == (*KINDS, wide), "one that is not asked for this time is not forgotten"
     assert kept["seeds"] == (1, 2, 3, 4)
-    with pytest.raises(UsageError, match="other kind attentive"):
+    with pytest.raises(UsageError, match="kind attentive"):
         Contrast(kinds=(KINDS[0], ("attentive", "--window 4"))).merge_settings(kept)
-    with pytest.raises(UsageError, match="other run_flags"):
+    with pytest.raises(UsageError, match="run_flags"):
         Contrast(run_flags="--generations 3").merge_settings(kept)
     assert Contrast().merge_settings({}) == asdict(Contrast())
 
@@ -79,9 +80,7 @@ def test_kinds_are_compared_seed_by_seed():
     nats, score = found["attentive", "nats_per_dimension"], found["attentive", "score"]
     assert (nats.mean, nats.seeds, nats.is_significant) == (pytest.approx(-0.01), 2, True)
     assert (score.mean, score.is_significant) == (-15.0, False)
-    assert describe_difference("attentive", "plain", "score", score).endswith(
-        "over 2 seeds: none, for one under 14.0 standard errors of so few seeds is none"
-    )
+    assert re.search(r"-15\.0 .* 2 seeds.* 14\.0", describe_difference("attentive", "plain", "score", score))
     (plain,) = [each for each in means(outcomes) if (each.kind, each.figure) == ("plain", "score")]
     assert plain.text == "600.0 ± 100.0"
     assert rows(outcomes)[0]["reality"] == "700.0 ± 5.0 on 16"

