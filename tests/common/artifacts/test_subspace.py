@@ -97,5 +97,5 @@ def test_an_invalid_archive_is_a_one_line_error(tmp_path, content):
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", "nothing", '{"weights": "é"}', "[" * 100_000])
 def test_damaged_text_is_an_error(text):
-    with pytest.raises(ValueError):  # noqa: PT011 - who keeps it says which file it is
+    with pytest.raises(ValueError):  # who keeps it says which file it is
         Subspace.from_text(text)

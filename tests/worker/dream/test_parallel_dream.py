@@ -66,5 +66,5 @@ def test_a_dream_that_has_ended_restarts(tmp_path):
 
 @pytest.mark.parametrize("temperature", [0.0, float("nan")])
 def test_an_invalid_temperature_is_refused(temperature):
-    with pytest.raises(UsageError, match="temperature must be a positive number"):
+    with pytest.raises(UsageError):
         ParallelDreamConfig(temperature)

@@ -129,5 +129,5 @@ def test_an_invalid_vector_is_refused(dreaming, random_bundle):
     (vector,) = candidates(random_bundle, 1)
     vector[3] = np.nan
     for wrong in (vector, vector[:-1]):
-        with pytest.raises(UsageError, match="finite parameters"):
+        with pytest.raises(UsageError):
             dreaming.score([(wrong, 1)])

@@ -175,12 +175,12 @@ def test_a_memory_that_was_given_may_be_changed(bundle):
 
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
 def test_an_invalid_share_is_refused(bundle, share):
-    with pytest.raises(UsageError, match="recorded states must be from 0 to 1"):
+    with pytest.raises(UsageError):
         DreamWorld(bundle, 1.0, recorded=share)
 
 
 def test_a_bundle_without_states_is_refused_with_the_remedy(random_bundle):
-    with pytest.raises(BundleError, match=r"random\.zip holds no recorded states .*`dreamfleet bundle --recorded N`"):
+    with pytest.raises(BundleError, match=r"random\.zip .*`dreamfleet bundle --recorded N`"):
         DreamBatch(random_bundle, spec(random_bundle))
     assert DreamWorld(random_bundle, 1.0).start_states.share == 0
 
@@ -189,6 +189,6 @@ def test_states_of_another_model_are_refused(bundle, tmp_path):
     parts = {name: bundle.read(name) for name in bundle.manifest.parts}
     other = MDNRNNConfig(latent=3, hidden=4, window=2)
     wrong = write_bundle(tmp_path / "w.zip", bundle.manifest, {**parts, RECORDED_STATES: npy(states(2, SMALL, other))})
-    with pytest.raises(BundleError, match=r"has 26 numbers, its model 14; build the bundle again"):
+    with pytest.raises(BundleError, match=r"26 .*14"):
         DreamWorld(wrong, 1.0, recorded=1.0)
     assert DreamWorld(wrong, 1.0).start_states.share == 0, "who begins none there need not be able to"

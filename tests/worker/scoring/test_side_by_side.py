@@ -88,7 +88,7 @@ def test_parameters_that_are_no_numbers_are_refused():
     bundle = find_bundle("tiny-int8")
     scorer = Scorer(spec(bundle), bundle)
     wrong = np.full(bundle.controller_shape.size, np.nan, np.float32)
-    with pytest.raises(ValueError, match="NaN or infinity"):
+    with pytest.raises(ValueError):
         scorer.score_all([*jobs(bundle)[:3], ("score", wrong, 1)], lambda _: None)
     scorer.close()
 

@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 from dreamfleet.worker.service.failure_log import MAX_KINDS, MAX_TRACE, FailureLog, ScoringFailure
@@ -23,9 +24,8 @@ def raise_deeper(error, depth):
 def test_a_failure_is_logged_with_its_task_its_job_and_its_traceback():
     logged = FailureLog().format_if_new(raised(RuntimeError("the road has ended")), "moon", [job()])
     first, *trace = logged.splitlines()
-    assert first.startswith("task moon: RuntimeError: the road has ended (")
-    assert "(candidate 7/2, seed 1048576)" in first
-    assert trace[0].startswith("Traceback")
+    assert re.search("moon.*RuntimeError: the road has ended .*candidate 7/2, seed 1048576", first)
+    assert "Traceback" in trace[0]
     assert trace[-1] == "RuntimeError: the road has ended"
 
 
@@ -41,8 +41,8 @@ def test_each_kind_is_logged_once():
 
 def test_the_first_of_several_jobs_is_named_and_the_others_are_counted():
     logged = FailureLog().format_if_new(raised(ValueError("lap 1")), "moon", [job(), job(1), job(2)])
-    assert "seed 1048576, or one of 2 jobs scored with it)" in logged
-    assert "as a slot started" in FailureLog().format_if_new(raised(ValueError("lap 1")), "moon", [])
+    assert re.search(r"seed 1048576.* 2\b", logged)
+    assert "seed" not in FailureLog().format_if_new(raised(ValueError("lap 1")), "moon", []).splitlines()[0]
 
 
 def test_the_log_is_bounded():

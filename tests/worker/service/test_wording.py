@@ -1,5 +1,7 @@
 """What a worker that waits or is refused says."""
 
+import re
+
 import pytest
 
 from dreamfleet.common.errors import RefusedError
@@ -51,8 +53,8 @@ def test_a_worker_that_is_early_is_not_called_revoked_at_once(monkeypatch):
     texts = WaitingText(WorkerConfig(run="night"), Network(connect=(ADDRESS,)), 5.0)
     monkeypatch.setattr(texts, "_secured", True)
     early, later = said(texts, (5.0, 5.0 + WAIT_LIMIT), answered=True)
-    assert "revoked" not in early
-    assert "revoked" in later
+    assert "--join" not in early
+    assert "--join" in later
 
 
 @pytest.mark.parametrize(
@@ -61,27 +63,23 @@ def test_a_worker_that_is_early_is_not_called_revoked_at_once(monkeypatch):
 def test_a_waiting_worker_names_the_address_at_once_and_what_to_start_later(answered, awaited, flag):
     texts = WaitingText(WorkerConfig(run="night"), Network(connect=(ADDRESS,)), 5.0)
     first, second = said(texts, (5.0, 6.0, 5.0 + WAIT_LIMIT, 500.0), answered=answered)
-    assert first == f"waiting for {awaited} at {ADDRESS}"
-    assert second == (
-        f"no coordinator of run night at {ADDRESS}; tried for 30 s; start one by: dreamfleet coordinator --run night "
-        f"{flag} {ADDRESS}"
-    )
+    assert re.search(f"{awaited}.* {ADDRESS}$", first)
+    assert re.search(f" {ADDRESS}.* 30 .*dreamfleet coordinator --run night {flag} {ADDRESS}$", second)
 
 
 def test_a_worker_whose_run_has_ended_says_so_once():
     texts = WaitingText(WorkerConfig(), Network(connect=(ADDRESS,)), 0.0, "run night ended after 2 generations")
     (text,) = said(texts, (0.0, 1.0, 500.0), answered=False)
-    assert text == f"run night ended after 2 generations; waiting for the next run at {ADDRESS}"
+    assert re.search(f"run night ended after 2 generations.* {ADDRESS}$", text)
 
 
 def test_a_worker_of_a_named_run_waits_for_it_alone():
     texts = WaitingText(WorkerConfig(run="night"), Network(connect=(ADDRESS,)), 0.0, "run night ended: 2 generations")
-    assert said(texts, (0.0, 1.0), answered=False) == [
-        f"run night ended: 2 generations; waiting for run night to go on at {ADDRESS}"
-    ]
+    (text,) = said(texts, (0.0, 1.0), answered=False)
+    assert re.search(f"run night ended: 2 generations.* run night.* {ADDRESS}$", text)
 
 
 def test_a_worker_that_waits_for_its_run_names_those_that_are_served_there():
     waiting = WaitingText(WorkerConfig(run="mine"), Network(connect=("tcp/a:1",)), 0.0)
     said = waiting.next(0.0, answered=True, others=lambda: ["mine", "night"])
-    assert said == "waiting for run mine at tcp/a:1; what is served there: night"
+    assert re.search("run mine.* tcp/a:1.* night$", said)

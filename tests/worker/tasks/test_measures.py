@@ -44,16 +44,15 @@ def test_measuring_changes_no_fitness_and_a_run_that_does_not_ask_gets_none():
 
 
 @pytest.mark.parametrize(
-    ("name", "why"),
-    [("speed", "unknown measure 'speed': known are steps, action0, action0.abs"), ("truth.speed", "no true state")],
+    ("name", "named"), [("speed", "'speed'.* steps, action0, action0.abs"), ("truth.speed", "'truth.speed'")]
 )
-def test_a_measure_that_the_world_lacks_is_refused(name, why):
-    with pytest.raises(UsageError, match=why):
+def test_a_measure_that_the_world_lacks_is_refused(name, named):
+    with pytest.raises(UsageError, match=named):
         Scorer(pole(name))
 
 
 def test_a_number_that_the_last_info_lacks_is_the_episodes_failure():
-    with pytest.raises(ValueError, match="last info has no number 'goal'"):
+    with pytest.raises(ValueError, match="'goal'"):
         score(pole("info.goal"), np.zeros(10, np.float32))
 
 
@@ -82,7 +81,7 @@ def test_a_dreams_measures_are_the_same_bits_in_any_batch():
 
 def test_a_dream_has_no_speed():
     bundle = find_bundle("tiny")
-    with pytest.raises(UsageError, match=r"a dream has no truth\.speed"):
+    with pytest.raises(UsageError, match=r"truth\.speed"):
         DreamBatch(bundle, TaskSpec("dream", bundle.sha256, 40, 0, measures=("truth.speed",)))
 
 

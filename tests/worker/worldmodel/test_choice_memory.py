@@ -138,9 +138,9 @@ def test_a_variant_that_says_nothing_is_the_one_graph_to_the_bit(random_bundle):
 def test_a_controller_of_another_variant_does_not_fit(random_bundle):
     plain, one_pedal = random_bundle.shape_of("zh"), random_bundle.shape_of("zh", 0, Variant(pedals="one"))
     assert (plain.size, one_pedal.size) == (867, 578)
-    with pytest.raises(ControllerError, match=r"a controller of 867 parameters does not fit .*, which needs 578"):
+    with pytest.raises(ControllerError, match=r"867 .*578"):
         random_bundle.with_controllers(plain, Variant(pedals="one"))
-    with pytest.raises(ControllerError, match=r"578 parameters does not fit .*, which needs 867"):
+    with pytest.raises(ControllerError, match=r"578 .*867"):
         random_bundle.with_controllers(one_pedal)
 
 

@@ -71,5 +71,5 @@ def test_the_graph_has_two_inputs_and_a_batch(random_bundle):
 
 def test_what_a_picture_alone_cannot_drive_is_refused(tmp_path):
     rewarded = write_random_bundle(tmp_path / "rewarded.zip", rnn=replace(REWARDED, previous_reward=True))
-    with pytest.raises(UsageError, match="sees the last reward"):
+    with pytest.raises(UsageError):
         export_driver(rewarded, controller_of(rewarded))

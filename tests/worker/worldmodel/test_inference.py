@@ -86,5 +86,5 @@ def test_the_graphs_compute_what_torch_does(random_bundle, inputs):
 def test_a_part_that_is_no_graph_is_an_error_of_the_bundle(random_bundle, tmp_path):
     parts = {name: random_bundle.read(name) for name in random_bundle.manifest.parts}
     broken = write_bundle(tmp_path / "broken.zip", random_bundle.manifest, {**parts, POLICY: b"no graph"})
-    with pytest.raises(BundleError, match=r"policy\.onnx cannot be run"):
+    with pytest.raises(BundleError, match=r"policy\.onnx"):
         open_part(broken, POLICY)

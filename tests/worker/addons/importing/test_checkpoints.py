@@ -109,11 +109,11 @@ def test_a_part_of_another_shape_is_refused(imported, tmp_path):
     vae, rnn, controller = imported[1]
     bad = {**vae, "encoder.conv2.weight": vae["encoder.conv2.weight"][:, :16]}
     theirs.write_checkpoints(tmp_path, (bad, {**rnn, "rnn.bias_hh_l0": rnn["rnn.bias_hh_l0"] * np.nan}, controller))
-    with pytest.raises(DatasetError, match=r"encoder.conv2.weight has the shape \(64, 16, 4, 4\)"):
+    with pytest.raises(DatasetError, match=r"\(64, 16, 4, 4\)"):
         read_vae(tmp_path / "vae" / "best.tar")
-    with pytest.raises(DatasetError, match=r"bias_hh holds NaN"):
+    with pytest.raises(DatasetError, match="bias_hh"):
         read_mdnrnn(tmp_path / "mdrnn" / "best.tar")
-    with pytest.raises(DatasetError, match="it is not the VAE"):
+    with pytest.raises(DatasetError, match="VAE"):
         read_vae(tmp_path / "ctrl" / "best.tar")
 
 

@@ -93,9 +93,9 @@ def test_several_tracks_side_by_side_are_the_single_ones(small):
 def test_what_is_no_action_or_no_features_is_refused(small):
     environment = CarRacingLatent(small)
     environment.reset(seed=SEED)
-    with pytest.raises(ValueError, match="three finite numbers"):
+    with pytest.raises(ValueError):
         environment.step(np.array([0, np.nan, 0]))
     environment.close()
     for make in (CarRacingLatent, Dream):
-        with pytest.raises(UsageError, match="features are z or zh, not 'h'"):
+        with pytest.raises(UsageError, match="'h'"):
             make(small, features="h")

