@@ -25,7 +25,7 @@ def test_a_batch_that_raises_costs_only_itself(stage, cached, said, monkeypatch)
     take = RunSession._handle_batch
     monkeypatch.setattr(RunSession, "_handle_batch", lambda *_: 1 / 0)
     hand.send(1, hand.job())
-    assert "ZeroDivisionError" in wait_for(said, "dropped a job")
+    wait_for(said, "ZeroDivisionError")
     monkeypatch.setattr(RunSession, "_handle_batch", take)
     hand.send(1, hand.job())
     assert hand.result(hand.job()).fitness is not None

@@ -2,6 +2,7 @@
 Tests worker/verbs/record.py."""
 
 import json
+import re
 
 import av
 import numpy as np
@@ -49,27 +50,27 @@ def test_each_track_has_its_own_video(verb, tmp_path, capsys):
 @pytest.mark.long  # whole laps: a mean is shown beside nothing less
 def test_without_a_seed_a_shipped_controllers_median_game_is_shown_beside_its_mean(tmp_path, capsys):
     words = ("record", "--controller", "tiny", "--out", str(tmp_path / "drive.mp4"))
-    for given, says in (
-        ((), "points on track 10060, the median of 100 tracks, whose mean is 832.1 ± 14.3\n"),
-        (("--seed", "10000", "--steps", "2"), "points on track 10000 in its first 2 steps (--steps)\n"),
+    for given, found in (
+        ((), r"10060.* 100 .*832\.1 ± 14\.3"),
+        (("--seed", "10000", "--steps", "2"), "10000.* 2 .*--steps"),
     ):
         assert command_line.main([*words, *given]) == 0
-        assert says in capsys.readouterr().out
+        assert re.search(found, capsys.readouterr().out)
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("words", "named"),
     [
-        (("--steps", "0"), "--steps must be at least 1 and --seed at least 0"),
-        (("--seed", "7", "-1"), "--steps must be at least 1 and --seed at least 0"),
-        (("--out", "drive.avi"), "--out drive.avi: give a name that ends in .mp4"),
-        (("--out", "folder.mp4"), "--out folder.mp4 is a folder: name a file in it"),
-        (("--out", "../elsewhere/drive.mp4"), "mkdir -p"),
+        (("--steps", "0"), "--steps"),
+        (("--seed", "7", "-1"), "--steps"),
+        (("--out", "drive.avi"), "drive.avi"),
+        (("--out", "folder.mp4"), "folder.mp4"),
+        (("--out", "../elsewhere/drive.mp4"), "../elsewhere"),
     ],
 )
-def test_an_invalid_recording_is_one_line_before_the_first_step(verb, words, says, tmp_path, monkeypatch, capsys):
+def test_an_invalid_recording_is_one_line_before_the_first_step(verb, words, named, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder.mp4").mkdir()
     assert command_line.main([*verb, *words]) == UsageError.exit_code
-    assert says in capsys.readouterr().err
+    assert named in capsys.readouterr().err
     assert not (tmp_path.parent / "elsewhere").exists()

