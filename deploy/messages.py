@@ -31,10 +31,11 @@ LISTS_FLAGS = "configure"  # its texts are those of docs/reference/verbs.md
 PROSE = re.compile(r"(?<![\w<{./-])[a-z]{2,}[,;:]? (?:[a-z]+[,;:]? )+[a-z]{2,}")
 NO_PROSE = re.compile(
     r"^\s*(?:SELECT|INSERT|UPDATE|DELETE|CREATE|PRAGMA|ALTER|WITH|BEGIN|<)|</|/>|\bimport \w|\bdef \w"
+    r"|^\s*\w+(?:, \w+)+\s*$"  # columns of a table
 )
 # What is data within a sentence: flags, numbers, names in backquotes, places that values come to, ends of lines.
 DATA = re.compile(
-    r"`[^`]*`|--[a-z][a-z0-9-]*|(?<!\w)\d[\d.,]*(?!\w)|%\(\w+\)[#0-9.+-]*[a-zA-Z]|%[#0-9.+-]*[a-zA-Z]|\{[^{}]*\}|\n"
+    r"`[^`]*`|--[a-z][a-z0-9-]*|--$|(?<!\w)\d[\d.,]*(?!\w)|%\(\w+\)[#0-9.+-]*[a-zA-Z]|%[#0-9.+-]*[a-zA-Z]|\{[^{}]*\}|\n"
 )
 
 
@@ -133,11 +134,10 @@ class Messages(ast.NodeTransformer):
         parts: list[ast.expr] = [node] if isinstance(node, ast.Constant) else node.values
         values: list[ast.expr] = [ast.Constant(key)]
         for part in parts:
-            values += (
-                [ast.Constant(" "), part]
-                if isinstance(part, ast.FormattedValue)
-                else [ast.Constant(f" {each}") for each in DATA.findall(str(template(part)))]
-            )
+            if isinstance(part, ast.FormattedValue):
+                values += [part] if template(values[-1]) == " --" else [ast.Constant(" "), part]
+            else:
+                values += [ast.Constant(f" {each}") for each in DATA.findall(str(template(part)))]
         if isinstance(node, ast.JoinedStr):
             new: ast.expr = ast.JoinedStr(values)
         else:

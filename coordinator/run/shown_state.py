@@ -8,6 +8,8 @@ from dreamfleet.common.protocol.pause_kind import PauseKind
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.run.run_state import Ended
 
+WAITS_FOR_WORKERS, WAITS_FOR_BATCH = "waiting for workers", "waiting for a batch"
+
 
 class ShownState(NamedTuple):
     """A state in a word, and why the run is paused or has ended, in words; `why` is empty in other states.
@@ -29,9 +31,9 @@ def shown_state(run: Run) -> ShownState:
     if (stalled := run.state.stalled) is not None:
         return ShownState("paused", stalled.why)
     if not run.fleet.has_workers:
-        return ShownState("waiting for workers")
+        return ShownState(WAITS_FOR_WORKERS)
     if (why := run.verification.waiting) and not run.fleet.takes_jobs:
         return ShownState("paused", why)
     if not run.generation.population:
-        return ShownState("waiting for a batch")
+        return ShownState(WAITS_FOR_BATCH)
     return ShownState("evaluating" if run.fleet.drain_background else "running")

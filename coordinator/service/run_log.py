@@ -23,7 +23,7 @@ from dreamfleet.common.runs.records import StoredGeneration, count_episodes, for
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, Credentials, describe_time_left
 from dreamfleet.common.transport.network import Network, is_loopback
 from dreamfleet.coordinator.run.run import Run
-from dreamfleet.coordinator.run.shown_state import shown_state
+from dreamfleet.coordinator.run.shown_state import WAITS_FOR_WORKERS, shown_state
 from dreamfleet.coordinator.service.snapshot import Snapshot
 
 log = logging.getLogger(__name__)
@@ -118,7 +118,7 @@ class RunLog:
 
     def _warn_if_no_worker(self, now: float) -> None:
         """Warn once per spell without workers: a run that stands still should not be silent."""
-        if shown_state(self._run).word != "waiting for workers":
+        if shown_state(self._run).word != WAITS_FOR_WORKERS:
             self._no_worker_since = now
         elif now - self._no_worker_since > NO_WORKER_SECONDS:
             self._no_worker_since = math.inf

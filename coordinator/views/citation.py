@@ -53,6 +53,7 @@ def citation_facts(run: RunFolder) -> dict[str, Any]:
         "on_failure": settings.on_failure,
         "spent": {**asdict(spent), "core_hours": spent.core_hours},
         "settings": to_plain(settings), "receipt": to_plain(receipt), "commands": _commands(run),
+        "bit_identical": {"candidate": not run.classes.varying, "run": not (run.classes.mixed or run.classes.varying)},
         "software": software_facts(receipt),
     }  # fmt: skip
 

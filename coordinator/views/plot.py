@@ -39,6 +39,7 @@ from dreamfleet.coordinator.views.shown_figure import ShownFigure
 
 TITLE = 90  # characters in a line of the title
 LABEL = 52  # characters in a line of the label of the y axis
+LEGEND_PLACE = "outside lower left"
 PAD = 0.08  # inches around panels, titles and legends
 LINE = 12  # points: the height of a line of the note under a title
 DECADE = 10
@@ -231,7 +232,7 @@ def _add_legend(figure: Figure, handles: Sequence[Any], columns: int = 1) -> Non
     """Put a legend under the panels, in one column if more would be wider than the figure."""
     for count in (columns, 1):
         legend = figure.legend(
-            handles=handles, loc="outside lower left", ncols=count, fontsize=9, frameon=False, borderaxespad=1
+            handles=handles, loc=LEGEND_PLACE, ncols=count, fontsize=9, frameon=False, borderaxespad=1
         )
         if count == 1 or legend.get_window_extent().width < figure.bbox.width:
             return

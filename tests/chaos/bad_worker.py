@@ -16,7 +16,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from dreamfleet.common.client.client import Client
+from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.worker.addons.bench.sleep_tasks import SLEEP_TASK
+from tests.support.access import until
 from tests.support.bundles import write_random_bundle
 from tests.support.hosts import new_host
 from tests.support.processes import processes_in
@@ -40,9 +42,9 @@ class Bench:
             "coordinator", "--run", "run", "--runs-dir", processes.runs, "--listen", processes.endpoint, near,
             "--insecure", "--bundle", bundle, "--evaluate-every", 0, "--generations", 10**6, *settings,
         )  # fmt: skip
-        self.coordinator.wait_for("incarnation")
+        self.coordinator.wait_until_serving()
         self.good = self.worker("good", inside=("taskset", "-c", "0"))
-        self.coordinator.wait_for("generation 2: mean")
+        until(lambda: self._closed() > 2, "three generations are closed")
 
     def worker(self, name, **more):
         return self._processes.worker("--run", "run", "--name", name, *self._tasks, **more)
@@ -54,34 +56,41 @@ class Bench:
         return (self._closed() - before) / (time.monotonic() - started)
 
     def _closed(self):
-        return sum(": mean" in line for line in self.coordinator.lines)
+        with open_run(self._processes.runs, "run") as run:
+            return len(run.history())
+
+    def _until_joined(self):
+        until(lambda: any(each.state == "present" for each in self._workers("bad/")), "the bad worker joins")
+
+    def _workers(self, name):
+        with Client((self._processes.endpoint,)) as client:
+            return [each for each in client.workers("run") if each.worker.startswith(name)]
 
     @contextmanager
     def slow_link(self):
         device = f"{self._host.name}-a"
         for inside, end in (((), device), (self._host.inside, f"{self._host.name}-b")):
             subprocess.run([*inside, "tc", "qdisc", "replace", "dev", end, *TBF], check=True)
-        with _ending(self.worker("bad", endpoint=self._near, inside=self._host.inside)) as bad:
-            bad.wait_for("joined run")
+        with _ending(self.worker("bad", endpoint=self._near, inside=self._host.inside)):
+            self._until_joined()
             yield
 
     @contextmanager
     def slow_core(self):
-        with _ending(self.worker("bad", inside=("taskset", "-c", "1", "chrt", "--idle", "0"))) as bad:
-            bad.wait_for("joined run", timeout=120)
+        with _ending(self.worker("bad", inside=("taskset", "-c", "1", "chrt", "--idle", "0"))):
+            self._until_joined()
             yield
 
     @contextmanager
     def flapping(self):
         again = ("sh", "-c", f'while true; do timeout -s KILL {LIFE} "$@"; done', "sh")
-        with _ending(self.worker("bad", inside=again)) as bad:
-            bad.wait_for("joined run")
+        with _ending(self.worker("bad", inside=again)):
+            self._until_joined()
             yield
 
     def finished(self):
         """Jobs that the bad one has brought back in this life."""
-        with Client((self._processes.endpoint,)) as client:
-            return sum(each.finished for each in client.workers("run") if each.worker.startswith("bad"))
+        return sum(each.finished for each in self._workers("bad/"))
 
 
 @contextmanager

@@ -41,7 +41,7 @@ class Fleet:
         self._excused = {}  # until when the end of a worker, by number, or of the coordinator, -1, is no failure
         self._heard = 0  # lines of the coordinator that have been looked at
         self.coordinator = processes.start("coordinator", "--run", "run", *self._settings, *self._first)
-        self.coordinator.wait_for("incarnation")
+        self.coordinator.wait_until_serving()
         addresses = ["127.0.0.1"] * WORKERS
         if host:
             addresses[-1] = host.address

@@ -56,7 +56,7 @@ class Weekend:
                         "--beat", "0.5")  # fmt: skip
         flags = [text for name, value in SETTINGS.items() for text in (f"--{name}", value)]
         self.coordinator = self._coordinate("--run", RUN, *flags)
-        self.coordinator.wait_for("incarnation")
+        self.coordinator.wait_until_serving()
         self.relays = [Relay(processes.port) for _ in range(WORKERS)]
         self.workers = [self._work(number) for number in range(WORKERS)]
         self._later = []  # (when, action)

@@ -231,7 +231,7 @@ def check_scores(processes, name, found, answer):
         assert int(each["generation"]) == generation
         assert [float(each["mean"]), float(each["error"])] == pytest.approx([mean, error])
     code, out, err = processes.call("runs", "show", name, "--runs-dir", processes.runs)
-    assert f"scored {mean:.1f} ± {error:.1f} (standard error)" in out, err
+    assert f"{mean:.1f} ± {error:.1f}" in out, err
 
 
 def check_status(processes, name, found):
@@ -240,7 +240,7 @@ def check_status(processes, name, found):
         "coordinator", "--resume", name, "--runs-dir", processes.runs, "--listen", processes.endpoint,
         "--generations", 99,
     )  # fmt: skip
-    coordinator.wait_for("listening")
+    coordinator.wait_until_serving()
     code, out, err = processes.call("status", "--connect", processes.endpoint, "--json")
     coordinator.end()
     assert code == 0, err

@@ -12,7 +12,7 @@ SAMPLE = '''
 def check(count):
     """A docstring is no message."""
     if count == "no more than that here":
-        raise UsageError(f"--population is {count} and should be 2 to {LIMIT}; see `dreamfleet runs`")
+        raise UsageError(f"--population is {count} and should be 2 to {LIMIT}; omit --{name}; see `dreamfleet runs`")
     log.info("%d candidates were scored", count)
     raise BatchError("too large", f"a batch of {count} candidates is too large")
     return "SELECT what is there FROM all of them"
@@ -30,5 +30,5 @@ def test_a_key_keeps_flags_numbers_values_and_names():
     assert "no more than that here" in code
     assert "FROM all of them" in code
     assert "candidates" not in code
-    for kept in ("--population", "{count}", "{LIMIT}", "`dreamfleet runs`", "%d", "'too large'"):
+    for kept in ("--population", "{count}", "{LIMIT}", "--{name}", "`dreamfleet runs`", "%d", "'too large'"):
         assert kept in code

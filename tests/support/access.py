@@ -35,7 +35,7 @@ def begin(processes, access, endpoint, bundle, *more, name="safe", inside=()):
         "--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 1, "--evaluate-every", 0, *more,
         inside=inside,
     )  # fmt: skip
-    process.wait_for("incarnation")
+    process.wait_until_serving()
     return process
 
 

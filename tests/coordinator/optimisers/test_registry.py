@@ -48,18 +48,18 @@ def test_an_optimiser_of_ones_own_is_found_by_entry_point(tmp_path):
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("cmea", "did you mean cma.* known are cma, cma-me, cmaes-lra"),
-        ("openai-es", "did you mean openes"),
-        ("OpenES", "did you mean openes"),
-        ("cmaes", "did you mean cma"),
-        ("PGPE", "did you mean pepg"),
-        ("adam", "'adam': known are cma"),
-        ("nowhere:Optimiser", "--trust nowhere"),
-        ("tests.support.nowhere:Optimiser", "cannot be loaded"),
-        (f"{MODULE}:Nothing", "cannot be loaded"),
-        (f"{MODULE}:SaysNothing", "lacks requirement, options"),
-        (f"{MODULE}:WithoutState", r"lacks state: dreamfleet\.coordinator\.optimisers\.api"),
-        (f"{MODULE}:BuiltFromNothing", "must be built from one Search"),
+        ("cmea", "cma.* cma, cma-me, cmaes-lra"),
+        ("openai-es", "openes.* cma"),
+        ("OpenES", "openes.* cma"),
+        ("cmaes", "cma.* cma, "),
+        ("PGPE", "pepg.* cma"),
+        ("adam", r"'adam'\S* [^,]*cma, "),
+        ("nowhere:Optimiser", "--trust.* nowhere"),
+        ("tests.support.nowhere:Optimiser", "tests.support.nowhere:Optimiser"),
+        (f"{MODULE}:Nothing", f"{MODULE}:Nothing"),
+        (f"{MODULE}:SaysNothing", "requirement, options"),
+        (f"{MODULE}:WithoutState", r"\bstate\b"),
+        (f"{MODULE}:BuiltFromNothing", f"{MODULE}:BuiltFromNothing"),
     ],
 )
 def test_an_unknown_or_incomplete_optimiser_is_refused_with_what_is_missing(name, says):
@@ -68,25 +68,25 @@ def test_an_unknown_or_incomplete_optimiser_is_refused_with_what_is_missing(name
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "names"),
     [
-        ({"covariance": "full"}, "has no option 'covariance', it knows: none; give --covariance diagonal"),
-        ({"options": ["elite=3"]}, "has no option 'elite', it knows: none"),
-        ({"options": ["elite"]}, "takes name=value"),
-        ({"options": ["a=1", "a=2"]}, "each name once"),
+        ({"covariance": "full"}, "'covariance'.*--covariance"),
+        ({"options": ["elite=3"]}, "'elite'"),
+        ({"options": ["elite"]}, "--optimiser-options.* 'elite'"),
+        ({"options": ["a=1", "a=2"]}, "--optimiser-options.* 'a=2'"),
     ],
 )
-def test_an_option_that_an_optimiser_does_not_know_is_refused_with_what_it_knows(arguments, says):
-    with pytest.raises(UsageError, match=says):
+def test_an_option_that_an_optimiser_does_not_know_is_refused_with_what_it_knows(arguments, names):
+    with pytest.raises(UsageError, match=names):
         build("cmaes-sep", *arguments.get("options", ()), covariance=arguments.get("covariance", "diagonal"))
 
 
 def test_pycmas_covariance_is_an_option_and_a_setting():
     as_option, as_setting = build("cma", "covariance=full"), build("cma", covariance="full")
     assert np.array_equal(as_option.ask(), as_setting.ask())
-    with pytest.raises(UsageError, match="diagonal, full, not 'half'"):
+    with pytest.raises(UsageError, match=r"diagonal, full.* 'half'"):
         build("cma", "covariance=half")
-    with pytest.raises(UsageError, match="each name once"):
+    with pytest.raises(UsageError, match="--optimiser-options"):
         build("cma", "covariance=full", covariance="full")
 
 
@@ -101,29 +101,24 @@ def test_an_option_reaches_an_optimiser_of_ones_own():
 
 
 @pytest.mark.parametrize(
-    ("name", "says"),
-    [("AsksForTooMany", r"asked for \(9, 12\) numbers, not \(8, 12\)"), ("Diverged", "no single-precision number")],
+    ("name", "names"), [("AsksForTooMany", r"\(9, 12\) .*\(8, 12\)"), ("Diverged", "--from.*--sigma0")]
 )
-def test_a_population_that_is_none_is_refused(name, says):
-    with pytest.raises(DreamfleetError, match=says):
+def test_a_population_that_is_none_is_refused(name, names):
+    with pytest.raises(DreamfleetError, match=names):
         build(f"{MODULE}:{name}").ask()
 
 
 def test_a_state_that_only_a_pickle_could_hold_is_refused():
-    with pytest.raises(DreamfleetError, match="cannot be kept, in mean"):
+    with pytest.raises(DreamfleetError, match=r"\bmean\b"):
         build(f"{MODULE}:KeepsObjects").state()
 
 
 @pytest.mark.parametrize(
-    ("optimiser", "dimension", "population", "says"),
-    [
-        ("cma", 300, 2, "at least 3 for 300 parameters, not 2: give --population"),
-        ("cmaes-lra", 12, 3, "at least 4, not 3: give --population"),
-        ("cmaes-sep", 1, 8, "at least 2 parameters"),
-    ],
+    ("optimiser", "dimension", "population", "flag"),
+    [("cma", 300, 2, "--population"), ("cmaes-lra", 12, 3, "--population"), ("cmaes-sep", 1, 8, "--optimiser")],
 )
-def test_a_search_that_an_optimiser_cannot_do_is_refused_and_the_next_one_works(optimiser, dimension, population, says):
-    with pytest.raises(UsageError, match=says):
+def test_a_search_that_an_optimiser_cannot_do_is_refused_and_the_next_one_works(optimiser, dimension, population, flag):
+    with pytest.raises(UsageError, match=flag):
         build(optimiser, dimension=dimension, population=population)
     more = {"dimension": 2} if dimension == 1 else {"dimension": dimension, "population": population + 1}
     evolution = build(optimiser, **more)
@@ -153,9 +148,9 @@ def test_starting_the_command_line_imports_no_optimiser():
 def test_a_state_that_the_journal_cannot_keep_is_refused(monkeypatch):
     monkeypatch.setattr("dreamfleet.coordinator.optimisers.registry.usable_memory", lambda: 10**18)
     check_memory("cma", 5_000, 32, {"covariance": "full"})
-    with pytest.raises(UsageError, match=r"has a state of 1\.2 GB, a journal keeps 1 GB at most: give --cov"):
+    with pytest.raises(UsageError, match=r"\b1\.2 .*--cov"):
         check_memory("cma", 6_000, 32, {"covariance": "full"})
-    with pytest.raises(UsageError, match=r"cmaes-lra .* has a state of 1\.6 GB"):
+    with pytest.raises(UsageError, match=r"cmaes-lra.* 1\.6 "):
         check_memory("cmaes-lra", 10_000, 32, {})
     check_memory("cmaes-sep", 10**6, 32, {})
 

@@ -91,7 +91,7 @@ def test_what_waits_is_bounded(door, monkeypatch):
     door.step()
     assert [door.submit(f"w{each}").refused for each in range(4)] == ["", "", "", "busy"]
     assert door.submit("w0").state == "waiting"  # known ones are found all the same
-    with pytest.raises(BatchError, match="split it"):
+    with pytest.raises(BatchError):
         BatchHeader("large", MAX_BATCH, 2, 0, 1, 64 * "0")
     for _ in range(200):  # uploads that never end
         header, _ = pack_batch(f"half-{_}", vectors(3000, _), [1])

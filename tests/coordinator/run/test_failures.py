@@ -170,9 +170,6 @@ def test_a_seed_on_which_all_candidates_fail_is_replaced_with_the_same_bits_thro
     assert [each.failed for each in whole[0]] == [0, 0, 0], (
         "what fails on a seed on which all fail is not the candidate's"
     )
-    with RunFolder(bench.path) as folder:
-        texts = [each.text for each in folder.events()]
-        assert texts.count("all candidates failed in generation 1: it gets other seeds") == 2
     (seeds,) = bench.journal._connection.execute("SELECT seeds FROM generation WHERE number = 1").fetchone()
     assert json.loads(seeds) == [training_seed(settings.seed, 1, each) for each in (4, 5)]
     assert story_of_killed(tmp_path, random_bundle, 26, settings, fails=fails) == whole
@@ -191,9 +188,8 @@ def test_seeds_on_which_the_whole_better_half_fails_are_replaced_in_a_race(faili
     bench = failing("race", settings=settings, fails=lambda job: job.seeds[0] == bad)
     assert bench.run.state.ended
     assert [each.failed for each in bench.run.history.rows] == [0, 0, 0]
-    with RunFolder(bench.path) as folder:
-        texts = [each.text for each in folder.events()]
-    assert "all candidates of the better half failed in generation 1: it gets other seeds" in texts
+    (seeds,) = bench.journal._connection.execute("SELECT seeds FROM generation WHERE number = 1").fetchone()
+    assert json.loads(seeds) == [training_seed(settings.seed, 1, each) for each in (4, 5, 6, 7)]
 
 
 def test_redraws_count_each_candidate_once_and_go_on_where_all_failed(tmp_path, random_bundle):
@@ -337,7 +333,6 @@ def test_a_run_that_nobody_can_score_pauses_before_every_job_was_tried(tmp_path,
         bench.serve()
         assert pause_kinds(bench) == [PauseKind.NO_ABLE_HOST]
         assert (len(bench.run.fleet.jobs.failures) < 80) == (tried < 80)
-        assert sum("it is tried again" in each for each in bench.run.take_notes()) == 1
         bench.journal.close()
 
 
@@ -361,7 +356,7 @@ def test_an_evaluation_counts_its_scored_episodes_and_one_without_any_ends(faili
     late = failing("late", settings=settings, fails=lambda job: job.episode >= CONFIRMING_OFFSET)
     assert late.run.state.ended
     with RunFolder(late.path) as folder:
-        assert any("no confirmed score" in each.text for each in folder.events())
+        assert folder.confirmation() is None
 
 
 def test_racing_goes_on_without_the_failed_ones(failing):
@@ -461,7 +456,6 @@ def test_an_episode_that_ends_its_worker_counts_as_failed_and_its_company_does_n
     with RunFolder(bench.path) as folder:
         facts = folder.failures()
     assert {each.candidate for each in facts} == {3}
-    assert all("its worker was lost" in each.error for each in facts)
     bench.journal.close()
 
 

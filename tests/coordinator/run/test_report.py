@@ -89,7 +89,7 @@ def test_a_run_that_resumes_beyond_its_limit_writes_the_controller_and_the_reaso
 
 def test_an_open_run_has_a_controller_once_a_generation_is_closed(make):
     bench = make()
-    with pytest.raises(ControllerError, match="no controller yet"):
+    with pytest.raises(ControllerError, match=bench.path.name):
         find_controller(bench.path.name, bench.path.parent)
     bench.close(1)
     controller, beside = find_controller(bench.path.name, bench.path.parent)

@@ -67,7 +67,7 @@ def test_an_exception_while_a_result_is_counted_ends_the_incarnation_and_the_nex
 
 
 def test_a_malformed_hello_is_refused_and_a_hello_with_a_known_reason_admits_nobody(bench):
-    assert "not a hello" in bench.worker_protocol.answer_hello(None, None, bench.now).why
+    assert not bench.worker_protocol.answer_hello(None, None, bench.now).accepted
     bench.run.fleet.remove_worker(B)
     refused = bench.worker_protocol.answer_hello(bench.request(B), Refusal("no " * 10_000, "wait"), bench.now)
     assert (refused.accepted, refused.remedy, refused.spec) == (False, "wait", {})

@@ -79,19 +79,18 @@ def test_a_share_of_recorded_states_is_frozen_with_a_dream_and_can_be_configured
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    "changes",
     [
-        ({"task": "dream", "recorded": -0.1}, "--recorded must be from 0 to 1, not -0.1"),
-        ({"task": "dream", "recorded": 1.5}, "--recorded must be from 0 to 1, not 1.5"),
-        ({"recorded": 0.5}, "--recorded needs task dream, not car-racing: omit it, or pass 0"),
-        ({"task": "gym:CartPole-v1", "recorded": 0.5}, "--recorded needs task dream, not gym:CartPole-v1"),
-        ({"task": "dream", "recorded": 0.5}, "holds no recorded states that dreams could begin at: build it again"),
+        {"task": "dream", "recorded": -0.1},
+        {"task": "dream", "recorded": 1.5},
+        {"recorded": 0.5},
+        {"task": "gym:CartPole-v1", "recorded": 0.5},
+        {"task": "dream", "recorded": 0.5},
     ],
 )
-def test_recorded_states_that_there_are_not_are_refused_in_one_line(random_bundle, changes, says):
-    with pytest.raises(DreamfleetError) as error:
+def test_recorded_states_that_there_are_not_are_refused_in_one_line(random_bundle, changes):
+    with pytest.raises(DreamfleetError, match="--recorded") as error:
         RunConfig(**changes).settings(random_bundle)
-    assert says in str(error.value)
     assert "\n" not in str(error.value)
 
 
@@ -134,25 +133,21 @@ def test_a_run_of_task_dream_that_drives_too_may_charge_its_drives(random_bundle
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "names"),
     [
-        (
-            {"variant": ("pedal=one",)},
-            "car-racing knows no option pedal: known are actions, pedals, pedal_shift, decide_every, ",
-        ),
-        ({"variant": ("pedals=three",)}, "pedals must be two, half or one, not 'three'"),
-        ({"variant": ("pedals",)}, "--variant 'pedals': write KEY=VALUE, such as pedals=one"),
-        ({"variant": ("pedals=one", "pedals=one")}, "a KEY stands there twice"),
-        ({"variant": ("time_cost=1",), "task": "dream"}, "time_cost needs candidates that drive"),
-        ({"variant": ("offroad_cost=2",), "task": "dream"}, "a dream has no lap and no road"),
-        ({"variant": ("pedals=one",), "task": "tests.support.tasks:Toy"}, "has no variants: car-racing has"),
-        ({"task_options": '{"pedals": "one"}'}, "--task-options are of tasks without a world model"),
+        ({"variant": ("pedal=one",)}, r"pedal\b.*pedals, pedal_shift, decide_every, "),
+        ({"variant": ("pedals=three",)}, "'three'"),
+        ({"variant": ("pedals",)}, "--variant 'pedals'"),
+        ({"variant": ("pedals=one", "pedals=one")}, "--variant"),
+        ({"variant": ("time_cost=1",), "task": "dream"}, "time_cost"),
+        ({"variant": ("offroad_cost=2",), "task": "dream"}, "offroad_cost"),
+        ({"variant": ("pedals=one",), "task": "tests.support.tasks:Toy"}, "tests.support.tasks:Toy"),
+        ({"task_options": '{"pedals": "one"}'}, "--task-options"),
     ],
 )
-def test_a_variant_that_there_is_not_is_refused_in_one_line(random_bundle, changes, says):
-    with pytest.raises(UsageError) as error:
+def test_a_variant_that_there_is_not_is_refused_in_one_line(random_bundle, changes, names):
+    with pytest.raises(UsageError, match=names) as error:
         RunConfig(**changes).settings(random_bundle)
-    assert says in str(error.value)
     assert "\n" not in str(error.value)
 
 
@@ -160,9 +155,9 @@ def test_a_start_that_drives_otherwise_is_refused_and_one_that_pays_otherwise_is
     one_pedal = StartPoint(np.zeros(578), random_bundle.sha256, "run night", '{"pedals": "one"}')
     one_pedal.check(RunConfig(variant=("pedals=one", "time_cost=1")).settings(random_bundle), random_bundle)
     for variant in ((), ("pedals=one", "decide_every=4")):
-        with pytest.raises(ControllerError, match=r'run night drives with {"pedals": "one"}, this .* omit --variant'):
+        with pytest.raises(ControllerError, match=r'run night .*{"pedals": "one"}.*--variant'):
             one_pedal.check(RunConfig(variant=variant).settings(random_bundle), random_bundle)
-    with pytest.raises(ControllerError, match="drives the plain way"):
+    with pytest.raises(ControllerError, match=r'{"decide_every": 4}'):
         StartPoint(np.zeros(867), random_bundle.sha256, "run night").check(
             RunConfig(variant=("decide_every=4",)).settings(random_bundle), random_bundle
         )
@@ -193,7 +188,7 @@ def test_a_presets_variant_is_no_matter_of_worlds_without_a_world_model():
 
 def test_a_preset_with_a_world_model_is_of_that_world_alone():
     found = load(RunConfig, "run", file={"run": {"preset": "real", "task": "gym:CartPole-v1"}}, preset=find_preset)
-    with pytest.raises(UsageError, match="preset real is of car-racing, and the task is gym:CartPole-v1: omit"):
+    with pytest.raises(UsageError, match=r"real .*car-racing.*gym:CartPole-v1.*--preset"):
         found.settings(None)
 
 
@@ -236,20 +231,20 @@ def test_what_a_preset_lets_candidates_pay_is_stronger_than_what_a_starts_paid(
 def test_the_dream_of_a_start_that_paid_has_no_price(random_bundle):
     start = StartPoint(np.zeros(867), random_bundle.sha256, "run night", '{"offroad_cost": 2.0}')
     assert start.apply_to(RunConfig(task="dream")).settings(random_bundle).task.options == ""
-    with pytest.raises(UsageError, match="pass --variant offroad_cost=0 over the preset's"):
+    with pytest.raises(UsageError, match=r"offroad_cost.*--variant"):
         RunConfig(task="dream", preset_variant=("offroad_cost=2",)).settings(random_bundle)
 
 
 def test_a_start_of_another_length_is_refused(random_bundle):
     start = StartPoint(np.zeros(867), random_bundle.sha256, "run night")
     start.check(RunConfig().settings(random_bundle), random_bundle)
-    with pytest.raises(ControllerError, match="867 parameters, this run's controllers 99"):
+    with pytest.raises(ControllerError, match=r"867 .*99"):
         start.check(RunConfig(features="z").settings(random_bundle), random_bundle)
 
 
 @pytest.mark.parametrize("temperature", [0.0, -1.0, 5000.0, float("nan"), float("inf")])
 def test_a_temperature_that_a_journal_cannot_keep_is_refused(temperature):
-    with pytest.raises(UsageError, match=r"--temperature must be from 0\.001 to 1000"):
+    with pytest.raises(UsageError, match="--temperature"):
         RunConfig(temperature=temperature)
 
 
@@ -275,44 +270,38 @@ def test_a_run_that_says_nothing_of_optimisers_keeps_the_words_of_the_first_vers
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "names"),
     [
-        ({"optimiser": "cmea"}, "unknown optimiser 'cmea'"),
-        ({"optimiser": "cmaes-sep", "covariance": "full"}, "give --covariance diagonal"),
-        ({"optimiser_options": ("restarts=3",)}, "has no option 'restarts', it knows: covariance"),
-        ({"population": 2}, "at least 3 for 867 parameters"),
-        (
-            {"controller": "hidden", "hidden_units": 10**5, "covariance": "full"},
-            "needs .* GB of memory, this host has .*: give --covariance diagonal",
-        ),
-        (
-            {"controller": "hidden", "hidden_units": 10**5, "population": 10**5},
-            "needs .* GB of memory, this host has .*: give fewer --hidden-units, a smaller --population",
-        ),
+        ({"optimiser": "cmea"}, "'cmea'"),
+        ({"optimiser": "cmaes-sep", "covariance": "full"}, "--covariance"),
+        ({"optimiser_options": ("restarts=3",)}, "'restarts'.* covariance"),
+        ({"population": 2}, "867 .*--population"),
+        ({"controller": "hidden", "hidden_units": 10**5, "covariance": "full"}, "--covariance"),
+        ({"controller": "hidden", "hidden_units": 10**5, "population": 10**5}, "--hidden-units.*--population"),
     ],
 )
-def test_what_an_optimiser_cannot_do_is_refused_before_there_is_a_run(random_bundle, changes, says):
-    with pytest.raises(UsageError, match=says):
+def test_what_an_optimiser_cannot_do_is_refused_before_there_is_a_run(random_bundle, changes, names):
+    with pytest.raises(UsageError, match=names):
         RunConfig(**changes).settings(random_bundle)
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "names"),
     [
-        ({"horizon": 2_000_000}, "--horizon must be from 1 to 1000000"),
-        ({"patience": 10**8}, "--patience must be from 0 to 1000000"),
-        ({"seed": 10**20}, "--seed must be from 0 to"),
-        ({"population": 10**11}, "--population must be from 2 to 100000"),
-        ({"hidden_units": 10**12}, "--hidden-units must be from 1 to 100000"),
-        ({"sigma0": 1e300}, "at most 1e"),
-        ({"task": ""}, "cannot name a task"),
-        ({"task": "a b:x"}, "cannot name a task"),
-        ({"task": "car-racng"}, "did you mean car-racing"),
-        ({"task": "gymm:CartPole-v1"}, "did you mean gym:..."),
+        ({"horizon": 2_000_000}, "--horizon .*1000000"),
+        ({"patience": 10**8}, "--patience .*1000000"),
+        ({"seed": 10**20}, "--seed"),
+        ({"population": 10**11}, "--population .*100000"),
+        ({"hidden_units": 10**12}, "--hidden-units .*100000"),
+        ({"sigma0": 1e300}, "--sigma0"),
+        ({"task": ""}, r"\bgym\b"),
+        ({"task": "a b:x"}, "a b:x"),
+        ({"task": "car-racng"}, "car-racing"),
+        ({"task": "gymm:CartPole-v1"}, r"gym\b"),
     ],
 )
-def test_what_a_journal_cannot_hold_is_refused_before_there_is_one(changes, says):
-    with pytest.raises(UsageError, match=says):
+def test_what_a_journal_cannot_hold_is_refused_before_there_is_one(changes, names):
+    with pytest.raises(UsageError, match=names):
         RunConfig(**changes)
 
 
@@ -332,10 +321,10 @@ def test_a_task_that_describes_itself_needs_no_bundle(random_bundle):
     assert not RunConfig().needs_no_bundle
     assert not RunConfig(task="dream").needs_no_bundle
     assert not RunConfig(task="no.such.module:Task", bundle="tiny").needs_no_bundle
-    for unknown, says in {"moon": "unknown task 'moon'", "no.such.module:Task": "--trust no.such.module"}.items():
-        with pytest.raises(UsageError, match=f"{says}.*with --bundle"):
+    for unknown, names in {"moon": "'moon'", "no.such.module:Task": "--trust"}.items():
+        with pytest.raises(UsageError, match=f"{names}.*--bundle"):
             _ = RunConfig(task=unknown).needs_no_bundle
-    with pytest.raises(UsageError, match="without a world model"):
+    with pytest.raises(UsageError, match="gym:CartPole-v1"):
         RunConfig(task="gym:CartPole-v1", bundle="tiny").settings(random_bundle)
 
 
@@ -349,13 +338,13 @@ def test_the_chosen_keys_of_an_observation_are_frozen_and_described_again(tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "flag"),
     [
-        ({"environment": ("x=1", "x=2")}, "stands there twice"),
-        ({"task_options": '{"normal": {"mean": [1], "deviation": [0]}}'}, "mean and a positive deviation of 4 numbers"),
-        ({"task_options": "{"}, "must be a JSON object"),
+        ({"environment": ("x=1", "x=2")}, "--environment"),
+        ({"task_options": '{"normal": {"mean": [1], "deviation": [0]}}'}, "--task-options"),
+        ({"task_options": "{"}, "--task-options"),
     ],
 )
-def test_options_that_describe_no_world_are_refused(changes, says):
-    with pytest.raises(UsageError, match=says):
+def test_options_that_describe_no_world_are_refused(changes, flag):
+    with pytest.raises(UsageError, match=flag):
         RunConfig(task="gym:CartPole-v1", **changes).settings(None)

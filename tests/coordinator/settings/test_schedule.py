@@ -74,62 +74,57 @@ NEXT = "\n[[stage]]\nhorizon = 50\n"
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "names"),
     [
-        ("", "holds 0 stages, and a schedule has 1 to 32"),
-        ("stage = []", "holds 0 stages"),
-        ("[stage]\nhorizon = 3\n", r"stage must be tables, each written \[\[stage\]\]"),
-        ("[[stages]]\nhorizon = 3\n", "unknown key 'stages': did you mean 'stage'"),
-        ("[run]\nhorizon = 3\n", r"unknown table \[run\]"),
-        ("[[stage]]\nhorizont = 3\n", "unknown key 'horizont' in stage 1: did you mean 'horizon'"),
-        ("[[stage]]\nseed = 3\n", "unknown key 'seed' in stage 1"),
-        ("[[stage]]\nhorizon = 3.5\n", "horizon in stage 1 must be a whole number, not 3.5"),
-        ("[[stage]]\ngenerations = 0\n" + NEXT, "stage 1: generations must be from 1 to"),
-        ("[[stage]]\ngenerations = 9\n[[stage]]\nsteps = -1\n" + NEXT, "stage 2: steps must be from 1 to"),
-        ("[[stage]]\nscore = inf\n" + NEXT, "stage 1: score must be a number, not inf"),
-        ("[[stage]]\n" * 33, "holds 33 stages"),
-        ("[[stage", "cannot be read as TOML"),
+        ("", r"\b0\b.*\b32\b"),
+        ("stage = []", r"\b0\b"),
+        ("[stage]\nhorizon = 3\n", r"\bstage\b"),
+        ("[[stages]]\nhorizon = 3\n", "'stages'.*'stage'"),
+        ("[run]\nhorizon = 3\n", r"\brun\b"),
+        ("[[stage]]\nhorizont = 3\n", "'horizont' .*stage 1.*'horizon'"),
+        ("[[stage]]\nseed = 3\n", "'seed' .*stage 1"),
+        ("[[stage]]\nhorizon = 3.5\n", "horizon .*stage 1.*3.5"),
+        ("[[stage]]\ngenerations = 0\n" + NEXT, "stage 1.*generations"),
+        ("[[stage]]\ngenerations = 9\n[[stage]]\nsteps = -1\n" + NEXT, "stage 2.*steps"),
+        ("[[stage]]\nscore = inf\n" + NEXT, "stage 1.*inf"),
+        ("[[stage]]\n" * 33, r"\b33\b"),
+        ("[[stage", "TOML|stages.toml"),
     ],
 )
-def test_what_no_schedule_can_be_is_one_line(read, text, says):
-    with pytest.raises(UsageError, match=says):
+def test_what_no_schedule_can_be_is_one_line(read, text, names):
+    with pytest.raises(UsageError, match=names):
         read(text)
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "names"),
     [
-        ("[[stage]]\nhorizon = 3\n" + NEXT, "stage 1 never ends, and stage 2 would never begin"),
-        ("[[stage]]\ngenerations = 3\n[[stage]]\ngenerations = 3\n", "stage 2 is the last and names an end"),
-        ("[[stage]]\nrestart = true\nscore = 1.0\n" + NEXT, "stage 1: restart is for a later stage"),
-        ("[[stage]]\ngenerations = 3\n[[stage]]\nrestart = true\nscore = 1.0\n" + NEXT, "give stage 1 a score"),
-        ("[[stage]]\nscore = 1.0\n[[stage]]\nrestart = true\n", "stage 2 is the last and a restart"),
+        ("[[stage]]\nhorizon = 3\n" + NEXT, "1 .*2"),
+        ("[[stage]]\ngenerations = 3\n[[stage]]\ngenerations = 3\n", "2 .*--generations"),
+        ("[[stage]]\nrestart = true\nscore = 1.0\n" + NEXT, "1"),
+        ("[[stage]]\ngenerations = 3\n[[stage]]\nrestart = true\nscore = 1.0\n" + NEXT, "2 .*1"),
+        ("[[stage]]\nscore = 1.0\n[[stage]]\nrestart = true\n", "2"),
         (
             "[[stage]]\nscore = 1.0\n[[stage]]\nrestart = true\nsteps = 9\npopulation = 8\nsigma0 = 0.2\n" + NEXT,
-            "stage 2 is a restart, which searches as stage 1 does and may be left out: omit population, sigma0",
+            "2 .*1 .*population, sigma0",
         ),
-        ("[[stage]]\ngenerations = 3\n", "stage 1 is the last and names an end"),
-        (
-            "[[stage]]\ngenerations = 25\nscore = 1.0\n" + NEXT,
-            "stage 1 never ends by its score: an evaluation counts 25",
-        ),
-        (
-            "[[stage]]\ngenerations = 2\nsteps = 128001\n" + NEXT,
-            "stage 1 never ends by its steps: .* have 128000 at most",
-        ),
-        ("[[stage]]\ngenerations = 2\nhorizon = 0\n" + NEXT, "stage 1: --horizon must be from 1 to 1000000, not 0"),
-        ("[[stage]]\ngenerations = 2\n" + NEXT + "sigma0 = 0.0\n", "stage 2: --sigma0 must be a positive number"),
-        ("[[stage]]\ngenerations = 2\n" + NEXT + "racing = true\nepisodes = 1\n", "stage 2: --racing needs at least 2"),
-        ("[[stage]]\ngenerations = 2\n" + NEXT + "population = 2\n", "stage 2: cma needs a population of at least 3"),
+        ("[[stage]]\ngenerations = 3\n", "1 .*--generations"),
+        ("[[stage]]\ngenerations = 25\nscore = 1.0\n" + NEXT, "1 .*--evaluate-every"),
+        ("[[stage]]\ngenerations = 2\nsteps = 128001\n" + NEXT, "1 .*128000"),
+        ("[[stage]]\ngenerations = 2\nhorizon = 0\n" + NEXT, "1.*--horizon .*1000000"),
+        ("[[stage]]\ngenerations = 2\n" + NEXT + "sigma0 = 0.0\n", "2.*--sigma0"),
+        ("[[stage]]\ngenerations = 2\n" + NEXT + "racing = true\nepisodes = 1\n", "2.*--racing"),
+        ("[[stage]]\ngenerations = 2\n" + NEXT + "population = 2\n", "2.*--population"),
     ],
 )
-def test_what_this_run_cannot_do_is_one_line(settings, text, says):
-    with pytest.raises(UsageError, match=says):
+def test_what_this_run_cannot_do_is_one_line(read, settings, text, names):
+    assert read(text), "each stage by itself is well-formed"
+    with pytest.raises(UsageError, match=f"(?<![0-9.]){names}"):
         settings(text)
 
 
 def test_a_score_needs_evaluations(settings):
-    with pytest.raises(UsageError, match="stage 1 ends by the score of an evaluated mean: give --evaluate-every"):
+    with pytest.raises(UsageError, match=r"1 .*--evaluate-every"):
         settings("[[stage]]\nscore = 1.0\n" + NEXT, evaluate_every=0)
 
 
@@ -145,14 +140,14 @@ def test_stages_may_stand_in_the_configuration_file_beside_other_tables(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("file", "said"),
+    ("file", "names"),
     [
-        ({"run": {"generations": 3}}, r"unknown key 'generations' in \[run\]: write it in \[limits\]"),
-        ({"limits": {"minutes": 3, "population": 8}}, r"unknown key 'population' in \[limits\]: write it in \[run\]"),
+        ({"run": {"generations": 3}}, r"'generations' .*\brun\b.*\blimits\b"),
+        ({"limits": {"minutes": 3, "population": 8}}, r"'population' .*\blimits\b.*\brun\b"),
     ],
 )
-def test_the_error_for_a_key_in_the_wrong_table_names_the_right_one(file, said):
-    with pytest.raises(UsageError, match=said):
+def test_the_error_for_a_key_in_the_wrong_table_names_the_right_one(file, names):
+    with pytest.raises(UsageError, match=names):
         load_run_config(args(file), {})
 
 
@@ -167,7 +162,7 @@ def test_a_schedule_of_its_own_is_stronger_than_the_configuration_file(tmp_path)
 
 def test_a_flag_that_the_first_stage_names_too_is_refused():
     file = {"stage": [{"steps": 9, "horizon": 3}, {"horizon": 5}]}
-    with pytest.raises(UsageError, match="--horizon and horizon of stage 1 are the same setting"):
+    with pytest.raises(UsageError, match=r"--horizon .*horizon .*1"):
         _with_stages(args(file, {"horizon"}), RunConfig(horizon=7))
     assert _with_stages(args(file, {"patience"}), RunConfig(patience=7)).stages
 
@@ -190,21 +185,21 @@ def test_a_share_that_is_driven_stays_a_share_whatever_the_episodes(settings):
 
 
 @pytest.mark.parametrize(
-    ("flags", "says"),
+    ("flags", "names"),
     [
-        ({"driven": 0.5}, "--driven needs task dream, not car-racing"),
-        ({"task": "dream", "driven": 1.5}, "--driven must be from 0 to 1, not 1.5"),
-        ({"task": "dream", "driven": float("nan")}, "--driven must be from 0 to 1, not nan"),
-        ({"task": "dream", "driven": 0.1, "episodes": 4}, "--driven 0.1 of 4 episodes is none of them, or all"),
-        ({"task": "dream", "driven": 0.5, "episodes": 4, "racing": True}, "--racing compares all candidates"),
+        ({"driven": 0.5}, "--driven .*dream.*car-racing"),
+        ({"task": "dream", "driven": 1.5}, "--driven .*1.5"),
+        ({"task": "dream", "driven": float("nan")}, "--driven .*nan"),
+        ({"task": "dream", "driven": 0.1, "episodes": 4}, "--driven .*0.1 .*4 .*--episodes"),
+        ({"task": "dream", "driven": 0.5, "episodes": 4, "racing": True}, "--racing"),
     ],
 )
-def test_what_cannot_be_driven_is_said(flags, says):
-    with pytest.raises(UsageError, match=says.replace("(", "[(]")):
+def test_what_cannot_be_driven_is_said(flags, names):
+    with pytest.raises(UsageError, match=names):
         RunConfig(**flags)
 
 
 def test_a_later_stage_that_mixes_is_looked_at_as_the_first_is(settings):
     text = "[[stage]]\ngenerations = 3\n[[stage]]\ndriven = 0.1\nepisodes = 4\n"
-    with pytest.raises(UsageError, match=r"stage 2: --driven 0\.1 of 4 episodes is none of them"):
+    with pytest.raises(UsageError, match=r"2.*--driven .*0\.1 .*4"):
         settings(text, task="dream")

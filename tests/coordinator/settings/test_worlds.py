@@ -52,7 +52,7 @@ def test_a_run_begins_without_the_worlds_package_and_can_be_configured_again(bun
 def test_without_a_task_it_is_the_bundles_own_world(bundle, random_bundle):
     assert settings_of(bundle).task.task == ABSENT
     assert settings_of(random_bundle).task.task == "car-racing"
-    with pytest.raises(UsageError, match="--bundle none: name what candidates are scored in with --task"):
+    with pytest.raises(UsageError, match=r"--bundle .*none.*--task"):
         RunConfig(bundle="none")
 
 
@@ -72,13 +72,13 @@ def test_a_task_that_ships_and_needs_no_world_model_gets_none_by_default():
 @pytest.mark.parametrize("task", ["takecover", "gym:CartPole-v1"])
 def test_a_world_model_of_another_world_is_refused(bundle, random_bundle, task):
     for each, world in ((bundle, ABSENT), (random_bundle, "car-racing")):
-        with pytest.raises(UsageError, match=f"is a world model of {world}, and not of {task}: name one of that"):
+        with pytest.raises(UsageError, match=f"{world}.*{task}.*--bundle"):
             settings_of(each, task=task)
 
 
 @pytest.mark.parametrize("preset", ["takecover", "real"])
 def test_a_preset_that_was_made_for_another_worlds_model_is_refused(bundle, preset):
-    with pytest.raises(UsageError, match=f"the preset {preset} is of .*b.zip is a world model of {ABSENT}: give"):
+    with pytest.raises(UsageError, match=f"{preset} .*b.zip .*{ABSENT}.*--preset"):
         RunConfig(**{**find_preset(preset), "bundle": str(bundle.path), "subspace": None}, preset=preset).settings(
             bundle
         )
@@ -101,17 +101,17 @@ def test_a_gymnasium_environment_is_scored_with_a_world_model_of_its_own(tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("flags", "says"),
+    ("flags", "names"),
     [
-        ({"variant": ("pedals=one",)}, "knows no option pedals: known are decide_every, feedback"),
-        ({"variant": ("decide_every=0",)}, "decide_every must be a whole number from 1 to 50"),
-        ({"task": "dream", "end": "soon"}, "a dream ends at a probability from 0 to 1, or 'drawn', not 'soon'"),
-        ({"task": "dream", "end": "1.5"}, "a dream ends at a probability from 0 to 1"),
-        ({"end": "drawn"}, "--end needs task dream, not the world that it dreams of: omit it, or pass ''"),
+        ({"variant": ("pedals=one",)}, "pedals.* decide_every, feedback"),
+        ({"variant": ("decide_every=0",)}, "decide_every .*50"),
+        ({"task": "dream", "end": "soon"}, "'drawn'.*'soon'"),
+        ({"task": "dream", "end": "1.5"}, "'drawn'.*1.5"),
+        ({"end": "drawn"}, "--end .*dream"),
     ],
 )
-def test_what_the_world_does_not_have_is_refused(bundle, flags, says):
-    with pytest.raises(UsageError, match=says):
+def test_what_the_world_does_not_have_is_refused(bundle, flags, names):
+    with pytest.raises(UsageError, match=names):
         settings_of(bundle, **flags)
 
 
@@ -139,7 +139,7 @@ def test_a_start_that_drives_otherwise_is_refused_in_any_world(bundle):
     held = StartPoint([0.0] * shape.size, bundle.sha256, "run night", '{"decide_every": 4}')
     held.check(settings, bundle)
     assert held.apply_to(RunConfig(bundle=str(bundle.path))).variant == ("decide_every=4",)
-    with pytest.raises(ControllerError, match="its parameters mean something else"):
+    with pytest.raises(ControllerError, match=r"decide_every.*--variant"):
         held.check(settings_of(bundle, task="dream"), bundle)
 
 
@@ -168,7 +168,7 @@ def test_episodes_of_the_first_world_have_its_thousand_steps(random_bundle):
 
 def test_each_demonstration_has_a_world_model_that_ships():
     assert {DemoConfig(world=each).plan.bundle for each in shipped.WORLDS} <= set(shipped_names())
-    with pytest.raises(UsageError, match="--world must be one of car-racing, takecover, not 'moon'"):
+    with pytest.raises(UsageError, match=r"--world .*car-racing, takecover.*'moon'"):
         DemoConfig(world="moon")
 
 

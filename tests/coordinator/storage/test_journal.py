@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.controller import ControllerShape
-from dreamfleet.common.errors import DamagedJournalError, JournalError, UsageError
+from dreamfleet.common.errors import DamagedJournalError, JournalError, NotWritableNowError, UsageError
 from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
@@ -63,7 +63,7 @@ def test_a_candidate_that_was_drawn_anew_and_does_not_exist_is_damage(journal, f
     with sqlite3.connect(folder / "journal.sqlite") as other:
         other.execute("INSERT INTO redraw VALUES (1, 0, ?, x'00')", (candidate,))
     other.close()
-    with pytest.raises(JournalError, match=r"is damaged: .* redrawn; restore it from a copy"):
+    with pytest.raises(DamagedJournalError):
         journal.last_generation()
 
 
@@ -159,7 +159,7 @@ def test_finalists_are_the_best_means_each_once(journal):
 
 
 def test_a_run_is_never_overwritten(folder, random_bundle):
-    with pytest.raises(JournalError, match=r"exists: choose another --run, or continue it with --resume"):
+    with pytest.raises(JournalError, match=r"--run.*--resume"):
         Journal.create(folder, SETTINGS, random_bundle.path)
 
 
@@ -199,22 +199,22 @@ def test_a_foreign_or_damaged_journal_is_refused_and_untouched(folder, damage, e
 def test_a_full_disk_is_a_clear_error(journal):
     journal._connection.execute("PRAGMA max_page_count = 20")
     journal.open_generation(0, bytes(400_000), 0.1, [1], VECTORS)
-    with pytest.raises(JournalError, match=r"cannot write .* full"):
+    with pytest.raises(NotWritableNowError):
         journal.commit()
 
 
 def test_an_unknown_run_names_those_that_exist(folder):
-    with pytest.raises(JournalError, match=r"no run 'day' in .*; there are: night"):
+    with pytest.raises(JournalError, match=r"'day' .*night"):
         open_run(folder.parent, "day")
     for number in range(2000):
         (folder.parent / f"day-{number}").mkdir()
         (folder.parent / f"day-{number}" / "journal.sqlite").touch()
-    with pytest.raises(JournalError, match=r"there are: night, .* and 1,993 more"):
+    with pytest.raises(JournalError, match=r"night, .* 1,993 "):
         open_run(folder.parent, "nighte")
 
 
 def test_a_folder_is_held_by_one(folder):
-    with run_lock(folder), pytest.raises(UsageError, match="held by a live coordinator"), run_lock(folder):
+    with run_lock(folder), pytest.raises(UsageError, match="night"), run_lock(folder):
         pass
 
 
@@ -252,7 +252,7 @@ def test_a_second_life_in_one_journal_is_noticed_by_the_first(journal, folder):
     other = Journal(folder / "journal.sqlite")
     other.begin_incarnation()
     other.close()
-    with pytest.raises(JournalError, match="another coordinator serves"):
+    with pytest.raises(JournalError, match=f"{folder.name}.* 2.* 1"):
         journal.check_incarnation()
 
 
@@ -260,7 +260,7 @@ def test_a_truncated_log_is_noticed_and_copied_from_memory(journal, folder, tmp_
     fill(journal)
     os.truncate(folder / "journal.sqlite-wal", 0)
     journal.set_fact("later", "1")
-    with pytest.raises(JournalError, match="was truncated"):
+    with pytest.raises(JournalError, match=folder.name):
         journal.commit()
     journal.save_copy(tmp_path / "journal.sqlite")
     with RunFolder(tmp_path) as copy:
@@ -289,7 +289,7 @@ def test_a_read_only_view_of_a_live_run_shows_what_is_in_its_write_ahead_log(fol
         shutil.copy(folder / "journal.sqlite-wal", tmp_path / "log")
         journal.close()
         shutil.move(tmp_path / "log", folder / "journal.sqlite-wal")
-        with pytest.raises(JournalError, match="copy the folder first"):
+        with pytest.raises(JournalError):
             RunFolder(view / "night").history()
 
 

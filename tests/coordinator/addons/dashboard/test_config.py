@@ -15,13 +15,13 @@ def test_a_loopback_address_needs_no_token(host):
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "example.org", ""])
 def test_any_other_address_needs_one(host):
-    with pytest.raises(UsageError, match="give a --token"):
+    with pytest.raises(UsageError, match="--token"):
         DashboardConfig(host=host)
     assert not DashboardConfig(host=host, token=TOKEN).is_loopback
 
 
 def test_a_short_token_is_refused():
-    with pytest.raises(UsageError, match="at least 12 characters"):
+    with pytest.raises(UsageError, match=r"--token.*\b12\b"):
         DashboardConfig(token="short")
 
 
@@ -31,7 +31,7 @@ def test_the_repr_hides_the_token():
 
 @pytest.mark.parametrize("port", [-1, 65536])
 def test_a_port_is_one(port):
-    with pytest.raises(UsageError, match="--port must be"):
+    with pytest.raises(UsageError, match="--port"):
         DashboardConfig(port=port)
 
 

