@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
@@ -39,7 +39,7 @@ from dreamfleet.coordinator.views.shown_figure import ShownFigure
 
 TITLE = 90  # characters in a line of the title
 LABEL = 52  # characters in a line of the label of the y axis
-LEGEND_PLACE = "outside lower left"
+LEGEND_PLACE: Final = "outside lower left"
 PAD = 0.08  # inches around panels, titles and legends
 LINE = 12  # points: the height of a line of the note under a title
 DECADE = 10
