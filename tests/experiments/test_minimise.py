@@ -207,7 +207,7 @@ def test_a_callback_ends_the_search_and_all_numbers_are_of_one_moment(tmp_path):
         ({"sigma": 3}, "'sigma0'"),
         ({"n_jobs": 3}, "'workers'"),
         ({"args": (3,)}, r"functools\.partial"),
-        ({"bounds": [(0, 0), (0, 0)]}, ""),
+        ({"bounds": [(0, 0), (0, 0)]}, "."),
         ({"tol": 3}, "'ftarget'"),
         ({"disp": True}, "`callback=print`"),
         ({"seed": "x"}, "'x'"),

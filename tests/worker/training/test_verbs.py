@@ -74,7 +74,7 @@ def test_a_file_and_variables_say_settings_too(tmp_path, monkeypatch, capsys):
         (("vae", "--set", "latnt=3"), "latnt"),
         (("vae", "--set", "hidden=3"), "'hidden'"),
         (("vae", "--set", "xyzzy=3"), "updates, batch, rate"),
-        (("vae", "--set", "latent"), "--set latent"),
+        (("vae", "--set", "latent"), "--set 'latent'"),
         (("vae", "--set", "latent=many"), "'many'"),
         (("vae", "--set", "channels=2,x"), "'x'"),
         (("vae", "--set", "padding=odd"), "valid, same"),
