@@ -26,6 +26,7 @@ class QueueLimit:
     rate: float = math.inf
 
 
+AT_ONCE, IN_A_SECOND = "too many at once", "too many in a second"  # reasons, which are counted
 HELLO_PATIENCE = 32  # events after which a waiting hello goes first
 QUEUE_LIMITS = {
     "result": QueueLimit(2048, 16 << 20),
@@ -94,8 +95,8 @@ class InboundQueue:
         if size > MAX_MESSAGE:
             return "oversize"
         if self._count[kind] >= bound.count or self._size[kind] + size > bound.size:
-            return "too many at once"
-        return "" if bound.rate == math.inf or self._spend_token(kind, bound, now) else "too many in a second"
+            return AT_ONCE
+        return "" if bound.rate == math.inf or self._spend_token(kind, bound, now) else IN_A_SECOND
 
     def _spend_token(self, kind: str, bound: QueueLimit, now: float) -> bool:
         """Take a token from the kind's bucket, which holds `count` and refills at `rate`; whether there was one."""

@@ -235,7 +235,7 @@ def test_a_failure_without_worker_is_shown():
 def test_the_curve_covers_the_whole_run(columns):
     history = [dataclasses.replace(STATUS.recent[0], number=number, mean=float(number)) for number in range(4000)]
     rows = drawn(dataclasses.replace(STATUS, recent=tuple(history)), columns).splitlines()
-    (caption,) = (row for row, text in enumerate(rows) if re.search(r"\b0 .*\b3999\b", text))
+    (caption,) = (row for row, text in enumerate(rows) if re.search(r"\b0 .*\b3999", text))
     lowest = rows[caption + 7].strip("│ ").split()[-1]  # the line at the bottom: risen to its height in the first bars
     assert lowest.startswith("▁")
     assert lowest.endswith("█")
