@@ -62,8 +62,8 @@ def test_an_end_of_the_runs_own_changes_its_dreams_and_its_controller_is_of_the_
 
 
 SMALL = {
-    "vae": "--updates 3 --batch 8 --latent 4 --channels 2 2 2 2 --validate-every 1",
-    "mdnrnn": "--updates 3 --batch 2 --latent 4 --hidden 4 --validate-every 1",
+    "vae": "--updates 3 --batch 8 --set latent=4 channels=2,2,2,2 validate_every=1",
+    "mdnrnn": "--updates 3 --batch 2 --set latent=4 hidden=4 validate_every=1",
     "bundle": "--end 0.9 --recorded 8",
 }
 LAYERS = tuple(word for name, text in SMALL.items() for word in (f"--{name}-flags", text))

@@ -13,7 +13,6 @@ from dreamfleet.common.cli import command_line
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.host.processes import VerbProcess, command
-from dreamfleet.common.host.reports import ADDRESS
 
 ROOT = Path(__file__).parents[2]
 DEADLINE = 300  # seconds to wait for an event: many times the usual, since a machine may be busy
@@ -71,8 +70,8 @@ class Process(VerbProcess):
         return super().wait_for(text, times, timeout)
 
     def wait_until_serving(self):
-        """Block until it reports the address at which it serves."""
-        return self.wait_for_report(ADDRESS, DEADLINE)
+        """Block until it serves: its address is reported a moment before it answers there."""
+        return self.wait_for("incarnation")
 
     def finish(self, timeout=DEADLINE):
         return super().finish(timeout)
@@ -113,10 +112,7 @@ class Processes:
             *arguments,
             root=root,
         )
-        if root == ROOT:
-            process.wait_until_serving()
-        else:
-            process.wait_for("incarnation")  # an earlier version reports nothing
+        process.wait_until_serving()
         return process
 
     def worker(self, *arguments, endpoint=None, inside=(), root=ROOT):
