@@ -9,7 +9,7 @@ SOURCES := pyproject.toml constraints.txt $(wildcard worker/worlds/car_racing/na
 # Every process of every test would compile our modules again where an environment forbids the cache.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-doom test-newest short slow setup check long box2d-py simulate chaos weekend fuzz sanitize bundle worker-size \
+.PHONY: demo test test-doom test-newest short slow setup check long box2d-py simulate mutants chaos weekend fuzz sanitize bundle worker-size \
   stranger reproduce reproduce-evolution messages keyed lock audit sbom structure words site reference clean
 
 demo: $(VENV)/.demo $(if $(filter takecover,$(WORLD)),$(VENV)/.demo-doom)  ## evolve a controller here (WORLD=takecover: there), judge it, plot it, record it
@@ -90,6 +90,9 @@ box2d-py: $(VENV)/bin/python  ## the same library from its source archive instea
 
 simulate: $(VENV)/.dev  ## SCHEDULES seeded schedules of faults against the pure parts, by a virtual clock: 100,000 take ten minutes
 	$(BIN)/python -m tests.simulation --schedules $(or $(SCHEDULES),100000) --seed $(or $(SEED),1) --jobs $(or $(JOBS),2)
+
+mutants: $(VENV)/.dev  ## COUNT small faults planted in the engine, drawn by SEED: which do its tests notice? REPLAY=FILE compares
+	$(BIN)/python -m tests.mutation --count $(or $(COUNT),300) --seed $(or $(SEED),1) $(if $(REPLAY),--replay $(REPLAY)) $(ARGS)
 
 weekend: $(VENV)/.dev  ## about MINUTES of a run that nobody watches, under outages, kills, clock steps and a full disk
 	$(BIN)/python -m tests.chaos.weekend --minutes $(or $(MINUTES),60) --seed $(or $(SEED),1) $(ARGS)
