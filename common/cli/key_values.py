@@ -1,8 +1,9 @@
-"""KEY=VALUE texts of flags."""
+"""Texts of flags: KEY=VALUE, and flags of another verb."""
 
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,6 +11,21 @@ from dreamfleet.common.errors import UsageError
 
 PYTHON_LITERALS = {"True": True, "False": False, "None": None}
 ENVIRONMENT_EXAMPLE = "continuous=true"
+
+
+def split_flags(flag: str, text: str, owner: str = "", reserved: Sequence[str] = ()) -> tuple[str, ...]:
+    """Flags of another verb that `flag` was given as one text.
+
+    `UsageError` if quotes do not match, or if one is in `reserved`, which `owner` sets itself.
+    """
+    try:
+        words = tuple(shlex.split(text))
+    except ValueError as error:
+        raise UsageError(f"{flag} {text!r}: {error}") from error
+    given = {word.partition("=")[0] for word in words if word.startswith("--")}
+    if taken := [each for each in reserved if any(each.startswith(word) for word in given)]:  # a short form too
+        raise UsageError(f"{flag}: omit {', '.join(taken)}, which {owner} sets itself")
+    return words
 
 
 def parse_arguments(flag: str, texts: Sequence[str], example: str) -> dict[str, Any]:

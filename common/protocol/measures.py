@@ -76,6 +76,11 @@ class Axis:
         return self.low + cell * width, self.low + (cell + 1) * width
 
     @property
+    def middles(self) -> list[float]:
+        """The middle of each cell."""
+        return [sum(self.bounds_of(cell)) / 2 for cell in range(self.cells)]
+
+    @property
     def edges(self) -> NDArray[np.float64]:
         """The bounds of all cells `(cells + 1,)`."""
         return np.linspace(self.low, self.high, self.cells + 1)

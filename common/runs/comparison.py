@@ -6,12 +6,13 @@ is therefore common to both scores and cancels in a difference per track (`commo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.function_values import is_minimised, value_of
+from dreamfleet.common.protocol.tasks import is_function_task
 from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.learning import LearningCurve, Point
 from dreamfleet.common.runs.paired_difference import PairedDifference
@@ -130,6 +131,24 @@ def at_equal_budget(sides: Sequence[ComparedRun]) -> list[EqualBudget]:
             most = min(spent(each.evaluated_means[-1].point.effort) for each in sides)
             found.append(EqualBudget(what, most, tuple(each.last_within_budget(spent, most) for each in sides)))
     return found
+
+
+def budget_name(sides: Sequence[ComparedRun], what: str) -> str:
+    """A kind of budget in words: a function has calls, and no steps."""
+    return "calls" if what == STEPS and all(is_function_task(each.settings.task.task) for each in sides) else what
+
+
+def paired_scores(
+    sides: Sequence[ComparedRun], equal: Sequence[EqualBudget]
+) -> Iterator[tuple[str, ComparedRun, Scores, Scores]]:
+    """Scores beside the first run's, at equal budgets, then confirmed: of what, the run, the first's, its own."""
+    for number, side in enumerate(sides[1:], 1):
+        for each in equal:
+            base, look = each.evaluated_means[0], each.evaluated_means[number]
+            if base is not None and look is not None:
+                yield f"at equal {budget_name(sides, each.what)}", side, base.scores, look.scores
+        if sides[0].confirmed is not None and side.confirmed is not None:
+            yield "confirmed", side, sides[0].confirmed_scores, side.confirmed_scores
 
 
 def difference(one: Scores, other: Scores) -> PairedDifference | str:

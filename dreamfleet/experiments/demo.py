@@ -29,10 +29,7 @@ from dreamfleet.common.client.client import Client
 from dreamfleet.common.client.eta import summarise_status
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
 from dreamfleet.common.files.regular_files import path_exists
-from dreamfleet.common.host.processes import (
-    VerbProcess,
-    shell_command,
-)
+from dreamfleet.common.host.processes import VerbProcess, shell_command
 from dreamfleet.common.host.reports import ADDRESS
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import never_stop
@@ -44,10 +41,10 @@ from dreamfleet.common.runs.seeds import TEST
 from dreamfleet.common.runs.standard_error import format_with_error, standard_error
 from dreamfleet.common.worlds.profile import DemoPlan
 from dreamfleet.common.worlds.score_words import profile_of
+from dreamfleet.common.worlds.shipped import WORLDS
 from dreamfleet.coordinator.settings.run_checks import NO_SUBSPACE
 from dreamfleet.coordinator.views.status_panel import RunPanel
 from dreamfleet.experiments import command_lines
-from dreamfleet.experiments.demo_plans import PLANS, find_plan, plan_defaults
 from dreamfleet.experiments.local_run import START_SECONDS, LocalRun, has_begun
 
 REFRESH = 0.5
@@ -57,11 +54,15 @@ PLOT, VIDEO, SCHEDULE = "fitness.png", "drive.mp4", "stages.toml"
 SUBSPACE_SIGMA0, FULL_SIGMA0 = 0.3, 0.1  # first step sizes from zero: in a subspace, and of all parameters
 SUBSPACE_SIGMA0_AFTER_DREAM, FULL_SIGMA0_AFTER_DREAM = 0.15, 0.06  # the same after a dream
 LATE_SIGMA0 = 0.06  # step size in a subspace once a mean is able
+PLANS: dict[str, DemoPlan] = {name: world.demo for name, world in WORLDS.items() if world.demo}
 
 
 def _option_of_plan(name: str, text: str) -> Any:
-    """An option whose default is the world's plan's."""
-    return option(None, f"{text} (default {plan_defaults(name)})")
+    """An option whose default is that of the world's plan."""
+    values = {world: f"{getattr(plan, name)}" for world, plan in PLANS.items()}
+    each = [f"{value} in {world}" for world, value in values.items()]
+    shown = ", ".join(each if len(set(values.values())) > 1 else [*values.values()][:1])
+    return option(None, f"{text} (default {shown})")
 
 
 @dataclass(frozen=True)
@@ -73,13 +74,9 @@ class DemoConfig:
     minutes: float | None = _option_of_plan("minutes", "then evolve in reality for so long; 0: not at all")
     temperature: float | None = _option_of_plan("temperature", "of the dream")
     population: int | None = _option_of_plan("population", "candidates a generation in reality")
-    episodes: int | None = _option_of_plan(
-        "episodes", "episodes a candidate in reality, after one each until a mean is able"
-    )
+    episodes: int | None = _option_of_plan("episodes", "episodes a candidate in reality, one until a mean is able")
     horizon: int | None = _option_of_plan("horizon", "steps of an episode at most in reality")
-    patience: int | None = _option_of_plan(
-        "patience", "cut an episode after so many steps without reward in reality; 0: never"
-    )
+    patience: int | None = _option_of_plan("patience", "steps without reward that end an episode in reality; 0: never")
     sigma0: float | None = option(
         None,
         f"first step size from zero (default {SUBSPACE_SIGMA0} in a subspace, else {FULL_SIGMA0}); "
@@ -107,9 +104,11 @@ class DemoConfig:
     @property
     def plan(self) -> DemoPlan:
         """The world's plan with what is given here; `UsageError` for a world without one."""
+        if self.world not in PLANS:
+            raise UsageError(f"--world must be one of {', '.join(PLANS)}, not {self.world!r}")
         names = {each.name for each in fields(DemoPlan)}
         given = {name: value for name, value in vars(self).items() if name in names and value is not None}
-        return replace(find_plan(self.world), **given)
+        return replace(PLANS[self.world], **given)
 
 
 @dataclass(frozen=True)
@@ -241,10 +240,8 @@ class Demo:
             logs.mkdir(parents=True, exist_ok=True)
             (logs / SCHEDULE).write_text(demo_run.schedule, encoding="utf-8")
             flags = {**flags, "schedule": logs / SCHEDULE}
-        words = command_lines.begin_run(
-            demo_run.run, self._runs_dir, (self._endpoint,), *command_lines.options(**flags),
-            world_model=self._plan.bundle, as_json=False,
-        )  # fmt: skip
+        settings = command_lines.options(**flags, bundle=self._plan.bundle)
+        words = command_lines.begin_run(demo_run.run, self._runs_dir, (self._endpoint,), *settings, as_json=False)
         with LocalRun(demo_run.run, words, logs) as run, run.connect(self._endpoint) as client:
             for name in (f"core-{number}" for number in range(workers)):
                 run.start_worker(name, command_lines.worker(demo_run.run, self._endpoint, 1, "--name", name))
@@ -275,23 +272,13 @@ class Demo:
         self._console.print(f"{path}: fitness over generations", markup=False)
 
     def _print_next_steps(self, folder: Path) -> None:
-        controller = folder / CONTROLLER
+        controller, mine = folder / CONTROLLER, ("--run", "mine", "--preset", self._plan.preset)
         files = f": the controller, {PLOT}, {VIDEO}, the journal. Three things to try:"
         self._console.print(Text.assemble("\n", (f"In {folder}", "bold"), files))
         for command in (
             shell_command("verify", "candidate", folder.name, "--candidate", "0/0", "--runs-dir", self._runs_dir),
             shell_command("evaluate", "--controller", controller, "--episodes", 100),
-            shell_command(
-                "coordinator",
-                "--run",
-                "mine",
-                "--preset",
-                self._plan.preset,
-                "--bundle",
-                self._plan.bundle,
-                "--listen",
-                self._endpoint,
-            )
+            shell_command("coordinator", *mine, "--bundle", self._plan.bundle, "--listen", self._endpoint)
             + f"   # and beside it: {shell_command('worker', '--connect', self._endpoint)}",
         ):
             self._console.print(f"  {command}", style="green", highlight=False, soft_wrap=True, markup=False)

@@ -6,8 +6,10 @@ import inspect
 import os
 import sys
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -61,9 +63,8 @@ def name_function(function: Callable[..., Any] | str) -> FunctionName:
     'function:numpy.linalg:norm'
     """
     if isinstance(function, str):
-        found = FunctionName(
-            f"{FUNCTION}:{function.removeprefix(f'{FUNCTION}:')}", module_folder(function.partition(":")[0])
-        )
+        own = function.removeprefix(f"{FUNCTION}:")
+        found = FunctionName(f"{FUNCTION}:{own}", module_folder(function.partition(":")[0]))
     else:
         found = _name_object(function)
     check_module_name(found.task.split(":")[1])
@@ -88,7 +89,9 @@ def _name_object(function: Callable[..., Any]) -> FunctionName:
         raise UsageError(f"{kind} has no name by which other processes find it: {REMEDY}")
     if module == MAIN:
         return _name_of_script(name)
-    found = _look_up(sys.modules.get(module), name)
+    found = None
+    with suppress(AttributeError):
+        found = attrgetter(name)(sys.modules.get(module))
     if found is not function and not (inspect.ismethod(function) and found == function):
         raise UsageError(f"{name} of {module} is another object than this function: {REMEDY}")
     return FunctionName(f"{FUNCTION}:{module}:{name}", module_folder(module))
@@ -103,10 +106,10 @@ def _name_instance(found: object, more: str = "") -> FunctionName:
         places[MAIN] = places.pop(MAIN)
     for module in places:
         for name, value in list(getattr(sys.modules.get(module), "__dict__", {}).items()):
+            if value is found and module == MAIN:
+                return _name_of_script(name + more)
             if value is found:
-                return _name_of_script(name + more) if module == MAIN else FunctionName(
-                    f"{FUNCTION}:{module}:{name}{more}", module_folder(module)
-                )  # fmt: skip
+                return FunctionName(f"{FUNCTION}:{module}:{name}{more}", module_folder(module))
     raise UsageError(f"no module has this object of type {kind.__name__} under a name: {REMEDY}")
 
 
@@ -124,10 +127,3 @@ def _name_of_script(name: str) -> FunctionName:
         )
     path = Path(file).resolve()
     return FunctionName(f"{FUNCTION}:{path.stem}:{name}", path.parent)
-
-
-def _look_up(module: object, name: str) -> Any:
-    found = module
-    for part in name.split("."):
-        found = getattr(found, part, None)
-    return found

@@ -21,10 +21,11 @@ from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import Stop, signals_deferred
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import JOURNAL
-from dreamfleet.common.transport.network import wait_for_listener
+from dreamfleet.common.transport.network import Network, wait_for_listener
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.experiments import command_lines
+from dreamfleet.experiments.command_lines import Words
 
 # Variables of a process that stays on this host, even if its user is in a fleet.
 ALONE = {"DREAMFLEET_JOIN": "", "DREAMFLEET_CONNECT": ""}
@@ -74,17 +75,14 @@ class LocalFleet:
 class LocalRun:
     """A run's coordinator, and workers of this host, as child processes; leaving the context ends them."""
 
-    def __init__(
-        self, name: str, words: Sequence[str], logs: Path, environment: Mapping[str, str] | None = None
-    ) -> None:
+    def __init__(self, name: str, words: Words, logs: Path, environment: Mapping[str, str] | None = None) -> None:
         """`words` are the coordinator's command line; each process logs into a file in `logs`."""
         self._name, self._words, self._logs, self._environment = name, words, logs, environment
-        self._log = logs / "coordinator.log"
         self._workers: list[VerbProcess] = []
 
     def __enter__(self) -> LocalRun:
         self._stack = ExitStack()
-        self.coordinator = self._start(self._words, self._log)
+        self.coordinator = self._start(self._words, "coordinator")
         return self
 
     def __exit__(self, *_error: object) -> None:
@@ -98,25 +96,16 @@ class LocalRun:
 
         `DreamfleetError` if it ends before, `UsageError` if its command line was wrong.
         """
-        deadline = time.monotonic() + START_SECONDS
-        while True:
+
+        def check() -> None:
             if (code := self.coordinator.exit_code) is not None:
                 raise (UsageError if code == UsageError.exit_code else DreamfleetError)(self.coordinator.last_line())
-            wait_for_listener((endpoint,), POLL_INTERVAL, lambda: False)
-            try:
-                with ExitStack() as stack:
-                    client = stack.enter_context(Client((endpoint,)))
-                    client.document(self._name)
-                    stack.pop_all()
-                    return client
-            except ConnectionFailedError:
-                if time.monotonic() > deadline:
-                    raise
-                time.sleep(CONNECT_INTERVAL)
+
+        return connect_once_ready(Network(connect=(endpoint,)), check, lambda client: client.document(self._name))
 
     def start_worker(self, name: str, words: Sequence[str]) -> None:
         """Start a worker by its command line; it logs into `name`.log."""
-        self._workers.append(self._start(words, self._logs / f"{name}.log"))
+        self._workers.append(self._start(words, name))
 
     def end_workers(self) -> None:
         """End the workers at once, which have nothing to finish."""
@@ -124,9 +113,10 @@ class LocalRun:
             while self._workers:
                 self._workers.pop().end(0)
 
-    def _start(self, words: Sequence[str], log: Path) -> VerbProcess:
+    def _start(self, words: Sequence[str], name: str) -> VerbProcess:
+        log, environment = self._logs / f"{name}.log", self._environment
         with signals_deferred():  # what is started is also ended
-            process = VerbProcess(*words, log=log, environment=self._environment, ends_with_parent=True)
+            process = VerbProcess(*words, log=log, environment=environment, ends_with_parent=True)
             return self._stack.enter_context(process)
 
     def check_workers(self) -> None:
@@ -158,17 +148,43 @@ class LocalRun:
         if code == StoppedError.exit_code:
             raise StoppedError(f"run {self._name} was left open")
         if code != 0:
-            raise DreamfleetError(f"{self.coordinator.last_line()}; the coordinator's log is {self._log}")
+            log = self._logs / "coordinator.log"
+            raise DreamfleetError(f"{self.coordinator.last_line()}; the coordinator's log is {log}")
 
 
-def evolve(name: str, words: Sequence[str], local_fleet: LocalFleet, logs: Path, stop: Stop) -> None:
+def connect_once_ready(
+    network: Network, check: Callable[[], None], probe: Callable[[Client], object] = lambda _client: None
+) -> Client:
+    """A client as soon as one is accepted and `probe(client)` is answered; `check` is called before each try."""
+    deadline = time.monotonic() + START_SECONDS
+    while True:
+        check()
+        wait_for_listener(network.connect, POLL_INTERVAL, lambda: False)
+        try:
+            with ExitStack() as stack:
+                client = stack.enter_context(Client(network))
+                probe(client)
+                stack.pop_all()
+                return client
+        except ConnectionFailedError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(CONNECT_INTERVAL)
+
+
+def coordinator_words(name: str, runs_dir: Path, fleet: LocalFleet, begin: Callable[[], Words]) -> Words:
+    """The coordinator's command line: it resumes a run that has begun, and begins another with the flags of `begin`."""
+    if has_begun(runs_dir, name):
+        return command_lines.resume_run(name, runs_dir, fleet.listen, *fleet.security)
+    return command_lines.begin_run(name, runs_dir, fleet.listen, *fleet.coordinator, *fleet.security, *begin())
+
+
+def evolve(name: str, words: Words, fleet: LocalFleet, logs: Path, stop: Stop) -> None:
     """Serve a run until it ends, as `LocalRun.wait` does; also `DreamfleetError` if this host's worker failed."""
     with LocalRun(name, words, logs) as run:
-        if local_fleet.slots:
-            flags = ("--exit-when-done", *local_fleet.worker)
-            run.start_worker(
-                "worker", command_lines.worker(name, local_fleet.local_endpoint, local_fleet.slots, *flags)
-            )
+        if fleet.slots:
+            flags = ("--exit-when-done", *fleet.worker)
+            run.start_worker("worker", command_lines.worker(name, fleet.local_endpoint, fleet.slots, *flags))
         run.wait(stop, run.check_workers)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from pathlib import Path
@@ -20,7 +21,7 @@ from dreamfleet.common.protocol.stop_kind import StopKind, StopReason
 from dreamfleet.common.runs.records import StoredGeneration, best_evaluation
 from dreamfleet.common.runs.run_paths import default_runs_dir
 from dreamfleet.common.schema.display import Displayed
-from dreamfleet.experiments.function_names import FunctionName, name_function
+from dreamfleet.experiments.function_names import name_function
 from dreamfleet.experiments.local_run import has_begun
 from dreamfleet.experiments.search_arguments import candidate_calls, check_names, read_objective, read_seed
 from dreamfleet.experiments.started_run import RunPausedError, StartedRun, start_run_in
@@ -119,12 +120,9 @@ def minimise(
     >>> found.fun <= 0.01, found.success, bool(np.abs(found.x).max() <= 0.01)
     (True, True, True)
     """
-    check_names(settings)
     given = {"penalty": penalty, "minimise": True, "integer": integer, "log": log}
-    objective = read_objective(x0, sigma0, bounds, given)
-    return _Searches(
-        name_function(function), objective, _is_noisy(function), ftarget, maxfevals, callback, workers, runs_dir,
-    ).search(run, popsize, restarts, restart, settings)  # fmt: skip
+    found = _Searches(function, x0, sigma0, bounds, given, ftarget, maxfevals, callback, workers, runs_dir, settings)
+    return found.search(run, popsize, restarts, restart)
 
 
 def maximise(
@@ -141,12 +139,9 @@ def maximise(
     >>> found.fun >= 1.9
     True
     """
-    check_names(settings)
     given = {"penalty": penalty, "minimise": False, "integer": integer, "log": log}
-    objective = read_objective(x0, sigma0, bounds, given)
-    return _Searches(
-        name_function(function), objective, _is_noisy(function), ftarget, maxfevals, callback, workers, runs_dir,
-    ).search(run, popsize, restarts, restart, settings)  # fmt: skip
+    found = _Searches(function, x0, sigma0, bounds, given, ftarget, maxfevals, callback, workers, runs_dir, settings)
+    return found.search(run, popsize, restarts, restart)
 
 
 def _is_noisy(function: Callable[..., Any] | str) -> bool:
@@ -174,10 +169,13 @@ class _Searches:
     """A search and its restarts, each a run."""
 
     def __init__(
-        self, function: FunctionName, objective: Objective, is_noisy: bool, ftarget: float | None,
-        maxfevals: int | None, callback: Callback | None, workers: int | None, runs_dir: Path | str | None,
+        self, function: Callable[..., Any] | str, x0: Any, sigma0: Any, bounds: Any, given: dict[str, Any],
+        ftarget: float | None, maxfevals: int | None, callback: Callback | None, workers: int | None,
+        runs_dir: Path | str | None, settings: dict[str, Any],
     ) -> None:  # fmt: skip
-        self._function, self._objective, self._is_noisy = function, objective, is_noisy
+        check_names(settings)
+        self._objective = read_objective(x0, sigma0, bounds, given)
+        self._function, self._is_noisy, self._settings = name_function(function), _is_noisy(function), settings
         self._ftarget, self._maxfevals, self._callback = ftarget, maxfevals, callback
         self._budget = maxfevals or 0  # 0: no limit
         self._workers, self._runs_dir = workers, runs_dir
@@ -191,17 +189,12 @@ class _Searches:
         self._failed = 0  # candidates
         self._first_failure = ""  # why the first one failed
 
-    def search(
-        self, name: str | None, popsize: int | None, restarts: int, kind: Restart, settings: dict[str, Any]
-    ) -> SearchResult:
+    def search(self, name: str | None, popsize: int | None, restarts: int, kind: Restart) -> SearchResult:
         """Search, restart while nothing else ends it, and say what was found; `UsageError` for wrong settings."""
         if kind not in ("ipop", "bipop"):
             raise UsageError(f"restart must be 'ipop' or 'bipop', not {kind!r}")
-        for what, value, least in (
-            ("restarts", restarts, 0),
-            ("popsize", popsize, 2),
-            ("maxfevals", self._maxfevals, 1),
-        ):
+        numbers = (("restarts", restarts, 0), ("popsize", popsize, 2), ("maxfevals", self._maxfevals, 1))
+        for what, value, least in numbers:
             if value is not None and not (isinstance(value, (int, np.integer)) and least <= value <= MOST):
                 raise UsageError(f"{what} must be a whole number from {least} to {MOST:,}, not {value!r:.100}")
         if self._ftarget is not None and not isinstance(self._ftarget, (int, float, np.number)):
@@ -218,13 +211,13 @@ class _Searches:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UsageError(f"runs_dir {folder} cannot be created ({error.strerror}): choose another") from error
-        size, seed = self._objective.dimension, read_seed(settings.pop("seed", 1))
+        size, seed = self._objective.dimension, read_seed(self._settings.pop("seed", 1))
         first = popsize or 4 + math.floor(3 * math.log(size))
-        if settings.get("optimiser", "cma") == "cma" and size <= FULL_DIMENSION:
-            settings = {"covariance": "full", **settings}
+        if self._settings.get("optimiser", "cma") == "cma" and size <= FULL_DIMENSION:
+            self._settings.setdefault("covariance", "full")
         for number, plan in enumerate(self._plans(first, seed, restarts, kind)):
             own = f"{self._runs[0]}-restart-{number}" if number else name
-            reason = self._run(own, plan, number, settings)
+            reason = self._run(own, plan, number)
             if self._stopped or self._has_reached or (self._budget and self._spent >= self._budget):
                 break
         return self._result(reason)
@@ -260,9 +253,9 @@ class _Searches:
         found = self._favorite if self._is_noisy else self._best
         return self._ftarget is not None and found is not None and found[0] >= self._objective.value(self._ftarget)
 
-    def _run(self, name: str | None, plan: _Plan, number: int, settings: dict[str, Any]) -> StopReason:
+    def _run(self, name: str | None, plan: _Plan, number: int) -> StopReason:
         """One search as a run; why it ended."""
-        objective = self._objective_of(plan, number)
+        objective, settings = self._objective_of(plan, number), self._settings
         target = None if self._ftarget is None else objective.value(self._ftarget)
         patience = 50 + math.ceil(100 * objective.dimension / plan.popsize)
         own: dict[str, Any] = {
@@ -291,9 +284,12 @@ class _Searches:
         """Follow a run to its end; why it ended. `UsageError` if no candidate of the search has a value."""
         try:
             for generation in run:
-                if not self._report(self._follow(run, objective, generation)):
-                    self._stopped = True
-                    return StopReason(None, "stopped by the callback")
+                progress = self._follow(run, objective, generation)
+                with suppress(StopIteration):
+                    if self._callback is None or self._callback(progress) is not False:
+                        continue
+                self._stopped = True
+                return StopReason(None, "stopped by the callback")
         except RunPausedError as pause:
             self._follow_rest(run, objective)
             if self._best is not None and run.failures():
@@ -345,19 +341,11 @@ class _Searches:
         self._history.append(progress)
         return progress
 
-    def _report(self, progress: Progress) -> bool:
-        """Report to the callback; whether the search goes on."""
-        try:
-            return self._callback is None or self._callback(progress) is not False
-        except StopIteration:
-            return False
-
     def _note_failures(self, run: StartedRun, failed: int) -> None:
         """Count failed candidates, and warn of the first one."""
         if failed and not self._failed:
-            self._first_failure = next(
-                (each.error for each in run.failures() if each.kind == "score"), "its error is in the log"
-            )
+            errors = (each.error for each in run.failures() if each.kind == "score")
+            self._first_failure = next(errors, "its error is in the log")
             text = f"{self._first_failure}; failed candidates rank last, and only this one is warned of"
             warnings.warn(text, RuntimeWarning, stacklevel=CALLER + 3)
         self._failed += failed

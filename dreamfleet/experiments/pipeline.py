@@ -1,12 +1,13 @@
-"""A world model from nothing: its stages, in order, in one data folder."""
+"""A world model from nothing: its stages, in order, in one data folder; and stages by the flags of their verbs."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from dreamfleet.common.cli.command_line import parse_flags
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.host.stop_signals import Stop, never_stop
@@ -14,10 +15,22 @@ from dreamfleet.worker.training.stages import StageReport
 from dreamfleet.worker.training.stages.bundle import BundleRequest, build_bundle
 from dreamfleet.worker.training.stages.collect import CollectRequest, collect_drives
 from dreamfleet.worker.training.stages.encode import EncodeRequest, encode_drives
-from dreamfleet.worker.training.stages.train import TrainRequest, train_model
+from dreamfleet.worker.training.stages.train import Model, TrainRequest, train_model
+from dreamfleet.worker.verbs import bundle, train
 
 COLLECT, VAE, ENCODE, MDNRNN, BUNDLE = STAGES = ("collect", "train.vae", "encode", "train.mdnrnn", "bundle")
 MORE = 4  # times as many updates as the VAE had are advised where it learnt too little
+
+
+def read_training(model: Model, data: Path, seed: int, *words: object) -> TrainRequest:
+    """The training of a model with this seed by flags of `train`; of one that is given twice the latter counts."""
+    request = train.make_request(parse_flags("train", train, (model, "--data", data, *words)))
+    return replace(request, settings={**request.settings, "seed": seed})
+
+
+def read_bundle(data: Path, out: Path, *words: object) -> BundleRequest:
+    """The bundle `out` of a data folder by flags of `bundle`."""
+    return bundle.make_request(parse_flags("bundle", bundle, ("--data", data, "--out", out, *words)))
 
 
 @dataclass(frozen=True)

@@ -106,10 +106,12 @@ def read_objective(x0: Any, sigma0: Any, bounds: Any, given: dict[str, Any]) -> 
         raise UsageError(f"bounds must be pairs of numbers, not {bounds!r:.100}") from error
     indices = {name: _read_indices(name, given[name]) for name in ("integer", "log")}
     _check_integers(lower, upper, indices["integer"])
-    given_steps = None if sigma0 is None else _read_numbers("sigma0", sigma0)
-    if given_steps is not None and not all(0 < each < math.inf for each in given_steps):
-        raise UsageError(f"sigma0 must be above 0, not {sigma0}")
-    scale = given_steps or _default_steps(len(start), lower, upper, indices["log"])
+    if sigma0 is None:
+        scale = _default_steps(len(start), lower, upper, indices["log"])
+    else:
+        scale = _read_numbers("sigma0", sigma0)
+        if not all(0 < each < math.inf for each in scale):
+            raise UsageError(f"sigma0 must be above 0, not {sigma0}")
     arguments = {"x0": start, "scale": scale[0] if len(scale) == 1 else scale, "lower": lower, "upper": upper}
     return Objective.of({**given, **arguments, **indices})
 
@@ -174,9 +176,7 @@ def read_bounds(bounds: Any, size: int) -> tuple[Any, Any]:
         if len(pairs) == 2 and all(each is None or np.ndim(each) == 0 for each in pairs):
             pairs = [tuple(pairs)] * size
     if len(pairs) != size or not all(np.ndim(each) == 1 and len(each) == 2 for each in pairs):
-        raise UsageError(
-            f"bounds must be a pair (low, high) for each of {plural(size, 'parameter')}, or one pair of numbers"
-        )
+        raise UsageError(f"bounds must be pairs (low, high) for {plural(size, 'parameter')}, or one pair of numbers")
     ends = [[None if each is None or math.isinf(each) else float(each) for each in side]
             for side in zip(*pairs, strict=True)]  # fmt: skip
     return ends[0], ends[1]

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
-from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any, Self, Unpack
@@ -67,9 +66,7 @@ class StartedRun(StoredRun):
     `address` is where further workers and `Client`s reach it, `client` a `Client` of it.
     """
 
-    def __init__(
-        self, path: Path, processes: LocalRun, address: str, client: Client | None, *, resumed: bool
-    ) -> None:  # fmt: skip
+    def __init__(self, path: Path, processes: LocalRun, address: str, client: Client | None, *, resumed: bool) -> None:
         """Of a `resumed` run, iterating begins with the generation that closes next."""
         super().__init__(path)
         self.address, self.client = address, client
@@ -219,37 +216,36 @@ def start_run_in(
     if type(slots) is not int or not 0 <= slots <= MOST_WORKERS:
         raise UsageError(f"workers must be a whole number from 0 to {MOST_WORKERS}, not {workers!r}")
     flags, listen = check_settings(settings), settings.pop("listen", ())
-    fleet = LocalFleet.of((listen,) if isinstance(listen, str) else tuple(listen), slots, flags, ())
+    fleet = LocalFleet.of((listen,) if isinstance(listen, str) else tuple(listen), slots, (), ())
     folder = Path(default_runs_dir() if runs_dir is None else runs_dir).absolute()
-    name, words = _coordinator_words(settings, folder, fleet)
+    name = _run_name(settings, folder)
+    words = command_lines.begin_run(name, folder, fleet.listen, *flags, as_json=False)
+    if settings.get("resume"):
+        words = command_lines.resume_run(name, folder, fleet.listen, *flags)
     processes = LocalRun(name, words, folder / name, {**os.environ, **ALONE, **own_arguments(), **environment})
     with ExitStack() as stack:
         stack.enter_context(_claim(folder / name))
         stack.callback(_discard_unless_begun, folder / name)
         stack.enter_context(processes)
-        start_workers = partial(_start_workers, processes, name, fleet.local_endpoint, slots)
+
+        def start_workers(flags: tuple[str, ...]) -> None:
+            for worker in (f"core-{number}" for number in range(slots)):
+                more = ("--name", worker, "--exit-when-done", *flags)
+                processes.start_worker(worker, command_lines.worker(name, fleet.local_endpoint, 1, *more))
+
         expected = task_flags(settings["task"]) if settings.get("task") and not settings.get("resume") else None
         if expected is not None:  # they load while the coordinator checks the task
             start_workers(expected)
         run = _open(processes, folder / name, fleet.local_endpoint, stack, resumed=bool(settings.get("resume")))
-        needed = None if run.client is None else _needed_flags(run)
+        needed = None
+        if run.client is not None:  # the flags by which a worker of this run announces its tasks
+            needed = task_flags(run.spec.task, *((bundle.manifest.task,) if (bundle := run.bundle()) else ()))
         if needed != expected:
             processes.end_workers()
             if needed is not None:
                 start_workers(needed)
         run.end_with(stack.pop_all())
     return run
-
-
-def _needed_flags(run: StartedRun) -> tuple[str, ...]:
-    """The flags by which a worker of this run announces its tasks."""
-    return task_flags(run.spec.task, *((found.manifest.task,) if (found := run.bundle()) else ()))
-
-
-def _start_workers(processes: LocalRun, name: str, endpoint: str, count: int, flags: tuple[str, ...]) -> None:
-    for worker in (f"core-{number}" for number in range(count)):
-        more = ("--name", worker, "--exit-when-done", *flags)
-        processes.start_worker(worker, command_lines.worker(name, endpoint, 1, *more))
 
 
 def evolve(
@@ -284,10 +280,9 @@ def check_settings(settings: Mapping[str, Any]) -> tuple[str, ...]:
     for name in settings:
         if name not in known:
             raise UsageError(f"unknown setting {name!r}{suggestion(name, known)}")
-    flags = tuple(word for name, value in settings.items() for word in flag_words(name, value))
-    parser.parse_all(flags)
-    apart = {key: value for key, value in settings.items() if key not in ("run", "resume", "listen")}
-    return tuple(word for name, value in apart.items() for word in flag_words(name, value))
+    words = {name: flag_words(name, value) for name, value in settings.items()}
+    parser.parse_all([word for each in words.values() for word in each])
+    return tuple(word for name, each in words.items() if name not in ("run", "resume", "listen") for word in each)
 
 
 def setting_names(parser: Parser) -> list[str]:
@@ -311,14 +306,14 @@ def flag_words(name: str, value: Any) -> tuple[str, ...]:
     return (f"--{flag}={value}",)
 
 
-def _coordinator_words(settings: Mapping[str, Any], folder: Path, fleet: LocalFleet) -> tuple[str, tuple[str, ...]]:
-    """The run's name, and the command line of its coordinator."""
+def _run_name(settings: Mapping[str, Any], folder: Path) -> str:
+    """The run to resume, or the name of a new one; `UsageError` if that exists."""
     if resumed := settings.get("resume"):
-        return resumed, command_lines.resume_run(check_run_name(resumed), folder, fleet.listen, *fleet.coordinator)
+        return check_run_name(resumed)
     name = check_run_name(settings.get("run") or _free_name(folder))
     if has_begun(folder, name):
         raise UsageError(f"run {name!r} exists in {folder}: continue it with resume={name!r}, or choose another name")
-    return name, command_lines.begin_run(name, folder, fleet.listen, *fleet.coordinator, as_json=False)
+    return name
 
 
 def _free_name(folder: Path) -> str:

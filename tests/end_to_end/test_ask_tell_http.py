@@ -1,7 +1,7 @@
 """Batches over HTTP: the bridge's answers to good and bad requests, and to connections that stop.
 
 Tests coordinator/addons/bridge/app.py, coordinator/addons/bridge/changes.py,
-coordinator/addons/bridge/config.py, coordinator/addons/bridge/guard.py, coordinator/addons/bridge/openapi.py,
+coordinator/addons/bridge/config.py, coordinator/addons/bridge/openapi.py,
 coordinator/addons/bridge/server.py and coordinator/addons/bridge/verb.py.
 """
 
@@ -164,9 +164,9 @@ def test_bad_requests_are_refused_with_a_reason_and_lose_nothing(bridge):
 
 IMPATIENT = """
 from dreamfleet.coordinator.addons.bridge import app, server
-from dreamfleet.coordinator.addons.dashboard import server as page
+from dreamfleet.coordinator.addons.web import server as web
 
-app.BODY_TIMEOUT, page.IDLE_TIMEOUT, server.KEEP_ALIVE, server.BridgeConnection.keep_alive = 3.0, 1.0, 4, 4
+app.BODY_TIMEOUT, web.IDLE_TIMEOUT, server.KEEP_ALIVE = 3.0, 1.0, 4
 """  # Python imports it as `sitecustomize` before the verb begins
 
 

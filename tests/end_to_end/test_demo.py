@@ -1,7 +1,6 @@
 """The demonstration, seconds long.
 
-Tests dreamfleet/experiments/demo.py, dreamfleet/experiments/demo_plans.py and
-dreamfleet/experiments/verbs/demo.py.
+Tests dreamfleet/experiments/demo.py and dreamfleet/experiments/verbs/demo.py.
 """
 
 import os
@@ -18,8 +17,7 @@ from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.common.runs.standard_error import format_with_error
-from dreamfleet.experiments.demo import Demo, DemoConfig, median_drive, plan_runs
-from dreamfleet.experiments.demo_plans import PLANS
+from dreamfleet.experiments.demo import PLANS, Demo, DemoConfig, median_drive, plan_runs
 from tests.support.processes import call_here
 from tests.support.tables import cells
 

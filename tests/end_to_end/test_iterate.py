@@ -20,7 +20,6 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.host.stop_signals import never_stop
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.experiments.isolated import run_isolated
 from dreamfleet.experiments.iteration.config import IterateConfig
 from dreamfleet.experiments.iteration.layout import IterationFolder
 from dreamfleet.experiments.iteration.ledger import FinishedPhase, IterationLedger
@@ -170,7 +169,7 @@ def gate(layout, new, drives=write_drives, **changes):
         .add(FinishedPhase(1, "bundle", 0, 0.0, ""))
         .add(FinishedPhase(2, "bundle", 0, 0.0, ""))
     )
-    phases = PhaseRunner(Requests(config, layout, ledger), None, run_isolated, never_stop)
+    phases = PhaseRunner(Requests(config, layout, ledger), None, never_stop, print)
     return phases.do(Phase(2, "gate")).figures
 
 

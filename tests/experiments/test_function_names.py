@@ -63,10 +63,7 @@ print(name_function(cost).task, name_function(heavy).task)
 
 
 def test_a_scripts_own_function_is_found_by_the_name_of_its_file(tmp_path):
-    for file, expected in (
-        ("tuning.py", "function:tuning:cost function:tuning:heavy"),
-        ("my-tuning.py", "UsageError"),
-    ):
+    for file, expected in (("tuning.py", "function:tuning:cost function:tuning:heavy"), ("my-tuning.py", "UsageError")):
         (tmp_path / file).write_text(SCRIPT)
         done = subprocess.run([sys.executable, file], cwd=tmp_path, capture_output=True, text=True, check=False)
         assert expected in done.stdout + done.stderr

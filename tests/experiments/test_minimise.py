@@ -241,8 +241,8 @@ def test_bounds_are_scipys_or_one_pair():
 
 
 def test_bipop_alternates_large_populations_and_small_ones_of_as_many_calls():
-    objective = module.Objective.of({"x0": [0.0]})
-    searches = module._Searches(module.FunctionName("function:m:f", None), objective, False, None, None, None, 1, None)
+    given = {"integer": (), "log": ()}
+    searches = module._Searches(objectives.sphere, [0.0], 1.0, None, given, None, None, None, 1, None, {})
     plans = []
     for plan in searches._plans(8, 1, 6, "bipop"):
         plans.append(plan)

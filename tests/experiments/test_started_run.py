@@ -14,14 +14,7 @@ import pytest
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
 from dreamfleet.coordinator.views.stored_run import open_run
-from dreamfleet.experiments.started_run import (
-    RunPausedError,
-    _claim,
-    _free_name,
-    check_settings,
-    evolve,
-    start_run,
-)
+from dreamfleet.experiments.started_run import RunPausedError, _claim, _free_name, check_settings, evolve, start_run
 from tests.support.processes import DEADLINE, ROOT, environment
 from tests.support.tasks import RAISING
 
@@ -152,10 +145,7 @@ def test_a_worker_that_dies_is_named_and_so_is_a_stop_from_elsewhere(alive, tmp_
 @pytest.mark.slow
 def test_a_pause_is_no_endless_wait(alive, tmp_path, random_bundle):
     rough = {"task": RAISING, "bundle": random_bundle.path, "on_failure": "pause", "population": 3, "episodes": 1}
-    with (
-        start_run(runs_dir=tmp_path, **{**SMALL, **rough}) as run,
-        pytest.raises(RunPausedError) as paused,
-    ):
+    with start_run(runs_dir=tmp_path, **{**SMALL, **rough}) as run, pytest.raises(RunPausedError) as paused:
         run.wait()
     assert paused.value.errors
 

@@ -6,7 +6,7 @@ import asyncio
 import base64
 import json
 import secrets
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import asdict
 from functools import wraps
@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
-from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -32,9 +33,9 @@ from dreamfleet.common.protocol.batches import MAX_CANDIDATES, BatchError, Batch
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.runs.seeds import remark_on_seeds
 from dreamfleet.coordinator.addons.bridge.changes import Changes
-from dreamfleet.coordinator.addons.bridge.guard import BridgeGuard
 from dreamfleet.coordinator.addons.bridge.openapi import document
-from dreamfleet.coordinator.addons.dashboard.sse import event, to_json
+from dreamfleet.coordinator.addons.web.documents import event, json_response
+from dreamfleet.coordinator.addons.web.guard import Guard
 
 MAX_BODY = 64 << 20  # bytes of a request
 MAX_TEXT = 16 << 20  # bytes of one whose vectors are numbers as text
@@ -44,6 +45,7 @@ BODY_TIMEOUT = 10.0  # seconds without a further byte of a request's body
 MOST_STREAMS = 256
 KEEP_ALIVE = 10.0  # seconds between two signs of life in a stream of events
 RUN_WAIT = 600.0  # seconds for which a stream waits for a coordinator that does not answer
+OPEN_PATHS = ("/v1/health",)  # need no token
 POLL = 0.5  # seconds between two looks at a batch of which no event arrives
 STATUS = {"malformed": 400, "too large": 413, "conflict": 409, "unknown": 404, "busy": 503, "not external": 409}
 Handler = Callable[[Request], Awaitable[Response]]
@@ -51,15 +53,10 @@ Handler = Callable[[Request], Awaitable[Response]]
 
 def make_app(client: Client, changes: Changes, tokens: Sequence[str], *, is_loopback: bool) -> ASGIApp:
     """The routes behind their guard."""
-    handlers = _Handlers(client, changes)
+    handlers = _Handlers(client, changes, document(needs_token=bool(tokens)))
     batch = "/v1/runs/{run}/batches/{id}"
-    description = document(needs_token=bool(tokens))
-
-    async def openapi(_request: Request) -> Response:
-        return JSONResponse(description)
-
     routes = [
-        _route("/v1/health", GET=handlers.health), _route("/openapi.json", GET=openapi),
+        _route("/v1/health", GET=handlers.health), _route("/openapi.json", GET=handlers.openapi),
         _route("/v1/runs", GET=handlers.runs),
         _route("/v1/runs/{run}/batches", GET=handlers.list_batches, POST=handlers.submit),
         _route(batch, GET=handlers.read, DELETE=handlers.cancel), _route(f"{batch}/events", GET=handlers.events),
@@ -68,22 +65,42 @@ def make_app(client: Client, changes: Changes, tokens: Sequence[str], *, is_loop
     return BridgeGuard(app, tokens, is_loopback=is_loopback)
 
 
+class BridgeGuard(Guard):
+    """Refuses in JSON."""
+
+    headers = {"cache-control": "no-store", "x-content-type-options": "nosniff"}  # noqa: RUF012 - a constant
+
+    def refuse(self, status: int, kind: str, text: str) -> Response:
+        """An error as the routes give it."""
+        return _error(status, kind, text)
+
+    def check(self, scope: Scope, headers: Headers) -> Response | None:
+        """Refuse a request without a token."""
+        if not self.tokens or scope["path"] in OPEN_PATHS or self.bears_token(headers):
+            return None
+        refusal = self.refuse(401, "unauthorised", "give one of the bridge's tokens: Authorization: Bearer TOKEN")
+        refusal.headers["www-authenticate"] = 'Bearer realm="dreamfleet"'
+        return refusal
+
+
 class _Handlers:
     """The request handlers; what waits for Zenoh runs in threads."""
 
-    def __init__(self, client: Client, changes: Changes) -> None:
-        self._client = client
-        self._batches = BatchClient(client.session)
-        self._changes = changes
+    def __init__(self, client: Client, changes: Changes, description: dict[str, Any]) -> None:
+        self._client, self._batches = client, BatchClient(client.session)
+        self._changes, self._description = changes, description
         self._seen: set[str] = set()  # runs whose coordinators have answered: theirs may be resumed
-        self._streams = 0
+        self.streams = 0  # that are open
         self._held = 0  # bytes of the bodies that are being read
 
     async def health(self, _request: Request) -> Response:
-        return JSONResponse({"status": "ok", "version": package_version("dreamfleet")})
+        return json_response({"status": "ok", "version": package_version("dreamfleet")})
+
+    async def openapi(self, _request: Request) -> Response:
+        return json_response(self._description)
 
     async def runs(self, _request: Request) -> Response:
-        return _json({"runs": await run_in_threadpool(self._list_runs)})
+        return json_response({"runs": await run_in_threadpool(self._list_runs)})
 
     async def submit(self, request: Request) -> Response:
         run = _run_name(request)
@@ -92,32 +109,29 @@ class _Handlers:
         async with self._body(request) as body:
             reply, remark = await self._ask(run, lambda: self._submit(run, body))
         headers = {"location": f"/v1/runs/{run}/batches/{reply.id}"}
-        return _json(_describe(reply) | {"remark": remark}, 201 if reply.is_new else 200, headers)
+        return json_response(_describe(reply) | {"remark": remark}, 201 if reply.is_new else 200, headers)
 
     async def list_batches(self, request: Request) -> Response:
         run = _run_name(request)
         found = await self._ask(run, lambda: self._batches.list_batches(run))
-        return _json({"batches": [asdict(each) for each in found]})
+        return json_response({"batches": [asdict(each) for each in found]})
 
     async def read(self, request: Request) -> Response:
         run, batch = _run_name(request), request.path_params["id"]
         pages = await self._ask(run, lambda: self._read_all(run, batch))
-        return _json(_describe(pages[0]) | _scores(pages))
+        return json_response(_describe(pages[0]) | _scores(pages))
 
     async def cancel(self, request: Request) -> Response:
         run, batch = _run_name(request), request.path_params["id"]
-        return _json(_describe(await self._ask(run, lambda: self._batches.cancel(run, batch))))
+        return json_response(_describe(await self._ask(run, lambda: self._batches.cancel(run, batch))))
 
     async def events(self, request: Request) -> Response:
         run, batch = _run_name(request), request.path_params["id"]
         first = await self._ask(run, lambda: self._batches.read(run, batch))
-        if self._streams >= MOST_STREAMS:
+        if self.streams >= MOST_STREAMS:
             raise BatchError("busy", "too many streams are open: close some, or ask for the batch itself")
-        self._streams += 1  # here, as no request comes between: the stream itself begins later
-        return _Stream(self._stream(run, first), self._stream_closed)
-
-    def _stream_closed(self) -> None:
-        self._streams -= 1
+        self.streams += 1  # here, as no request comes between: the stream itself begins later
+        return _Stream(self._stream(run, first), self)
 
     def _list_runs(self) -> list[dict[str, Any]]:
         rows = []
@@ -134,8 +148,8 @@ class _Handlers:
 
     def _submit(self, run: str, body: bytes) -> tuple[BatchReply, str]:
         given = _parse(body)
-        batch_id = given["id"] if "id" in given else secrets.token_hex(8)
-        seeds, episodes = given.get("seeds", []), _whole(given.get("episodes", 0))
+        batch_id, seeds = given.get("id", secrets.token_hex(8)), given.get("seeds", [])
+        episodes = _whole(given.get("episodes", 0))
         if not isinstance(batch_id, str):
             raise BatchError("malformed", "id must be a text")
         if not isinstance(seeds, list):
@@ -173,9 +187,7 @@ class _Handlers:
                 elif size > MOST_DISCARDED:
                     break
             if size > MAX_BODY:  # it was read to its end, else its sender would not read the answer
-                raise BatchError(
-                    "too large", f"a request has at most {MAX_BODY:,} bytes: split the batch into smaller ones"
-                )
+                raise BatchError("too large", f"a request has at most {MAX_BODY:,} bytes: split the batch")
             if sum(map(len, chunks)) < size:
                 raise BatchError("busy", "too many large batches are being sent at once: send it again later")
             yield b"".join(chunks)
@@ -187,9 +199,9 @@ class _Handlers:
         try:
             found = await run_in_threadpool(ask)
         except ConnectionFailedError as error:
-            if run in self._seen:
-                raise BatchError("busy", f"{error}; ask again with the same id") from error
-            raise BatchError("unknown", str(error)) from error
+            seen = run in self._seen
+            text = f"{error}; ask again with the same id" if seen else str(error)
+            raise BatchError("busy" if seen else "unknown", text) from error
         self._seen.add(run)
         self._changes.subscribe(run)
         return found
@@ -224,20 +236,20 @@ class _Handlers:
 
 
 class _Stream(StreamingResponse):
-    """Server-sent events; `closed` is called once they have ended, even if none was sent."""
+    """Server-sent events; an open stream less once they have ended, even if none was sent."""
 
     media_type = "text/event-stream"
 
-    def __init__(self, events: AsyncIterator[bytes], closed: Callable[[], None]) -> None:
+    def __init__(self, events: AsyncIterator[bytes], handlers: _Handlers) -> None:
         super().__init__(events)
-        self._closed = closed
+        self._handlers = handlers
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send the events until they end or the client leaves."""
         try:
             await super().__call__(scope, receive, send)
         finally:
-            self._closed()
+            self._handlers.streams -= 1
 
 
 def _parse(body: bytes) -> dict[str, Any]:
@@ -245,11 +257,11 @@ def _parse(body: bytes) -> dict[str, Any]:
         raise BatchError("malformed", f"{name} is not a number in JSON")
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        found = dict(pairs)
-        if len(found) < len(pairs):  # which one counts depends on the reader
-            names = [name for name, _ in pairs]
-            twice = next(name for name in names if names.count(name) > 1)
-            raise BatchError("malformed", f"{truncate(twice, 60)!r} is given twice")
+        found = dict[str, Any]()
+        for name, value in pairs:
+            if name in found:  # which one counts depends on the reader
+                raise BatchError("malformed", f"{truncate(name, 60)!r} is given twice")
+            found[name] = value
         return found
 
     is_text = b'"float32"' not in body
@@ -279,19 +291,15 @@ def _read_vectors(given: object) -> object:
             raise BatchError("malformed", "vectors must be rows of numbers: no texts, true, false or null")
         return given
     if not (isinstance(given, dict) and given.keys() == {"float32", "size"}):
-        raise BatchError(
-            "malformed",
-            'vectors must be a list of rows of numbers, all of one length, or {"float32": BASE64, "size": N}',
-        )
+        forms = 'a list of rows of numbers, all of one length, or {"float32": BASE64, "size": N}'
+        raise BatchError("malformed", f"vectors must be {forms}")
     try:
         if type(size := _whole(given["size"])) is not int:
             raise TypeError("size is no whole number")
         numbers = np.frombuffer(base64.b64decode(given["float32"], validate=True), dtype="<f4")
         return numbers.reshape(-1, size)
     except (ValueError, TypeError) as error:
-        raise BatchError(
-            "malformed", "vectors: float32 must be base64 of little-endian numbers, `size` of them a vector"
-        ) from error
+        raise BatchError("malformed", "float32 must be base64 of rows of `size` little-endian numbers") from error
 
 
 def _whole(value: Any) -> Any:
@@ -345,16 +353,12 @@ def _answering(handler: Handler) -> Handler:
 async def _http_error(_request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     kind = "unknown" if error.status_code == 404 else "malformed"
-    return _error(error.status_code, kind, error.detail, dict(error.headers or {}))
+    return _error(error.status_code, kind, error.detail, error.headers)
 
 
 async def _bug(_request: Request, _cause: Exception) -> Response:
     return _error(500, "failed", "this is a bug of dreamfleet; the bridge's log says more")
 
 
-def _error(status: int, kind: str, text: str, headers: dict[str, str] | None = None) -> Response:
-    return _json({"error": kind, "text": text}, status, headers)
-
-
-def _json(document: dict[str, Any], status: int = 200, headers: dict[str, str] | None = None) -> Response:
-    return Response(to_json(document), status, headers, "application/json")
+def _error(status: int, kind: str, text: str, headers: Mapping[str, str] | None = None) -> Response:
+    return json_response({"error": kind, "text": text}, status, headers)

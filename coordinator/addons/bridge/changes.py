@@ -22,7 +22,7 @@ class Changes:
         self._followers: dict[asyncio.Event, tuple[str, str]] = {}  # event to set -> run and batch
         self._subscribers: dict[str, Any] = {}
 
-    def close(self) -> None:
+    async def close(self) -> None:
         """End all streams."""
         self.closed = True
         for changed in self._followers:

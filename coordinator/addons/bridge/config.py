@@ -8,14 +8,14 @@ from pathlib import Path
 
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.transport.network import is_loopback_host
+from dreamfleet.coordinator.addons.web.address import WebAddress
 
 LEAST_TOKEN = 16  # characters: anyone who reaches the port can guess
 MOST_TOKENS = 1000
 
 
 @dataclass(frozen=True)
-class BridgeConfig:
+class BridgeConfig(WebAddress):
     """Where the bridge listens, and the file of its tokens."""
 
     host: str = option("127.0.0.1", "listen here; addresses that others can reach need --token-file")
@@ -23,19 +23,9 @@ class BridgeConfig:
     token_file: str | None = option(None, "file with a token in each line; every request must bear one of them")
 
     def __post_init__(self) -> None:
-        if not 0 <= self.port <= 65535:
-            raise UsageError(f"--port must be from 0 to 65535, not {self.port}")
+        super().__post_init__()
         if self.token_file is None and not self.is_loopback:
             raise UsageError(f"--host {self.host} lets others submit batches: give a --token-file, or leave --host out")
-
-    @property
-    def is_loopback(self) -> bool:
-        """Whether only this computer can reach the bridge."""
-        return is_loopback_host(self.host)
-
-    def address(self, port: int) -> str:
-        """The URL of the bridge."""
-        return f"http://{f'[{self.host}]' if ':' in self.host else self.host}:{port}"
 
     def read_tokens(self) -> tuple[str, ...]:
         """The tokens, none without a file; `UsageError` if others may read the file, or a token is short."""

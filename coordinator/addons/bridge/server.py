@@ -1,14 +1,10 @@
-"""Serve the bridge: open the port, report its address, and run until stopped."""
+"""Serve the bridge: open the port, find a router, report the address, and run until stopped."""
 
 from __future__ import annotations
 
 import logging
-import socket
 from collections.abc import Callable
-from contextlib import ExitStack
 from time import sleep
-
-import uvicorn
 
 from dreamfleet.common.client.batch_client import BatchClient
 from dreamfleet.common.client.client import Client
@@ -18,9 +14,9 @@ from dreamfleet.common.transport.network import Network, wait_for_listener
 from dreamfleet.coordinator.addons.bridge.app import make_app
 from dreamfleet.coordinator.addons.bridge.changes import Changes
 from dreamfleet.coordinator.addons.bridge.config import BridgeConfig
-from dreamfleet.coordinator.addons.dashboard.server import HttpConnection, open_socket, run_server, server_config
+from dreamfleet.coordinator.addons.web import server
 
-KEEP_ALIVE = 60  # seconds
+KEEP_ALIVE = 60  # seconds for which a connection stays while a search thinks about its next batch
 RETRY = 1.0  # seconds between two tries to reach a router
 log = logging.getLogger(__name__)
 
@@ -31,21 +27,17 @@ def serve(config: BridgeConfig, network: Network, on_ready: Callable[[str], None
     `HandshakeRejectedError` if it rejects this one.
     """
     tokens = config.read_tokens()
-    with ExitStack() as stack:
-        listening = stack.enter_context(open_socket(config.host, config.port))  # a port in use is said at once
+    with server.open_socket(config) as listening:  # a port in use is said at once
         try:
             with interrupted_by_signals():
-                client = stack.enter_context(_connect(network))
+                client = _connect(network)
         except KeyboardInterrupt:
             return
-        changes = Changes(BatchClient(client.session))
-        app = make_app(client, changes, tokens, is_loopback=config.is_loopback)
-        server = _BridgeServer(
-            server_config(app, BridgeConnection, timeout_keep_alive=KEEP_ALIVE),
-            changes,
-        )
-        address = config.address(listening.getsockname()[1])
-        run_server(server, listening, lambda: on_ready(address))
+        with client:
+            changes = Changes(BatchClient(client.session))
+            app = make_app(client, changes, tokens, is_loopback=config.is_loopback)
+            url = config.url(listening.getsockname()[1])
+            server.serve(app, listening, lambda: on_ready(url), changes.close, KEEP_ALIVE)
 
 
 def _connect(network: Network) -> Client:
@@ -62,22 +54,3 @@ def _connect(network: Network) -> Client:
                 log.warning("%s; waiting for it", error)
             waiting = True
         sleep(RETRY)
-
-
-class BridgeConnection(HttpConnection):
-    """A connection that stays while a search thinks about its next batch."""
-
-    keep_alive = KEEP_ALIVE
-
-
-class _BridgeServer(uvicorn.Server):
-    """Ends open streams at shutdown."""
-
-    def __init__(self, config: uvicorn.Config, changes: Changes) -> None:
-        super().__init__(config)
-        self._changes = changes
-
-    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """End the streams, then shut down as uvicorn does."""
-        self._changes.close()
-        await super().shutdown(sockets)

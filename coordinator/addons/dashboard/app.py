@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable
 from contextlib import aclosing
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,9 @@ from dreamfleet.coordinator.addons.dashboard.assets import Assets
 from dreamfleet.coordinator.addons.dashboard.compared_runs import compare_runs
 from dreamfleet.coordinator.addons.dashboard.config import DashboardConfig
 from dreamfleet.coordinator.addons.dashboard.feed import Feed
-from dreamfleet.coordinator.addons.dashboard.guard import Guard
-from dreamfleet.coordinator.addons.dashboard.sse import event, to_json
+from dreamfleet.coordinator.addons.dashboard.guard import PageGuard
 from dreamfleet.coordinator.addons.dashboard.view_processes import ViewProcesses, ViewTarget
+from dreamfleet.coordinator.addons.web.documents import event, json_response
 from dreamfleet.coordinator.views.prometheus import CONTENT_TYPE, exposition
 
 EVENTS = "text/event-stream"
@@ -40,17 +40,15 @@ def make_app(feed: Feed, views: ViewProcesses, runs_dir: Path, config: Dashboard
         Route("/runs", handlers.runs), Route("/runs/{name}", handlers.run),
         Route("/hosts/{name}", handlers.hosts), Route("/compare/{one}/{other}", handlers.compare),
     ]  # fmt: skip
-    return Guard(Starlette(routes=routes), config.token, is_loopback=config.is_loopback)
+    tokens = () if config.token is None else (config.token,)
+    return PageGuard(Starlette(routes=routes), tokens, is_loopback=config.is_loopback)
 
 
 class _Handlers:
     """The request handlers. Those without `async` read disks, so they run in a thread."""
 
     def __init__(self, feed: Feed, views: ViewProcesses, runs_dir: Path, files: Assets) -> None:
-        self._feed = feed
-        self._views = views
-        self._runs_dir = runs_dir
-        self._files = files
+        self._feed, self._views, self._runs_dir, self._files = feed, views, runs_dir, files
         self._listing: asyncio.Task[list[dict[str, Any]]] | None = None
 
     def index(self, _request: Request) -> Response:
@@ -91,7 +89,7 @@ class _Handlers:
         if self._listing is None or self._listing.done():
             self._listing = asyncio.create_task(asyncio.to_thread(stored_runs.list_runs, self._runs_dir))
         rows = await asyncio.shield(self._listing)
-        return _json({"runs": rows, "folder": printable(str(self._runs_dir))})
+        return json_response({"runs": rows, "folder": printable(str(self._runs_dir))})
 
     def run(self, request: Request) -> Response:
         return _found(stored_runs.describe_run, self._runs_dir, request.path_params["name"])
@@ -126,10 +124,6 @@ def _stream(request: Request, events: AsyncIterator[bytes]) -> Response:
 def _found(read: Callable[..., dict[str, Any]], *given: Any) -> Response:
     """What `read` finds in journals, or 404 with the reason."""
     try:
-        return _json(read(*given))
+        return json_response(read(*given))
     except DreamfleetError as error:
-        return _json({"error": printable(str(error))}, 404)
-
-
-def _json(document: Mapping[str, Any], status: int = 200) -> Response:
-    return Response(to_json(document), status, media_type="application/json")
+        return json_response({"error": printable(str(error))}, 404)

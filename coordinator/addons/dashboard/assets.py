@@ -36,7 +36,10 @@ class Assets:
         """`ModuleNotFoundError` if plotly is not installed."""
         names = sorted(each.name for each in FOLDER.iterdir() if each.suffix in MEDIA_TYPES)
         ours = {name: Asset((FOLDER / name).read_bytes(), MEDIA_TYPES[Path(name).suffix]) for name in names}
-        charts = Asset(_plotly_path().read_bytes(), MEDIA_TYPES[".js"])
+        spec = find_spec("plotly")  # without the slow import of the package
+        if spec is None or spec.origin is None:
+            raise ModuleNotFoundError(name="plotly")
+        charts = Asset((Path(spec.origin).parent / "package_data" / CHARTS).read_bytes(), MEDIA_TYPES[".js"])
         # The modules import each other, so one hash covers them all.
         self.digest = _digest(*(each.data for each in ours.values()))
         charts_digest = _digest(charts.data)
@@ -51,11 +54,3 @@ class Assets:
 
 def _digest(*parts: bytes) -> str:
     return hashlib.sha256(b"\0".join(parts)).hexdigest()[:DIGEST_LENGTH]
-
-
-def _plotly_path() -> Path:
-    """The path of plotly.js, found without the slow import of the package."""
-    spec = find_spec("plotly")
-    if spec is None or spec.origin is None:
-        raise ModuleNotFoundError(name="plotly")
-    return Path(spec.origin).parent / "package_data" / CHARTS

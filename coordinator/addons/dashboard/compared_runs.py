@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from dreamfleet.common.errors import BundleError
 from dreamfleet.common.printable import format_setting, plural, printable
-from dreamfleet.common.runs.comparison import (
-    ComparedRun,
-    EqualBudget,
-    Scores,
-    are_comparable,
-    at_equal_budget,
-    difference,
-    differing_settings,
-)
+from dreamfleet.common.runs import comparison
+from dreamfleet.common.runs.comparison import ComparedRun
 from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
@@ -34,20 +26,21 @@ def compare_runs(runs_dir: Path, one: str, other: str) -> dict[str, Any]:
     `JournalError` or `UsageError` if a run is missing or unreadable.
     """
     with open_run(runs_dir, one) as first, open_run(runs_dir, other) as second:
-        (base, problem), (other_side, other_problem) = _side(first), _side(second)
-        sides = base, other_side
+        (base, problem), (side, other_problem) = _side(first), _side(second)
         word = score_word_of_run(second.spec, second.bundle_path)
+    sides = base, side
     worlds = {each.world for each in sides if each.world is not None}
-    comparable = are_comparable(sides)
-    equal = at_equal_budget(sides) if comparable else []
-    pairs = _pairs(sides, equal) if comparable else ()
+    pairs = comparison.paired_scores(sides, comparison.at_equal_budget(sides))
     return {
         "problem": problem or other_problem,
         "worlds": sorted(map(printable, worlds)),
-        "differences": [_difference(of, sides, difference(*scores), word) for of, *scores in pairs],
+        "differences": [
+            _difference(of, sides, comparison.difference(*scores), word)
+            for of, _, *scores in (pairs if comparison.are_comparable(sides) else ())
+        ],
         "settings": [
             [printable(name), *("default" if value is None else printable(format_setting(value)) for value in values)]
-            for name, values in differing_settings(sides).items()
+            for name, values in comparison.differing_settings(sides).items()
         ],
     }
 
@@ -58,16 +51,6 @@ def _side(run: RunFolder) -> tuple[ComparedRun, str]:
         return ComparedRun.of(run), ""
     except BundleError as error:
         return ComparedRun(run.name, run.settings, None, Effort(), Effort(), (), None, {}), printable(str(error))
-
-
-def _pairs(sides: Sides, equal: Sequence[EqualBudget]) -> Iterator[tuple[str, Scores, Scores]]:
-    """What is compared: both runs' means at equal budgets, then their confirmed ones."""
-    for each in equal:
-        one, other = each.evaluated_means
-        if one is not None and other is not None:
-            yield f"at equal {each.what}", one.scores, other.scores
-    if all(each.confirmed is not None for each in sides):
-        yield "confirmed", sides[0].confirmed_scores, sides[1].confirmed_scores
 
 
 def _difference(of: str, sides: Sides, found: PairedDifference | str, word: str) -> dict[str, Any]:

@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.transport.network import is_loopback_host
+from dreamfleet.coordinator.addons.web.address import WebAddress
 
 LEAST_TOKEN = 12  # characters: anyone who reaches the port can guess
 
 
 @dataclass(frozen=True)
-class DashboardConfig:
+class DashboardConfig(WebAddress):
     """Address, token, and the number of live views."""
 
     host: str = option("127.0.0.1", "listen here; addresses that others can reach need a token")
@@ -24,22 +24,10 @@ class DashboardConfig:
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        if not 0 <= self.port <= 65535:
-            raise UsageError(f"--port must be from 0 to 65535, not {self.port}")
+        super().__post_init__()
         if self.views < 0:
             raise UsageError(f"--views must be at least 0, not {self.views}")
         if self.token is not None and len(self.token) < LEAST_TOKEN:
             raise UsageError(f"--token must have at least {LEAST_TOKEN} characters: `openssl rand -hex 16` makes one")
         if self.token is None and not self.is_loopback:
-            raise UsageError(
-                f"--host {self.host} shows the page to others: give a --token that they must know, or omit --host"
-            )
-
-    @property
-    def is_loopback(self) -> bool:
-        """Whether only this computer can reach the page."""
-        return is_loopback_host(self.host)
-
-    def address(self, port: int) -> str:
-        """The URL of the page."""
-        return f"http://{f'[{self.host}]' if ':' in self.host else self.host}:{port}/"
+            raise UsageError(f"--host {self.host} shows the page to others: give a --token, or omit --host")

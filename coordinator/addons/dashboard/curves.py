@@ -60,16 +60,18 @@ def curves(
     """
     settings, task = data.settings, data.settings.task
     rows = [in_values(each, task) for each in downsample(data.history)]
-    dreamt = settings.task.task == DREAM
+    dreamt, every = settings.task.task == DREAM, settings.evaluate_every
+    often = "of each generation" if every == 1 else f"every {every} generations"
     stages = begun_stages(settings, data.history, data.evaluations)
     steps = join_distinct(
         describe_steps(each.stage.horizon, each.stage.driven, dreamt=dreamt, limit=data.episode_limit)
         for each in stages
     )
-    band = _band(rows, quartiles, task)
-    is_log = (
-        is_minimised(task) and bool(rows) and spans_decades([end for each in rows for end in (each.best, each.mean)])
-    )
+    band, looks = _band(rows, quartiles, task), downsample(data.evaluations)
+    reported = [] if data.confirmed is None else [data.confirmed]
+    confirmed = _judged(reported, [len(data.history) - 1] * len(reported), task, spent)
+    ends = [end for each in rows for end in (each.best, each.mean)]
+    is_log = is_minimised(task) and bool(rows) and spans_decades(ends)
     drawn: dict[str, Any] = {
         "step": sampling_step(len(data.history)),
         "generation": [each.number for each in rows],
@@ -79,8 +81,8 @@ def curves(
         "high": [_rounded(high) for _, high in band],
         "band": "± 1 standard deviation" if quartiles is None else "the middle half of the candidates",
         "sigma": [_rounded(each.sigma) for each in rows],
-        "evaluations": _evaluations(data, spent),
-        "confirmed": None if data.confirmed is None else _confirmed(data.confirmed, data, spent),
+        "evaluations": _judged(looks, [each.generation for each in looks], task, spent),
+        "confirmed": {name: column[0] for name, column in confirmed.items()} if reported else None,
         "stages": [each.since for each in stages[1:]],
         "dreamt": dreamt,
         "fitness_axis": _value_axis(task, is_log=is_log) if is_function_task(task.task) else f"fitness over {steps}",
@@ -89,7 +91,8 @@ def curves(
         "score_axis": _value_axis(task, is_log=is_log)
         if is_function_task(task.task)
         else f"score{' in reality' * dreamt}, mean of {plural(settings.evaluation_episodes, word)}",
-        "coming": _coming(settings),
+        "coming": "Once the first generation closes: the mean, the best and the spread of its candidates"
+        f"{f', and the evaluated mean {often}' if every else ''}.",
         "note": exploration_note(settings),
     }
     if spent is not None:
@@ -100,13 +103,6 @@ def curves(
 def _value_axis(task: TaskSpec, *, is_log: bool) -> str:
     goal = "smaller is better" if is_minimised(task) else "larger is better"
     return f"value: {goal}{' (log scale)' if is_log else ''}"
-
-
-def _coming(settings: RunSettings) -> str:
-    """What an empty chart will show."""
-    every = settings.evaluate_every
-    mean = f", and the evaluated mean {'of each generation' if every == 1 else f'every {every} generations'}"
-    return f"Once the first generation closes: the mean, the best and the spread of its candidates{mean * bool(every)}."
 
 
 def cumulative_effort(start: Effort, efforts: Iterable[GenerationEffort], generations: int) -> list[Effort]:
@@ -133,34 +129,21 @@ def _band(rows: Sequence[StoredGeneration], quartiles: Quartiles | None, task: T
             for each, pair in zip(rows, fitness, strict=True)]  # fmt: skip
 
 
-def _evaluations(data: RunData, spent: Sequence[Effort] | None) -> dict[str, Any]:
-    rows = downsample(data.evaluations)
-    columns: dict[str, Any] = {
+def _judged(
+    rows: Sequence[StoredEvaluation] | Sequence[StoredConfirmation], until: Sequence[int], task: TaskSpec,
+    spent: Sequence[Effort] | None,
+) -> dict[str, list[Any]]:  # fmt: skip
+    """Columns of means that were judged, with the effort until the end of these generations."""
+    columns: dict[str, list[Any]] = {
         "generation": [each.generation for each in rows],
-        "mean": [_rounded(value_of(each.mean, data.settings.task)) for each in rows],
+        "mean": [_rounded(value_of(each.mean, task)) for each in rows],
         "error": [_rounded(each.error) for each in rows],
         "episodes": [each.episodes for each in rows],
     }
-    if spent is not None:
-        columns |= _effort_columns([_effort_at(spent, each.generation) for each in rows])
-    return columns
-
-
-def _confirmed(found: StoredConfirmation, data: RunData, spent: Sequence[Effort] | None) -> dict[str, Any]:
-    point = {
-        "generation": found.generation,
-        "mean": _rounded(value_of(found.mean, data.settings.task)),
-        "error": _rounded(found.error),
-        "episodes": found.episodes,
-    }
     if spent is None:
-        return point
-    columns = _effort_columns([_effort_at(spent, len(data.history) - 1)])
-    return point | {name: column[0] for name, column in columns.items()}
-
-
-def _effort_at(spent: Sequence[Effort], generation: int) -> Effort:
-    return spent[min(generation, len(spent) - 1)] if spent and generation >= 0 else Effort()
+        return columns
+    efforts = [spent[min(each, len(spent) - 1)] if spent and each >= 0 else Effort() for each in until]
+    return columns | _effort_columns(efforts)
 
 
 def _effort_columns(efforts: Sequence[Effort]) -> dict[str, list[float]]:

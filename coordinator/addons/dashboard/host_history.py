@@ -64,7 +64,9 @@ def host_history(
         "width": width,
         "hosts": [_row(name, each, since, width) for name, each in ordered[:MOST_HOSTS]],
         "more": max(len(ordered) - MOST_HOSTS, 0),
-        "events": [_event_row(each) for each in events if each.what in (*_CAME, *_GONE)][: -MOST_EVENTS - 1 : -1],
+        "events": [
+            {"at": each.happened, "text": printable(each.text)} for each in events if each.what in (*_CAME, *_GONE)
+        ][: -MOST_EVENTS - 1 : -1],
     }
 
 
@@ -74,8 +76,7 @@ class _Spans:
     def __init__(self, work: Sequence[StoredWork], times: Times, end: float) -> None:
         self._times, self._end = times, end
         self._last = max((closed for _, closed in times.values() if closed is not None), default=end)
-        besides = {each.generation for each in work if each.kind != "score" and not each.confirming}
-        self._besides = sorted(besides)
+        self._besides = sorted({each.generation for each in work if each.kind != "score" and not each.confirming})
 
     def __call__(self, work: StoredWork) -> tuple[float, float]:
         """Candidates: while their generation was open. A mean: in idle slots, until the next one's turn."""
@@ -154,7 +155,3 @@ def _row(name: str, host: _Host, since: float, width: float) -> dict[str, Any]:
         "workers": _count_present(host.present, since, width),
         "present": host.present,
     }
-
-
-def _event_row(event: StoredEvent) -> dict[str, Any]:
-    return {"at": event.happened, "text": printable(event.text)}

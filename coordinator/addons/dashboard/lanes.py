@@ -16,9 +16,7 @@ UNKNOWN, LOST, SILENT, IDLE = " ", "x", "?", "."  # and 1 to 9: how fast, 9 bein
 @dataclass
 class _Stretch:
     began: float
-    states: dict[str, tuple[str, float]] = field(
-        default_factory=dict
-    )  # by worker: a sign, or steps per second and slot
+    states: dict[str, tuple[str, float]] = field(default_factory=dict)  # by worker: sign, or steps a second and slot
 
 
 class Lanes:
@@ -42,7 +40,7 @@ class Lanes:
         """The lane of each worker, `LENGTH` characters each."""
         fastest = max((rate for each in self._stretches for _, rate in each.states.values()), default=0.0)
         signs = [
-            {worker: sign or _speed_digit(rate, fastest) for worker, (sign, rate) in each.states.items()}
+            {worker: sign or str(max(round(9 * rate / fastest), 1)) for worker, (sign, rate) in each.states.items()}
             for each in self._stretches
         ]
         return ["".join(each.get(worker.worker, UNKNOWN) for each in signs).rjust(LENGTH) for worker in workers]
@@ -53,7 +51,3 @@ def _sign_and_rate(worker: WorkerStatus) -> tuple[str, float]:
         return (SILENT if worker.state == "silent" else LOST), 0.0
     rate = worker.steps_per_second / max(worker.slots, 1)
     return ("", rate) if rate > 0 else (IDLE, 0.0)
-
-
-def _speed_digit(rate: float, fastest: float) -> str:
-    return str(min(max(round(9 * rate / fastest), 1), 9))

@@ -26,8 +26,8 @@ from dreamfleet.common.worlds.score_words import score_word, score_word_of_run
 from dreamfleet.coordinator.addons.dashboard.curves import RunData, curves, downsample
 from dreamfleet.coordinator.addons.dashboard.lanes import Lanes
 from dreamfleet.coordinator.addons.dashboard.page_state import RunSnapshot, page_state
-from dreamfleet.coordinator.addons.dashboard.sse import event
 from dreamfleet.coordinator.addons.dashboard.stored_runs import describe_archive, read_quartiles
+from dreamfleet.coordinator.addons.web.documents import event
 
 ANSWER_TIMEOUT = 1.5  # seconds to wait for answers
 PATIENCE = 5.0  # seconds of slow answers after which a silent run is lost; if others answer fast, at once
@@ -125,8 +125,8 @@ class Watcher:
                 former = self._followed.pop(name, None)  # reinsert it as the newest
                 followed = self._followed[name] = _FollowedRun(status, self._runs_dir)
                 followed.lanes = self._past_lanes.pop(followed.uid, followed.lanes)
-                if former is not None and former.uid == followed.uid:
-                    followed.go_on_from(former)
+                if former is not None and former.uid == followed.uid:  # its curves may be others than viewers have
+                    followed.lanes, followed.drawings = former.lanes, former.drawings
             followed.update(status, self._client, now)
         except UNREADABLE as error:
             self._problem = f"run {name}: {error}"
@@ -157,13 +157,9 @@ class Watcher:
                 self._problem = f"run {name}: {error}"
         default_run = next(reversed(live or list(self._followed)), None)
         absent_event = {
-            "link": "absent",
-            "run": "",
-            "live": sorted(live),
-            "address": ", ".join(self._network.connect),
-            "trouble": truncate(self._problem, 1000),
-            "only": self._only or "",
-        }
+            "link": "absent", "run": "", "live": sorted(live), "address": ", ".join(self._network.connect),
+            "trouble": truncate(self._problem, 1000), "only": self._only or "",
+        }  # fmt: skip
         statuses = tuple(self._followed[name].full_status for name in sorted(live) if name in events)
         return DashboardSnapshot(events, default_run, event("frame", absent_event), statuses)
 
@@ -185,7 +181,8 @@ class _FollowedRun:
     _quartiles: dict[int, tuple[float, float]] | None = None  # `None`: no journal of it here
     _archive: EliteArchive | None = None  # of a run with one, whose journal is on this disk
     _archived: int = 0  # generations whose candidates are in it
-    _rendered_curves: tuple[Any, bytes, int] = (None, b"", 0)  # cache key, event, counter
+    drawings: int = 0  # how often the curves were rendered
+    _rendered_curves: tuple[Any, bytes] = (None, b"")  # cache key, event
 
     def __post_init__(self) -> None:
         self._word = score_word(self.status.settings.task.task)
@@ -222,20 +219,15 @@ class _FollowedRun:
         """Whether generations may be others than those known here: results were recalled, or a copy was resumed."""
         return status.incarnation != self.status.incarnation or len(self.history) > status.generations
 
-    def go_on_from(self, former: _FollowedRun) -> None:
-        """Keep what happened, and let the curves be others than those that viewers have."""
-        self.lanes = former.lanes
-        self._rendered_curves = (None, b"", former._rendered_curves[2])
-
     def update(self, status: Status, client: Client, now: float) -> None:
         """Take a status, and fetch the rows that it leaves out."""
         self.status, self.heard, self.lost = status, now, None
         self._workers, self._population = status.worker_list, (status.population,)
-        self._update_lanes(now)
+        self.lanes.update(self._workers, now)
         self._fetch_missing_rows(status, client)
         if status.workers.known > len(status.worker_list):
             self._workers = list(_fetch_rows(client, "workers", WorkerStatus, self.name))
-            self._update_lanes(now)
+            self.lanes.update(self._workers, now)
         if status.population.total > len(status.population.done):
             self._population = client.candidates(self.name, status.generation.number)
 
@@ -252,11 +244,8 @@ class _FollowedRun:
             folder=None if self._quartiles is None else self.runs_dir / self.name, word=self._word,
         )  # fmt: skip
         self._render_curves()
-        _, drawing, times = self._rendered_curves
-        return RunEvents(event("frame", {**page_state(snapshot), "live": live}), drawing, (self.uid, times))
-
-    def _update_lanes(self, now: float) -> None:
-        self.lanes.update(self._workers, now)
+        frame = event("frame", {**page_state(snapshot), "live": live})
+        return RunEvents(frame, self._rendered_curves[1], (self.uid, self.drawings))
 
     def _fetch_missing_rows(self, status: Status, client: Client) -> None:
         """Fetch closed generations and evaluations that are not known yet."""
@@ -292,44 +281,25 @@ class _FollowedRun:
             return
         status = self.status
         data = RunData(status.settings, self.history, self.evaluations, status.confirmed, status.episode_limit)
-        self._read_quartiles()
-        self._read_elites()
+        try:
+            if self._quartiles is not None or self._archive is not None:
+                with open_run(self.runs_dir, self.name) as stored:
+                    self._read_journal(stored)
+        except DreamfleetError:  # it was moved away
+            self._quartiles = self._archive = None
         drawn = {**curves(data, self._quartiles, word=self._word), "archive": describe_archive(self._archive)}
-        self._rendered_curves = (
-            of,
-            event("curves", drawn),
-            self._rendered_curves[2] + 1,
-        )
+        self._rendered_curves, self.drawings = (of, event("curves", drawn)), self.drawings + 1
 
-    def _read_elites(self) -> None:
-        """Add the candidates of newly closed generations to the archive, if it is drawn."""
-        if self._archive is None or self._archived >= len(self.history):
-            return
-        try:
-            with open_run(self.runs_dir, self.name) as stored:
-                if stored.uid == self.uid:
-                    self._archive.read(stored, self._archived)
-                    self._archived = len(self.history)
-        except DreamfleetError:
-            self._archive = None  # it was moved away
-
-    def _read_quartiles(self) -> None:
-        """Read the missing quartiles of drawn generations from the journal, if it is on this disk."""
-        read = self._quartiles
-        if read is None:
-            return
-        wanted = [each for each in downsample(self.history) if each.number not in read]
-        try:
-            with open_run(self.runs_dir, self.name) as stored:
-                found = self._read_missing_quartiles(stored, wanted)
-        except DreamfleetError:
-            found = None  # it was moved away
-        self._quartiles = None if found is None else {**read, **found}
-
-    def _read_missing_quartiles(
-        self, stored: RunFolder, wanted: list[StoredGeneration]
-    ) -> Mapping[int, tuple[float, float]] | None:
-        return read_quartiles(stored, self.status.settings, wanted) if stored.uid == self.uid else None
+    def _read_journal(self, stored: RunFolder) -> None:
+        """Read the missing quartiles of drawn generations, and the candidates of newly closed ones."""
+        is_own, read = stored.uid == self.uid, self._quartiles
+        if read is not None:
+            wanted = [each for each in downsample(self.history) if each.number not in read]
+            found = read_quartiles(stored, self.status.settings, wanted) if is_own else None
+            self._quartiles = None if found is None else {**read, **found}
+        if self._archive is not None and is_own and self._archived < len(self.history):
+            self._archive.read(stored, self._archived)
+            self._archived = len(self.history)
 
 
 def _fetch_rows(client: Client, part: str, kind: type[T], run: str, offset: int = 0) -> Iterator[T]:

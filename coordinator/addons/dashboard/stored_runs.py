@@ -65,25 +65,18 @@ def describe_run(runs_dir: Path, name: str) -> dict[str, Any]:
         if [each.number for each in history] != list(range(len(history))):
             raise JournalError(f"the journal of run {name} is damaged: generations are missing; restore it from a copy")
         data = RunData(settings, history, run.evaluations(), run.confirmation(), run.episode_limit)
-        start = run.start_effort()
-        efforts = run.efforts()
+        start, efforts = run.start_effort(), run.efforts()
         spent = cumulative_effort(start, efforts, len(history))
         total = sum((each.effort for each in efforts), start)
         word = score_word_of_run(run.spec, run.bundle_path)
         return {
-            "run": run.name,
-            "state": printable(run.state),
-            "ended": run.ended is not None,
-            "tiles": _tiles(run, data, total, word),
-            "again": _resume_command(run),
-            "facts": _about(run, settings),
-            "outcome": _outcome(run, data, total, word),
-            "settings": flatten_settings(settings),
-            "world": _world(run),
+            "run": run.name, "state": printable(run.state), "ended": run.ended is not None,
+            "tiles": _tiles(run, data, total, word), "again": _resume_command(run), "facts": _about(run, settings),
+            "outcome": _outcome(run, data, total, word), "settings": flatten_settings(settings), "world": _world(run),
             "curves": curves(data, read_quartiles(run, settings, downsample(history)), spent, word),
             "archive": describe_archive(EliteArchive.of(run)),
             "generations": [_generation_row(in_values(each, run.spec)) for each in history[-LAST:][::-1]],
-        }
+        }  # fmt: skip
 
 
 def describe_hosts(runs_dir: Path, name: str) -> dict[str, Any]:
@@ -108,15 +101,12 @@ def describe_archive(archive: EliteArchive | None) -> dict[str, Any] | None:
     first, second = (*archive.axes, Axis("", 0, 1, 1))[:2]
     more = ". Each cell shows its best over the other axes" if len(archive.axes) > 2 else ""
     return {
-        "x": _middles(first),
-        "y": _middles(second),
+        "x": first.middles, "y": second.middles,
         "z": [[None if isnan(value) else value for value in row] for row in archive.grid().T.tolist()],
         "x_title": describe_measure(first.measure),
         "y_title": describe_measure(second.measure) if second.measure else "",
-        "cells": _cell_texts(archive),
-        "filled": len(archive.elites),
-        "caption": printable(archive.description + more),
-    }
+        "cells": _cell_texts(archive), "filled": len(archive.elites), "caption": printable(archive.description + more),
+    }  # fmt: skip
 
 
 def _cell_texts(archive: EliteArchive) -> list[list[str]]:
@@ -131,10 +121,6 @@ def _cell_texts(archive: EliteArchive) -> list[list[str]]:
         [",".join(map(str, best[column, row].cell)) if (column, row) in best else "" for column in range(columns)]
         for row in range(rows)
     ]
-
-
-def _middles(axis: Axis) -> list[float]:
-    return [sum(axis.bounds_of(cell)) / 2 for cell in range(axis.cells)]
 
 
 def read_quartiles(run: RunFolder, settings: RunSettings, drawn: Sequence[StoredGeneration]) -> Quartiles | None:
@@ -168,25 +154,17 @@ def _run_row(path: Path) -> dict[str, Any]:
     try:
         with RunFolder(path) as run:
             spec, history = run.spec, run.history()
-            best, confirmed = (
-                in_values(each, spec) for each in (best_evaluation(run.evaluations()), run.confirmation())
-            )
+            judged = best_evaluation(run.evaluations()), run.confirmation()
+            best, confirmed = (in_values(each, spec) for each in judged)
             return {
-                "run": printable(run.name),
-                "created": run.created,
-                "begun": format_time(run.created),
-                "task": printable(spec.task),
-                "generations": len(history),
+                "run": printable(run.name), "created": run.created, "begun": format_time(run.created),
+                "task": printable(spec.task), "generations": len(history),
                 "mean": value_of(history[-1].mean, spec) if history else None,
-                "best": best.mean if best else None,
-                "confirmed": confirmed.mean if confirmed else None,
-                "best_error": best.error if best else None,
-                "confirmed_error": confirmed.error if confirmed else None,
-                "again": _resume_command(run),
-                "state": printable(run.state),
-                "ended": run.ended is not None,
+                "best": best and best.mean, "best_error": best and best.error,
+                "confirmed": confirmed and confirmed.mean, "confirmed_error": confirmed and confirmed.error,
+                "again": _resume_command(run), "state": printable(run.state), "ended": run.ended is not None,
                 "damaged": False,
-            }
+            }  # fmt: skip
     except JournalError as error:
         return {**dict.fromkeys(COLUMNS), "run": printable(path.name), "state": printable(str(error)), "damaged": True}
 
@@ -229,6 +207,8 @@ def _tiles(run: RunFolder, data: RunData, total: Effort, word: str) -> list[dict
 def _about(run: RunFolder, settings: RunSettings) -> Facts:
     """What the run is."""
     task, world = settings.task.task, _world(run)
+    limit, horizon = run.episode_limit, settings.task.horizon
+    steps = f"{min(horizon, limit or horizon):,} steps{describe_limit(horizon, limit)}"
     population = f"{plural(settings.population, 'candidate')}, {plural(settings.episodes, 'episode')} each"
     facts = [
         ("task", ", ".join(filter(None, (task, describe_sign(settings.task.options))))),
@@ -236,17 +216,13 @@ def _about(run: RunFolder, settings: RunSettings) -> Facts:
         ("begun", format_time(run.created)),
         *([("ended", format_time(run.ended_at))] if run.ended_at else []),
         ("population", SUBMITTED if settings.is_external else population),
-        *([] if is_function_task(task) else [("horizon", _horizon(settings.task.horizon, run.episode_limit))]),
+        *([] if is_function_task(task) else [("horizon", steps)]),
         ("optimiser", describe_optimiser(settings)),
         *([] if settings.is_external else [("first step size", f"{settings.sigma0:g}")]),
         ("seed", str(settings.seed)),
         *([] if run.checks is None else [("checks", run.checks.description)]),
     ]
     return [(name, printable(value)) for name, value in facts]
-
-
-def _horizon(horizon: int, limit: int | None) -> str:
-    return f"{min(horizon, limit or horizon):,} steps{describe_limit(horizon, limit)}"
 
 
 def _outcome(run: RunFolder, data: RunData, total: Effort, word: str) -> Facts:

@@ -24,17 +24,28 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C."""
     config = load(DashboardConfig, "dashboard", **args.sources)
+    from dreamfleet.coordinator.addons.dashboard.app import make_app
+    from dreamfleet.coordinator.addons.dashboard.feed import Feed
     from dreamfleet.coordinator.addons.dashboard.live_runs import Watcher
-    from dreamfleet.coordinator.addons.dashboard.server import serve
     from dreamfleet.coordinator.addons.dashboard.view_processes import ViewProcesses
+    from dreamfleet.coordinator.addons.web import server
 
     network = resolve_network(args)
     joined = () if args.global_config.join is None else ("--join", str(args.global_config.join))
     views = ViewProcesses(("--connect", *network.connect, *joined), args.runs_dir, config.views)
-    serve(config, Watcher(network, args.run, args.runs_dir), views, args.runs_dir, _print_address)
+    feed = Feed(Watcher(network, args.run, args.runs_dir))
+    app = make_app(feed, views, args.runs_dir, config)
+
+    async def end_streams() -> None:
+        feed.close()
+        await views.close()
+
+    with server.open_socket(config) as listening:
+        address = f"{config.url(listening.getsockname()[1])}/"
+
+        def on_ready() -> None:
+            print(f"the dashboard is at {address}", file=sys.stderr, flush=True)
+            report(ADDRESS, address)
+
+        server.serve(app, listening, on_ready, end_streams)
     return 0
-
-
-def _print_address(address: str) -> None:
-    print(f"the dashboard is at {address}", file=sys.stderr, flush=True)
-    report(ADDRESS, address)

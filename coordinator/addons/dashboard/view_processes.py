@@ -20,7 +20,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.processes import VerbProcess
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol import keys
-from dreamfleet.coordinator.addons.dashboard.sse import event
+from dreamfleet.coordinator.addons.web.documents import event
 
 RATE = 10  # pictures a second
 LINGER = 5.0  # seconds until a view without viewers ends: the page may just be reloading
@@ -89,9 +89,7 @@ class ViewProcesses:
         view = self._views.get(target)
         if view is None or view.is_closing:
             if self._closed or not self._has_room():
-                yield notice_event(
-                    "ended", f"{self._limit} live views are open, and no more are allowed here: leave another"
-                )
+                yield notice_event("ended", f"{self._limit} live views are open, the most allowed here: leave one")
                 return
             try:
                 view = self._views[target] = _ViewProcess(target.flags(self._connection_flags, self._runs_dir))
@@ -162,11 +160,6 @@ class _ViewProcess:
             self._sending_since.pop(viewer, None)
             self.viewers -= 1
 
-    @property
-    def _has_active_viewer(self) -> bool:
-        late = self._loop.time() - STALLED
-        return self.viewers > sum(since < late for since in self._sending_since.values())
-
     async def _run(self) -> None:
         """Run until the process ends or no viewers are left."""
         clock = self._loop.time
@@ -175,7 +168,8 @@ class _ViewProcess:
             while not self._ended.is_set() and clock() < left:
                 with suppress(TimeoutError):
                     await asyncio.wait_for(self._ended.wait(), CHECK_INTERVAL)
-                if self._has_active_viewer:
+                late = clock() - STALLED
+                if self.viewers > sum(since < late for since in self._sending_since.values()):
                     left = clock() + LINGER
                 if not self._pictures and self._child.lines and (said := self._child.lines[-1]) != heard:
                     heard = said

@@ -43,20 +43,18 @@ def archive_figure(run: RunFolder) -> ShownFigure:
     else:
         axes.set_yticks([])
     if (best := archive.best) is not None:
-        middle = [axis.low + (cell + 0.5) * (axis.high - axis.low) / axis.cells
-                  for axis, cell in zip((first, second), (*best.cell, 0), strict=False)]  # fmt: skip
+        middle = [axis.middles[cell] for axis, cell in zip((first, second), (*best.cell, 0), strict=False)]
         axes.plot(*middle, "*", color="white", markeredgecolor="black", markersize=13)
     bar = figure.colorbar(mesh, ax=axes, pad=0.03)
     bar.set_label("fitness of the elite (sum of rewards, mean over its episodes)")
     filled = f"{len(archive.elites)} of {archive.cells} cells filled (empty ones are grey)"
     lines = [f"{run.name}: {filled}", f"QD score {format_number(archive.qd_score)}"]
-    if archive.best is not None:
-        lines[1] += f"; star: the best, --cell {','.join(map(str, archive.best.cell))}"
+    if best is not None:
+        lines[1] += f"; star: the best, --cell {','.join(map(str, best.cell))}"
     if len(archive.axes) > 2:
         lines.append("each cell shows its best over the other axes")
-    axes.set_title(
-        "\n".join(line for each in lines for line in textwrap.wrap(each, TITLE)), fontsize=11, parse_math=False
-    )
+    title = "\n".join(line for each in lines for line in textwrap.wrap(each, TITLE))
+    axes.set_title(title, fontsize=11, parse_math=False)
     return figure
 
 
@@ -66,7 +64,6 @@ def _label(values: Any, numbers: Any, axis: Axis, name: str) -> None:
     values.set_ticks(axis.edges[::every], labels=[f"{each:.3g}" for each in axis.edges[::every].tolist()])
     values.set_tick_params(labelsize=8)
     values.set_label_text("\n".join(textwrap.wrap(describe_measure(axis.measure), LABEL)), parse_math=False)
-    middles = [sum(axis.bounds_of(cell)) / 2 for cell in range(axis.cells)]
-    numbers.set_ticks(middles[::every], labels=[str(each) for each in range(axis.cells)[::every]])
+    numbers.set_ticks(axis.middles[::every], labels=[str(each) for each in range(axis.cells)[::every]])
     numbers.set_tick_params(length=0, labelsize=8)
     numbers.set_label_text(name)

@@ -62,12 +62,11 @@ class RibsOptimiser(ABC):
     requirement: ClassVar[str] = f"ribs=={version('ribs')}"
     options: ClassVar[Mapping[str, str]] = {}
     takes_measures: ClassVar[bool] = True
+    _emitter_count = 1
 
     def __init__(self, search: Search) -> None:
         if not search.archive:
-            raise UsageError(
-                "this optimiser fills an archive: give its axes, such as --archive steps=0:500:20 brake.share=0:1:20"
-            )
+            raise UsageError("give the axes of its archive, such as --archive steps=0:500:20 brake.share=0:1:20")
         cells = math.prod(axis.cells for axis in search.archive)
         if (size := cells * search.dimension * 8) > LARGEST_ARCHIVE:
             raise UsageError(
@@ -89,10 +88,6 @@ class RibsOptimiser(ABC):
         )
         shares = np.array_split(np.arange(search.population), self._emitter_count)
         self._emitters = [self._emitter(len(share), seed) for share, seed in zip(shares, seeds, strict=True)]
-
-    @property
-    def _emitter_count(self) -> int:
-        return 1
 
     @abstractmethod
     def _emitter(self, candidates: int, seed: Any) -> Any:
@@ -136,13 +131,9 @@ class RibsOptimiser(ABC):
         start = 0
         for emitter in self._emitters:
             own = slice(start, start := start + emitter.batch_size)
-            self._tell_emitter(
-                emitter, self._asked[own], fitness[own], inside[own], {"status": status[own], "value": value[own]}
-            )
-
-    def _tell_emitter(self, emitter: Any, *told: Any) -> None:
-        if not self._archive.empty:  # an emitter that starts anew draws an elite
-            emitter.tell(*told)
+            if not self._archive.empty:  # an emitter that starts anew draws an elite
+                added = {"status": status[own], "value": value[own]}
+                emitter.tell(self._asked[own], fitness[own], inside[own], added)
 
     def prepare(self) -> None:  # noqa: B027 - not abstract: doing nothing is all there is to do
         """Do nothing: an emitter's question depends on the archive."""
@@ -193,9 +184,7 @@ class MapElites(RibsOptimiser):
 
     def _emitter(self, candidates: int, seed: Any) -> Any:
         search = self._search
-        return GaussianEmitter(
-            self._archive, sigma=search.sigma0, x0=search.mean, batch_size=candidates, seed=seed
-        )  # fmt: skip
+        return GaussianEmitter(self._archive, sigma=search.sigma0, x0=search.mean, batch_size=candidates, seed=seed)
 
     def _emitter_state(self, emitter: Any) -> State:
         return {"random": _random_state(emitter._rng)}
@@ -218,7 +207,7 @@ class CmaMe(RibsOptimiser):
 
     def __init__(self, search: Search) -> None:
         self._covariance = search.choice("covariance", "diagonal", "full")
-        self._count = _emitters(search)
+        self._emitter_count = _emitters(search)
         super().__init__(search)
 
     @classmethod
@@ -231,10 +220,6 @@ class CmaMe(RibsOptimiser):
         return Footprint(memory=(4 * count + 4) * matrix, state=3 * count * matrix)
 
     @property
-    def _emitter_count(self) -> int:
-        return self._count
-
-    @property
     def sigma(self) -> float:
         """The mean of the emitters' step sizes."""
         return float(np.mean([emitter._opt.sigma for emitter in self._emitters]))
@@ -242,14 +227,9 @@ class CmaMe(RibsOptimiser):
     def _emitter(self, candidates: int, seed: Any) -> Any:
         search, kind = self._search, "cma_es" if self._covariance == "full" else "sep_cma_es"
         return EvolutionStrategyEmitter(
-            self._archive,
-            x0=search.mean,
-            sigma0=search.sigma0,
-            ranker="2imp",
-            es=kind,
-            batch_size=candidates,
+            self._archive, x0=search.mean, sigma0=search.sigma0, ranker="2imp", es=kind, batch_size=candidates,
             seed=seed,
-        )
+        )  # fmt: skip
 
     def _emitter_state(self, emitter: Any) -> State:
         strategy = emitter._opt

@@ -24,6 +24,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -36,10 +37,7 @@ STOP_DRAINED = ((signal.SIGTERM, DRAIN_TIMEOUT),)
 LEAST_FREE = 700_000_000  # bytes needed while an environment is made
 LONGEST_TAIL = 8192  # bytes read from the end of a log for its last line
 JOIN, LOG, STATE, COMPLETE, CREATED = "join", "log", "worker.json", "whole", "made"
-REPORTS, REPORTS_VARIABLE = (
-    "reports",
-    "DREAMFLEET_REPORTS",
-)  # where a worker reports that it has begun, or why it failed
+REPORTS, REPORTS_VARIABLE = "reports", "DREAMFLEET_REPORTS"  # a worker reports there that it has begun, or failed
 FOLDERS = ("environments", "workers", "cache")  # under the root
 LOCK = "lock"
 # Starts a worker only once a line says that its state is written: one that nobody knows of could not be ended.
@@ -49,10 +47,6 @@ JOIN_HERE = "{join}"  # placeholder for the join file's path
 
 class FailedError(Exception):
     """A request failed; the text says why and what to do."""
-
-
-class DisconnectedError(Exception):
-    """The other side closed the connection."""
 
 
 class Channel:
@@ -77,7 +71,7 @@ class Channel:
         return data
 
     def wait_for_request(self, seconds: float = TICK) -> bool:
-        """Wait for a request; whether one came. `DisconnectedError` if the connection is closed."""
+        """Wait for a request; whether one came. `EOFError` if the connection is closed."""
         if not self._waiting and select.select([0], [], [], seconds)[0]:
             self._read()
         return bool(self._waiting)
@@ -90,7 +84,7 @@ class Channel:
     def _read(self) -> None:
         data = os.read(0, 1 << 20)
         if not data:
-            raise DisconnectedError
+            raise EOFError
         self._waiting += data
 
 
@@ -118,11 +112,6 @@ class HostFolder:
         found = list(self.root.iterdir()) if self.root.is_dir() else []
         mere = (aside(self.root / CREATED), *(each for each in found if each.name == LOCK and not each.stat().st_size))
         return bool(found) and all(each in mere for each in found)
-
-    @property
-    def removal(self) -> str:
-        """The shell command that removes what is ours."""
-        return f"cd {shlex.quote(str(self.root))} && rm -rf {' '.join((*FOLDERS, CREATED, LOCK))}"
 
     def environment(self, name: str) -> Path:
         """The folder of an environment."""
@@ -199,24 +188,21 @@ class HostFolder:
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         try:
             file = open(os.open(path, flags, 0o666), "r+b", buffering=0)  # noqa: SIM115 - the caller closes it
+            if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                return file
+            file.close()
         except OSError as error:
             if error.errno not in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
                 raise
-            raise FailedError(f"{path} is not a regular file: remove it") from error
-        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            file.close()
-            raise FailedError(f"{path} is not a regular file: remove it")
-        return file
+        raise FailedError(f"{path} is not a regular file: remove it")
 
     def _acquire(self, lock: int) -> None:
-        said = False
-        while True:
+        for attempt in count():
             with suppress(BlockingIOError):
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 return
-            if not said:
+            if not attempt:
                 self.channel.send("say", "another command works there: waiting for it")
-            said = True
             self.channel.wait_for_request()
 
 
@@ -286,21 +272,12 @@ class WorkerProcess:
             self.state = _checked_state(json.loads((folder / STATE).read_text()))
 
     @property
-    def is_elsewhere(self) -> bool:
-        """Whether a host of another name started it, and it does not run here: that name may also be a former one."""
-        return bool(self.state) and self.state["node"] != platform.node() and not self._runs_here
-
-    @property
     def is_alive(self) -> bool:
-        """Whether the process that was started still runs."""
+        """Whether the process that was started still runs, on this host."""
         with suppress(ChildProcessError):
             os.waitpid(-1, os.WNOHANG)  # reap our own children
-        return bool(self.state) and self._runs_here
-
-    @property
-    def _runs_here(self) -> bool:
-        """Whether its process runs on this host: a start names the boot too, so that no other host's is equal."""
-        return bool(process_start(self.state["pid"]) == self.state["birth"])
+        # A start names the boot too, so that no process of another host has an equal one.
+        return bool(self.state) and bool(process_start(self.state["pid"]) == self.state["birth"])
 
     @property
     def tunnel_pid(self) -> int:
@@ -311,7 +288,7 @@ class WorkerProcess:
     def check_known(self) -> None:
         """`FailedError` with the remedy if it may run although this agent cannot end it."""
         name = self.folder.name
-        if self.is_elsewhere:
+        if self.state and self.state["node"] != platform.node() and not self.is_alive:
             raise FailedError(
                 f"worker {name} was started by {self.state['node']}, which shares this folder or is this host's former "
                 "name: give each host a name of its own, or run `dreamfleet down` for that host; if the worker no "
@@ -366,29 +343,25 @@ def last_line(log: Path) -> str:
     return said[-1] if said else ""
 
 
-def inspect_host(host_folder: HostFolder) -> dict[str, Any]:
+def inspect_host(host_folder: HostFolder, _request: dict[str, Any]) -> dict[str, Any]:
     """Describe the host, its environments and workers; changes nothing."""
     there = next(each for each in (host_folder.root, *host_folder.root.parents) if each.exists())
     installed = None
     with suppress(importlib.metadata.PackageNotFoundError):
         installed = importlib.metadata.version("dreamfleet")
     return {
-        "python": list(sys.version_info[:2]),
-        "executable": sys.executable,
-        "machine": platform.machine(),
-        "system": platform.system(),
-        "installed": installed,
+        "python": list(sys.version_info[:2]), "executable": sys.executable, "machine": platform.machine(),
+        "system": platform.system(), "installed": installed,
         "venv": importlib.util.find_spec("venv") is not None and importlib.util.find_spec("ensurepip") is not None,
         "writable": os.access(there, os.W_OK),
         "noexec": bool(os.statvfs(there).f_flag & getattr(os, "ST_NOEXEC", 0)),
-        "root": str(host_folder.root),
-        "free": shutil.disk_usage(there).free,
+        "root": str(host_folder.root), "free": shutil.disk_usage(there).free,
         "environments": [each for each in host_folder.names("environments") if host_folder.is_complete(each)],
         "workers": [WorkerProcess(host_folder.worker(each)).describe() for each in host_folder.names("workers")],
-    }
+    }  # fmt: skip
 
 
-def install(host_folder: HostFolder, request: dict[str, Any], files: dict[str, bytes]) -> dict[str, Any]:
+def install(host_folder: HostFolder, request: dict[str, Any]) -> dict[str, Any]:
     """Make the environment of this name unless it is complete; return its Python."""
     folder = host_folder.environment(request["environment"])
     with host_folder.locked():
@@ -397,7 +370,7 @@ def install(host_folder: HostFolder, request: dict[str, Any], files: dict[str, b
         remove_tree(folder)  # left by an interrupted attempt
         parcel = folder / "parcel"
         parcel.mkdir(parents=True)
-        for name, data in files.items():
+        for name, data in request["files"].items():
             (parcel / Path(name).name).write_bytes(data)
         host_folder.channel.send("say", "makes its environment")
         _call(host_folder, sys.executable, "-m", "venv", str(folder))
@@ -415,15 +388,10 @@ def install(host_folder: HostFolder, request: dict[str, Any], files: dict[str, b
 def _call(host_folder: HostFolder, *command: str, inside: Path | None = None) -> None:
     """Run a command of the installation; `FailedError` with the reason and a remedy."""
     done = subprocess.run(
-        command,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=inside,
+        command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, cwd=inside,
         env={**os.environ, **host_folder.caches},
         pass_fds=(host_folder.lock,),  # it outlives an agent that is killed, and until then others must wait
-    )
+    )  # fmt: skip
     if done.returncode == 0:
         return
     said = [each.strip() for each in (done.stdout + done.stderr).splitlines() if each.strip()]
@@ -439,7 +407,7 @@ def _call(host_folder: HostFolder, *command: str, inside: Path | None = None) ->
     )
 
 
-def start(host_folder: HostFolder, request: dict[str, Any], files: dict[str, bytes]) -> dict[str, Any]:
+def start(host_folder: HostFolder, request: dict[str, Any]) -> dict[str, Any]:
     """Start a worker unless the same one runs; a different one of its name is drained first."""
     folder = host_folder.worker(request["name"])
     with host_folder.locked():
@@ -452,7 +420,7 @@ def start(host_folder: HostFolder, request: dict[str, Any], files: dict[str, byt
         outcome = "replaced" if found.is_alive else "started"
         found.end(host_folder.channel, STOP_DRAINED)
         folder.mkdir(parents=True, exist_ok=True)
-        for name, data in files.items():
+        for name, data in request["files"].items():
             _write_private(folder / name, data)
         began = _launch(host_folder, folder, request)
     _wait_for_begin(began, folder, host_folder.channel)
@@ -498,21 +466,18 @@ def _launch(host_folder: HostFolder, folder: Path, request: dict[str, Any]) -> s
 def _wait_for_begin(began: subprocess.Popen[bytes], folder: Path, channel: Channel) -> None:
     """Wait until the worker reports that it has begun; `FailedError` if it failed instead."""
     deadline = time.monotonic() + START_TIMEOUT
-    while began.poll() is None and not _has_begun(folder) and time.monotonic() < deadline:
+    while began.poll() is None and time.monotonic() < deadline:
+        if "begun" in _reports(folder) and last_line(folder / LOG):  # which its status then shows
+            return
         channel.wait_for_request()
     if began.poll():
         why = _reports(folder).get("failure") or last_line(folder / LOG) or f"exit code {began.returncode}"
         raise FailedError(f"its worker ended at once: {why}")
 
 
-def _has_begun(folder: Path) -> bool:
-    """Whether the worker has begun and logged something, which its status then shows."""
-    return "begun" in _reports(folder) and bool(last_line(folder / LOG))
-
-
 def _reports(folder: Path) -> dict[str, Any]:
     """What a worker reported, as `common/host/reports.py` writes it."""
-    found: dict[str, Any] = {}
+    found = dict[str, Any]()
     with suppress(FileNotFoundError, ValueError, TypeError):
         for line in (folder / REPORTS).read_text().splitlines():
             found.update(json.loads(line))
@@ -563,31 +528,30 @@ def end(host_folder: HostFolder, request: dict[str, Any]) -> dict[str, Any]:
     return {"ended": ended}
 
 
+ACTIONS: dict[str, Callable[[HostFolder, dict[str, Any]], dict[str, Any]]] = {
+    "look": inspect_host, "install": install, "start": start, "follow": follow, "end": end,
+}  # fmt: skip
+
+
 def handle_request(request: dict[str, Any], channel: Channel) -> None:
     """Do what a request says, and answer."""
-    files = {name: channel.file(size) for name, size in request.get("files", [])}
+    request["files"] = {name: channel.file(size) for name, size in request.get("files", [])}
     host_folder, where = HostFolder(request["root"], channel), request["root"]
-    actions: dict[str, Callable[[], dict[str, Any]]] = {
-        "look": lambda: inspect_host(host_folder),
-        "install": lambda: install(host_folder, request, files),
-        "start": lambda: start(host_folder, request, files),
-        "follow": lambda: follow(host_folder, request),
-        "end": lambda: end(host_folder, request),
-    }
     try:
-        channel.send("ok", actions[request["do"]]())
+        channel.send("ok", ACTIONS[request["do"]](host_folder, request))
     except FailedError as error:
         channel.send("failed", str(error))
     except OSError as error:
         if request["do"] == "end":
             why = f"{error.filename or where}: {error.strerror or error}"
-            channel.send("failed", f"{why}; what is left there is removed by: {host_folder.removal}")
+            removal = f"cd {shlex.quote(str(host_folder.root))} && rm -rf {' '.join((*FOLDERS, CREATED, LOCK))}"
+            channel.send("failed", f"{why}; what is left there is removed by: {removal}")
         elif error.errno in (errno.ENOSPC, errno.EDQUOT):
             channel.send("failed", f"no space left in {where}: make room there, or name another --remote-dir")
         elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
             channel.send("failed", f"{error.filename or where} cannot be written there: name another --remote-dir")
         else:
-            channel.send("failed", f"{error}")
+            channel.send("failed", str(error))
 
 
 def main() -> None:
@@ -603,7 +567,7 @@ def main() -> None:
             if request.get("held"):
                 held.append(request)
             handle_request(request, channel)
-    except DisconnectedError:
+    except EOFError:
         for each in held:
             host_folder = HostFolder(each["root"], channel)
             if WorkerProcess(host_folder.worker(each["name"])).tunnel_pid == os.getpid():

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from dreamfleet.common.cli.config import load, option, read_table
+from dreamfleet.common.cli.key_values import split_flags
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.keys import check_worker_name
 from dreamfleet.common.transport.network import is_loopback
@@ -49,11 +49,9 @@ class SpawnConfig:
             raise UsageError(f"--wheelhouse {self.wheelhouse} holds no wheel: fill it with `pip download -d FOLDER`")
         if not self.remote_dir.strip("/ ") or self.remote_dir == "~":
             raise UsageError(f"--remote-dir {self.remote_dir!r}: name a folder of its own")
-        if not _split_flags("ssh", self.ssh):
+        if not split_flags("--ssh", self.ssh):
             raise UsageError("--ssh: name the ssh client")
-        said = {word.partition("=")[0] for word in _split_flags("worker-flags", self.worker_flags)}
-        if taken := [flag for flag in RESERVED_FLAGS if flag in said]:
-            raise UsageError(f"--worker-flags: {', '.join(taken)} is given otherwise: see --help")
+        split_flags("--worker-flags", self.worker_flags, "spawn", RESERVED_FLAGS)
 
 
 @dataclass(frozen=True)
@@ -77,21 +75,6 @@ class Host:
             raise UsageError(f"{self.address!r} is not a host: write it as user@host, host, or ssh://user@host:port")
         check_worker_name(self.name)
 
-    @property
-    def flags(self) -> list[str]:
-        """Further flags for its worker."""
-        return _split_flags("worker-flags", self.spawn.worker_flags)
-
-    @property
-    def ssh(self) -> list[str]:
-        """The ssh command with the user's flags."""
-        return _split_flags("ssh", self.spawn.ssh)
-
-    @property
-    def environment(self) -> dict[str, str]:
-        """Environment variables for its worker."""
-        return dict(each.partition("=")[::2] for each in self.spawn.env)
-
     def forwards(self, connect: Iterable[str], *, joins: bool) -> tuple[str, ...]:
         """HOST:PORT of each endpoint to reach through a tunnel; empty without one.
 
@@ -99,10 +82,8 @@ class Host:
         since a join file names the endpoints.
         """
         endpoints = tuple(connect)
-        wanted = self.spawn.tunnel
-        if wanted is None:
-            wanted = not joins and all(map(is_loopback, endpoints))
-        if not wanted:
+        is_default = not joins and all(map(is_loopback, endpoints))
+        if not (is_default if self.spawn.tunnel is None else self.spawn.tunnel):
             return ()
         if strange := [each for each in endpoints if not each.startswith("tcp/")]:
             raise UsageError(f"--tunnel carries tcp alone, which ssh encrypts, and not {', '.join(strange)}")
@@ -118,11 +99,10 @@ def read_hosts(rows: Sequence[Mapping[str, Any]], sources: Mapping[str, Any]) ->
         if "address" not in own:
             raise UsageError(f'{where} has no address: write address = "user@host"')
         about = HostConfig(**read_table(HostConfig, where, own))
-        rest = read_table(SpawnConfig, where, {key: value for key, value in row.items() if key not in own})
-        table = (sources.get("file") or {}).get("spawn", {})
-        texts = {key: str(value) if isinstance(value, Path) else value for key, value in rest.items()}
-        lists = {key: list(value) if isinstance(value, tuple) else value for key, value in texts.items()}
-        spawn = load(SpawnConfig, "spawn", **{**sources, "file": {"spawn": {**table, **lists}}})
+        rest = {key: value for key, value in row.items() if key not in own}
+        read_table(SpawnConfig, where, rest)  # its errors name this table
+        table = {**(sources.get("file") or {}).get("spawn", {}), **rest}
+        spawn = load(SpawnConfig, "spawn", **{**sources, "file": {"spawn": table}})
         hosts.append(Host(about.name or default_name(about.address), about.address, spawn))
     return check_unique(hosts)
 
@@ -133,9 +113,7 @@ def check_unique(hosts: list[Host]) -> list[Host]:
         raise UsageError(f"no host is named: give user@host, or a file with [[{HOSTS}]] tables")
     names = [each.name for each in hosts]
     if twice := sorted({each for each in names if names.count(each) > 1}):
-        raise UsageError(
-            f"several hosts are called {', '.join(twice)}: give each a name of its own in a file, for --hosts"
-        )
+        raise UsageError(f"several hosts are called {', '.join(twice)}: give each its own name in a file, for --hosts")
     return hosts
 
 
@@ -143,10 +121,3 @@ def default_name(address: str) -> str:
     """The name of a host without a given one, from its address."""
     found = _ADDRESS.fullmatch(address)
     return re.sub(r"[^A-Za-z0-9.-]+", "-", found["host"] if found else address).strip("-.")[:63] or "worker"
-
-
-def _split_flags(name: str, text: str) -> list[str]:
-    try:
-        return shlex.split(text)
-    except ValueError as error:
-        raise UsageError(f"--{name} {text!r}: {error}") from error

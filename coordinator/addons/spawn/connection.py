@@ -59,13 +59,7 @@ _SSH_NOISE = re.compile(r"Warning: Permanently added|^Allocated port|^\s*$|^@+$"
 
 OnMessage = Callable[[str, str], None]
 """Takes a message of the working agent: its kind, `say` or `line`, and the text."""
-
-
 T = TypeVar("T")
-
-
-def _ignore_message(_kind: str, _text: str) -> None:
-    """Ignore a message."""
 
 
 class Connection:
@@ -75,15 +69,8 @@ class Connection:
         self._address = address
         program = (files("dreamfleet.coordinator.addons.spawn") / "agent.py").read_bytes()
         tunnel = [word for each in forwards for word in ("-R", f"127.0.0.1:0:{each}")]
-        words = [
-            *ssh,
-            *OPTIONS,
-            *(TUNNEL if forwards else ()),
-            *tunnel,
-            "--",
-            address,
-            _remote_command(python, len(program)),
-        ]
+        command = _remote_command(python, len(program))
+        words = [*ssh, *OPTIONS, *(TUNNEL if forwards else ()), *tunnel, "--", address, command]
         self._stderr_lines: deque[str] = deque(maxlen=KEPT_LINES)
         self._forwards = frozenset(forwards)
         self._ports: dict[str, int] = {}
@@ -94,9 +81,7 @@ class Connection:
             # Its own: it ends as our pipe does, and may leave a shared connection, which is the user's.
             self._child = CommandChild(words, is_own=True, stdin=PIPE, stdout=PIPE, stderr=PIPE)
         except OSError as error:
-            raise DreamfleetError(
-                f"{ssh[0]} cannot be run ({error.strerror}): install an ssh client, or name --ssh"
-            ) from error
+            raise DreamfleetError(f"{ssh[0]} cannot be run ({error.strerror}): install ssh, or name --ssh") from error
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
         self._program = program
@@ -105,16 +90,16 @@ class Connection:
         """Start the agent and wait for it; `close` from another thread ends the wait."""
         with self._patience(QUICK):
             self._send(self._program)
-        self._answer(QUICK, _ignore_message)
+        self._answer(QUICK, lambda _kind, _text: None)
 
     def ask(
-        self, do: str, answer: type[T], on_message: OnMessage = _ignore_message,
-        sent: Mapping[str, bytes] | None = None, silence: float | None = SLOW, **facts: Any,
+        self, do: str, answer: type[T], on_message: OnMessage, sent: Mapping[str, bytes], silence: float | None,
+        **facts: object,
     ) -> T:  # fmt: skip
         """Send a request and return its answer; `DreamfleetError` if it failed, or after so much `silence`."""
-        names = [(name, len(data)) for name, data in (sent or {}).items()]
+        names = [(name, len(data)) for name, data in sent.items()]
         with self._patience(silence):
-            self._send(json.dumps({"do": do, "files": names, **facts}).encode() + b"\n", *(sent or {}).values())
+            self._send(json.dumps({"do": do, "files": names, **facts}).encode() + b"\n", *sent.values())
         try:
             return from_plain(answer, self._answer(silence, on_message))
         except MalformedError as error:
@@ -128,7 +113,9 @@ class Connection:
     def ports(self, forwards: Sequence[str]) -> list[int]:
         """The ports on the remote side of the tunnel, in the order of `forwards`."""
         with self._changed:
-            if not self._changed.wait_for(lambda: self._ports.keys() >= set(forwards) or self._ended, FORWARD):
+            if not self._changed.wait_for(
+                lambda: self._ports.keys() >= set(forwards) or self._child.exit_code is not None, FORWARD
+            ):
                 raise ConnectionFailedError("ssh did not say which port its tunnel was given")
         if not self._ports.keys() >= set(forwards):
             raise self._failure()
@@ -137,10 +124,6 @@ class Connection:
     def close(self) -> None:
         """Close the connection, which ends workers that use its tunnel. From any thread."""
         self._child.end(PATIENCE)
-
-    @property
-    def _ended(self) -> bool:
-        return self._child.exit_code is not None
 
     def _send(self, *data: bytes) -> None:
         assert self._child.popen.stdin is not None

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from functools import partial
 
 from dreamfleet.common.errors import DreamfleetError, StoppedError
@@ -16,7 +16,6 @@ from dreamfleet.coordinator.addons.spawn.remote_host import FAILED, FleetAddress
 log = logging.getLogger(__name__)
 POLL_INTERVAL = 0.2  # seconds between checks for a stop
 
-OnStatuses = Callable[[Sequence[HostStatus]], None]
 OnLogLine = Callable[[str, str], None]
 """A host's name and a line of its worker's log."""
 
@@ -32,32 +31,27 @@ def end(hosts: Sequence[Host], *, all_workers: bool, now: bool, keep: bool) -> l
 
 
 def bring_up(
-    hosts: Sequence[Host], fleet_address: FleetAddress, on_statuses: OnStatuses, on_log_line: OnLogLine | None
-) -> list[HostStatus]:
+    hosts: Sequence[Host], fleet_address: FleetAddress, on_statuses: Callable[[Sequence[HostStatus]], None],
+    on_log_line: OnLogLine | None,
+) -> list[HostStatus]:  # fmt: skip
     """Start a worker on each host. With `on_log_line` or a tunnel, return only when they end or at Ctrl-C.
 
     Calls `on_statuses` when all are up and when they ended, `on_log_line` for each line of a log.
     """
-    with stop_on_signals() as stop, ExitStack() as stack:
-        remote_hosts = _open_remote_hosts(hosts, fleet_address, stack, on_log_line or _ignore_line)
+    with _opened(hosts, fleet_address, on_log_line or _ignore_line) as (remote_hosts, stop):
         rows = _run_in_threads(remote_hosts, RemoteHost.bring_up, stop, RemoteHost.close)
         if stop():
-            raise StoppedError(
-                "interrupted: some workers may run; the same command continues, and `dreamfleet down` ends them"
-            )
+            raise StoppedError("some workers may run: the same command continues, and `dreamfleet down` ends them")
         on_statuses(rows)
-        up = [remote_host for remote_host, row in zip(remote_hosts, rows, strict=True) if row.state != FAILED]
-        held = [remote_host for remote_host in up if remote_host.forwards]
+        up = [each for each, row in zip(remote_hosts, rows, strict=True) if row.state != FAILED]
+        held = [each for each in up if each.forwards]
         if held:
-            log.info("%s: the worker reaches its coordinator through this command, and ends with it (Ctrl-C)",
-                     ", ".join(remote_host.host.name for remote_host in held))  # fmt: skip
+            names = ", ".join(each.host.name for each in held)
+            log.info("%s: the worker reaches its coordinator through this command, and ends with it (Ctrl-C)", names)
         if watched := up if on_log_line else held:
-            then = dict(
-                zip(
-                    watched, _run_in_threads(watched, _follow_until_ended, stop, RemoteHost.stop_following), strict=True
-                )
-            )
-            rows = [then.get(remote_host, row) for remote_host, row in zip(remote_hosts, rows, strict=True)]
+            ended = _run_in_threads(watched, _follow_until_ended, stop, RemoteHost.stop_following)
+            then = dict(zip(watched, ended, strict=True))
+            rows = [then.get(each, row) for each, row in zip(remote_hosts, rows, strict=True)]
             on_statuses(rows)
     return rows
 
@@ -74,33 +68,32 @@ def _follow_until_ended(remote_host: RemoteHost) -> HostStatus:
 def _run_on_all(
     hosts: Sequence[Host], fleet_address: FleetAddress, do: Callable[[RemoteHost], HostStatus]
 ) -> list[HostStatus]:
-    with stop_on_signals() as stop, ExitStack() as stack:
-        rows = _run_in_threads(
-            _open_remote_hosts(hosts, fleet_address, stack, _ignore_line), do, stop, RemoteHost.close
-        )
+    with _opened(hosts, fleet_address, _ignore_line) as (remote_hosts, stop):
+        rows = _run_in_threads(remote_hosts, do, stop, RemoteHost.close)
         if stop():
             raise StoppedError("interrupted: the same command continues")
         return rows
 
 
-def _open_remote_hosts(
-    hosts: Sequence[Host], fleet_address: FleetAddress, stack: ExitStack, on_log_line: OnLogLine
-) -> list[RemoteHost]:
-    remote_hosts = [
-        RemoteHost(each, fleet_address, partial(log.info, "%s %s", each.name), partial(on_log_line, each.name))
-        for each in hosts
-    ]
-    for remote_host in remote_hosts:
-        stack.callback(remote_host.close)
-    return remote_hosts
+@contextmanager
+def _opened(
+    hosts: Sequence[Host], fleet_address: FleetAddress, on_log_line: OnLogLine
+) -> Iterator[tuple[list[RemoteHost], Stop]]:
+    """Yield the hosts, whose connections are closed at the end, and whether a signal asks to stop."""
+    with stop_on_signals() as stop, ExitStack() as stack:
+        remote_hosts = [
+            RemoteHost(each, fleet_address, partial(log.info, "%s %s", each.name), partial(on_log_line, each.name))
+            for each in hosts
+        ]
+        for remote_host in remote_hosts:
+            stack.callback(remote_host.close)
+        yield remote_hosts, stop
 
 
 def _run_in_threads(
-    remote_hosts: Sequence[RemoteHost],
-    do: Callable[[RemoteHost], HostStatus],
-    stop: Stop,
+    remote_hosts: Sequence[RemoteHost], do: Callable[[RemoteHost], HostStatus], stop: Stop,
     leave: Callable[[RemoteHost], None],
-) -> list[HostStatus]:
+) -> list[HostStatus]:  # fmt: skip
     """The status of `do` for each host. The first Ctrl-C calls `leave` for each, the second closes all connections."""
     left = False
     with ThreadPoolExecutor(max(len(remote_hosts), 1)) as pool:

@@ -96,8 +96,7 @@ def pack_wheel(*, native: bool) -> Wheel:
     files = dict(_modules(native))
     has_native = any(name.endswith(NATIVE) for name in files)
     platform_tag = re.sub(r"[^a-z0-9]", "_", sysconfig.get_platform().lower())
-    tag = f"cp311-abi3-{platform_tag}" if has_native else "py3-none-any"
-    pure = "false" if has_native else "true"
+    tag, pure = (f"cp311-abi3-{platform_tag}", "false") if has_native else ("py3-none-any", "true")
     files[f"{about}/METADATA"] = _text(found, "METADATA", "PKG-INFO")
     files[f"{about}/entry_points.txt"] = _text(found, "entry_points.txt")
     files[f"{about}/WHEEL"] = f"Wheel-Version: 1.0\nGenerator: {NAME}\nRoot-Is-Purelib: {pure}\nTag: {tag}\n".encode()
@@ -139,9 +138,7 @@ def _distribution() -> Distribution:
     try:
         return distribution(NAME)
     except PackageNotFoundError:
-        raise DreamfleetError(
-            "dreamfleet is not installed here, so that nothing can be packed: pip install it"
-        ) from None
+        raise DreamfleetError("dreamfleet is not installed here, so nothing can be packed: pip install it") from None
 
 
 def _text(found: Distribution, *names: str) -> bytes:

@@ -1,4 +1,7 @@
-"""The steps on one host: connect, inspect, install, start, follow the log, end."""
+"""The steps on one host: connect, inspect, install, start, follow the log, end; and the forms of its agent's answers.
+
+A host that answers in another form fails alone.
+"""
 
 from __future__ import annotations
 
@@ -7,28 +10,83 @@ import json
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
+from msgspec import Meta
+
+from dreamfleet.common.cli.key_values import split_flags
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.printable import one_line
-from dreamfleet.common.schema.validation import MAX_TEXT
+from dreamfleet.common.schema.validation import MAX_TEXT, Count
 from dreamfleet.coordinator.addons.spawn.agent import JOIN, JOIN_HERE, LEAST_FREE
-from dreamfleet.coordinator.addons.spawn.answers import (
-    EndAnswer,
-    FollowAnswer,
-    HostAnswer,
-    InstallAnswer,
-    StartAnswer,
-    WorkerAnswer,
-)
 from dreamfleet.coordinator.addons.spawn.config import Host
 from dreamfleet.coordinator.addons.spawn.connection import QUICK, SLOW, Connection
 from dreamfleet.coordinator.addons.spawn.parcel import Parcel, pack, runs_here
 
+Name = Annotated[str, Meta(max_length=4096)]
+Line = Annotated[str, Meta(max_length=1 << 16)]
 T = TypeVar("T")
 OnText = Callable[[str], None]
 FAILED = "failed"
+NO_FILES: Mapping[str, bytes] = {}
+
+
+@dataclass(frozen=True)
+class WorkerAnswer:
+    """A worker on a host."""
+
+    name: Name
+    running: bool
+    slots: Count | None
+    age: float | None  # seconds since its start
+    digest: Name | None
+    last: Line  # of its log
+
+
+@dataclass(frozen=True)
+class StartAnswer(WorkerAnswer):
+    """A worker after `start`."""
+
+    outcome: Literal["started", "running", "replaced"]
+
+
+@dataclass(frozen=True)
+class FollowAnswer(WorkerAnswer):
+    """A worker after `follow`."""
+
+    ended: bool
+
+
+@dataclass(frozen=True)
+class EndAnswer:
+    """The workers that `end` ended, as they were before."""
+
+    ended: tuple[WorkerAnswer, ...]
+
+
+@dataclass(frozen=True)
+class InstallAnswer:
+    """The Python of an environment."""
+
+    python: Name
+
+
+@dataclass(frozen=True)
+class HostAnswer:
+    """What `look` finds on a host."""
+
+    python: Annotated[tuple[int, ...], Meta(min_length=2, max_length=2)]
+    executable: Name
+    machine: Name
+    system: Name
+    installed: Name | None  # the version of dreamfleet there
+    venv: bool
+    writable: bool
+    noexec: bool  # whether no program may be run from its file system
+    root: Name
+    free: Count  # bytes
+    environments: tuple[Name, ...]
+    workers: tuple[WorkerAnswer, ...]
 
 
 @dataclass(frozen=True)
@@ -60,7 +118,6 @@ class RemoteHost:
         self._on_log_line = on_log_line
         self._connection: Connection | None = None
         self._closed = threading.Event()
-        self._root = {"root": host.spawn.remote_dir}
         self.forwards = host.forwards(fleet_address.connect, joins=bool(fleet_address.join))
 
     def check(self) -> HostStatus:
@@ -72,26 +129,25 @@ class RemoteHost:
         environment = self._environment(found)
         there = "is there" if environment in (None, *found.environments) else "is to be made"
         version = ".".join(map(str, found.python))
-        return HostStatus(
-            self.host.name,
-            "ready",
-            f"Python {version}, {found.machine}, {found.free / 1e9:.1f} GB free, its environment {there}",
-        )
+        what = f"Python {version}, {found.machine}, {found.free / 1e9:.1f} GB free, its environment {there}"
+        return HostStatus(self.host.name, "ready", what)
 
     def bring_up(self) -> HostStatus:
         """Start the worker, in an environment that is made if it is missing."""
         found = self._inspect(self.forwards)
-        python = self._python(found)
-        connect = self._endpoints()
-        words = ["-P", "-m", "dreamfleet", "worker", "--name", self.host.name, "--slots", str(self.host.spawn.slots)]
+        python, connect = self._python(found), self._fleet_address.connect
+        join, spawn = self._fleet_address.join, self.host.spawn
+        if self.forwards and self._connection is not None:  # the remote ends of the tunnel
+            connect = tuple(f"tcp/127.0.0.1:{port}" for port in self._connection.ports(self.forwards))
+        words = ["-P", "-m", "dreamfleet", "worker", "--name", self.host.name, "--slots", str(spawn.slots)]
         words += ["--connect", *connect] if connect else []
-        words += ["--join", JOIN_HERE] if self._fleet_address.join else []
-        words += self.host.flags
-        facts: dict[str, Any] = {"python": python, "words": words, "env": self.host.environment}
-        text = json.dumps(facts, sort_keys=True).encode() + hashlib.sha256(self._fleet_address.join).digest()
-        files = {JOIN: self._fleet_address.join} if self._fleet_address.join else {}
-        started = self._ask("start", StartAnswer, sent=files, **facts, name=self.host.name, slots=self.host.spawn.slots,
-                            held=bool(self.forwards), digest=hashlib.sha256(text).hexdigest())  # fmt: skip
+        words += ["--join", JOIN_HERE] if join else []
+        words += split_flags("--worker-flags", spawn.worker_flags)
+        environment = dict(each.partition("=")[::2] for each in spawn.env)
+        facts: dict[str, Any] = {"python": python, "words": words, "env": environment}
+        digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode() + hashlib.sha256(join).digest()).hexdigest()
+        started = self._ask("start", StartAnswer, sent={JOIN: join} if join else {}, **facts, name=self.host.name,
+                            slots=spawn.slots, held=bool(self.forwards), digest=digest)  # fmt: skip
         return self._status(started.outcome, started)
 
     def follow(self) -> HostStatus | None:
@@ -110,8 +166,7 @@ class RemoteHost:
             self._connect(())
         names = None if all_workers else [self.host.name]
         ended = self._ask("end", EndAnswer, names=names, now=now, keep=keep).ended
-        left = [each.name for each in ended if each.running]
-        if left:
+        if left := [each.name for each in ended if each.running]:
             return HostStatus(self.host.name, "left", f"{', '.join(left)} left")
         return HostStatus(self.host.name, "nothing", "no worker runs there")
 
@@ -123,7 +178,8 @@ class RemoteHost:
 
     def _connect(self, forwards: tuple[str, ...]) -> None:
         spawn = self.host.spawn
-        self._connection = Connection(self.host.ssh, self.host.address, spawn.remote_python, forwards)
+        ssh = split_flags("--ssh", spawn.ssh)
+        self._connection = Connection(ssh, self.host.address, spawn.remote_python, forwards)
         if self._closed.is_set():
             self._connection.close()
         self._connection.start_agent()
@@ -154,40 +210,39 @@ class RemoteHost:
                 f"{found.free / 1e6:.0f} MB are free at {found.root}, and an environment takes "
                 f"{LEAST_FREE / 1e6:.0f}: make room there, or name another --remote-dir"
             )
-        pack_for(self.host.spawn.wheelhouse, found).check_fits(found.machine)
+        self._parcel(found).check_fits(found.machine)
 
     def _environment(self, found: HostAnswer) -> str | None:
         """The worker's environment; `None` if dreamfleet is installed in the Python that the user named."""
         if self.host.spawn.remote_python and found.installed:
             return None
-        return pack_for(self.host.spawn.wheelhouse, found).environment(found.python, found.machine)
+        return self._parcel(found).environment(found.python, found.machine)
+
+    def _parcel(self, found: HostAnswer) -> Parcel:
+        """The parcel for the system and processor of a host."""
+        return pack(self.host.spawn.wheelhouse, native=runs_here(found.system, found.machine))
 
     def _python(self, found: HostAnswer) -> str:
         """Install the worker if needed; the path of its Python."""
         name = self._environment(found)
         if name is None:
             return found.executable
-        parcel = pack_for(self.host.spawn.wheelhouse, found)
+        parcel = self._parcel(found)
         files = {} if name in found.environments else parcel.files()
         if files and not runs_here(found.system, found.machine):
             self._on_progress(f"is {found.system} on {found.machine}: gymnasium draws there, which is slower")
-        made = self._ask("install", InstallAnswer, sent=files, environment=name, wheel=parcel.wheel.name,
-                         offline=parcel.wheelhouse is not None)  # fmt: skip
-        return made.python
-
-    def _endpoints(self) -> list[str]:
-        """The endpoints that the worker connects to: those given, or the remote ends of the tunnel."""
-        if not self.forwards:
-            return list(self._fleet_address.connect)
-        assert self._connection is not None
-        return [f"tcp/127.0.0.1:{port}" for port in self._connection.ports(self.forwards)]
+        offline = parcel.wheelhouse is not None
+        return self._ask(
+            "install", InstallAnswer, sent=files, environment=name, wheel=parcel.wheel.name, offline=offline
+        ).python
 
     def _ask(
-        self, do: str, answer: type[T], *, sent: Mapping[str, bytes] | None = None, silence: float | None = SLOW,
+        self, do: str, answer: type[T], *, sent: Mapping[str, bytes] = NO_FILES, silence: float | None = SLOW,
         **facts: object,
     ) -> T:  # fmt: skip
         assert self._connection is not None
-        return self._connection.ask(do, answer, self._on_message, sent, silence, **self._root, **facts)
+        root = self.host.spawn.remote_dir
+        return self._connection.ask(do, answer, self._on_message, sent, silence, root=root, **facts)
 
     def _on_message(self, kind: str, text: str) -> None:
         if kind == "line":
@@ -197,8 +252,3 @@ class RemoteHost:
 
     def _status(self, state: str, worker: WorkerAnswer) -> HostStatus:
         return HostStatus(self.host.name, state, worker.last, worker.slots or None, worker.age)
-
-
-def pack_for(wheelhouse: Path | None, found: HostAnswer) -> Parcel:
-    """The parcel for the system and processor of a host."""
-    return pack(wheelhouse, native=runs_here(found.system, found.machine))

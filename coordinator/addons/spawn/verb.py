@@ -16,7 +16,7 @@ from dreamfleet.common.cli.output import add_json_flag, print_rows
 from dreamfleet.common.client.eta import format_duration
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import is_file, read_regular
-from dreamfleet.common.printable import one_line, printable
+from dreamfleet.common.printable import printable
 from dreamfleet.common.security.credentials import MAX_BYTES
 from dreamfleet.coordinator.addons.spawn.config import HOSTS, Host, SpawnConfig, check_unique, default_name, read_hosts
 from dreamfleet.coordinator.addons.spawn.parallel import bring_up, check, end
@@ -35,10 +35,20 @@ def configure_spawn(parser: argparse.ArgumentParser) -> None:
 
 
 def start_workers(args: argparse.Namespace) -> int:
-    """Start a worker on each host that was named; one whose worker runs is left alone."""
+    """Start a worker on each host, or with `--check` look at it; exit 1 if a host failed."""
     if args.name is not None and (args.file or len(args.hosts) > 1):
         raise UsageError("--name is one worker's: for several hosts write a file with their names, for --hosts")
-    return _start(args, _find_hosts(args, args.name))
+    hosts, fleet_address = _find_hosts(args, args.name), _fleet_address(args)
+    if args.check:
+        rows = check(hosts, fleet_address)
+        _print_hosts(args, rows)
+    else:
+
+        def show(host: str, line: str) -> None:
+            print(json.dumps({"host": host, "line": line}) if args.json else f"{host} | {printable(line)}", flush=True)
+
+        rows = bring_up(hosts, fleet_address, lambda rows: _print_hosts(args, rows), show if args.follow else None)
+    return _exit_code(rows)
 
 
 def configure_down(parser: argparse.ArgumentParser) -> None:
@@ -52,8 +62,7 @@ def configure_down(parser: argparse.ArgumentParser) -> None:
 
 def end_workers(args: argparse.Namespace) -> int:
     """End the workers; exit 1 if a host failed."""
-    hosts = _find_hosts(args)
-    rows = end(hosts, all_workers=args.file is None, now=args.now, keep=args.keep)
+    rows = end(_find_hosts(args), all_workers=args.file is None, now=args.now, keep=args.keep)
     _print_hosts(args, rows)
     return _exit_code(rows)
 
@@ -66,9 +75,7 @@ class _HostsFile(argparse.Action):
 
 
 def _add_host_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "hosts", nargs="*", metavar="HOST", help="a host as ssh takes it: user@host, or ssh://user@host:port"
-    )
+    parser.add_argument("hosts", nargs="*", metavar="HOST", help="as ssh takes it: user@host, or ssh://user@host:port")
     parser.add_argument(
         "--hosts", dest="file", type=Path, metavar="FILE", action=_HostsFile,
         help="the hosts of this TOML file instead: a [[host]] table for each (docs/how-to/hosts.md)",
@@ -89,18 +96,6 @@ def _find_hosts(args: argparse.Namespace, name: str | None = None) -> list[Host]
     return check_unique([Host(name or default_name(each), each, spawn) for each in args.hosts])
 
 
-def _start(args: argparse.Namespace, hosts: Sequence[Host]) -> int:
-    """Start a worker on each host, or with `--check` look at it; exit 1 if a host failed."""
-    fleet_address = _fleet_address(args)
-    if args.check:
-        rows = check(hosts, fleet_address)
-        _print_hosts(args, rows)
-    else:
-        show = (lambda host, line: _print_log_line(args, host, line)) if args.follow else None
-        rows = bring_up(hosts, fleet_address, lambda rows: _print_hosts(args, rows), show)
-    return _exit_code(rows)
-
-
 def _fleet_address(args: argparse.Namespace) -> FleetAddress:
     """Endpoints that were given, a worker's join file for all hosts, or by default this host's own."""
     network, join = resolve_network(args, "worker"), args.global_config.join
@@ -112,17 +107,11 @@ def _fleet_address(args: argparse.Namespace) -> FleetAddress:
 def _print_hosts(args: argparse.Namespace, rows: Sequence[HostStatus]) -> None:
     if args.json:
         print(json.dumps({"hosts": [asdict(each) for each in rows]}), flush=True)
-    else:
-        print_rows([_table_row(each) for each in rows], right=("slots", "since"))
-
-
-def _table_row(row: HostStatus) -> dict[str, object]:
-    since = None if row.since is None else format_duration(row.since)
-    return {"host": row.host, "state": row.state, "slots": row.slots, "since": since, "what": one_line(row.what)}
-
-
-def _print_log_line(args: argparse.Namespace, host: str, line: str) -> None:
-    print(json.dumps({"host": host, "line": line}) if args.json else f"{host} | {printable(line)}", flush=True)
+        return
+    shown = [{"host": each.host, "state": each.state, "slots": each.slots,
+              "since": None if each.since is None else format_duration(each.since), "what": each.what}
+             for each in rows]  # fmt: skip
+    print_rows(shown, right=("slots", "since"))
 
 
 def _exit_code(rows: Sequence[HostStatus]) -> int:

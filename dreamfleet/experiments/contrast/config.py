@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from dreamfleet.common.cli.key_values import split_flags
 from dreamfleet.common.cli.presets import default_run_preset
 from dreamfleet.common.errors import UsageError
-from dreamfleet.experiments.command_lines import Words, split_flags
+from dreamfleet.experiments.command_lines import Words
 from dreamfleet.experiments.iteration.config import RESERVED_FLAGS
 
 # Equal parameters: 422,625 and 421,277 of 32 latents and three actions.
@@ -82,16 +82,10 @@ class Contrast:
         """
         mine, kinds = asdict(self), dict(self.kinds)
         known: dict[str, str] = dict(kept.get("kinds", ()))
-        differing: list[str] = [
-            name for name in ("mdnrnn_flags", "run_flags") if name in kept and kept[name] != mine[name]
-        ]
+        differing: list[str] = []
+        differing += [name for name in ("mdnrnn_flags", "run_flags") if name in kept and kept[name] != mine[name]]
         differing += [f"kind {name}" for name, flags in known.items() if kinds.get(name, flags) != flags]
         if differing:
             raise UsageError(f"it was begun with other {', '.join(differing)}: omit that, or begin in another --out")
         seeds = tuple(dict.fromkeys((*kept.get("seeds", ()), *self.seeds)))
         return {**mine, "kinds": tuple((known | kinds).items()), "seeds": seeds}
-
-
-def parse_kinds(given: Sequence[Sequence[str]]) -> tuple[tuple[str, str], ...]:
-    """The kinds of `--kind NAME FLAGS`, in order; by default the two that ship."""
-    return tuple((name, flags) for name, flags in given) or KINDS

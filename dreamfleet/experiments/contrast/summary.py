@@ -89,10 +89,14 @@ def differences(outcomes: Sequence[TrialResult]) -> Iterator[tuple[str, str, Pai
 def describe_difference(kind: str, first: str, figure: str, found: PairedDifference) -> str:
     """A difference in words, and whether it is one."""
     digits = 1 if figure == SCORE else 3
-    label = "score in reality" if figure == SCORE else figure.replace("_", " ")
     verdict = "" if found.is_significant else f": none, for one under {found.threshold_text} is none"
     size = format_with_error(found.mean, found.error, digits, sign="+")
-    return f"{label}: {kind} less {first} {size} over {plural(found.seeds, 'seed')}{verdict}"
+    return f"{name_figure(figure)}: {kind} less {first} {size} over {plural(found.seeds, 'seed')}{verdict}"
+
+
+def name_figure(figure: str) -> str:
+    """A figure in words."""
+    return "score in reality" if figure == SCORE else figure.replace("_", " ")
 
 
 def _reality(found: TrialResult) -> str:

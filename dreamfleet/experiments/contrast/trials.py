@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,18 +10,17 @@ from typing import Any
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.cli.presets import default_run_preset
 from dreamfleet.common.errors import DatasetError, UsageError
-from dreamfleet.common.files.atomic_write import atomic_write
-from dreamfleet.common.files.regular_files import is_folder, path_exists, read_text
+from dreamfleet.common.files.regular_files import is_folder, path_exists
 from dreamfleet.common.host.stop_signals import Stop
 from dreamfleet.common.runs.records import best_evaluation
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.experiments import command_lines
-from dreamfleet.experiments.command_lines import Words
+from dreamfleet.experiments.command_lines import options
 from dreamfleet.experiments.contrast.config import Contrast, Trial
 from dreamfleet.experiments.contrast.summary import TrialResult
 from dreamfleet.experiments.isolated import run_isolated
-from dreamfleet.experiments.local_run import LocalFleet, evolve, has_begun, has_ended, task_flags
-from dreamfleet.experiments.stage_flags import read_training
+from dreamfleet.experiments.kept_document import read_document, write_document
+from dreamfleet.experiments.local_run import LocalFleet, coordinator_words, evolve, has_ended, task_flags
+from dreamfleet.experiments.pipeline import read_training
 from dreamfleet.worker.training.stages.bundle import BundleRequest, build_bundle
 from dreamfleet.worker.training.stages.train import TrainRequest, summarise, train_model
 
@@ -30,7 +28,6 @@ from dreamfleet.worker.training.stages.train import TrainRequest, summarise, tra
 SHARED = ("episodes", "encoded", "vae.safetensors")
 SETTINGS = "contrast.json"
 LOCK = "contrast.lock"
-MOST_BYTES = 1 << 20
 
 
 class Trials:
@@ -52,12 +49,15 @@ class Trials:
         if not any((self._data / "encoded").iterdir()):
             raise DatasetError(f"{self._data} has no encoded drives: dreamfleet encode --data {self._data}")
         path = self._folder / SETTINGS
-        begun, data = _read_settings(path), str(self._data.resolve())
+        begun, data = read_document(path, _check_settings) or {}, str(self._data.resolve())
         if begun.get("data", data) != data:
             raise UsageError(f"{self._folder} was begun on {begun['data']}: begin in another --out")
         kept = self._contrast.merge_settings(begun)
-        self._parameters = {trial: self._count_parameters(trial) for trial in self._contrast.trials}
-        _write_settings(path, {**kept, "data": data})
+        for trial in self._contrast.trials:  # refuses wrong training flags
+            self._link_data(trial)
+            log = self._log_path(trial, "summary")
+            self._parameters[trial] = run_isolated(summarise, self._training(trial), log, self._stop).parameters
+        write_document(path, {**kept, "data": data}, "--out")
 
     def do(self, trial: Trial, on_step: Callable[[str], None]) -> TrialResult:
         """Do what is left of a trial; `on_step` is called as each part begins."""
@@ -70,19 +70,13 @@ class Trials:
             request = BundleRequest(self._trial_folder(trial), model)
             run_isolated(build_bundle, request, self._log_path(trial, "bundle"), self._stop)
         if not has_ended(self._runs, trial.name):
-            local_fleet = self._local_fleet()
-            world = Bundle.open(model).manifest.task
+            fleet, world = self._local_fleet(), Bundle.open(model).manifest.task
             on_step(f"{trial.name}: evolve in the dream of {world}, from the preset {default_run_preset(world)}")
-            local_fleet = replace(local_fleet, worker=(*local_fleet.worker, *task_flags(world)))
-            words = self._run_command(trial, local_fleet, world)
-            evolve(trial.name, words, local_fleet, self._trial_folder(trial) / "logs", self._stop)
+            fleet = replace(fleet, worker=(*fleet.worker, *task_flags(world)))
+            flags = (*self._contrast.run_flags_in(world), *options(bundle=model, seed=trial.seed))
+            words = coordinator_words(trial.name, self._runs, fleet, lambda: flags)
+            evolve(trial.name, words, fleet, self._trial_folder(trial) / "logs", self._stop)
         return self._outcome(trial)
-
-    def _count_parameters(self, trial: Trial) -> int:
-        """How many parameters its model has; `UsageError` for wrong training flags."""
-        self._link_data(trial)
-        log = self._log_path(trial, "summary")
-        return run_isolated(summarise, self._training(trial), log, self._stop).parameters
 
     def _trial_folder(self, trial: Trial) -> Path:
         return self._folder / trial.name
@@ -106,14 +100,6 @@ class Trials:
         flags = self._contrast.training_flags(trial)
         return read_training("mdnrnn", self._trial_folder(trial), trial.seed, *flags)
 
-    def _run_command(self, trial: Trial, local_fleet: LocalFleet, world: str) -> Words:
-        if has_begun(self._runs, trial.name):
-            return command_lines.resume_run(trial.name, self._runs, local_fleet.listen)
-        return command_lines.begin_run(
-            trial.name, self._runs, local_fleet.listen, *local_fleet.coordinator, *self._contrast.run_flags_in(world),
-            world_model=self._model_path(trial), seed=trial.seed,
-        )  # fmt: skip
-
     def _outcome(self, trial: Trial) -> TrialResult:
         quality = Bundle.open(self._model_path(trial)).manifest.provenance.get("quality", {})
         figures = {name: float(value) for name, value in quality.items() if isinstance(value, (int, float))}
@@ -128,22 +114,7 @@ class Trials:
         )
 
 
-def _read_settings(path: Path) -> dict[str, Any]:
-    """The settings that the folder was begun with; nothing if it is new."""
-    try:
-        found = json.loads(read_text(path, MOST_BYTES))
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError, RecursionError) as error:
-        raise DatasetError(f"{path} is damaged ({error}); put it back from a copy") from error
+def _check_settings(found: Any) -> dict[str, Any]:
     if not isinstance(found, dict):
-        raise DatasetError(f"{path} is damaged; put it back from a copy")
+        raise TypeError("it holds no settings")
     return found
-
-
-def _write_settings(path: Path, content: Any) -> None:
-    try:
-        with atomic_write(path) as file:
-            file.write((json.dumps(content, indent=1) + "\n").encode())
-    except OSError as error:
-        raise DatasetError(f"cannot write {path}: {error.strerror}; make room, or choose another --out") from error

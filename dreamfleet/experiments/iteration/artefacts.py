@@ -10,19 +10,10 @@ from dreamfleet.common.artifacts.bundle import hash_file
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.files.regular_files import is_file
 from dreamfleet.common.host.processes import shell_command
+from dreamfleet.experiments.iteration import plan
 from dreamfleet.experiments.iteration.layout import ENCODED, EPISODES, IterationFolder
 from dreamfleet.experiments.iteration.ledger import Artefact, FinishedPhase, IterationLedger
-from dreamfleet.experiments.iteration.plan import (
-    BUNDLE,
-    COLLECT,
-    DATA,
-    EVOLVE,
-    GATE,
-    INIT,
-    MDNRNN,
-    VAE,
-    Phase,
-)
+from dreamfleet.experiments.iteration.plan import Phase
 
 
 def hash_artefacts(layout: IterationFolder, paths: Iterable[Path]) -> tuple[Artefact, ...]:
@@ -43,7 +34,7 @@ def entries_to_check(ledger: IterationLedger) -> Iterator[FinishedPhase]:
     last = max((each.round for each in ledger.entries), default=0)
     model = ledger.model_round(last - 1) if last > 1 else last
     for each in ledger.entries:
-        if each.phase in DATA or each.round >= last - 1 or each.round == model:
+        if each.phase in plan.DATA or each.round >= last - 1 or each.round == model:
             yield each
 
 
@@ -74,7 +65,7 @@ def undo(layout: IterationFolder, ledger: IterationLedger, phases: Iterable[Phas
     """
     phases = tuple(phases)
     before = ledger.before(phases[0])
-    if any(each.name in DATA for each in phases):
+    if any(each.name in plan.DATA for each in phases):
         _undo_drives(layout, ledger, before, phases)
     for each in phases:
         for path in _outputs(layout, each):
@@ -85,7 +76,7 @@ def undo(layout: IterationFolder, ledger: IterationLedger, phases: Iterable[Phas
 def _undo_drives(
     layout: IterationFolder, ledger: IterationLedger, before: IterationLedger, phases: tuple[Phase, ...]
 ) -> None:
-    random = [each for each in ledger.entries if each.phase_key in phases and each.phase == COLLECT]
+    random = [each for each in ledger.entries if each.phase_key in phases and each.phase == plan.COLLECT]
     whole = {drive.path for each in random for drive in each.made if not _fault(layout, drive)}
     for path in drive_files(layout):
         if layout.relative(path) not in before.files | whole:
@@ -97,12 +88,12 @@ def _outputs(layout: IterationFolder, phase: Phase) -> list[Path]:
     """The paths in its round's folder that a phase makes, finished or not."""
     number, folder = phase.round, layout.round(phase.round)
     return {
-        INIT: [folder],
-        VAE: [*folder.glob("vae.*")],
-        MDNRNN: [*folder.glob("mdnrnn.*")],
-        BUNDLE: [layout.bundle(number)],
-        GATE: [layout.refitted(number), layout.gate_file(number)],
-        EVOLVE: [layout.run(number), layout.means(number), layout.start(number)],
+        plan.INIT: [folder],
+        plan.VAE: [*folder.glob("vae.*")],
+        plan.MDNRNN: [*folder.glob("mdnrnn.*")],
+        plan.BUNDLE: [layout.bundle(number)],
+        plan.GATE: [layout.refitted(number), layout.gate_file(number)],
+        plan.EVOLVE: [layout.run(number), layout.means(number), layout.start(number)],
     }.get(phase.name, [])
 
 

@@ -7,9 +7,10 @@ from typing import Literal
 
 from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli.config import option
+from dreamfleet.common.cli.key_values import split_flags
 from dreamfleet.common.cli.presets import NAMES, check_preset, default_training_preset
 from dreamfleet.common.errors import UsageError
-from dreamfleet.experiments.command_lines import Words, split_flags
+from dreamfleet.experiments.command_lines import Words
 
 # They change no round that is finished, nor what it means; what `--run-flags` lead to is compared instead of them.
 CHANGEABLE = frozenset({"rounds", "local", "jobs", "device", "run_flags"})
@@ -17,18 +18,9 @@ MOST_SEED = 2**31 - 1  # each round's training multiplies its own
 RUN_FLAGS = ("run_flags", "later_run_flags")
 # Flags of trainings and `bundle` that iterate sets itself.
 RESERVED_FLAGS = (
-    "--data",
-    "--preset",
-    "--device",
-    "--seed",
-    "--continue-from",
-    "--new",
-    "--summary",
-    "--json",
-    "--out",
-    "--extract",
+    "--data", "--preset", "--device", "--seed", "--continue-from", "--new", "--summary", "--json", "--out", "--extract",
     "--from",
-)
+)  # fmt: skip
 SURVIVAL_EPISODES = 40
 LEAST = {
     "rounds": 1, "drives": 2, "more_drives": 0, "own_drives": 0, "means": 1, "drive_steps": 1, "vae_updates": 1,
@@ -41,13 +33,9 @@ LEAST = {
 class IterateConfig:
     """How many rounds, and what each drives, learns, dreams and is held to."""
 
-    init: str = option(
-        "", "controller to go on from, and with it its world model: a file, or one that ships (default none)"
-    )
+    init: str = option("", "controller to go on from, with its world model: a file, or one that ships (default none)")
     rounds: int = option(5, "rounds in all: each makes a world model and evolves in its dream; more may follow later")
-    task: str = option(
-        "", f"the world, such as gym:ENVIRONMENT (default {FIRST_WORLD}); as `collect` takes this and these:"
-    )
+    task: str = option("", f"the world, as gym:ENVIRONMENT (default {FIRST_WORLD}); as `collect` takes this and these:")
     environment: tuple[str, ...] = option((), "KEY=VALUE arguments of the world; values as in JSON")
     observation: str = option("", "picture among several, by its key; render: what is drawn")
     crop: str = option("", "part of the picture that is seen, as top:bottom,left:right")
@@ -67,9 +55,7 @@ class IterateConfig:
     spells: float = option(0.0, "chance of each of their steps that an action which rests, as a brake, is tried")
     drive_steps: int | None = option(None, "steps of a drive at most (default the preset's)")
     vae: Literal["decoder", "whole", "keep"] = option("decoder", "the part of the VAE that learns on in later rounds")
-    vae_updates: int | None = option(
-        None, "updates of the VAE in each later round (default what --vae-flags say, else 1800)"
-    )
+    vae_updates: int | None = option(None, "updates of the VAE in later rounds (default as --vae-flags say, else 1800)")
     mdnrnn_updates: int | None = option(
         None, "updates of the MDN-RNN in each later round (default what --mdnrnn-flags say, else 600)"
     )
@@ -80,15 +66,9 @@ class IterateConfig:
         "--generations 32", "flags of each round's `coordinator`, whose preset is the world's unless another is named"
     )
     later_run_flags: str = option("", "flags that follow these wherever a world model came before: --temperature 1")
-    go_on: bool = option(
-        False, "begin each evolution at the last round's optimum, fitted to the new model, instead of at zero"
-    )
-    subspace: bool = option(
-        False, "let each such evolution search what its model foretells of the last drives alone: needs --go-on"
-    )
-    views: int = option(
-        0, "beside it so many directions that foretell what the model will see, as `lab subspace` finds them"
-    )
+    go_on: bool = option(False, "begin each evolution at the last optimum, fitted to the new model, instead of at zero")
+    subspace: bool = option(False, "search only what each model foretells of the last drives: needs --go-on")
+    views: int = option(0, "beside it so many directions that foretell coming views, as `lab subspace` finds them")
     gate_drives: int = option(20, "drives of `inspect --probe` that a new world model is held to the old by; 0: none")
     gate_losses: int = option(30, "losses of `inspect --losses` that it is held to it by; 0: none")
     gate_lives: int | None = option(

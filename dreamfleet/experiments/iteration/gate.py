@@ -12,7 +12,7 @@ difference, and by more than `MARGIN`. What could not be measured of both refuse
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,9 +59,8 @@ def judge(old: Figures, new: Figures) -> GateDecision:
         return GateDecision(True, "kept: nothing was measured of both")
     worse = [name for name, (before, after) in both.items() if after.is_clearly_below(before)]
     compared = ", ".join(f"{name} {before} -> {after}" for name, (before, after) in both.items())
-    return GateDecision(
-        not worse, f"{compared}: {'refused, clearly worse in ' + ' and '.join(worse) if worse else 'kept'}"
-    )
+    verdict = f"refused, clearly worse in {' and '.join(worse)}" if worse else "kept"
+    return GateDecision(not worse, f"{compared}: {verdict}")
 
 
 def figures(measured: Mapping[str, Any]) -> dict[str, Figure | None]:
@@ -76,7 +75,8 @@ def knows(probe: Any | None) -> Figure | None:
         return None
     known = [each.found["zh_linear"] for each in probe.known]
     found = [Figure(each.value, each.error) if each.value > 0 else NOTHING for each in known]
-    return Figure(_mean(each.value for each in found), _mean(each.error for each in found))
+    value, error = (sum(getattr(each, name) for each in found) / len(found) for name in ("value", "error"))
+    return Figure(value, error)
 
 
 def loses(losses: Any | None) -> Figure | None:
@@ -97,8 +97,3 @@ def survives(survival: Any | None) -> Figure | None:
     """Of a `Survival`; `None` of one episode, which has no standard error."""
     found = survival and survival.agreement
     return None if found is None or found.error is None else Figure(found.value, found.error)
-
-
-def _mean(values: Iterable[float]) -> float:
-    taken = list(values)
-    return sum(taken) / len(taken)

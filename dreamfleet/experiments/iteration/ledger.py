@@ -8,15 +8,13 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from dreamfleet.common.errors import DatasetError, UsageError
-from dreamfleet.common.files.atomic_write import atomic_write
-from dreamfleet.common.files.regular_files import read_text
-from dreamfleet.common.schema.validation import MalformedError, from_plain
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.schema.validation import from_plain
 from dreamfleet.experiments.iteration.config import CHANGEABLE, IterateConfig
 from dreamfleet.experiments.iteration.plan import ALL, BUNDLE, DATA, EVOLVE, GATE, INIT, Phase
+from dreamfleet.experiments.kept_document import read_document, write_document
 
 FORMAT = 1
-MOST_BYTES = 256 << 20
 FIGURES: dict[str, dict[str, Any]] = {  # of a finished phase, which later phases and summaries read
     **{phase: {"new": int, "episodes": int} for phase in DATA},
     INIT: {"sha256": str, "controller": str},
@@ -118,14 +116,10 @@ class IterationLedger:
             raise UsageError(f"{folder} was begun with {'; '.join(differing)}: omit that, or begin in another --data")
         return replace(self, settings=wanted)
 
-    def to_json(self) -> str:
-        """The file's text."""
-        return json.dumps(asdict(self), indent=1, default=str) + "\n"
-
     @classmethod
-    def from_json(cls, text: str) -> IterationLedger:
-        """Read what `to_json` wrote; `ValueError`, `TypeError` or `MalformedError` if it is damaged."""
-        found: IterationLedger = from_plain(cls, json.loads(text))
+    def _parse(cls, plain: Any) -> IterationLedger:
+        """`ValueError`, `TypeError` or `UsageError` if it is damaged."""
+        found: IterationLedger = from_plain(cls, plain)
         if found.format != FORMAT:
             raise ValueError(f"it is of format {found.format}; this version reads {FORMAT}")
         known = {each.name for each in fields(IterateConfig)}
@@ -138,21 +132,12 @@ class IterationLedger:
 
     def save(self, path: Path) -> None:
         """Write it, whole or not at all."""
-        try:
-            with atomic_write(path) as file:
-                file.write(self.to_json().encode())
-        except OSError as error:
-            raise DatasetError(f"cannot write {path}: {error.strerror}; make room, or choose another --data") from error
+        write_document(path, asdict(self), "--data")
 
     @classmethod
     def load(cls, path: Path) -> IterationLedger | None:
         """The folder's ledger; `None` if it has none, `DatasetError` if it is damaged."""
-        try:
-            return cls.from_json(read_text(path, MOST_BYTES))
-        except FileNotFoundError:
-            return None
-        except (OSError, ValueError, TypeError, RecursionError, MalformedError, UsageError) as error:
-            raise DatasetError(f"{path} is damaged ({error}); put it back from a copy") from error
+        return read_document(path, cls._parse)
 
 
 def as_data(request: Any) -> dict[str, Any]:

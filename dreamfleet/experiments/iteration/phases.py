@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,23 +25,13 @@ from dreamfleet.common.runs.records import StoredEvaluation, best_evaluation
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import BUNDLE as RUN_BUNDLE
 from dreamfleet.experiments.command_lines import Words
-from dreamfleet.experiments.iteration import artefacts, gate
+from dreamfleet.experiments.isolated import run_isolated
+from dreamfleet.experiments.iteration import artefacts, gate, plan
 from dreamfleet.experiments.iteration.layout import ENCODED, EPISODES
-from dreamfleet.experiments.iteration.plan import (
-    BUNDLE,
-    COLLECT,
-    DRIVE,
-    ENCODE,
-    EVOLVE,
-    GATE,
-    INIT,
-    MDNRNN,
-    TAKE,
-    VAE,
-    Phase,
-)
+from dreamfleet.experiments.iteration.plan import MDNRNN, VAE, Phase
 from dreamfleet.experiments.iteration.requests import Requests
-from dreamfleet.experiments.local_run import LocalFleet, evolve, has_begun, has_ended
+from dreamfleet.experiments.kept_document import write_document
+from dreamfleet.experiments.local_run import LocalFleet, coordinator_words, evolve, has_ended
 from dreamfleet.worker.training.stages.bundle import ExtractRequest, build_bundle, extract_models
 from dreamfleet.worker.training.stages.collect import CollectReport, collect_drives, import_kept
 from dreamfleet.worker.training.stages.encode import EncodeRequest, encode_drives
@@ -51,17 +40,8 @@ from dreamfleet.worker.training.stages.subspace import fit_subspace
 from dreamfleet.worker.training.stages.train import MODELS, Model, summarise, train_model
 
 log = logging.getLogger("dreamfleet.coordinator.iterate")
-
-
 Request = TypeVar("Request")
 Report = TypeVar("Report")
-
-
-class RunStage(Protocol):
-    """Runs a stage to its end in a process of its own, which logs to a file."""
-
-    def __call__(self, function: Callable[[Request, Stop], Report], request: Request, log: Path) -> Report:
-        """The stage's report; its errors."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +54,12 @@ class PhaseResult:
 
 
 class PhaseRunner:
-    """Runs phases of an iteration; `requests` knows what is finished."""
+    """Runs phases of an iteration; `requests` knows what is finished, `on_line` gets each line that a stage prints."""
 
-    def __init__(self, requests: Requests, local_fleet: Callable[[], LocalFleet], run: RunStage, stop: Stop):
-        self._requests, self._local_fleet, self._run, self._stop = requests, local_fleet, run, stop
+    def __init__(
+        self, requests: Requests, local_fleet: Callable[[], LocalFleet], stop: Stop, on_line: Callable[[str], None]
+    ) -> None:
+        self._requests, self._local_fleet, self._stop, self._on_line = requests, local_fleet, stop, on_line
         self._layout, self._ledger, self._config = requests.layout, requests.ledger, requests.config
 
     def do(self, phase: Phase) -> PhaseResult:
@@ -85,8 +67,9 @@ class PhaseRunner:
         number = phase.round
         self._link_data(number)
         done: dict[str, Callable[[int], PhaseResult]] = {
-            INIT: self._init, COLLECT: self._collect, TAKE: self._import_kept, DRIVE: self._drive, VAE: self._vae,
-            ENCODE: self._encode, MDNRNN: self._mdnrnn, BUNDLE: self._bundle, GATE: self._gate, EVOLVE: self._evolve,
+            plan.INIT: self._init, plan.COLLECT: self._collect, plan.TAKE: self._import_kept, plan.DRIVE: self._drive,
+            VAE: self._vae, plan.ENCODE: self._encode, MDNRNN: self._mdnrnn, plan.BUNDLE: self._bundle,
+            plan.GATE: self._gate, plan.EVOLVE: self._evolve,
         }  # fmt: skip
         return done[phase.name](number)
 
@@ -100,7 +83,7 @@ class PhaseRunner:
                 (folder / name).symlink_to(Path("..", "..", name), target_is_directory=True)
 
     def _call(self, number: int, name: str, stage: Callable[[Request, Stop], Report], request: Request) -> Report:
-        return self._run(stage, request, self._layout.log(number, name))
+        return run_isolated(stage, request, self._layout.log(number, name), self._stop, self._on_line)
 
     def _init(self, number: int) -> PhaseResult:
         """Copy `--init`'s controller and world model, and write the checkpoints that training continues from."""
@@ -111,23 +94,23 @@ class PhaseRunner:
         for path in checkpoints:  # of an attempt that was killed
             path.unlink(missing_ok=True)
         _copy(bundle.path, layout.bundle(number))
-        self._call(number, INIT, extract_models, request)
+        self._call(number, plan.INIT, extract_models, request)
         for model in MODELS:
-            self._call(number, INIT, summarise, self._requests.train(1, model))
+            self._call(number, plan.INIT, summarise, self._requests.train(1, model))
         controller.save(layout.optimum(number))
         pilots = self._save_pilots(controller, [controller.parameters], layout.means(number), layout.bundle(number))
         figures = {"sha256": bundle.sha256, "controller": self._config.init}
         return PhaseResult((request,), figures, (layout.bundle(number), *checkpoints, layout.optimum(number), *pilots))
 
     def _collect(self, number: int) -> PhaseResult:
-        return self._drives(number, COLLECT, collect_drives, self._requests.collect(number))
+        return self._drives(number, plan.COLLECT, collect_drives, self._requests.collect(number))
 
     def _import_kept(self, number: int) -> PhaseResult:
-        return self._drives(number, TAKE, import_kept, self._requests.import_kept(number))
+        return self._drives(number, plan.TAKE, import_kept, self._requests.import_kept(number))
 
     def _drive(self, number: int) -> PhaseResult:
         pilots = sorted(self._layout.means(number - 1).glob("[0-9]*.npz"))
-        return self._drives(number, DRIVE, collect_drives, self._requests.drive(pilots))
+        return self._drives(number, plan.DRIVE, collect_drives, self._requests.drive(pilots))
 
     def _drives(
         self, number: int, name: str, stage: Callable[[Request, Stop], CollectReport], request: Request
@@ -154,35 +137,33 @@ class PhaseRunner:
 
     def _encode(self, number: int) -> PhaseResult:
         request = EncodeRequest(self._layout.round(number))
-        self._call(number, ENCODE, encode_drives, request)
+        self._call(number, plan.ENCODE, encode_drives, request)
         return PhaseResult((request,))
 
     def _bundle(self, number: int) -> PhaseResult:
         self._encode(number)  # as before the training: recorded states need latents too
         request = self._requests.bundle(number)
-        report = self._call(number, BUNDLE, build_bundle, request)
+        report = self._call(number, plan.BUNDLE, build_bundle, request)
         provenance = Bundle.open(report.bundle).manifest.provenance
         facts = {name: provenance[name] for name in ("frames", "quality")}
         return PhaseResult((request,), {"sha256": report.sha256, **facts}, (report.bundle,))
 
     def _gate(self, number: int) -> PhaseResult:
         refitted, gate_file = self._layout.refitted(number), self._layout.gate_file(number)
-        asked, measured = self._requests.gate(number), dict[str, dict[str, Any]]()
+        asked, measured = self._requests.gate(number), dict[str, dict[str, tuple[Any, str]]]()
         fitting = (self._requests.refit(number, refitted),) if self._config.gate_losses else ()
-        unfitted = fitting and self._try(number, "gate-refit", refit_controller, fitting[0])[1]
+        unfitted = self._try(number, "gate-refit", refit_controller, fitting[0])[1] if fitting else ""
         for side, requests in asked.items():
             measured[side] = {}
             for what, request in requests.items():
-                if (side, what) == ("new", "losses") and unfitted:
-                    found: tuple[Any, str] = (None, unfitted)
-                else:
-                    found = self._try(number, f"gate-{side}-{what}", add_on("measure"), request)
-                measured[side][what] = found
+                measured[side][what] = None, unfitted
+                if (side, what) != ("new", "losses") or not unfitted:
+                    measured[side][what] = self._try(number, f"gate-{side}-{what}", add_on("measure"), request)
         plain = {
             side: {what: report.facts if report else {"failed": why} for what, (report, why) in each.items()}
             for side, each in measured.items()
         }
-        _write_json(gate_file, plain)
+        write_document(gate_file, plain, "--data")
         figures = {
             side: gate.figures({what: report and report.found[what] for what, (report, _) in each.items()})
             for side, each in measured.items()
@@ -203,30 +184,26 @@ class PhaseRunner:
             return None, str(error)
 
     def _evolve(self, number: int) -> PhaseResult:
-        layout, name = self._layout, self._layout.run_name(number)
-        words: tuple[Any, ...] = ()
+        layout, name, asked = self._layout, self._layout.run_name(number), tuple[Words, ...]()
         if not has_ended(layout.runs, name):
-            local_fleet = self._local_fleet()
-            log.info("run %s is reached at %s", name, ", ".join(local_fleet.listen))
-            words = (self._run_command(number, local_fleet),)
-            evolve(name, words[0], local_fleet, layout.round(number) / "logs", self._stop)
+            fleet = self._local_fleet()
+            log.info("run %s is reached at %s", name, ", ".join(fleet.listen))
+            words = coordinator_words(name, layout.runs, fleet, lambda: self._run_flags(number))
+            evolve(name, words, fleet, layout.round(number) / "logs", self._stop)
+            asked = (words,)
         with open_run(layout.runs, name) as run:
             pilots, means = self._pilots(run, layout.means(number))
             figures = _describe_run(run)
         made = (layout.run(number) / RUN_BUNDLE, layout.optimum(number), *pilots)
-        return PhaseResult(words, {**figures, "means": means}, made)
+        return PhaseResult(asked, {**figures, "means": means}, made)
 
-    def _run_command(self, number: int, local_fleet: LocalFleet) -> Words:
-        if has_begun(self._layout.runs, self._layout.run_name(number)):
-            return self._requests.resume_run(number, local_fleet.listen, local_fleet.security)
-        start, subspace = None, None
-        if self._config.go_on and not self._config.is_from_scratch(number):
-            start = self._layout.start(number)
-            self._write_start(number, start)
-            subspace = self._find_subspace(number) if self._config.subspace else None
-        return self._requests.begin_run(
-            number, local_fleet.listen, (*local_fleet.coordinator, *local_fleet.security), start, subspace
-        )
+    def _run_flags(self, number: int) -> Words:
+        if not self._config.go_on or self._config.is_from_scratch(number):
+            return self._requests.run_flags(number)
+        start = self._layout.start(number)
+        self._write_start(number, start)
+        subspace = self._find_subspace(number) if self._config.subspace else None
+        return self._requests.run_flags(number, start, subspace)
 
     def _find_subspace(self, number: int) -> Path | None:
         """The subspace that a round searches; None if its model predicts nothing of the last drives."""
@@ -316,8 +293,3 @@ def _copy(before: Path, path: Path) -> None:
             shutil.copyfileobj(source, target)
     except OSError as error:
         raise DatasetError(f"cannot write {path}: {error.strerror}; make room, or choose another --data") from error
-
-
-def _write_json(path: Path, content: Any) -> None:
-    with atomic_write(path) as file:
-        file.write(json.dumps(content, indent=1).encode())

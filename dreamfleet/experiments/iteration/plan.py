@@ -33,9 +33,7 @@ class Phase(NamedTuple):
         number, _, name = text.partition("/")
         known = (INIT,) if number == "0" else ALL
         if not (number.isascii() and number.isdigit() and len(number) < 10 and name in known):
-            raise UsageError(
-                f"{text!r} is not a phase: write ROUND/PHASE, such as 2/mdnrnn; phases are {', '.join(ALL)}, and 0/init"
-            )
+            raise UsageError(f"{text!r} is not a phase: write ROUND/PHASE; phases are {', '.join(ALL)}, and 0/init")
         return cls(int(number), name)
 
 
@@ -66,23 +64,15 @@ class PhasePlan:
     def next(self, finished: Sequence[Any]) -> Phase | None:
         """The first unfinished phase; None if all are finished."""
         done = set(finished)
-        return next((each for each in self if each not in done and not self._is_superseded(each, done)), None)
-
-    @staticmethod
-    def _is_superseded(phase: Phase, done: set[Any]) -> bool:
-        """Whether it is a gate whose round has evolved without it, so that its model counts."""
-        return phase.name == GATE and Phase(phase.round, EVOLVE) in done
+        # The model of a round that has evolved without its gate counts.
+        passed = {Phase(each.round, GATE) for each in finished if each.name == EVOLVE}
+        return next((each for each in self if each not in done | passed), None)
 
     def phases_from(self, phase: Phase, finished: Sequence[Phase]) -> tuple[Phase, ...]:
         """A finished phase and all later ones that were finished or begun; `UsageError` if it is not finished."""
         if phase not in finished:
-            raise UsageError(
-                f"{phase} is not finished, so it cannot be done again; finished are {_format_phases(finished)}"
-            )
+            known = ", ".join(map(str, finished)) or "none"
+            raise UsageError(f"{phase} is not finished, so it cannot be done again; finished are {known}")
         behind = tuple(finished[finished.index(phase) :])
         begun = self.next(finished)
         return (*behind, begun) if begun else behind
-
-
-def _format_phases(finished: Sequence[Phase]) -> str:
-    return ", ".join(map(str, finished)) or "none"

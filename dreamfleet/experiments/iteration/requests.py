@@ -12,13 +12,12 @@ from dreamfleet.common.cli.add_ons import add_on
 from dreamfleet.common.cli.world_flags import OPTIONS, world_arguments
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.runs.seeds import VALIDATION
-from dreamfleet.experiments import command_lines
 from dreamfleet.experiments.command_lines import Words, options
 from dreamfleet.experiments.iteration.config import IterateConfig
 from dreamfleet.experiments.iteration.layout import IterationFolder
 from dreamfleet.experiments.iteration.ledger import IterationLedger
 from dreamfleet.experiments.iteration.plan import EVOLVE, GATE, MDNRNN, VAE, Phase
-from dreamfleet.experiments.stage_flags import read_bundle, read_training
+from dreamfleet.experiments.pipeline import read_bundle, read_training
 from dreamfleet.worker.training.stages.bundle import BundleRequest
 from dreamfleet.worker.training.stages.collect import CollectRequest, ImportRequest
 from dreamfleet.worker.training.stages.refit import RefitRequest
@@ -32,7 +31,7 @@ LATER_UPDATES = {VAE: 1800, MDNRNN: 600}  # default of a round that continues a 
 
 @dataclass(frozen=True)
 class Requests:
-    """Each phase's requests, and the command lines of its coordinator."""
+    """Each phase's requests, and the flags of its coordinator."""
 
     config: IterateConfig
     layout: IterationFolder
@@ -111,21 +110,11 @@ class Requests:
                     )  # fmt: skip
         return found
 
-    def begin_run(
-        self, number: int, listen: Sequence[str], more: Sequence[str], start: Path | None = None,
-        subspace: Path | None = None,
-    ) -> Words:  # fmt: skip
-        """A round's evolution; `more` are flags that stand before those of the run."""
-        layout = self.layout
-        return command_lines.begin_run(
-            layout.run_name(number), layout.runs, listen, *more, *self.config.flags_of_run(number),
-            world_model=layout.bundle(self.ledger.model_round(number)), seed=self.seed(Phase(number, EVOLVE)),
-            init=start, subspace=subspace,
-        )  # fmt: skip
-
-    def resume_run(self, number: int, listen: Sequence[str], security: Sequence[str] = ()) -> Words:
-        """The same evolution, resumed."""
-        return command_lines.resume_run(self.layout.run_name(number), self.layout.runs, listen, *security)
+    def run_flags(self, number: int, start: Path | None = None, subspace: Path | None = None) -> Words:
+        """The flags of a round's new run."""
+        bundle, seed = self.layout.bundle(self.ledger.model_round(number)), self.seed(Phase(number, EVOLVE))
+        own = options(bundle=bundle, seed=seed, init=start, subspace=subspace)
+        return (*self.config.flags_of_run(number), *own)
 
     def _collect(self, episodes: int | None, pilots: Sequence[Path] = (), **settings: object) -> CollectRequest:
         config = self.config

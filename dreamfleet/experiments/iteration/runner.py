@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from datetime import UTC, datetime
-from functools import partial
 
 from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
 from dreamfleet.common.host.processes import shell_command
@@ -21,21 +19,16 @@ from dreamfleet.experiments.iteration.phases import PhaseRunner
 from dreamfleet.experiments.iteration.plan import Phase, PhasePlan
 from dreamfleet.experiments.iteration.requests import Requests
 from dreamfleet.experiments.local_run import LocalFleet
-from dreamfleet.worker.training.stages.train import MODELS, Model, summarise
+from dreamfleet.worker.training.stages.train import MODELS, summarise
 
 
 class Iteration:
     """An iteration in a folder that the caller has locked."""
 
     def __init__(
-        self,
-        layout: IterationFolder,
-        config: IterateConfig,
-        ledger: IterationLedger,
-        local_fleet: Callable[[], LocalFleet],
-        stop: Stop,
-        network_flags: Words = (),
-    ) -> None:
+        self, layout: IterationFolder, config: IterateConfig, ledger: IterationLedger,
+        local_fleet: Callable[[], LocalFleet], stop: Stop, network_flags: Words = (),
+    ) -> None:  # fmt: skip
         """`network_flags` are not in the ledger, so the printed resume command repeats them."""
         self.ledger = ledger
         self._resume_command = shell_command("iterate", "--data", layout.root, *network_flags)
@@ -60,15 +53,17 @@ class Iteration:
         if self.ledger.entries or self._config.init or self._config.task:
             return
         for model in MODELS:
-            if getattr(self._config, f"{model}_flags"):
-                self._check_flags(requests, model)
+            if getattr(self._config, f"{model}_flags"):  # which must fit layers, though nothing is trained
+                log = self._layout.root / "logs" / f"{model}.log"
+                try:
+                    run_isolated(summarise, requests.train(1, model), log, self._stop)
+                except UsageError as error:
+                    raise UsageError(f"--{model}-flags: {error}") from error
 
     def run_remaining(
-        self,
-        on_begin: Callable[[Phase], None],
-        on_finished: Callable[[FinishedPhase], None],
+        self, on_begin: Callable[[Phase], None], on_finished: Callable[[FinishedPhase], None],
         on_line: Callable[[str], None],
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Run what is left; `on_begin` is called as a phase begins, `on_finished` when it is in the ledger.
 
         `on_line` gets each progress line of a phase's verbs.
@@ -82,29 +77,14 @@ class Iteration:
 
     def _run_phase(self, phase: Phase, on_line: Callable[[str], None]) -> FinishedPhase:
         requests, begun = Requests(self._config, self._layout, self.ledger), time.monotonic()
-        with self._explain_errors(phase):
-            run = partial(run_isolated, stop=self._stop, on_line=on_line)
-            done = PhaseRunner(requests, self._local_fleet, run, self._stop).do(phase)
+        try:
+            done = PhaseRunner(requests, self._local_fleet, self._stop, on_line).do(phase)
             made = artefacts.hash_artefacts(self._layout, done.made)
+        except StoppedError as error:
+            kept = f"what is finished is kept; resume with: {self._resume_command}"
+            raise StoppedError(f"{phase}: {error}; {kept}") from error
+        except DreamfleetError as error:
+            raise type(error)(f"{phase}: {error}") from error
         seconds, at = round(time.monotonic() - begun, 1), datetime.now(UTC).isoformat(timespec="seconds")
         asked, seed = tuple(map(as_data, done.requests)), requests.seed(phase)
         return FinishedPhase(phase.round, phase.name, seed, seconds, at, asked, done.figures or {}, made)
-
-    @contextmanager
-    def _explain_errors(self, phase: Phase) -> Iterator[None]:
-        """Add the phase to an error, and to a stop the command that resumes."""
-        try:
-            yield
-        except StoppedError as error:
-            raise StoppedError(
-                f"{phase}: {error}; what is finished is kept; resume with: {self._resume_command}"
-            ) from error
-        except DreamfleetError as error:
-            raise type(error)(f"{phase}: {error}") from error
-
-    def _check_flags(self, requests: Requests, model: Model) -> None:
-        """Check flags and layers of the first round's training, of which nothing is trained."""
-        try:
-            run_isolated(summarise, requests.train(1, model), self._layout.root / "logs" / f"{model}.log", self._stop)
-        except UsageError as error:
-            raise UsageError(f"--{model}-flags: {error}") from error

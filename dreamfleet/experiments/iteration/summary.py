@@ -20,7 +20,9 @@ SHOWN = {  # figures of training, as `train` names them
 
 def format_entry(entry: FinishedPhase) -> str:
     """A finished phase: its round, what, how long, and what came out."""
-    return f"round {entry.round}  {entry.phase:<7} {_seconds(entry.seconds):>8}  {describe_outcome(entry)}".rstrip()
+    seconds = entry.seconds
+    lasted = f"{seconds:.0f} s" if seconds < 600 else f"{seconds / 60:.0f} min"
+    return f"round {entry.round}  {entry.phase:<7} {lasted:>8}  {describe_outcome(entry)}".rstrip()
 
 
 def describe_outcome(entry: FinishedPhase) -> str:
@@ -76,25 +78,16 @@ def best_round(rounds: list[dict[str, Any]]) -> dict[str, Any] | None:
 
 
 def _round(layout: IterationFolder, ledger: IterationLedger, number: int) -> dict[str, Any]:
-    bundle, gate, run = (_figures(ledger, number, phase) for phase in (BUNDLE, GATE, EVOLVE))
+    entries = (ledger.entry(number, phase) for phase in (BUNDLE, GATE, EVOLVE))
+    bundle, gate, run = (entry.figures if entry else {} for entry in entries)
     data = [each.figures["episodes"] for each in ledger.entries if each.round <= number and each.phase in DATA]
     return {
-        "round": number,
-        "drives": data[-1] if data else 0,
-        "frames": bundle.get("frames"),
-        "quality": bundle.get("quality", {}),
-        "bundle": str(layout.bundle(number)) if bundle else None,
-        "sha256": bundle.get("sha256"),
-        "gate": gate or None,
+        "round": number, "drives": data[-1] if data else 0, "frames": bundle.get("frames"),
+        "quality": bundle.get("quality", {}), "bundle": str(layout.bundle(number)) if bundle else None,
+        "sha256": bundle.get("sha256"), "gate": gate or None, "score": run.get("score"),
         "evolved_in": ledger.model_round(number) if run else None,
-        "score": run.get("score"),
         "controller": str(layout.optimum(number)) if run else None,
-    }
-
-
-def _figures(ledger: IterationLedger, number: int, phase: str) -> dict[str, Any]:
-    entry = ledger.entry(number, phase)
-    return entry.figures if entry else {}
+    }  # fmt: skip
 
 
 def _figure(gate: Mapping[str, Any] | None, name: str) -> str | None:
@@ -112,7 +105,3 @@ def _model_state(row: Mapping[str, Any]) -> str | None:
     if row["gate"] is not None:
         return "kept" if row["gate"]["kept"] else "refused"
     return "kept" if row["evolved_in"] == row["round"] else None
-
-
-def _seconds(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 600 else f"{seconds / 60:.0f} min"

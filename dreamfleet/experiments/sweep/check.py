@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any
 
 from dreamfleet.common.artifacts.bundle_store import find_bundle
@@ -12,7 +11,7 @@ from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, RunConfig
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.experiments.local_run import load_parsed_flags
-from dreamfleet.experiments.sweep.plan import Sweep, SweepRun
+from dreamfleet.experiments.sweep.plan import Sweep
 
 # Flags of `coordinator` that a sweep sets for each run, or has for all of them.
 OWN = (
@@ -37,7 +36,7 @@ def check_runs(sweep: Sweep, sources: Mapping[str, Any]) -> tuple[str, ...]:
     tasks: dict[str, None] = {}
     checked: set[str] = set()
     for run in sweep.runs:
-        with _naming(run):
+        try:
             parsed = parser.parse_all([*sweep.flags, *run.flags])
             config, limits = load_parsed_flags(parsed, sources)
             load(NetworkConfig, "network", **{**sources, "flags": parsed})
@@ -46,6 +45,8 @@ def check_runs(sweep: Sweep, sources: Mapping[str, Any]) -> tuple[str, ...]:
             if run.setting not in checked:
                 checked.add(run.setting)
                 tasks |= dict.fromkeys(_check_settings(config, has_start=getattr(parsed, "init", None) is not None))
+        except UsageError as error:
+            raise UsageError(f"run {run.name} of the sweep: {error}") from error
     return tuple(tasks)
 
 
@@ -55,12 +56,3 @@ def _check_settings(config: RunConfig, *, has_start: bool) -> list[str]:
     if not has_start:  # a start point may name another world model
         config.settings(bundle)
     return [each for each in (config.task, bundle and bundle.manifest.task) if each]
-
-
-@contextmanager
-def _naming(run: SweepRun) -> Iterator[None]:
-    """Name the run in a `UsageError`."""
-    try:
-        yield
-    except UsageError as error:
-        raise UsageError(f"run {run.name} of the sweep: {error}") from error

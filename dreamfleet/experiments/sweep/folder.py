@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from dreamfleet.common.errors import DreamfleetError, UsageError
-from dreamfleet.common.files.atomic_write import atomic_write, reporting_unwritable_folder
-from dreamfleet.common.files.regular_files import path_exists, read_text
+from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.protocol.keys import check_run_name
-from dreamfleet.common.schema.validation import OPTIONAL, MalformedError, from_plain, to_plain
+from dreamfleet.common.schema.validation import OPTIONAL, from_plain, to_plain
+from dreamfleet.experiments.kept_document import read_document, write_document
 from dreamfleet.experiments.local_run import has_begun
-from dreamfleet.experiments.sweep.options import SweepOptions
-from dreamfleet.experiments.sweep.plan import Sweep
+from dreamfleet.experiments.sweep.plan import Sweep, SweepOptions
 
 SUFFIX = ".sweep"
 SETTINGS, LOCK, FIGURE = "sweep.json", "sweep.lock", "learning.png"
-MOST_BYTES = 4 << 20
 
 
 @dataclass(frozen=True)
@@ -67,9 +64,7 @@ class SweepFolder:
         """Keep a sweep, and how it is served."""
         vary = tuple(VariedSetting(key, tuple(values)) for key, values in sweep.vary.items())
         stored = StoredSweep(sweep.name, vary, sweep.flags, tasks, options)
-        path = self.path / SETTINGS
-        with reporting_unwritable_folder(self.path, "choose another --runs-dir"), atomic_write(path) as file:
-            file.write((json.dumps(to_plain(stored), indent=1) + "\n").encode())
+        write_document(self.path / SETTINGS, to_plain(stored), "--runs-dir")
 
     def read(self) -> tuple[Sweep, tuple[str, ...]]:
         """The sweep and its workers' tasks; `UsageError` if there is none of this name."""
@@ -81,14 +76,9 @@ class SweepFolder:
         return self._read().options
 
     def _read(self) -> StoredSweep:
-        path = self.path / SETTINGS
-        try:
-            plain: Any = json.loads(read_text(path, MOST_BYTES))
-            return from_plain(StoredSweep, plain)
-        except FileNotFoundError:
-            raise UsageError(f"no sweep {self._name} in {self.runs_dir}: begin it with --run {self._name}") from None
-        except (OSError, ValueError, RecursionError, MalformedError) as error:
-            raise DreamfleetError(f"{path} is damaged ({error}); put it back from a copy") from error
+        if (found := read_document(self.path / SETTINGS, partial(from_plain, StoredSweep))) is None:
+            raise UsageError(f"no sweep {self._name} in {self.runs_dir}: begin it with --run {self._name}")
+        return found
 
 
 def find_sweep(runs_dir: Path, name: str) -> SweepFolder | None:

@@ -1,4 +1,4 @@
-"""A sweep: the settings that all its runs share, those that vary, and the runs that follow. Pure."""
+"""A sweep: what its runs share, what varies, the runs that follow, and how they are served. Pure."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from itertools import product
 from math import prod
 from typing import Any
 
+from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.keys import check_run_name
@@ -19,6 +20,7 @@ MOST_RUNS = 1000  # of one sweep
 _RANGE = re.compile(r"(-?\d+)\.\.(-?\d+)")
 _DASHED = re.compile(r"(0|[1-9]\d*)-([1-9]\d*)")
 SEED = "seed"  # runs that differ in it alone are one setting's repetitions
+PARALLEL, MOST_PARALLEL, MOST_WORKERS = 4, 64, 1024
 Vary = Mapping[str, Sequence[str]]  # flag of `coordinator` without `--` -> its values
 
 
@@ -36,8 +38,11 @@ class SweepRun:
 
     @property
     def flags(self) -> Words:
-        """The flags of its coordinator that no other run of the sweep has in common."""
-        return tuple(_flag(key, value) for key, value in self.values)
+        """The flags of its coordinator alone; the values true and false stand for a flag and its `--no-`."""
+        switches = {"true": "--", "false": "--no-"}
+        return tuple(
+            f"{switches[value]}{key}" if value in switches else f"--{key}={value}" for key, value in self.values
+        )
 
 
 @dataclass(frozen=True)
@@ -53,9 +58,7 @@ class Sweep:
         if not self.vary:
             raise UsageError("nothing varies: give --vary SETTING=VALUES, such as --vary seed=1..5 population=8,32")
         if (count := prod(len(values) for values in self.vary.values())) > MOST_RUNS:
-            raise UsageError(
-                f"{count:,} runs are more than the {MOST_RUNS:,} of a sweep: vary less, or in several sweeps"
-            )
+            raise UsageError(f"{count:,} runs are more than a sweep's {MOST_RUNS:,}: vary less, or in several sweeps")
         names = [each.name for each in self.runs]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise UsageError(f"two runs of the sweep would be called {twice[0]}: leave out one of their values")
@@ -64,15 +67,34 @@ class Sweep:
     def runs(self) -> tuple[SweepRun, ...]:
         """All runs: of each setting the first seed, then of each the second, so that an early end compares evenly."""
         keys = sorted(self.vary, key=lambda key: key != SEED)
-        return tuple(
-            self._run(dict(zip(keys, values, strict=True))) for values in product(*(self.vary[key] for key in keys))
-        )
+        found = []
+        for values in product(*(self.vary[key] for key in keys)):
+            by_key = dict(zip(keys, values, strict=True))
+            ordered = tuple((key, by_key[key]) for key in self.vary)
+            name = "-".join((self.name, *(_name_part(key, value) for key, value in ordered)))
+            found.append(SweepRun(check_run_name(name), ordered))
+        return tuple(found)
 
-    def _run(self, values: Mapping[str, str]) -> SweepRun:
-        ordered = tuple((key, values[key]) for key in self.vary)
-        return SweepRun(
-            check_run_name("-".join((self.name, *(_name_part(key, value) for key, value in ordered)))), ordered
-        )
+
+@dataclass(frozen=True)
+class SweepOptions:
+    """What flags or a file say of serving a sweep, and defaults for the rest; `UsageError` if it cannot be."""
+
+    parallel: int = option(PARALLEL, "runs that are open at once")
+    workers: int | None = option(
+        None, "workers of one slot on this host (default one a core, or none with --connect); 0: only others'"
+    )
+    listen: tuple[str, ...] = option((), "endpoints of its router")
+    connect: tuple[str, ...] = option((), "endpoints of another router")
+    insecure: bool = option(False, "listen to anyone")
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.parallel <= MOST_PARALLEL:
+            raise UsageError(f"--parallel must be from 1 to {MOST_PARALLEL}, not {self.parallel}")
+        if self.workers is not None and not 0 <= self.workers <= MOST_WORKERS:
+            raise UsageError(f"--workers must be from 0 to {MOST_WORKERS}, not {self.workers}")
+        if self.listen and self.connect:
+            raise UsageError("--listen starts a router here and --connect uses another one: give one of them")
 
 
 def staggered_share(number: int, parallel: int) -> float:
@@ -115,7 +137,8 @@ def read_vary(table: Any) -> dict[str, tuple[str, ...]]:
         if isinstance(values, str):
             found |= parse_vary([f"{key}={values}"])
         elif isinstance(values, list) and values and all(isinstance(each, (str, int, float)) for each in values):
-            _add(found, key.replace("_", "-"), tuple(_text(each) for each in values))
+            texts = (str(each).lower() if isinstance(each, bool) else str(each) for each in values)
+            _add(found, key.replace("_", "-"), tuple(texts))
         else:
             raise UsageError(f"{key} in [vary] must be a list of values, or a text such as '1..5'")
     return found
@@ -144,17 +167,6 @@ def _split(text: str, values: str) -> Iterator[str]:
             yield from map(str, range(low, high + 1))
         else:
             yield part
-
-
-def _text(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def _flag(key: str, value: str) -> str:
-    """One value as a flag of `coordinator`; true and false stand for a flag and its `--no-`."""
-    if value in ("true", "false"):
-        return f"--{key}" if value == "true" else f"--no-{key}"
-    return f"--{key}={value}"
 
 
 def _name_part(key: str, value: str) -> str:

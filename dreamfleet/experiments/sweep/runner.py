@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dreamfleet.common.client.client import Client
-from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, StoppedError
+from dreamfleet.common.errors import DreamfleetError, StoppedError
 from dreamfleet.common.host.child import PATIENCE
 from dreamfleet.common.host.processes import VerbProcess
 from dreamfleet.common.host.stop_signals import Stop, signals_deferred
@@ -21,16 +21,9 @@ from dreamfleet.common.protocol.pause_kind import PauseKind
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.settings.environment_check import CHECKED
+from dreamfleet.experiments import local_run
 from dreamfleet.experiments.command_lines import Words, command
-from dreamfleet.experiments.local_run import (
-    ALONE,
-    ANY_ADDRESS,
-    POLL_INTERVAL,
-    START_SECONDS,
-    has_begun,
-    has_ended,
-    task_flags,
-)
+from dreamfleet.experiments.local_run import POLL_INTERVAL, has_begun, has_ended, task_flags
 from dreamfleet.experiments.sweep.folder import SweepFolder
 from dreamfleet.experiments.sweep.plan import Sweep, SweepRun, staggered_share
 
@@ -62,7 +55,7 @@ class SweepFleet:
     @property
     def local_endpoint(self) -> str:
         """Where this host's own processes connect to."""
-        return ANY_ADDRESS.sub("/127.0.0.1:", self.endpoint)
+        return local_run.ANY_ADDRESS.sub("/127.0.0.1:", self.endpoint)
 
 
 @dataclass
@@ -110,7 +103,8 @@ class SweepRunner:
     def serve(self, stop: Stop, on_change: Callable[[], None]) -> None:
         """Serve until every run is over; `StoppedError` as soon as `stop` is true."""
         self._start_fleet()
-        with self._connect() as client:
+        network = replace(self._fleet.network, listen=(), connect=(self._fleet.local_endpoint,))
+        with local_run.connect_once_ready(network, self._check_helpers) as client:
             while not all(each.is_over for each in self.progress):
                 if stop():
                     raise StoppedError("stopped")
@@ -130,18 +124,6 @@ class SweepRunner:
             flags = ("--any", "--runs", self._fleet.parallel, "--slots", 1, "--name", name, *task_flags(*self._tasks))
             self._start_helper(name, command("worker", "--connect", self._fleet.local_endpoint, *flags))
 
-    def _connect(self) -> Client:
-        """A client of the router, as soon as that listens."""
-        deadline = time.monotonic() + START_SECONDS
-        while True:
-            try:
-                return Client(replace(self._fleet.network, listen=(), connect=(self._fleet.local_endpoint,)))
-            except ConnectionFailedError:
-                self._check_helpers()
-                if time.monotonic() > deadline:
-                    raise
-                time.sleep(POLL_INTERVAL)
-
     def _start_coordinators(self) -> None:
         """Start or resume runs until `parallel` are open; a run that has ended before is finished."""
         for each in self.progress:
@@ -152,13 +134,14 @@ class SweepRunner:
                 if has_ended(runs_dir, name):
                     each.state, each.text = "finished", "before"
                     continue
-                words = self._run_command(each.run, resumed=has_begun(runs_dir, name))
                 each.state, each.text = "running", ""
-                self._coordinators[name] = self._start(words, runs_dir / name / "coordinator.log")
+                self._coordinators[name] = self._start(self._run_command(each.run), runs_dir / name / "coordinator.log")
 
-    def _run_command(self, run: SweepRun, *, resumed: bool) -> Words:
-        share = ("--share", staggered_share(self._sweep.runs.index(run), self._fleet.parallel))
-        own = ("--resume", run.name) if resumed else ("--run", run.name, *share, *self._sweep.flags, *run.flags)
+    def _run_command(self, run: SweepRun) -> Words:
+        own: tuple[object, ...] = ("--resume", run.name)
+        if not has_begun(self._folder.runs_dir, run.name):
+            share = staggered_share(self._sweep.runs.index(run), self._fleet.parallel)
+            own = ("--run", run.name, "--share", share, *self._sweep.flags, *run.flags)
         place = ("--runs-dir", self._folder.runs_dir, "--connect", self._fleet.local_endpoint, "--json")
         return command("coordinator", *own, *self._fleet.security, *self._config, *place)
 
@@ -179,13 +162,10 @@ class SweepRunner:
             elif code < 0 and each.restarts < MOST_RESTARTS:
                 each.state, each.restarts = "waiting", each.restarts + 1
                 each.text = "its coordinator was killed"
-            else:
-                each.state, each.text = "failed", self._describe_failure(process)
-
-    def _describe_failure(self, process: VerbProcess) -> str:
-        """Why a coordinator failed; its log is empty where the disk is full."""
-        full = shutil.disk_usage(self._folder.runs_dir).free < FULL_DISK
-        return f"{'the disk of its folder is full; ' if full else ''}{process.last_line()}"
+            else:  # its log is empty where the disk is full
+                full = shutil.disk_usage(self._folder.runs_dir).free < FULL_DISK
+                each.state = "failed"
+                each.text = f"{'the disk of its folder is full; ' if full else ''}{process.last_line()}"
 
     def _look(self, client: Client) -> None:
         """Read how far the open runs are. One that stays paused by itself might wait for ever, so it has failed."""
@@ -221,8 +201,7 @@ class SweepRunner:
     def _check_helpers(self) -> None:
         """Start a router or worker again that was killed; `DreamfleetError` if one fails."""
         for name, (words, process, started) in list(self._helpers.items()):
-            code = process.exit_code
-            if code is None:
+            if (code := process.exit_code) is None:
                 continue
             if code >= 0 and name == "router":
                 raise DreamfleetError(f"the sweep's router failed: {process.last_line()}")
@@ -240,7 +219,7 @@ class SweepRunner:
         self._helpers[name] = words, self._start(words, self._folder.path / f"{name}.log"), time.monotonic()
 
     def _start(self, words: Words, log: Path) -> VerbProcess:
-        alone = ALONE if self._fleet.has_router else {}  # a fleet of the user's has its own
+        alone = local_run.ALONE if self._fleet.has_router else {}  # a fleet of the user's has its own
         environment = {**os.environ, **alone, CHECKED: self._checks}
         return VerbProcess(*words, log=log, environment=environment, ends_with_parent=True)
 

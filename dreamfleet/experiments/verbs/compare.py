@@ -32,19 +32,15 @@ SUMMARY = (
     "`evaluate --out` (paired differences), or the settings of sweeps"
 )
 EXTRAS = ()
-SAME_SEEDS = (
-    "all runs are judged on the same validation seeds, so their ± are not independent: differences are paired by seed"
-)
+SAME_SEEDS = "all runs have the same validation seeds, so their ± are not independent: differences are paired"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument(
-        "names",
-        metavar="RUN|SWEEP|REPORT",
-        nargs="+",
+        "names", metavar="RUN|SWEEP|REPORT", nargs="+",
         help="names of runs, or files of `evaluate --out`, 2 or more; or names of sweeps, with runs beside them",
-    )
+    )  # fmt: skip
     add_global_flags(parser, "runs_dir")
     add_json_flag(parser)
 
@@ -144,13 +140,19 @@ def _compare_runs(args: argparse.Namespace, names: Sequence[str]) -> int:
     found = list(_run_differences(sides, equal)) if comparable else []
     if args.json:
         runs = [_run_facts(each) for each in sides]
-        budgets = [_budget_facts(sides, each) for each in equal]
+        budgets = [{"what": each.what, "spent": each.spent, "looks": _evaluation_facts(sides, each)} for each in equal]
         print(json.dumps({"runs": runs, "settings": settings, "equal": budgets, "differences": found}, default=str))
         return 0
     shown = [each.in_values for each in sides]
     print_rows([_run_row(each) for each in shown], drop_order=("task", "spent"))
     print()
-    _print_settings(sides, settings)
+    if settings:
+        rows = [[name, *("default" if value is None else format_setting(value) for value in values)]
+                for name, values in settings.items()]  # fmt: skip
+        print_rows([dict(zip(("setting", *(each.name for each in sides)), row, strict=True)) for row in rows])
+        print()
+    else:
+        print("their settings are equal")
     if len(worlds) > 1:
         print(f"their evaluations are in different worlds ({', '.join(sorted(worlds))}): scores are not compared")
     elif sides and not comparable and worlds:
@@ -175,39 +177,12 @@ def _run_row(side: ComparedRun) -> dict[str, object]:
     }  # fmt: skip
 
 
-def _print_settings(sides: Sequence[ComparedRun], settings: Mapping[str, Sequence[Any]]) -> None:
-    if not settings:
-        print("their settings are equal")
-        return
-    rows = [
-        {
-            "setting": name,
-            **{
-                side.name: "default" if value is None else format_setting(value)
-                for side, value in zip(sides, values, strict=True)
-            },
-        }
-        for name, values in settings.items()
-    ]
-    print_rows(rows)
-    print()
-
-
 def _format_budget(sides: Sequence[ComparedRun], equal: EqualBudget) -> str:
-    from dreamfleet.common.runs.comparison import CORE_HOURS
+    from dreamfleet.common.runs.comparison import CORE_HOURS, budget_name
 
     spent = f"{equal.spent:.3g}" if equal.what == CORE_HOURS else f"{equal.spent:,.0f}"
-    what = _describe_budget(sides, equal)
     parts = [f"{side.name} {_format_evaluation(look)}" for side, look in zip(sides, equal.evaluated_means, strict=True)]
-    return f"at {spent} {what}: {', '.join(parts)}"
-
-
-def _describe_budget(sides: Sequence[ComparedRun], equal: EqualBudget) -> str:
-    """What was spent, in words: a function has calls, and no steps."""
-    from dreamfleet.common.runs.comparison import STEPS
-
-    is_function = all(is_function_task(each.settings.task.task) for each in sides)
-    return "calls" if is_function and equal.what == STEPS else equal.what
+    return f"at {spent} {budget_name(sides, equal.what)}: {', '.join(parts)}"
 
 
 def _format_evaluation(look: EvaluatedMean | None) -> str:
@@ -218,24 +193,16 @@ def _format_evaluation(look: EvaluatedMean | None) -> str:
 
 def _run_differences(sides: Sequence[ComparedRun], equal: Sequence[EqualBudget]) -> Iterator[dict[str, Any]]:
     """Each run less the first: at equal budgets, then of confirmed scores."""
-    from dreamfleet.common.runs.comparison import difference
+    from dreamfleet.common.runs.comparison import difference, paired_scores
 
-    def paired(of: str, side: ComparedRun, one: dict[int, float], other: dict[int, float]) -> dict[str, Any]:
+    for of, side, one, other in paired_scores(sides, equal):
         found = difference(one, other)
-        figures = {**asdict(found), "clear": found.is_significant} if isinstance(found, PairedDifference) else {}
         if isinstance(found, PairedDifference):
+            figures = {**asdict(found), "clear": found.is_significant}
             text = found.describe(minimised=side.minimised)
         else:
-            text = _describe_one_call(side, one, other) or found
-        return {"of": of, "run": side.name, "against": sides[0].name, **figures, "text": text}
-
-    for number, side in enumerate(sides[1:], 1):
-        for each in equal:
-            base, look = each.evaluated_means[0], each.evaluated_means[number]
-            if base is not None and look is not None:
-                yield paired(f"at equal {_describe_budget(sides, each)}", side, base.scores, look.scores)
-        if sides[0].confirmed is not None and side.confirmed is not None:
-            yield paired("confirmed", side, sides[0].confirmed_scores, side.confirmed_scores)
+            figures, text = {}, _describe_one_call(side, one, other) or found
+        yield {"of": of, "run": side.name, "against": sides[0].name, **figures, "text": text}
 
 
 def _describe_one_call(side: ComparedRun, one: Mapping[int, float], other: Mapping[int, float]) -> str:
@@ -250,16 +217,13 @@ def _describe_one_call(side: ComparedRun, one: Mapping[int, float], other: Mappi
 
 
 def _run_facts(side: ComparedRun) -> dict[str, Any]:
+    effort, inherited = ({**asdict(each), "core_hours": each.core_hours} for each in (side.total, side.inherited))
     confirmed = side.confirmed and with_error(side.confirmed)
-    effort = {**asdict(side.total), "core_hours": side.total.core_hours}
-    inherited = {**asdict(side.inherited), "core_hours": side.inherited.core_hours}
-    facts = {"run": side.name, "world": side.world, "effort": effort, "inherited": inherited}
-    return {**facts, "confirmed": confirmed}
+    return {"run": side.name, "world": side.world, "effort": effort, "inherited": inherited, "confirmed": confirmed}
 
 
-def _budget_facts(sides: Sequence[ComparedRun], equal: EqualBudget) -> dict[str, Any]:
-    evaluated_means = [
+def _evaluation_facts(sides: Sequence[ComparedRun], equal: EqualBudget) -> list[Any]:
+    return [
         look and {"run": side.name, "generation": look.generation, "score": look.point.score, "error": look.point.error}
         for side, look in zip(sides, equal.evaluated_means, strict=True)
     ]
-    return {"what": equal.what, "spent": equal.spent, "looks": evaluated_means}

@@ -12,7 +12,7 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_signals
 from dreamfleet.common.printable import plural
-from dreamfleet.experiments.contrast.config import KINDS, RUN_FLAGS, SEEDS, Contrast, parse_kinds
+from dreamfleet.experiments.contrast.config import KINDS, RUN_FLAGS, SEEDS, Contrast
 
 if TYPE_CHECKING:
     from dreamfleet.experiments.contrast.summary import TrialResult
@@ -52,7 +52,8 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.experiments.contrast.trials import LOCK, Trials
     from dreamfleet.experiments.local_run import LocalFleet, parse_run_flags
 
-    contrast = Contrast(parse_kinds(args.kind), tuple(args.seeds), args.mdnrnn_flags, args.run_flags)
+    kinds = tuple((name, flags) for name, flags in args.kind) or KINDS
+    contrast = Contrast(kinds, tuple(args.seeds), args.mdnrnn_flags, args.run_flags)
     parse_run_flags(contrast.run_flags_in(FIRST_WORLD), args.sources, "lab contrast")  # wrong flags end it now
     file = ("--config", str(args.config)) if args.config else ()
     check_modules(PACKAGES)
@@ -97,7 +98,6 @@ def _print_results(args: argparse.Namespace, outcomes: list[TrialResult]) -> Non
     print_rows(rows, right=tuple(rows[0])[1:-1], drop_order=("reward loss", "after 50", "AUC after 10", "parameters"))
     print()
     for each in means:
-        label = "score in reality" if each.figure == summary.SCORE else each.figure.replace("_", " ")
-        print(f"{each.kind}, {label}: {each.text} over {plural(each.seeds, 'seed')}")
+        print(f"{each.kind}, {summary.name_figure(each.figure)}: {each.text} over {plural(each.seeds, 'seed')}")
     first = outcomes[0].kind
     print("\n".join(("", *(summary.describe_difference(kind, first, figure, each) for kind, figure, each in found))))

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from dreamfleet.experiments.iteration.layout import IterationFolder
     from dreamfleet.experiments.iteration.ledger import IterationLedger
     from dreamfleet.experiments.iteration.runner import Iteration
-    from dreamfleet.experiments.local_run import LocalFleet
 
 SUMMARY = (
     "make world models and evolve in their dreams in turn; each world model learns from drives of the last evolution"
@@ -40,12 +39,8 @@ VARYING = ("preset", "schedule", "bundle", "loaded_subspace")  # to the rounds' 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument(
-        "--data", type=Path, required=True, help="the iteration's folder; one that was begun is resumed"
-    )
-    parser.add_argument(
-        "--redo", metavar="ROUND/PHASE", help="first undo this phase and all after it, such as 2/mdnrnn"
-    )
+    parser.add_argument("--data", type=Path, required=True, help="the iteration's folder; a begun one is resumed")
+    parser.add_argument("--redo", metavar="ROUND/PHASE", help="first undo this phase and all later, such as 2/mdnrnn")
     add_json_flag(parser)
     listen = "workers of any host find the rounds' runs here (default: none do)"
     texts = {"listen": listen, "join": "a coordinator's join file, for the rounds' runs"}
@@ -78,7 +73,7 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
     from dreamfleet.experiments.iteration.phases import find_init
     from dreamfleet.experiments.iteration.plan import INIT, Phase
     from dreamfleet.experiments.iteration.runner import Iteration
-    from dreamfleet.experiments.local_run import parse_run_flags
+    from dreamfleet.experiments.local_run import LocalFleet, parse_run_flags, task_flags
 
     begun = IterationLedger.load(layout.ledger)
     config = load(IterateConfig, "iterate", base=begun.settings if begun else None, **args.sources)
@@ -95,17 +90,24 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
     if new:
         for run in (first, later):
             _check_run(config, run, layout)
-    ledger = (
-        IterationLedger.begin(config, settings)
-        if begun is None or new
-        else begun.with_settings(config, settings, layout.root)
-    )
+    if begun is None or new:
+        ledger = IterationLedger.begin(config, settings)
+    else:
+        ledger = begun.with_settings(config, settings, layout.root)
     if config.local == 0 and not args.listen:
         raise UsageError("no worker would score: give --local slots here, or --listen for workers of other hosts")
-    Network(args.listen, credentials=load_credentials(args, ("coordinator",))).check_open(insecure=_insecure(args))
-    iteration = Iteration(
-        layout, config, ledger, lambda: _local_fleet(args, config, more, task), stop, _network_flags(args)
-    )
+    # The setting of flag, environment or file holds for the rounds' coordinators too.
+    insecure = load(NetworkConfig, "network", **args.sources).insecure
+    Network(args.listen, credentials=load_credentials(args, ("coordinator",))).check_open(insecure=insecure)
+    own, security = task_flags(task, config.task), security_flags(args)
+
+    def local_fleet() -> LocalFleet:
+        join = args.global_config.join
+        return LocalFleet.of(args.listen, config.local, more, own, join, security, insecure=insecure)
+
+    listen = ("--listen", *args.listen) if args.listen else ()
+    repeated = (*listen, *security, *(("--insecure",) if insecure else ()))
+    iteration = Iteration(layout, config, ledger, local_fleet, stop, repeated)
     if args.redo:
         if (phase := Phase.of(args.redo)).name == INIT:
             find_init(config.init, layout.runs)  # before all that followed from it is removed
@@ -156,26 +158,6 @@ def _stand_in(config: IterateConfig) -> Bundle:
         return shipped
     facts = WorldFacts.of(one_hot(shipped.manifest.actions), packages=(), horizon=DEFAULT_HORIZON, frames_per_second=1)
     return Bundle(shipped.path, shipped.sha256, replace(shipped.manifest, task=config.task, world=facts))
-
-
-def _local_fleet(args: argparse.Namespace, config: IterateConfig, more: tuple[str, ...], task: str) -> LocalFleet:
-    from dreamfleet.experiments.local_run import LocalFleet, task_flags
-
-    own = task_flags(task, config.task)
-    return LocalFleet.of(
-        args.listen, config.local, more, own, args.global_config.join, security_flags(args), insecure=_insecure(args)
-    )
-
-
-def _network_flags(args: argparse.Namespace) -> tuple[str, ...]:
-    """The flags of where workers of other hosts connect, as a person repeats them."""
-    listen = ("--listen", *args.listen) if args.listen else ()
-    return (*listen, *security_flags(args), *(("--insecure",) if _insecure(args) else ()))
-
-
-def _insecure(args: argparse.Namespace) -> bool:
-    """The setting of flag, environment or file, which holds for the rounds' coordinators too."""
-    return load(NetworkConfig, "network", **args.sources).insecure
 
 
 def _run_phases(iteration: Iteration, layout: IterationFolder) -> None:

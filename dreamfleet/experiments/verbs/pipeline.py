@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.command_line import parse_flags
+from dreamfleet.common.cli.key_values import split_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
 from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.cli.world_flags import add_world_flags, world_arguments
@@ -17,9 +18,7 @@ from dreamfleet.common.files.atomic_write import check_output_path
 from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import stop_on_signals
-from dreamfleet.experiments.command_lines import split_flags
-from dreamfleet.experiments.pipeline import PipelineRequest, make_world_model
-from dreamfleet.experiments.stage_flags import read_bundle, read_training
+from dreamfleet.experiments.pipeline import PipelineRequest, make_world_model, read_bundle, read_training
 from dreamfleet.worker.training.stages import StageReport
 from dreamfleet.worker.training.stages.train import Model, TrainRequest
 from dreamfleet.worker.verbs import collect
@@ -39,9 +38,7 @@ EXAMPLES = {"collect": "--steps 200", "vae": "--batch 50", "mdnrnn": "--set hidd
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument(
-        "--data", type=Path, required=True, help="folder of the data set; one that was begun is resumed"
-    )
+    parser.add_argument("--data", type=Path, required=True, help="folder of the data set; a begun one is resumed")
     parser.add_argument("--preset", help=preset_help_text("training"))
     add_world_flags(parser)
     parser.add_argument(

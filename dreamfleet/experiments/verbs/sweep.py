@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dreamfleet.common.cli.config import add_flags, read_toml
+from dreamfleet.common.cli.config import add_flags, read_table, read_toml
 from dreamfleet.common.cli.global_config import add_global_flags, load_credentials, security_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import StoppedError, UsageError
@@ -18,17 +18,17 @@ from dreamfleet.common.printable import plural
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
-from dreamfleet.experiments.sweep.options import PARALLEL, SweepOptions
+from dreamfleet.experiments.sweep.plan import Sweep, SweepOptions, parse_vary, read_vary
 
 if TYPE_CHECKING:
     from dreamfleet.experiments.sweep.folder import SweepFolder
-    from dreamfleet.experiments.sweep.plan import Sweep
     from dreamfleet.experiments.sweep.runner import RunProgress, SweepFleet
     from dreamfleet.experiments.sweep.summary import RunResult
 
 SUMMARY = "evolve with several seeds and settings on one fleet, and compare the settings"
 EXTRAS: tuple[str, ...] = ()
 SETTINGS_OF_RUNS = ("beat", "evaluation_share", "failure_limit", "share", "strict")  # of `NetworkConfig`
+ENDPOINTS = ("listen", "connect")
 LEFT_OPEN = 130
 MOST_EQUAL = 10  # pairs of settings with equal results that are named
 
@@ -46,11 +46,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "seed alone repeat one setting",
     )  # fmt: skip
     parser.add_argument("--resume", metavar="NAME", help="continue this sweep: finished runs are not repeated")
-    parser.add_argument("--parallel", type=int, metavar="K", help=f"runs that are open at once (default {PARALLEL})")
-    parser.add_argument(
-        "--workers", type=int, metavar="N",
-        help="workers of one slot on this host (default one a core, or none with --connect); 0: only others'",
-    )  # fmt: skip
+    add_flags(parser, SweepOptions, only=("parallel", "workers"))
     texts = {
         "listen": "the sweep's router listens here, so that workers of other hosts may join (default a free port of "
         "this host alone)",
@@ -94,31 +90,17 @@ def run(args: argparse.Namespace) -> int:
 
 def _options(args: argparse.Namespace, file: Mapping[str, Any], kept: SweepOptions) -> SweepOptions:
     """How to serve the sweep: flags over the file over what is kept of it. A new endpoint replaces both kept ones."""
-    has_endpoint = any(each in args.given or each in file for each in ("listen", "connect"))
-
-    def number(name: str) -> int | None:
-        value = getattr(args, name) if getattr(args, name) is not None else file.get(name, getattr(kept, name))
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int)):
-            raise UsageError(f"{name} in {args.file} must be a whole number, not {value!r}")
-        return value
-
-    def endpoints(name: str) -> tuple[str, ...]:
-        if name in args.given:
-            return tuple(getattr(args.global_config, name))
-        value = file.get(name, [] if has_endpoint else list(getattr(kept, name)))
-        found = [value] if isinstance(value, str) else value
-        if not (isinstance(found, list) and all(isinstance(each, str) for each in found)):
-            raise UsageError(f"{name} in {args.file} must be an endpoint, such as tcp/0.0.0.0:7447")
-        return tuple(found)
-
-    listen, connect = endpoints("listen"), endpoints("connect")
-    insecure = bool(getattr(args, "insecure", False)) or (kept.insecure and not has_endpoint)
-    return SweepOptions(number("parallel") or 0, number("workers"), listen, connect, insecure)
+    table = {name: file[name] for name in ("parallel", "workers", *ENDPOINTS) if name in file}
+    table |= {name: [table[name]] for name in ENDPOINTS if isinstance(table.get(name), str)}
+    given = read_table(SweepOptions, str(args.file), table)
+    given |= {name: getattr(args, name) for name in ("parallel", "workers", "insecure") if hasattr(args, name)}
+    given |= {name: getattr(args.global_config, name) for name in ENDPOINTS if name in args.given}
+    replaced = {"listen": (), "connect": (), "insecure": False} if given.keys() & set(ENDPOINTS) else {}
+    return replace(kept, **{**replaced, **given})
 
 
 def _new_sweep(args: argparse.Namespace, file: Mapping[str, Any]) -> Sweep:
     from dreamfleet.experiments.started_run import check_settings, flag_words
-    from dreamfleet.experiments.sweep.plan import Sweep, parse_vary, read_vary
 
     name = args.run_name or file.get("run")
     if not isinstance(name, str):
@@ -156,9 +138,7 @@ def _fleet(args: argparse.Namespace, options: SweepOptions) -> SweepFleet:
         network = Network(connect=options.connect, credentials=credentials)
         return SweepFleet(network, options.workers or 0, options.parallel, False, security_flags(args))
     if args.global_config.join is not None:
-        raise UsageError(
-            "a sweep's own router knows no join files: give --connect, a fleet with one, or leave --join out"
-        )
+        raise UsageError("a sweep's own router knows no join files: give --connect to a fleet with one, or omit --join")
     network = Network(options.listen or (f"tcp/127.0.0.1:{free_port()}",))
     network.check_open(insecure=options.insecure)
     workers = usable_cores() if options.workers is None else options.workers
@@ -195,8 +175,7 @@ def _report(args: argparse.Namespace, sweep: Sweep, folder: SweepFolder, progres
     kind = summary.judged_by(results)
     found = [] if kind is None else summary.means(results, kind)
     equal = [] if kind is None else summary.find_equal(results, kind)
-    failed = [each for each in progress if each.state == "failed"]
-    left = [each for each in progress if each.state == "left open"]
+    failed, left = ([each for each in progress if each.state == state] for state in ("failed", "left open"))
     figure = _draw(folder, results)
     if args.json:
         print_answer(
@@ -223,9 +202,8 @@ def print_settings(results: list[RunResult]) -> None:
     if (kind := summary.judged_by(shown)) is None:
         return
     heading = summary.describe_kind(kind, shown)
-    print_rows(
-        [{"setting": each.setting, "runs": each.runs, heading: each.text} for each in summary.means(shown, kind)]
-    )
+    means = summary.means(shown, kind)
+    print_rows([{"setting": each.setting, "runs": each.runs, heading: each.text} for each in means])
     print("± is the standard error among runs")
     equal = summary.find_equal(results, kind)
     for sentence in equal[:MOST_EQUAL]:

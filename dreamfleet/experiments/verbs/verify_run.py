@@ -25,9 +25,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--run", dest="run_name", metavar="NAME", help="the new run, or one to resume (default CONTROLLER-again)"
     )
-    parser.add_argument(
-        "--optimiser", metavar="MODULE:ATTRIBUTE", help="the run's optimiser, if it is no installed one"
-    )
+    parser.add_argument("--optimiser", metavar="MODULE:ATTRIBUTE", help="the run's optimiser, if no installed one")
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
     add_global_flags(parser, "runs_dir")
     add_json_flag(parser)

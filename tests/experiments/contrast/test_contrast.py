@@ -6,14 +6,8 @@ from dataclasses import asdict
 import pytest
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.experiments.contrast.config import KINDS, Contrast, Trial, parse_kinds
-from dreamfleet.experiments.contrast.summary import (
-    TrialResult,
-    describe_difference,
-    differences,
-    means,
-    rows,
-)
+from dreamfleet.experiments.contrast.config import KINDS, Contrast, Trial
+from dreamfleet.experiments.contrast.summary import TrialResult, describe_difference, differences, means, rows
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 
@@ -23,7 +17,7 @@ def test_the_two_kinds_that_ship_have_as_many_parameters():
         sum(each.numel() for each in MDNRNN(config).parameters())
         for config in (MDNRNNConfig(), MDNRNNConfig(window=8, hidden=236))
     )
-    assert parse_kinds(()) == KINDS == (("plain", ""), ("attentive", "--set window=8 hidden=236"))
+    assert KINDS == (("plain", ""), ("attentive", "--set window=8 hidden=236"))
     assert abs(plain - attentive) < plain / 200
 
 

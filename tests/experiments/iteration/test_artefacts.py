@@ -4,7 +4,7 @@ import pytest
 
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.host.stop_signals import never_stop
-from dreamfleet.experiments.iteration import artefacts
+from dreamfleet.experiments.iteration import artefacts, phases
 from dreamfleet.experiments.iteration.config import IterateConfig
 from dreamfleet.experiments.iteration.layout import IterationFolder
 from dreamfleet.experiments.iteration.phases import PhaseRunner
@@ -109,15 +109,16 @@ def test_random_drives_are_driven_again_only_where_they_are_damaged(layout, fini
 
 
 @pytest.mark.parametrize("phase", ["mdnrnn", "bundle"])
-def test_latents_are_made_again_where_they_are_needed(layout, phase):
+def test_latents_are_made_again_where_they_are_needed(layout, phase, monkeypatch):
     asked = []
 
-    def run(stage, request, log):
+    def run(stage, *_):
         asked.append(stage.__name__)
         if stage is not encode_drives:
             raise DatasetError("enough")
 
+    monkeypatch.setattr(phases, "run_isolated", run)
     requests = Requests(IterateConfig(), layout, ledger())
     with pytest.raises(DatasetError):
-        PhaseRunner(requests, None, run, never_stop).do(Phase(1, phase))
+        PhaseRunner(requests, None, never_stop, asked.append).do(Phase(1, phase))
     assert asked == ["encode_drives", "build_bundle" if phase == "bundle" else "train_model"]

@@ -1,4 +1,4 @@
-"""What is finished, as the folder keeps it."""
+"""What is finished, as the folder keeps it. Tests dreamfleet/experiments/kept_document.py."""
 
 import json
 from dataclasses import replace
@@ -12,10 +12,15 @@ from tests.support.ledgers import RUN, entry, ledger
 from tests.support.phase_requests import requests
 
 
+def kept(written, folder):
+    """A ledger as it is read from the disk."""
+    written.save(folder / "iteration.json")
+    return IterationLedger.load(folder / "iteration.json")
+
+
 def test_it_is_kept_whole(tmp_path):
     written = ledger(entry(1, "collect", [Artefact("episodes/000000.npz", "ab" * 32)], episodes=1, new=1))
-    written.save(tmp_path / "iteration.json")
-    assert IterationLedger.load(tmp_path / "iteration.json") == written
+    assert kept(written, tmp_path) == written
     assert IterationLedger.load(tmp_path / "absent.json") is None
 
 
@@ -35,7 +40,8 @@ def test_it_is_kept_whole(tmp_path):
 )
 def test_damage_is_one_line_with_a_remedy(tmp_path, damage):
     path = tmp_path / "iteration.json"
-    path.write_text(damage(ledger(entry(1, "collect", episodes=1, new=1)).to_json()))
+    ledger(entry(1, "collect", episodes=1, new=1)).save(path)
+    path.write_text(damage(path.read_text()))
     with pytest.raises(DatasetError, match=r"iteration\.json"):
         IterationLedger.load(path)
 
@@ -55,7 +61,7 @@ def test_drives_are_counted_by_the_last_phase_that_made_some():
 
 
 def test_other_settings_are_refused_with_what_differs(tmp_path):
-    begun = IterationLedger.from_json(ledger().to_json())
+    begun = kept(ledger(), tmp_path)
     with pytest.raises(UsageError, match=r"noise 0\.3.* 0\.5.* seed 0.* 4.* population 64.* 32"):
         begun.with_settings(IterateConfig(noise=0.5, seed=4), {**RUN, "population": 32}, tmp_path)
     assert begun.with_settings(IterateConfig(), json.loads(json.dumps(RUN)), tmp_path) == begun
@@ -64,10 +70,10 @@ def test_other_settings_are_refused_with_what_differs(tmp_path):
 def test_a_ledger_from_before_a_setting_had_its_default(tmp_path):
     begun = ledger()
     del begun.settings["noise"]
-    older = IterationLedger.from_json(begun.to_json())
+    older = kept(begun, tmp_path)
     run = {name: value for name, value in RUN.items() if name != "population"}
     assert older.with_settings(IterateConfig(), RUN, tmp_path).settings == ledger().settings
-    before = IterationLedger.from_json(replace(older, run=run).to_json())
+    before = kept(replace(older, run=run), tmp_path)
     assert before.with_settings(IterateConfig(), RUN, tmp_path).run == before.run
     with pytest.raises(UsageError, match=r"noise 0\.3.* 0\.5"):
         older.with_settings(IterateConfig(noise=0.5), RUN, tmp_path)
@@ -83,7 +89,7 @@ def test_what_changes_no_finished_round_is_taken(changes, tmp_path):
 
 def test_a_world_that_is_kept_is_the_same_when_it_is_read(tmp_path):
     config = IterateConfig(task="gym:Some-v0", environment=("mode=1",), skip=4)
-    begun = IterationLedger.from_json(IterationLedger.begin(config, RUN).to_json())
+    begun = kept(IterationLedger.begin(config, RUN), tmp_path)
     again = IterateConfig(**begun.settings)
     assert requests(**begun.settings).collect(1).world == requests(**vars(config)).collect(1).world != {}
     assert begun.with_settings(again, RUN, tmp_path).settings["task"] == "gym:Some-v0"

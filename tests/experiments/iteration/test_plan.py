@@ -32,11 +32,7 @@ def test_later_rounds_drive_what_evolved_before_and_pass_a_gate():
 
 
 @pytest.mark.parametrize(
-    ("changes", "phase"),
-    [
-        ({"own_drives": 0}, "drive"),
-        ({"gate_drives": 0, "gate_losses": 0}, "gate"),
-    ],
+    ("changes", "phase"), [({"own_drives": 0}, "drive"), ({"gate_drives": 0, "gate_losses": 0}, "gate")]
 )
 def test_a_phase_that_would_do_nothing_is_left_out(changes, phase):
     assert phase not in names(PhasePlan(IterateConfig(**changes)), 2).split()

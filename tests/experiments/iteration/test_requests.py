@@ -1,4 +1,4 @@
-"""What each phase asks of the stages, and its coordinator's words. Tests dreamfleet/experiments/stage_flags.py."""
+"""What each phase asks of the stages, and its coordinator's flags."""
 
 from pathlib import Path
 
@@ -78,7 +78,7 @@ def test_with_init_the_first_round_goes_on_as_later_ones_do():
     assert (refit.controller, refit.to) == (str(begun / "controller.npz"), "data/rounds/01/round-1.zip")
     old = made.gate(1)["old"]["probe"]
     assert (old.subject, old.controller) == (str(begun / "bundle.zip"), str(begun / "controller.npz"))
-    assert f"--bundle {begun / 'bundle.zip'}" in " ".join(made.begin_run(1, (), ())), "no gate has passed another"
+    assert f"--bundle {begun / 'bundle.zip'}" in " ".join(made.run_flags(1)), "no gate has passed another"
     run = IterateConfig(init="tiny", run_flags="--generations 3", later_run_flags="--temperature 1")
     assert run.flags_of_run(1) == ("--generations", "3", "--temperature", "1")
 
@@ -103,14 +103,8 @@ def test_a_round_evolves_in_the_model_that_counts_with_a_seed_of_its_own():
     refused = requests(
         *ROUND_2, entry(2, "bundle"), entry(2, "gate", kept=False), run_flags="--generations 3 --recorded 0.5"
     )
-    words = " ".join(refused.begin_run(2, ("tcp/127.0.0.1:7000",), ("--preset", "dream"), Path("start.npz")))
-    assert words == (
-        "coordinator --preset dream --generations 3 --recorded 0.5 --run round-02 "
-        "--bundle data/rounds/01/round-1.zip --seed 2 --init start.npz "
-        "--runs-dir data/runs --json --listen tcp/127.0.0.1:7000"
-    )
-    assert " ".join(refused.resume_run(2, ("tcp/127.0.0.1:7000",))) == (
-        "coordinator --resume round-02 --runs-dir data/runs --json --listen tcp/127.0.0.1:7000"
+    assert " ".join(refused.run_flags(2, Path("start.npz"))) == (
+        "--generations 3 --recorded 0.5 --bundle data/rounds/01/round-1.zip --seed 2 --init start.npz"
     )
 
 
@@ -119,15 +113,15 @@ def test_an_evolution_in_a_subspace_names_its_file():
     few = Path("few.npz")
     found = made.subspace(2, few)
     assert (found.bundle, found.out, found.views) == ("data/rounds/01/round-1.zip", few, 0), "of the model that counts"
-    assert "--init start.npz --subspace few.npz" in " ".join(made.begin_run(2, (), (), Path("start.npz"), few))
+    assert "--init start.npz --subspace few.npz" in " ".join(made.run_flags(2, Path("start.npz"), few))
     assert requests(*ROUND_2, views=8, subspace=True, go_on=True).subspace(2, few).views == 8
 
 
 def test_later_rounds_may_evolve_otherwise_than_the_first():
     made = requests(*ROUND_2, run_flags="--generations 32", later_run_flags="--generations 6 --temperature 1")
-    first, later = (" ".join(made.begin_run(number, (), (), None)) for number in (1, 2))
-    assert first.startswith("coordinator --generations 32 --run round-01")
-    assert later.startswith("coordinator --generations 32 --generations 6 --temperature 1 --run round-02")
+    first, later = (" ".join(made.run_flags(number)) for number in (1, 2))
+    assert first.startswith("--generations 32 --bundle")
+    assert later.startswith("--generations 32 --generations 6 --temperature 1 --bundle")
 
 
 @pytest.mark.parametrize("flags", ["--data elsewhere", "--updates 3 --seed=9", "--continue other.safetensors", "--new"])

@@ -1,5 +1,5 @@
 """A sweep's plan, what it keeps, and its results, without processes.
-Tests check.py, figure.py, folder.py, options.py, plan.py and summary.py."""
+Tests check.py, figure.py, folder.py, plan.py and summary.py."""
 
 import argparse
 import json
@@ -15,8 +15,7 @@ from dreamfleet.experiments.local_run import task_flags
 from dreamfleet.experiments.sweep.check import check_runs
 from dreamfleet.experiments.sweep.figure import sweep_figure
 from dreamfleet.experiments.sweep.folder import SETTINGS, SweepFolder
-from dreamfleet.experiments.sweep.options import SweepOptions
-from dreamfleet.experiments.sweep.plan import MOST_RUNS, Sweep, parse_vary, read_vary
+from dreamfleet.experiments.sweep.plan import MOST_RUNS, Sweep, SweepOptions, parse_vary, read_vary
 from dreamfleet.experiments.sweep.summary import (
     CONFIRMED,
     FITNESS,

@@ -1,4 +1,5 @@
-"""The routes of the page and their access control. Tests assets.py, guard.py, server.py and sse.py."""
+"""The routes of the page and their access control. Tests assets.py, guard.py, coordinator/addons/web/documents.py,
+coordinator/addons/web/guard.py and coordinator/addons/web/server.py."""
 
 import asyncio
 import json

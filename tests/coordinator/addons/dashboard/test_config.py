@@ -1,4 +1,4 @@
-"""The dashboard's address and token."""
+"""The dashboard's address and token. Tests coordinator/addons/web/address.py."""
 
 import pytest
 
@@ -36,5 +36,5 @@ def test_a_port_is_one(port):
 
 
 def test_an_address_can_be_opened():
-    assert DashboardConfig().address(8420) == "http://127.0.0.1:8420/"
-    assert DashboardConfig(host="::1").address(1) == "http://[::1]:1/"
+    assert DashboardConfig().url(8420) == "http://127.0.0.1:8420"
+    assert DashboardConfig(host="::1").url(1) == "http://[::1]:1"

@@ -66,7 +66,7 @@ def test_an_environment_without_its_python_is_not_listed(tmp_path, there):
     (folder / "bin").mkdir(parents=True)
     (folder / COMPLETE).touch()
     (folder / "bin" / "python").symlink_to(os.devnull if there else tmp_path / "gone")
-    found = agent.inspect_host(HostFolder(str(tmp_path), Channel()))
+    found = agent.inspect_host(HostFolder(str(tmp_path), Channel()), {})
     assert found["environments"] == (["one"] if there else [])
 
 
@@ -97,7 +97,7 @@ def test_damaged_files_of_the_agent_are_read_as_nothing(tmp_path, capsys, damage
     (root / CREATED).write_bytes(damage)
     (host_folder.worker("box") / STATE).write_bytes(damage)
     (root / "workers" / ".DS_Store").touch()
-    assert agent.inspect_host(host_folder)["workers"][0]["running"] is False
+    assert agent.inspect_host(host_folder, {})["workers"][0]["running"] is False
     agent.handle_request({"do": "end", "root": str(root), "names": None, "now": True, "keep": False}, Channel())
     assert '"ok"' in capsys.readouterr().out
     assert not any(root.glob("*"))

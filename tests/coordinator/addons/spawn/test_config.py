@@ -24,7 +24,7 @@ def test_a_hosts_table_overrides_the_file_and_flags_override_it(tmp_path):
     row = {"address": "me@big", "slots": 16, "env": ["A=1", "B=x=y"], "wheelhouse": str(tmp_path)}
     (host,) = hosts(row, file={"spawn": {"slots": 4, "remote_dir": "/data/fleet"}})
     assert (host.name, host.spawn.slots, host.spawn.remote_dir) == ("big", 16, "/data/fleet")
-    assert host.environment == {"A": "1", "B": "x=y"}
+    assert host.spawn.env == ("A=1", "B=x=y")
     assert host.spawn.wheelhouse == tmp_path
     (host,) = hosts(row, environment={"DREAMFLEET_SPAWN_SLOTS": "3"})
     assert host.spawn.slots == 3
@@ -39,8 +39,8 @@ def test_the_documented_file_is_valid(tmp_path):
     path.write_text(text.replace("/data/wheels", str(tmp_path)))
     file = read_config_file(path)
     big, node = hosts(*file["host"], file=file)
-    assert (big.name, big.spawn.slots, big.flags) == ("big", 16, ["--run", "night", "--exit-when-done"])
-    assert (node.name, node.spawn.wheelhouse, node.environment) == ("node-7", tmp_path, {"OMP_NUM_THREADS": "1"})
+    assert (big.name, big.spawn.slots, big.spawn.worker_flags) == ("big", 16, "--run night --exit-when-done")
+    assert (node.name, node.spawn.wheelhouse, node.spawn.env) == ("node-7", tmp_path, ("OMP_NUM_THREADS=1",))
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,5 @@
 """Hosts that answer nonsense, print without end or say nothing: each is one row, and the others go on.
-Tests answers.py, parallel.py and remote_host.py."""
+Tests parallel.py and remote_host.py."""
 
 import resource
 import shlex

@@ -1,4 +1,4 @@
-"""Server-sent events and their JSON: NaN and infinity, which browsers refuse, become null."""
+"""Server-sent events and responses in JSON: NaN and infinity, which browsers refuse, become null."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import json
 import math
 from collections.abc import Mapping
 from typing import Any
+
+from starlette.responses import Response
 
 
 def to_json(document: Mapping[str, Any]) -> str:
@@ -19,6 +21,11 @@ def to_json(document: Mapping[str, Any]) -> str:
 def event(kind: str, document: Mapping[str, Any]) -> bytes:
     """A server-sent event."""
     return f"event: {kind}\ndata: {to_json(document)}\n\n".encode()
+
+
+def json_response(document: Mapping[str, Any], status: int = 200, headers: Mapping[str, str] | None = None) -> Response:
+    """A response that holds the document."""
+    return Response(to_json(document), status, headers, "application/json")
 
 
 def _dumps(document: Any) -> str:

@@ -1,0 +1,1 @@
+"""One small web server for add-ons: its address, limits, guard and streams of events."""
