@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import re
 from collections.abc import Sequence
@@ -74,11 +73,3 @@ def format_setting(value: object) -> str:
 def printable_lines(text: str) -> str:
     """The text with each of its lines printable; its line breaks are trusted."""
     return "\n".join(map(printable, text.split("\n")))
-
-
-class PrintableFormatter(logging.Formatter):
-    """A log formatter that makes records printable."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        """Format one record."""
-        return printable_lines(super().format(record))

@@ -11,7 +11,6 @@ import logging
 import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -126,7 +125,7 @@ def _named_modules(args: argparse.Namespace, environment: Mapping[str, str], fil
 
 def load_credentials(args: argparse.Namespace, roles: Collection[str] = ()) -> Credentials | None:
     """Read and check the join file, if one is set; `AccessError` if its role is not among `roles` (empty: any role)."""
-    from dreamfleet.common.security.certificate_check import check_certificate
+    from dreamfleet.common.security.handshake import check_certificate
 
     path: Path | None = args.global_config.join
     if path is None:
@@ -138,7 +137,7 @@ def load_credentials(args: argparse.Namespace, roles: Collection[str] = ()) -> C
             f"with `{issue_command(next(iter(roles)), 'NAME')}`"
         )
     check_certificate(credentials)
-    left = credentials.time_left(datetime.now(UTC))
+    left = credentials.time_left
     if left < EXPIRY_WARNING:
         log.warning("%s expires soon (%s): have %s %s issued again", path, describe_time_left(left), credentials.role,
                     credentials.name)  # fmt: skip

@@ -6,7 +6,6 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,8 +15,8 @@ from dreamfleet.common.cli.task_check import try_task
 from dreamfleet.common.errors import AccessError, CacheError, DreamfleetError
 from dreamfleet.common.files.file_system import file_system_type, is_network, lock_problem
 from dreamfleet.common.host.packages import PACKAGES, install_command, package_version, wrong_version
-from dreamfleet.common.security.certificate_check import check_certificate
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, describe_time_left, read_join_file
+from dreamfleet.common.security.handshake import check_certificate
 
 GROUP = "dreamfleet.checks"
 # The `Finding.role`s that each role needs. The extra of the last one's name installs it, except for the coordinator.
@@ -74,7 +73,7 @@ def _check_join_file(path: Path) -> Finding:
         check_certificate(credentials)
     except AccessError as error:
         return Finding("join file", False, True, str(error), "everything", "have another issued")
-    left = credentials.time_left(datetime.now(UTC))
+    left = credentials.time_left
     found = f"{path}: {credentials.role} {credentials.name}, {describe_time_left(left)}"
     remedy = f"have {credentials.role} {credentials.name} issued again"
     return Finding("join file", left > EXPIRY_WARNING, False, found, "everything", remedy)

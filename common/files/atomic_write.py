@@ -67,7 +67,9 @@ def atomic_write(path: Path, *, private: bool = False) -> Iterator[BinaryIO]:
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        with _open_for_writing(aside, private) as file:
+        if private:
+            aside.unlink(missing_ok=True)  # a leftover may have another mode
+        with open_new(aside) if private else aside.open("wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -75,13 +77,6 @@ def atomic_write(path: Path, *, private: bool = False) -> Iterator[BinaryIO]:
         fsync_path(path.parent)
     finally:
         aside.unlink(missing_ok=True)
-
-
-def _open_for_writing(path: Path, private: bool) -> BinaryIO:
-    if not private:
-        return path.open("wb")
-    path.unlink(missing_ok=True)  # a leftover may have another mode
-    return open_new(path)
 
 
 def open_new(path: Path) -> BinaryIO:

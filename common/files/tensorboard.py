@@ -31,31 +31,30 @@ class EventFileWriter:
 
     def begin(self, step: int) -> None:
         """Start a session at `step`: TensorBoard discards points of earlier files from there on."""
-        from tensorboardX.proto.event_pb2 import Event, SessionLog
+        from tensorboardX.proto.event_pb2 import SessionLog
 
-        self._write(Event(step=step, file_version=FILE_VERSION))
-        self._write(Event(step=step, session_log=SessionLog(status=SessionLog.START)))
+        self._write(step=step, file_version=FILE_VERSION)
+        self._write(step=step, session_log=SessionLog(status=SessionLog.START))
 
     def add(self, step: int, **values: float) -> None:
         """Add scalars of one step by name, in one record; `__` in a name becomes TensorBoard's `/`."""
-        from tensorboardX.proto.event_pb2 import Event
         from tensorboardX.proto.summary_pb2 import Summary
         from tensorboardX.summary import scalar
 
         each = (scalar(name.replace("__", "/"), value).value for name, value in values.items())
-        self._write(Event(step=step, summary=Summary(value=chain.from_iterable(each))))
+        self._write(step=step, summary=Summary(value=chain.from_iterable(each)))
         self._writer.flush()  # visible while the training runs
 
     def add_text(self, name: str, text: str) -> None:
         """Add a text, shown beside the curves."""
-        from tensorboardX.proto.event_pb2 import Event
         from tensorboardX.summary import text as summary_of
 
-        self._write(Event(summary=summary_of(name, text)))
+        self._write(summary=summary_of(name, text))
 
-    def _write(self, event: Any) -> None:
-        event.wall_time = time.time()
-        self._writer.write_event(event)
+    def _write(self, **fields: Any) -> None:
+        from tensorboardX.proto.event_pb2 import Event
+
+        self._writer.write_event(Event(wall_time=time.time(), **fields))
 
 
 @contextmanager

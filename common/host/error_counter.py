@@ -37,15 +37,12 @@ class ErrorCounter:
             self._counts[reason] += 1
             count = self._counts[reason]
         if count & (count - 1) == 0:
+            frames = traceback.extract_tb(error.__traceback__)
+            place = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else "nowhere"
             self._log.error(
                 "dropped a %s (%d so far): %s at %s; it was: %s", reason, count, truncate(str(error), MAX_LOGGED_CHARS),
-                _describe_place(error), truncate(_describe_event(event), MAX_LOGGED_CHARS),
+                place, truncate(_describe_event(event), MAX_LOGGED_CHARS),
             )  # fmt: skip
-
-
-def _describe_place(error: Exception) -> str:
-    frames = traceback.extract_tb(error.__traceback__)
-    return f"{frames[-1].filename}:{frames[-1].lineno}" if frames else "nowhere"
 
 
 def _describe_event(event: object) -> str:

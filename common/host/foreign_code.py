@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
+from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from pathlib import Path
 
 from dreamfleet.common.host.descendants import VARIABLE, Descendants
-from dreamfleet.common.host.stop_signals import SIGNALS
+from dreamfleet.common.host.stop_signals import handlers_kept
 
 log = logging.getLogger(__name__)
 STDOUT, STDERR = 1, 2
@@ -26,12 +25,8 @@ def contained(what: str) -> Iterator[None]:
     What it prints goes to stderr: stdout is for a verb's answer. Processes that it starts end with this one, at the
     latest. After `SLOW` seconds a warning says `what` takes so long.
     """
-    with ExitStack() as stack:
-        stack.enter_context(_warning_if_slow(what))
-        if not os.environ.get(VARIABLE):  # else another process ends them
-            stack.enter_context(Descendants().starting())
-        stack.enter_context(answer_kept())
-        stack.enter_context(_handlers_kept())
+    starting = nullcontext() if os.environ.get(VARIABLE) else Descendants().starting()  # another process may end them
+    with _warning_if_slow(what), starting, answer_kept(), handlers_kept():
         yield
 
 
@@ -69,20 +64,6 @@ def _folder_kept() -> Iterator[None]:
     finally:
         if before is not None:
             os.chdir(before)
-
-
-@contextmanager
-def _handlers_kept() -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():  # others set no handlers
-        yield
-        return
-    before = {number: signal.getsignal(number) for number in SIGNALS}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            if handler is not None:  # of native code
-                signal.signal(number, handler)
 
 
 @contextmanager

@@ -13,12 +13,12 @@ from datetime import UTC, datetime
 from typing import Literal
 
 from dreamfleet.common.host.reports import FAILURE, report
-from dreamfleet.common.printable import PrintableFormatter, one_line, printable, shorten_words
+from dreamfleet.common.printable import one_line, printable_lines, shorten_words
 
 PROCESSES = ("coordinator", "worker")  # loggers whose lines are their process's
 
 
-class TextFormatter(PrintableFormatter):
+class TextFormatter(logging.Formatter):
     """A record as one line. `label` names this process among others in the same log: `run night`, `worker core-0`."""
 
     label = ""
@@ -34,9 +34,9 @@ class TextFormatter(PrintableFormatter):
         package, _, rest = record.name.partition(".")
         speaker = rest.partition(".")[0] if package == "dreamfleet" and rest else record.name
         speaker = self.label if self.label and speaker in PROCESSES else speaker
-        words = ["" if day == self._day else day, time, level, f"{printable(speaker)}: {super().format(record)}"]
+        words = ["" if day == self._day else day, time, level, f"{speaker}: {super().format(record)}"]
         self._day = day
-        return " ".join(filter(None, words))
+        return printable_lines(" ".join(filter(None, words)))
 
 
 class JsonFormatter(logging.Formatter):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -125,6 +126,11 @@ def _may_have(top: str, read: Callable[[str], str | None]) -> bool:
         lines = f"\n{files}"
         return f"\n{top}/" in lines or f"\n{top}." in lines
     return any(top in (read(name) or "") for name in ("installed-files.txt", "SOURCES.txt"))
+
+
+def allow_swig_types() -> None:
+    """Ignore warnings of native modules made by SWIG, such as Box2D, whose import they would else end (SIGSEGV)."""
+    warnings.filterwarnings("ignore", r"builtin type [sS]wig\w* has no __module__", DeprecationWarning)
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -19,7 +20,7 @@ from typing import Any, Generic, NoReturn, TypeVar
 
 from dreamfleet.common.host.child import FunctionChild
 from dreamfleet.common.host.foreign_code import send_stdout_to_stderr
-from dreamfleet.common.host.stall_watch import START_LIMIT, StallWatch, describe_slow_start, describe_stall
+from dreamfleet.common.host.stall_watch import START_LIMIT, StallWatch, describe_stall
 from dreamfleet.common.host.user_code import keep_user_arguments
 
 LOOK_INTERVAL = 1.0  # seconds between two looks whether all processes run
@@ -122,7 +123,7 @@ class _Process(Generic[Item, Answer]):
         if not self._stall or quiet <= limit:
             return None
         self.kill()
-        return describe_stall(limit) if self.steps else describe_slow_start(limit)
+        return describe_stall(limit, is_ready=self.steps > 0)
 
     def kill(self) -> None:
         """End it and what it started."""
@@ -131,40 +132,40 @@ class _Process(Generic[Item, Answer]):
         self.child = None
 
 
+@dataclass(frozen=True)
 class _Pool(Generic[Item, Answer]):
     """Hands items to processes and collects the answers."""
 
-    def __init__(
-        self, waiting: deque[Item], idle: list[_Process[Item, Answer]], on_loss: Callable[[Item, int | str], Answer],
-        on_look: Callable[[int], None], has_failed: Callable[[Answer], bool],
-    ) -> None:  # fmt: skip
-        self.waiting, self._idle, self._on_loss, self._on_look = waiting, idle, on_loss, on_look
-        self._has_failed = has_failed
-        self._running: dict[Future[Answer], tuple[_Process[Item, Answer], Item]] = {}
+    waiting: deque[Item]
+    idle: list[_Process[Item, Answer]]
+    on_loss: Callable[[Item, int | str], Answer]
+    on_look: Callable[[int], None]
+    has_failed: Callable[[Answer], bool]
+    running: dict[Future[Answer], tuple[_Process[Item, Answer], Item]] = field(default_factory=dict)
 
     def answers(self) -> Iterator[Answer]:
         """The answers as they come; what `work` or `on_loss` raises ends them."""
         looked_at = monotonic()
-        while self.waiting or self._running:
-            while self.waiting and self._idle:
-                process, item = self._idle.pop(0), self.waiting.popleft()
-                self._running[process.submit(item)] = process, item
-            wait(self._running, LOOK_INTERVAL, FIRST_COMPLETED)
-            self._on_look(sum(process.steps for process, _ in self._running.values()))
+        while self.waiting or self.running:
+            while self.waiting and self.idle:
+                process, item = self.idle.pop(0), self.waiting.popleft()
+                self.running[process.submit(item)] = process, item
+            wait(self.running, LOOK_INTERVAL, FIRST_COMPLETED)
+            self.on_look(sum(process.steps for process, _ in self.running.values()))
             gap, looked_at = max(0.0, monotonic() - looked_at - LOOK_INTERVAL), monotonic()
-            for future, (process, item) in list(self._running.items()):
+            for future, (process, item) in list(self.running.items()):
                 is_answered = future.done() and not isinstance(future.exception(), BrokenProcessPool)
                 reason = None if is_answered else process.find_loss(gap)
                 if not is_answered and reason is None:
                     continue
-                del self._running[future]
-                failed = reason is not None or (future.exception() is None and self._has_failed(future.result()))
+                del self.running[future]
+                failed = reason is not None or (future.exception() is None and self.has_failed(future.result()))
                 if failed and not process.is_fresh:
                     process.kill()
-                    self._running[process.submit(item)] = process, item
+                    self.running[process.submit(item)] = process, item
                     continue
-                self._idle.append(process)
-                yield future.result() if reason is None else self._on_loss(item, reason)
+                self.idle.append(process)
+                yield future.result() if reason is None else self.on_loss(item, reason)
 
 
 def _take(asked: deque[Future[Answer]], message: tuple[Answer | None, BaseException | None] | None) -> None:

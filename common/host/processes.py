@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import queue
 import shlex
 import shutil
 import subprocess
@@ -57,7 +56,6 @@ class VerbProcess(CommandChild):
         self.lines: list[str] = []  # the last lines of stderr
         self._log = log
         self._out: deque[str] = deque(maxlen=KEPT_LINES)
-        self._new_lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._reports = ReportPipe()
         inherited = {**(os.environ if environment is None else environment), VARIABLE: str(self._reports.write)}
         within = (*inside, *(parent_death_command() if ends_with_parent else ()))
@@ -71,27 +69,14 @@ class VerbProcess(CommandChild):
                 stdout=target, stderr=target, env=inherited, pass_fds=(self._reports.write,),
             )  # fmt: skip
         streams = (
-            (self.popen.stdout, read or (lambda stream: _drain(stream, self._out.append, None))),
-            (self.popen.stderr, lambda stream: _drain(stream, self._add_line, self._new_lines)),
+            (self.popen.stdout, read or (lambda stream: _drain(stream, self._out.append))),
+            (self.popen.stderr, lambda stream: _drain(stream, self._add_line)),
         )
         self._readers = [
             threading.Thread(target=take, args=(stream,), daemon=True) for stream, take in streams if stream is not None
         ]
         for reader in self._readers:
             reader.start()
-
-    def wait_for(self, text: str, times: int = 1, timeout: float = 60.0) -> str:
-        """Block until stderr contained `text` in `times` new lines since the last wait; returns the last of them."""
-        deadline, line = time.monotonic() + timeout, None
-        while times:
-            try:
-                line = self._new_lines.get(timeout=max(0.0, deadline - time.monotonic()))
-            except queue.Empty:
-                raise DreamfleetError(f"{text!r} was not printed within {timeout:g} s; {self.last_line()}") from None
-            if line is None:
-                raise DreamfleetError(f"ended before printing {text!r}:\n{''.join(self.lines)}")
-            times -= text in line
-        return line or ""
 
     def reports(self, name: str) -> list[Any]:
         """What it reported under this name so far, the oldest first."""
@@ -134,16 +119,13 @@ class VerbProcess(CommandChild):
         self.lines.append(line)
         if len(self.lines) > 2 * KEPT_LINES:
             del self.lines[:KEPT_LINES]
-        self._new_lines.put(line)
 
     def _join(self) -> None:
         for reader in self._readers:
             reader.join(PATIENCE)  # a grandchild may hold the pipe
 
 
-def _drain(stream: IO[bytes], take: Callable[[str], None], end: queue.SimpleQueue[str | None] | None) -> None:
+def _drain(stream: IO[bytes], take: Callable[[str], None]) -> None:
     with stream:
         for line in stream:
             take(line.decode(errors="replace"))
-    if end is not None:
-        end.put(None)

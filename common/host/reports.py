@@ -10,7 +10,7 @@ from weakref import finalize
 
 VARIABLE = "DREAMFLEET_REPORTS"  # where this process reports: a file's path, or the number of an inherited descriptor
 FAILURE = "failure"  # why the verb fails
-ADDRESS = "address"  # where a server that is ready is reached
+ADDRESS = "address"  # where a server that answers from now on is reached
 WARNING = "warning"  # what the check of a run's task found
 BEGUN = "begun"  # the verb's settings are right, and it begins its work
 _targets: list[int] = []

@@ -27,11 +27,6 @@ class StallWatch:
         return now - self._since
 
 
-def describe_stall(limit: float) -> str:
-    """Why a process was killed that made no step for `limit` seconds."""
-    return f"no step for {limit:g} s"
-
-
-def describe_slow_start(limit: float) -> str:
-    """Why a process was killed that was not ready for a step after `limit` seconds."""
-    return f"not ready after {limit:g} s"
+def describe_stall(limit: float, *, is_ready: bool) -> str:
+    """Why a process was killed that made no step for `limit` seconds, or was not ready for its first one."""
+    return f"no step for {limit:g} s" if is_ready else f"not ready after {limit:g} s"

@@ -80,39 +80,27 @@ def _interrupt_soon() -> None:
 
 @contextmanager
 def stop_on_signals() -> Iterator[Stop]:
-    """Yield a `Stop` that is True after a first Ctrl-C or SIGTERM; a second one raises `KeyboardInterrupt`.
-
-    Main thread only: other threads cannot handle signals.
-    """
+    """Yield a `Stop` that is True after a Ctrl-C or SIGTERM; a second raises `KeyboardInterrupt`. Main thread only."""
     stopped = False
 
-    def handle(_number: int, _frame: Any) -> None:
+    def handle(number: int, frame: Any) -> None:
         nonlocal stopped
         if stopped:
-            interrupts.raise_one(_number, _frame)
+            interrupts.raise_one(number, frame)
         stopped = True
 
-    before = {number: signal.signal(number, handle) for number in SIGNALS}
-    try:
+    with _handled_by(handle):
         yield lambda: stopped
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager
 def interrupted_by_signals() -> Iterator[None]:
-    """Make both Ctrl-C and SIGTERM raise `KeyboardInterrupt`, so that `finally` blocks run.
+    """Make both Ctrl-C and SIGTERM raise `KeyboardInterrupt`, so that `finally` blocks run; main thread only.
 
-    By default only Ctrl-C raises, and not in a script's background jobs, which shells start with SIGINT ignored. Main
-    thread only.
+    By default only Ctrl-C raises, and not in a script's background jobs, which shells start with SIGINT ignored.
     """
-    before = {number: signal.signal(number, interrupts.raise_one) for number in SIGNALS}
-    try:
+    with _handled_by(interrupts.raise_one):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager
@@ -122,14 +110,31 @@ def signals_deferred() -> Iterator[None]:
         yield
         return
     waiting: list[int] = []
-    before = {number: signal.signal(number, lambda number, _frame: waiting.append(number)) for number in SIGNALS}
+    with _handled_by(lambda number, _frame: waiting.append(number)):
+        yield
+    for received in waiting:
+        signal.raise_signal(received)
+
+
+@contextmanager
+def _handled_by(handler: Callable[[int, Any], object]) -> Iterator[None]:
+    with handlers_kept():
+        for number in SIGNALS:
+            signal.signal(number, handler)
+        yield
+
+
+@contextmanager
+def handlers_kept() -> Iterator[None]:
+    """Leave the handlers of Ctrl-C and SIGTERM as they were, whatever sets others inside."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    for received in waiting:
-        signal.raise_signal(received)
+        if threading.current_thread() is threading.main_thread():  # others set no handlers
+            for number, handler in before.items():
+                if handler is not None:  # of native code
+                    signal.signal(number, handler)
 
 
 def call_on_signals(stop: Callable[[], None]) -> None:
@@ -178,11 +183,9 @@ def outlive_stop_signals() -> None:
             signal.signal(number, signal.SIG_DFL)
         unblock()
 
-    def unblock() -> None:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
-
     # Blocked around a fork, so that a signal for the new process waits until that handles it.
     block = partial(signal.pthread_sigmask, signal.SIG_BLOCK, SIGNALS)
+    unblock = partial(signal.pthread_sigmask, signal.SIG_UNBLOCK, SIGNALS)
     os.register_at_fork(before=block, after_in_parent=unblock, after_in_child=restore)
     for number in SIGNALS:
         signal.signal(number, lambda *_: None)

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import ModuleType
 
 from dreamfleet.common.errors import DreamfleetError, UsageError
-from dreamfleet.common.host.swig_types import allow_swig_types
+from dreamfleet.common.host.packages import allow_swig_types
 from dreamfleet.common.host.user_code import describe_error, user_code
 
 VARIABLE = "DREAMFLEET_TRUST"

@@ -14,6 +14,7 @@ import sys
 import sysconfig
 import threading
 import traceback
+from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -52,22 +53,22 @@ def user_code(name: str, deed: str) -> Iterator[None]:
     `UsageError` if it ends the process, with its text or code and what it printed last. `deed` says what it does, such
     as `importing mine`.
     """
+    kept: deque[str] = deque(maxlen=KEPT)
     with ExitStack() as stack:
         stack.enter_context(_arguments_shown(name))
-        printed = _Printed()
         if sys.stdout is not None and sys.stderr is not None:
-            stack.enter_context(redirect_stdout(printed.copying(sys.stdout)))
-            stack.enter_context(redirect_stderr(printed.copying(sys.stderr)))
+            stack.enter_context(redirect_stdout(_Copying(sys.stdout, kept)))
+            stack.enter_context(redirect_stderr(_Copying(sys.stderr, kept)))
         try:
             yield
         except SystemExit as error:
             code = "" if error.code is None else one_line(f"{error.code!r:.{KEPT}}")
+            text = one_line("".join(kept))
+            printed = f" and printed {text!r}" if text else ""
             raise UsageError(
-                f"{deed} called sys.exit({code}){printed.words}: put what it does as a program under "
+                f"{deed} called sys.exit({code}){printed}: put what it does as a program under "
                 '`if __name__ == "__main__":`'
             ) from error
-        finally:
-            printed.is_over = True
 
 
 def describe_error(error: BaseException) -> str:
@@ -86,38 +87,15 @@ def find_user_line(error: BaseException) -> str:
     return one_line(f"{Path(file).name}:{line}: {linecache.getline(file, line)}"[:KEPT]).rstrip(": ")
 
 
-class _Printed:
-    """What code printed last."""
-
-    def __init__(self) -> None:
-        self._text = ""
-        self.is_over = False
-
-    @property
-    def words(self) -> str:
-        """What was printed, on one line, as part of a sentence."""
-        text = one_line(self._text)
-        return f" and printed {text!r}" if text else ""
-
-    def copying(self, stream: Any) -> Any:
-        """A stream that writes to `stream`, and keeps here what it writes."""
-        return _Copying(self, stream)
-
-    def add(self, text: str) -> None:
-        """Keep this, if it is printed inside."""
-        if not self.is_over:
-            self._text = (self._text + text)[-KEPT:]
-
-
 class _Copying:
     """A stream that keeps what it passes on. A user's logger may hold it for long, so it is like the stream."""
 
-    def __init__(self, printed: _Printed, stream: Any) -> None:
-        self._printed, self._stream = printed, stream
+    def __init__(self, stream: Any, kept: deque[str]) -> None:
+        self._stream, self._kept = stream, kept
 
     def write(self, text: str) -> Any:
         """Write the text; as the stream's own."""
-        self._printed.add(text)
+        self._kept.extend(text[-KEPT:])
         return self._stream.write(text)
 
     def __getattr__(self, name: str) -> Any:

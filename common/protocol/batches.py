@@ -74,25 +74,19 @@ class BatchHeader:
         if self.seeds and self.episodes:
             raise BatchError("malformed", "give seeds, or a number of episodes, not both")
         if self.total > MAX_BATCH:
-            raise BatchError(
-                "too large",
-                f"a batch of {plural(self.population, 'vector')} of {plural(self.size, 'number')} has "
-                f"{self.total:,} bytes, "
-                f"{MAX_BATCH:,} are allowed: split it into smaller batches",
-            )
+            form = f"{plural(self.population, 'vector')} of {plural(self.size, 'number')}"
+            most = f"{MAX_BATCH:,} are allowed: split it into smaller batches"
+            raise BatchError("too large", f"a batch of {form} has {self.total:,} bytes, {most}")
         if not _SHA256.fullmatch(self.sha256):
             raise BatchError("malformed", "sha256 must have 64 hexadecimal digits")
         self.check_episodes(self.seeds or self.episodes)
 
     def check_episodes(self, episodes: int) -> None:
         """`BatchError` if so many episodes a candidate are too many jobs."""
-        if self.population * episodes > MAX_EPISODES:
-            raise BatchError(
-                "too large",
-                f"{plural(self.population, 'vector')} of {plural(episodes, 'episode')} each are "
-                f"{self.population * episodes:,} "
-                f"episodes, {MAX_EPISODES:,} are allowed: split it into smaller batches",
-            )
+        if (jobs := self.population * episodes) > MAX_EPISODES:
+            form = f"{plural(self.population, 'vector')} of {plural(episodes, 'episode')}"
+            most = f"{MAX_EPISODES:,} are allowed: split it into smaller batches"
+            raise BatchError("too large", f"{form} each are {jobs:,} episodes, {most}")
 
     @property
     def total(self) -> int:
@@ -142,9 +136,8 @@ def pack_batch(
     plain = [] if seeds is None else list(seeds)
     if seeds is not None and not plain:
         raise BatchError("malformed", "the list of seeds is empty: leave it out, or name at least one seed")
-    if not all(isinstance(each, (int, np.integer)) and not isinstance(each, bool) for each in plain) or not all(
-        0 <= each <= LAST_SEED for each in plain
-    ):
+    whole = all(isinstance(each, (int, np.integer)) and not isinstance(each, bool) for each in plain)
+    if not whole or not all(0 <= each <= LAST_SEED for each in plain):
         raise BatchError("malformed", f"seeds are whole numbers from 0 to {LAST_SEED}")
     rows = _as_float32(vectors)
     form = {"population": rows.shape[0], "size": rows.shape[1], "seeds": len(plain), "episodes": episodes}

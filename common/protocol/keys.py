@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import secrets
 import socket
+from collections.abc import Callable
 
 from dreamfleet.common.errors import UsageError
 
@@ -19,19 +20,18 @@ _LIFE = re.compile(r"[0-9a-f]{8}")
 
 def check_run_name(name: str) -> str:
     """Return `name` if it may name a run, else raise `UsageError`."""
-    if not _RUN.fullmatch(name):
-        raise UsageError(
-            f"{name!r} cannot name a run: use 1 to 63 of A-Z, a-z, 0-9, '_' and '-', and begin with a letter or a digit"
-        )
-    return name
+    return _check_name(name, _RUN, "run", "'_' and '-'")
 
 
 def check_worker_name(name: str) -> str:
     """Return `name` if it may name a worker, else raise `UsageError`."""
-    if not _WORKER_NAME.fullmatch(name):
+    return _check_name(name, _WORKER_NAME, "worker", "'.', '_' and '-'")
+
+
+def _check_name(name: str, pattern: re.Pattern[str], what: str, marks: str) -> str:
+    if not pattern.fullmatch(name):
         raise UsageError(
-            f"{name!r} cannot name a worker: use 1 to 63 of A-Z, a-z, 0-9, '.', '_' and '-', and begin with a letter "
-            "or a digit"
+            f"{name!r} cannot name a {what}: use 1 to 63 of A-Z, a-z, 0-9, {marks}, and begin with a letter or a digit"
         )
     return name
 
@@ -54,6 +54,38 @@ def new_worker_identity(name: str | None = None) -> str:
     return f"{clean}/{secrets.token_hex(4)}"
 
 
+def _of_run(kind: str) -> Callable[[str, str], str]:
+    """The keys of a kind: they name a run, and end in a worker, a nonce, a verb or a hash."""
+    return lambda run, end: f"{_PREFIX}/{run}/{kind}/{end}"
+
+
+def _event(kind: str) -> Callable[[str], str]:
+    """The key of a run's events of a kind, from the coordinator to everyone."""
+    return lambda run: f"{_PREFIX}/{run}/event/{kind}"
+
+
+# From one worker, and to it
+job = _of_run("job")  # from the coordinator: numbered batches
+result = _of_run("result")  # to the coordinator: finished jobs
+heartbeat = _of_run("beat")  # to the coordinator: its jobs and load
+upload = _of_run("upload")  # to the coordinator: a job's output that is too large for a result
+view = _of_run("view")  # to everyone: live frames, while somebody subscribes
+live_worker = _of_run("live/worker")  # its liveliness token
+
+# By nonces, which distinguish two coordinators of one run
+live_coordinator = _of_run("live/coordinator")  # its liveliness token
+claim = _of_run("claim")  # query from another coordinator: who are you
+
+# Queries of anyone
+control = _of_run("control")  # by verbs: `pause`, `resume`, `drain` or `stop`
+batch = _of_run("batch")  # by verbs: `submit`, `read` and `cancel` with an id in the parameters, or `list`
+bundle = _of_run("bundle")  # by SHA-256: a part of the world model; parameters `offset` and `length`, in bytes
+
+event_generation = _event("generation")  # each closed generation
+event_status = _event("status")  # as the coordinator leaves: the last status
+event_batch = _event("batch")  # each change of a submitted batch
+
+
 def hello(run: str) -> str:
     """Worker to coordinator: query to join a run, or every live run with `*`. Outside the version; never changes."""
     return f"{ROOT}/hello/{run}"
@@ -64,79 +96,9 @@ def secured_hello(run: str, worker: str) -> str:
     return f"{ROOT}/hello/{run}/{worker}"
 
 
-def job(run: str, worker: str) -> str:
-    """Coordinator to one worker: numbered batches."""
-    return f"{_PREFIX}/{run}/job/{worker}"
-
-
-def result(run: str, worker: str) -> str:
-    """One worker to the coordinator: finished jobs."""
-    return f"{_PREFIX}/{run}/result/{worker}"
-
-
-def heartbeat(run: str, worker: str) -> str:
-    """One worker to the coordinator: its jobs and load."""
-    return f"{_PREFIX}/{run}/beat/{worker}"
-
-
-def live_worker(run: str, worker: str) -> str:
-    """A worker's liveliness token."""
-    return f"{_PREFIX}/{run}/live/worker/{worker}"
-
-
-def live_coordinator(run: str, nonce: str) -> str:
-    """A coordinator's liveliness token; the nonce distinguishes two coordinators of one run."""
-    return f"{_PREFIX}/{run}/live/coordinator/{nonce}"
-
-
-def claim(run: str, nonce: str) -> str:
-    """Query from one coordinator of a run to another: who are you."""
-    return f"{_PREFIX}/{run}/claim/{nonce}"
-
-
 def status(run: str, part: str = "") -> str:
     """Query for a run's status, as JSON; `part` is one of `dreamfleet.common.client.status.PARTS`."""
     return f"{_PREFIX}/{run}/status/{part}" if part else f"{_PREFIX}/{run}/status"
-
-
-def control(run: str, verb: str) -> str:
-    """Query that requests `pause`, `resume`, `drain` or `stop`."""
-    return f"{_PREFIX}/{run}/control/{verb}"
-
-
-def batch(run: str, verb: str) -> str:
-    """Query about submitted batches: `submit`, `read` and `cancel` with an id in the parameters, or `list`."""
-    return f"{_PREFIX}/{run}/batch/{verb}"
-
-
-def bundle(run: str, sha256: str) -> str:
-    """Query for a part of the frozen world model: parameters `offset` and `length`, in bytes."""
-    return f"{_PREFIX}/{run}/bundle/{sha256}"
-
-
-def upload(run: str, worker: str) -> str:
-    """One worker to the coordinator: a job's output that is too large for a result."""
-    return f"{_PREFIX}/{run}/upload/{worker}"
-
-
-def event_generation(run: str) -> str:
-    """Coordinator to everyone: each closed generation."""
-    return f"{_PREFIX}/{run}/event/generation"
-
-
-def event_status(run: str) -> str:
-    """Coordinator to everyone, as it leaves: the last status."""
-    return f"{_PREFIX}/{run}/event/status"
-
-
-def event_batch(run: str) -> str:
-    """Coordinator to everyone: each change of a submitted batch."""
-    return f"{_PREFIX}/{run}/event/batch"
-
-
-def view(run: str, worker: str) -> str:
-    """One worker to everyone: live frames, while somebody subscribes."""
-    return f"{_PREFIX}/{run}/view/{worker}"
 
 
 def all_workers(kind: str, run: str) -> str:
@@ -146,5 +108,4 @@ def all_workers(kind: str, run: str) -> str:
 
 def worker_from_key(key: str) -> str:
     """The worker's identity `<name>/<life>` in a key: its last two chunks."""
-    name, life = key.rsplit("/", 2)[-2:]
-    return f"{name}/{life}"
+    return "/".join(key.rsplit("/", 2)[-2:])

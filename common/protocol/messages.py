@@ -19,17 +19,7 @@ from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.measures import MeasureNames, Measures
 from dreamfleet.common.schema.display import DisplayedFields
-from dreamfleet.common.schema.validation import (
-    OPTIONAL,
-    Count,
-    Digest,
-    Finite,
-    Packed,
-    Seconds,
-    Text,
-    Word,
-    to_plain,
-)
+from dreamfleet.common.schema.validation import OPTIONAL, Count, Digest, Finite, Packed, Seconds, Text, Word, to_plain
 
 MAX_MESSAGE = 48 * 1024
 MAX_PART = 40 * 1024  # leaves room for the rest of the message
@@ -45,7 +35,6 @@ MAX_SLOTS = 4096  # of one worker
 TAG_BYTES = 8
 MIN_TEMPERATURE, MAX_TEMPERATURE = 1e-3, 1e3  # of a dream
 OWN_END_VERSION = 10  # added to the world's version by runs with an end rule of their own
-
 
 # The first bytes of a digest, unique among one worker's jobs
 Tag = Annotated[bytes, Meta(min_length=TAG_BYTES, max_length=TAG_BYTES)]
@@ -398,7 +387,3 @@ class ControlReply:
     accepted: bool
     why: Text
     again: Text = field(default="", metadata=OPTIONAL)  # the command that resumes the run, if the coordinator leaves
-
-
-MSGPACK_MESSAGES: tuple[type[Message], ...] = (JobBatch, ResultBatch, Heartbeat, BundlePart, UploadPart, ViewFrame)
-"""The messages in msgpack; the others are JSON."""

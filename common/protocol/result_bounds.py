@@ -16,6 +16,7 @@ LARGEST_FITNESS = 1e100
 LONGEST_EPISODE = 10**6  # steps of a whole episode; the horizon bounds scored ones
 MAX_SECONDS = 1e9
 MAX_COUNT = 2**63 - 1  # the largest integer in SQLite and in messages
+OUT_OF_BOUNDS, TOO_LONG, IMPOSSIBLE_TIME = "fitness out of bounds", "too many steps", "impossible time"  # causes
 
 
 def max_steps(horizon: int) -> int:
@@ -26,18 +27,14 @@ def max_steps(horizon: int) -> int:
 def rejection_reason(fitness: float, steps: int, seconds: float, horizon: int) -> Failure | None:
     """Why a result must be rejected; `None` if it is valid."""
     if not abs(fitness) <= LARGEST_FITNESS:  # false of NaN too
-        limits = f"within ±{LARGEST_FITNESS:g}"
-        return _rejection(
-            "fitness out of bounds", f"the episode gave {fitness:g}, which must lie {limits}: scale the reward"
-        )
-    if not 0 <= steps <= max_steps(horizon):
-        return _rejection("too many steps", f"the episode has {steps:.6g} steps, more than the allowed {horizon}")
-    if not 0 <= seconds <= MAX_SECONDS:
-        return _rejection("impossible time", f"the episode took {seconds:g} seconds")
-    return None
-
-
-def _rejection(cause: str, detail: str) -> Failure:
+        cause = OUT_OF_BOUNDS
+        detail = f"the episode gave {fitness:g}, which must lie within ±{LARGEST_FITNESS:g}: scale the reward"
+    elif not 0 <= steps <= max_steps(horizon):
+        cause, detail = TOO_LONG, f"the episode has {steps:.6g} steps, more than the allowed {horizon}"
+    elif not 0 <= seconds <= MAX_SECONDS:
+        cause, detail = IMPOSSIBLE_TIME, f"the episode took {seconds:g} seconds"
+    else:
+        return None
     return Failure(f"{cause}: {detail}", cause)
 
 

@@ -1,9 +1,20 @@
-"""Why a run ended: what ended it, as a program reads it, and the same in words."""
+"""What pauses or ends a run, as a program reads it, and an end in words."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+
+
+class PauseKind(StrEnum):
+    """What pauses a run."""
+
+    BY_HAND = "by_hand"
+    DRAINING = "draining"
+    DISBANDING = "disbanding"
+    FAILED_JOB = "failed_job"
+    FAILED_CANDIDATES = "failed_candidates"
+    NO_ABLE_HOST = "no_able_host"
 
 
 class StopKind(StrEnum):

@@ -122,8 +122,7 @@ def load_task(name: str) -> Any:
         if not remedy and not isinstance(error, (ImportError, AttributeError, TypeError, ValueError)):
             raise
         raise UsageError(f"task {name!r} cannot be loaded: {error}{remedy and f'; {remedy}'}") from error
-    if not colon and _ENVIRONMENT.search(name):
-        raise UsageError(f"unknown task {name!r}: gymnasium's environments are written {GYM}:{name}")
+    check_task(name)
     known = ", ".join(map(written_name, points)) or "none"
     raise UsageError(f"unknown task {name!r}: known are {known}")
 
@@ -139,21 +138,15 @@ def written_name(name: str) -> str:
 
 def _task_class(module: Any, name: str) -> Any:
     """A task's class in a module; `TypeError` for anything else, as the name may come from an untrusted file."""
-    if not hasattr(module, name) and _names_environment(name):
-        written = f"{GYM}:{module.__name__}:{name}"
+    gymnasium, written = sys.modules.get("gymnasium"), f"{GYM}:{module.__name__}:{name}"
+    if not hasattr(module, name) and (_ENVIRONMENT.search(name) or name in getattr(gymnasium, "registry", ())):
         raise AttributeError(f"{module.__name__} has no class {name}; write {written} if that is its environment")
     found = getattr(module, name)
     if not isinstance(found, type):
         raise TypeError(f"{name} of {module.__name__} is not a task: it is not a class")
-    if issubclass(found, getattr(sys.modules.get("gymnasium"), "Env", ())):
-        written = f"{GYM}:{module.__name__}:{name}"
+    if issubclass(found, getattr(gymnasium, "Env", ())):
         raise TypeError(f"{name} of {module.__name__} is an environment of gymnasium and no task: write {written}")
     return found
-
-
-def _names_environment(name: str) -> bool:
-    """Whether a name looks like one of gymnasium's environments, or a module that was imported registered it."""
-    return bool(_ENVIRONMENT.search(name)) or name in getattr(sys.modules.get("gymnasium"), "registry", ())
 
 
 def is_shipped(name: str) -> bool:

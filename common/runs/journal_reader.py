@@ -13,8 +13,7 @@ from typing import Any
 from dreamfleet.common.errors import DamagedJournalError, JournalError
 from dreamfleet.common.files.file_system import lock_problem
 from dreamfleet.common.files.regular_files import check_regular
-from dreamfleet.common.files.sqlite_verdicts import is_damage, is_locked
-from dreamfleet.common.files.thread_connections import ThreadConnections
+from dreamfleet.common.files.sqlite import ThreadConnections, is_damage, is_locked
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.runs import schema
 from dreamfleet.common.runs.seeds import CHOOSING_OFFSET

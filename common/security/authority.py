@@ -13,7 +13,7 @@ import ipaddress
 import re
 import secrets
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -32,7 +32,7 @@ from dreamfleet.common.protocol.keys import check_worker_name
 from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, CertificateLedger, IssuedJoinFile
 from dreamfleet.common.security.credentials import SEATS, Credentials, derive_password, format_join_file, hash_authority
 
-AUTHORITY_YEARS = 10  # validity of the authority's certificate
+AUTHORITY_DAYS = 3650  # validity of the authority's certificate
 DEFAULT_DAYS = {"coordinator": 90, "router": 90, "operator": 90, "viewer": 90, "worker": 30}  # validity of join files
 CLOCK_SKEW = timedelta(minutes=5)  # certificates are valid from so long before their issue
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")  # in the certificate of every listener
@@ -74,22 +74,16 @@ class Authority:
             raise UsageError(f"{folder} holds an authority already: name another --access-dir")
         key, now = generate_private_key(SECP256R1()), datetime.now(UTC)
         name = _x509_name(f"dreamfleet {secrets.token_hex(4)}")
-        certificate = (
-            _certificate_builder(name, name, key, now, now + timedelta(days=365 * AUTHORITY_YEARS))
-            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-            .add_extension(_key_usage(signs_certificates=True), critical=True)
-            .sign(key, hashes.SHA256())
-        )
-        pem = certificate.public_bytes(serialization.Encoding.PEM)
+        pem = _certify(name, name, key, key, x509.random_serial_number(), now, now + timedelta(days=AUTHORITY_DAYS))
         with reporting_write_errors(folder, "--access-dir"):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         with reporting_write_errors(folder, "--access-dir"), _locked(folder):
             if _authority_exists(folder):
                 raise UsageError(f"{folder} holds an authority already: name another --access-dir")
-            _write_private(folder / _CERTIFICATE, pem)
+            _write_private(folder / _CERTIFICATE, pem.encode())
             if passwords:
                 _write_private(folder / _SECRET, secrets.token_hex(32).encode())
-            CertificateLedger(hash_authority(pem.decode()), passwords).save(folder / LEDGER_FILE)
+            CertificateLedger(hash_authority(pem), passwords).save(folder / LEDGER_FILE)
             _write_private(folder / _KEY, _key_bytes(key))  # last: its presence marks a complete authority
         return cls(folder)
 
@@ -121,16 +115,11 @@ class Authority:
                 who = (replace(who, secret=self._secret) if who.can_listen
                        else replace(who, password=derive_password(self._secret, who.identity)))  # fmt: skip
             entry = IssuedJoinFile(role, seat, name, f"{serial:x}" if who.certificate else "", who.expires.timestamp())
-            replace(ledger, issued=(*ledger.issued, entry)).save(
-                self._folder / LEDGER_FILE
-            )  # before the file: what is out is known
+            # Before the file: what is out is known.
+            replace(ledger, issued=(*ledger.issued, entry)).save(self._folder / LEDGER_FILE)
             with reporting_write_errors(out):
                 _write_private(out, format_join_file(who).encode())
         return who
-
-    def issued(self) -> tuple[IssuedJoinFile, ...]:
-        """All issued join files, oldest first."""
-        return CertificateLedger.load(self._folder / LEDGER_FILE).issued
 
     def revoke(self, name: str, role: str | None = None) -> tuple[IssuedJoinFile, ...]:
         """Revoke the join files of a name, and so its seat; returns them.
@@ -150,21 +139,14 @@ class Authority:
     def _sign_certificate(
         self, who: Credentials, key: EllipticCurvePrivateKey, serial: int, hosts: Sequence[str], now: datetime
     ) -> str:
-        builder = _certificate_builder(
-            _x509_name(who.identity), self._certificate.subject, key, min(now, who.expires), who.expires, serial
-        )
-        purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
+        purposes, more = [ExtendedKeyUsageOID.CLIENT_AUTH], list[x509.ExtensionType]()
         if who.can_listen:
             purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
             names = [_alternative_name(each) for each in dict.fromkeys((*hosts, *LOCAL_HOSTS))]
-            builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
-        certificate = (
-            builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-            .add_extension(_key_usage(signs_certificates=False), critical=True)
-            .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
-            .sign(self._key, hashes.SHA256())
-        )
-        return certificate.public_bytes(serialization.Encoding.PEM).decode()
+            more.append(x509.SubjectAlternativeName(names))
+        more.append(x509.ExtendedKeyUsage(purposes))
+        name, authority = _x509_name(who.identity), self._certificate.subject
+        return _certify(name, authority, key, self._key, serial, min(now, who.expires), who.expires, more)
 
     @contextmanager
     def _locked_ledger(self) -> Iterator[CertificateLedger]:
@@ -202,26 +184,29 @@ def _assign_seat(ledger: CertificateLedger, role: str, name: str) -> int:
     return seat
 
 
-def _certificate_builder(
-    subject: x509.Name, issuer: x509.Name, key: EllipticCurvePrivateKey, start: datetime, end: datetime,
-    serial: int | None = None,
-) -> x509.CertificateBuilder:  # fmt: skip
-    return x509.CertificateBuilder(
-        issuer_name=issuer, subject_name=subject, public_key=key.public_key(),
-        serial_number=serial or x509.random_serial_number(), not_valid_before=start - CLOCK_SKEW, not_valid_after=end,
+def _certify(
+    subject: x509.Name, issuer: x509.Name, key: EllipticCurvePrivateKey, signer: EllipticCurvePrivateKey, serial: int,
+    start: datetime, end: datetime, more: Iterable[x509.ExtensionType] = (),
+) -> str:  # fmt: skip
+    """A certificate of `key` as PEM, signed by `signer`: an authority's if it is the same; `more` are not critical."""
+    is_authority = key is signer
+    usage = x509.KeyUsage(
+        digital_signature=True, content_commitment=False, key_encipherment=False, data_encipherment=False,
+        key_agreement=False, key_cert_sign=is_authority, crl_sign=is_authority, encipher_only=False,
+        decipher_only=False,
     )  # fmt: skip
+    builder = x509.CertificateBuilder(
+        issuer_name=issuer, subject_name=subject, public_key=key.public_key(), serial_number=serial,
+        not_valid_before=start - CLOCK_SKEW, not_valid_after=end,
+    )  # fmt: skip
+    limits = x509.BasicConstraints(ca=is_authority, path_length=0 if is_authority else None)
+    for each in (limits, usage, *more):
+        builder = builder.add_extension(each, critical=each in (limits, usage))
+    return builder.sign(signer, hashes.SHA256()).public_bytes(serialization.Encoding.PEM).decode()
 
 
 def _x509_name(common_name: str) -> x509.Name:
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
-
-
-def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
-    return x509.KeyUsage(
-        digital_signature=True, content_commitment=False, key_encipherment=False, data_encipherment=False,
-        key_agreement=False, key_cert_sign=signs_certificates, crl_sign=signs_certificates, encipher_only=False,
-        decipher_only=False,
-    )  # fmt: skip
 
 
 def _alternative_name(text: str) -> x509.GeneralName:

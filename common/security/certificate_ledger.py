@@ -101,7 +101,6 @@ class RevocationWatcher:
         self._next = float("-inf")
         self._seen: tuple[int, ...] | None = None  # of the ledger that was last loaded
         self._complaint = ""  # why the last attempt failed, logged once
-        self._is_gone = False
         self.revoked_seats = frozenset(kept)
         if credentials is None:
             return
@@ -129,7 +128,7 @@ class RevocationWatcher:
         if own is None:
             return
         is_revoked = own.identity in self.revoked_seats
-        if is_revoked or own.time_left(datetime.now(UTC)) <= timedelta():
+        if is_revoked or own.time_left <= timedelta():
             raise AccessError(
                 f"the join file of {own.identity} ({own.name}) {'is revoked' if is_revoked else 'has expired'}: have "
                 f"another issued with `{issue_command(own.role, own.name)}`"
@@ -152,12 +151,10 @@ class RevocationWatcher:
         self._next = now + CHECK_INTERVAL
         try:
             found = self._path.stat()
-        except OSError:
-            if self._seen is not None and not self._is_gone:
-                self._is_gone = True
-                log.warning("%s is gone: what is revoked from now on is not seen; put it back", self._path)
-            return
-        self._is_gone = False
+        except OSError as error:
+            if self._seen is None:  # there was none
+                return
+            raise AccessError(f"{self._path} is gone: what is revoked from now on is not seen; put it back") from error
         seen = found.st_ino, found.st_mtime_ns, found.st_ctime_ns, found.st_size
         if seen == self._seen:
             return

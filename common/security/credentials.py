@@ -13,14 +13,17 @@ import json
 import os
 import stat
 import tomllib
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from msgspec import Meta
 
 from dreamfleet.common.errors import AccessError
 from dreamfleet.common.files.regular_files import open_regular
 from dreamfleet.common.protocol.keys import check_worker_name
+from dreamfleet.common.schema.validation import OPTIONAL, MalformedError, from_plain
 
 VERSION = 1
 # Number of seats of each role. A router knows all seats when it starts, also those issued later.
@@ -42,13 +45,13 @@ class Credentials:
     role: str
     seat: int
     name: str  # as issued
-    expires: datetime
+    expires: Annotated[datetime, Meta(tz=True)]
     ca: str = field(repr=False)
-    connect: tuple[str, ...] = ()
-    certificate: str = field(default="", repr=False)
-    key: str = field(default="", repr=False)
-    password: str = field(default="", repr=False)
-    secret: str = field(default="", repr=False)
+    connect: tuple[str, ...] = field(default=(), metadata=OPTIONAL)
+    certificate: str = field(default="", repr=False, metadata=OPTIONAL)
+    key: str = field(default="", repr=False, metadata=OPTIONAL)
+    password: str = field(default="", repr=False, metadata=OPTIONAL)
+    secret: Annotated[str, Meta(pattern="^([0-9a-f]{2})*$")] = field(default="", repr=False, metadata=OPTIONAL)
 
     @property
     def identity(self) -> str:
@@ -70,9 +73,10 @@ class Credentials:
         """Whether the fleet uses passwords rather than certificates."""
         return bool(self.password or self.secret)
 
-    def time_left(self, now: datetime) -> timedelta:
-        """The time until it expires."""
-        return self.expires - now
+    @property
+    def time_left(self) -> timedelta:
+        """The time until it expires, by this host's clock."""
+        return self.expires - datetime.now(UTC)
 
 
 def issue_command(role: str, name: str) -> str:
@@ -115,8 +119,8 @@ def describe_time_left(left: timedelta) -> str:
     return f"{hours // 24} days left" if hours >= 48 else f"{hours} hours left"
 
 
-def read_join_file(path: Path, now: datetime | None = None) -> Credentials:
-    """Read a join file; `AccessError` if it is invalid, readable by others, or expired at `now`."""
+def read_join_file(path: Path) -> Credentials:
+    """Read a join file; `AccessError` if it is invalid, readable by others, or expired."""
     try:
         with open_regular(path, MAX_BYTES) as file:
             found = os.fstat(file.fileno())
@@ -129,10 +133,10 @@ def read_join_file(path: Path, now: datetime | None = None) -> Credentials:
         raise AccessError(f"{path} is not a join file: it is not TOML; have another issued") from error
     _check_private(path, found)
     credentials = _parse_credentials(path, document)
-    if credentials.time_left(now or datetime.now(UTC)) <= timedelta():
+    if credentials.time_left <= timedelta():
         raise AccessError(
             f"{path} expired on {credentials.expires:%Y-%m-%d}, and this host's clock says "
-            f"{now or datetime.now(UTC):%Y-%m-%d %H:%M} UTC: set the clock if that is wrong, else have "
+            f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC: set the clock if that is wrong, else have "
             f"{credentials.role} {credentials.name} issued again"
         )
     return credentials
@@ -146,31 +150,17 @@ def _check_private(path: Path, found: os.stat_result) -> None:
 
 
 def _parse_credentials(path: Path, document: dict[str, Any]) -> Credentials:
-    version = document.pop("version", None)
-    if version != VERSION:
+    if document.pop("version", None) != VERSION:
         raise AccessError(f"{path} is not a join file of this version: have another issued")
-    kinds: dict[str, tuple[type, Any]] = {each.name: (str, each.default) for each in fields(Credentials)}
-    kinds |= {"seat": (int, MISSING), "expires": (datetime, MISSING), "connect": (list, [])}
-    for name, (kind, default) in kinds.items():
-        if name not in document and default is MISSING:
-            raise AccessError(f"{path} is not a join file: {name!r} is missing")
-        if type(document.get(name, default)) is not kind:
-            raise AccessError(f"{path} is not a join file: {name!r} has the wrong type")
-    if unknown := sorted(set(document) - set(kinds)):
-        raise AccessError(f"{path} is not a join file: {unknown[0]!r} is unknown")
-    values = {**document, "connect": tuple(document.get("connect", ()))}
-    if values["role"] not in SEATS or not 1 <= values["seat"] <= SEATS[values["role"]] or not values["expires"].tzinfo:
-        raise AccessError(f"{path} is not a join file: its role, seat or end is invalid")
-    if not all(isinstance(each, str) for each in values["connect"]):
-        raise AccessError(f"{path} is not a join file: 'connect' has the wrong type")
-    credentials = Credentials(**values)
+    try:
+        credentials = from_plain(Credentials, document)
+    except MalformedError as error:
+        raise AccessError(f"{path} is not a join file: {error}") from error
+    if not 1 <= credentials.seat <= SEATS.get(credentials.role, 0):
+        raise AccessError(f"{path} is not a join file: its role or seat is invalid")
     has_certificate = bool(credentials.certificate and credentials.key)
     if not (has_certificate or credentials.password) or (credentials.can_listen and not has_certificate):
         raise AccessError(f"{path} is not a join file: its certificate, key or password is missing")
-    try:
-        bytes.fromhex(credentials.secret)
-    except ValueError:
-        raise AccessError(f"{path} is not a join file: 'secret' is not hexadecimal") from None
     return credentials
 
 

@@ -1,4 +1,9 @@
-"""Diagnosis of failed connections: Zenoh reports only that it could not connect."""
+"""TLS handshakes: whether a join file agrees with the certificate in it, and why a connection failed.
+
+Only the certificate says who a join file's holder is. Python's `ssl` reads one only as part of a handshake, so both of
+its ends are played in memory: this needs neither a network nor the extra `access`. Of a failed connection Zenoh reports
+only that it could not connect.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +11,84 @@ import socket
 import ssl
 from collections.abc import Iterable
 from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
-from dreamfleet.common.security.certificate_check import (
-    EXPIRED,
-    NOT_YET_VALID,
-    describe_clock_error,
-    load_own_certificate,
-)
+from dreamfleet.common.errors import AccessError
 from dreamfleet.common.security.credentials import Credentials
 
+NOT_YET_VALID, EXPIRED = 9, 10  # OpenSSL's codes: X509_V_ERR_CERT_NOT_YET_VALID, X509_V_ERR_CERT_HAS_EXPIRED
 PATIENCE = 2.0  # seconds
 CLOCK_ALERT = "SSLV3_ALERT_CERTIFICATE_EXPIRED"  # also of a certificate that is not yet valid (RFC 8446, 6.2)
+
+
+def check_certificate(credentials: Credentials) -> None:
+    """`AccessError` if the certificate is not of this seat, end and authority, or not valid by this host's clock.
+
+    Without a certificate, as with a password, there is nothing to compare.
+    """
+    if not credentials.certificate:
+        return
+    whose = f"the join file of {credentials.identity} ({credentials.name})"
+    try:
+        found = _read_certificate(credentials)
+    except ssl.SSLCertVerificationError as error:
+        damage = " is damaged: its certificate is not of its authority; have another issued"
+        why = f": {clock}" if (clock := describe_clock_error(error)) else damage
+        raise AccessError(f"{whose}{why}") from error
+    except (ssl.SSLError, ValueError, TypeError) as error:
+        raise AccessError(f"{whose} is damaged: its certificate or key is invalid; have another issued") from error
+    except OSError as error:
+        raise AccessError(f"{whose} cannot be checked in a temporary file: {error.strerror}") from error
+    name = dict(pair for part in found["subject"] for pair in part).get("commonName")
+    end = datetime.fromtimestamp(ssl.cert_time_to_seconds(found["notAfter"]), UTC)
+    if (name, end) != (credentials.identity, credentials.expires):
+        raise AccessError(
+            f"{whose} was edited: its certificate is of {name} until {end:%Y-%m-%d %H:%M} UTC; have another issued"
+        )
+
+
+def describe_clock_error(error: ssl.SSLCertVerificationError) -> str:
+    """Why a certificate is not yet valid, or no longer, with this host's clock; empty for other errors."""
+    now = f"this host's clock says {datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
+    if error.verify_code == NOT_YET_VALID:
+        return f"its certificate is not yet valid, and {now}: set the clock"
+    if error.verify_code == EXPIRED:
+        return f"its certificate has expired, and {now}: set the clock if that is wrong, else have it issued again"
+    return ""
+
+
+def load_own_certificate(context: ssl.SSLContext, credentials: Credentials) -> None:
+    """Have a TLS context show the certificate of a join file, if it has one; `OSError` or `ValueError`."""
+    if not credentials.certificate:
+        return
+    with TemporaryDirectory(prefix="dreamfleet-") as folder:  # mode 700; `ssl` reads files only
+        certificate, key = Path(folder) / "certificate", Path(folder) / "key"
+        certificate.write_text(credentials.certificate)
+        key.write_text(credentials.key)
+        context.load_cert_chain(certificate, key, "")
+
+
+def _read_certificate(credentials: Credentials) -> dict[str, Any]:
+    """The certificate's fields, verified against the authority's and this host's clock; `OSError` or `ValueError`."""
+    listening, calling = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    listening.verify_mode = ssl.CERT_REQUIRED
+    listening.load_verify_locations(cadata=credentials.ca)
+    calling.check_hostname, calling.verify_mode = False, ssl.CERT_NONE
+    for context in (listening, calling):
+        load_own_certificate(context, credentials)
+    there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
+    client, server = calling.wrap_bio(back, there), listening.wrap_bio(there, back, server_side=True)
+    open_ends = [client, server]
+    while open_ends:
+        for each in tuple(open_ends):
+            try:
+                each.do_handshake()
+                open_ends.remove(each)
+            except ssl.SSLWantReadError:
+                continue
+    return server.getpeercert() or {}
 
 
 def diagnose_connection(endpoints: Iterable[str], credentials: Credentials | None) -> str | None:
@@ -60,9 +132,7 @@ def _diagnose_tls(link: socket.socket, host: str, credentials: Credentials) -> s
         with context.wrap_socket(link, server_hostname=host.strip("[]")) as secured:
             return _read_refusal(secured)
     except ssl.SSLCertVerificationError as error:
-        if error.verify_code in (NOT_YET_VALID, EXPIRED):
-            return describe_clock_error(error)
-        return (
+        return describe_clock_error(error) or (
             f"its certificate is not valid here ({error.verify_message.rstrip('.')}): it is another fleet's, or was "
             "issued without --host for this name; have the coordinator's join file issued again"
         )

@@ -36,7 +36,8 @@ class Network:
         for endpoint in (*self.listen, *self.connect):
             check_endpoint(endpoint)
             if self.credentials is not None and not endpoint.startswith(SECURED_PREFIX):
-                raise UsageError(f"{endpoint} is not encrypted: with a join file it is {_to_secured(endpoint)}")
+                secured = SECURED_PREFIX + endpoint.partition("/")[2]
+                raise UsageError(f"{endpoint} is not encrypted: with a join file it is {secured}")
             if self.credentials is None and endpoint.startswith(SECURED_PREFIX):
                 raise UsageError(f"{endpoint} is encrypted: give --join FILE, which `dreamfleet access issue` makes")
         for endpoint in self.connect:
@@ -52,13 +53,15 @@ class Network:
                 )
 
 
-def _to_secured(endpoint: str) -> str:
-    return SECURED_PREFIX + endpoint.partition("/")[2]
+def split_endpoint(endpoint: str) -> tuple[str, int]:
+    """The host, without brackets, and the port of a well-formed endpoint."""
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    return host.strip("[]"), int(port)
 
 
 def is_loopback(endpoint: str) -> bool:
     """Whether only this host can reach an endpoint."""
-    return is_loopback_host(endpoint.partition("/")[2].rpartition(":")[0].strip("[]"))
+    return is_loopback_host(split_endpoint(endpoint)[0])
 
 
 def wait_for_listener(endpoints: Sequence[str], seconds: float, stopped: Callable[[], bool]) -> bool:
@@ -69,17 +72,12 @@ def wait_for_listener(endpoints: Sequence[str], seconds: float, stopped: Callabl
     """
     if not all(is_loopback(each) and each.startswith(("tcp/", SECURED_PREFIX)) for each in endpoints):
         return True
-    places, until = [_place(each) for each in endpoints], monotonic() + seconds
+    places, until = [split_endpoint(each) for each in endpoints], monotonic() + seconds
     while not any(map(_is_open, places)):
         if stopped() or monotonic() > until:
             return False
         sleep(LOOK_INTERVAL)
     return True
-
-
-def _place(endpoint: str) -> tuple[str, int]:
-    host, _, port = endpoint.partition("/")[2].rpartition(":")
-    return host.strip("[]"), int(port)
 
 
 def _is_open(place: tuple[str, int]) -> bool:

@@ -29,20 +29,14 @@ def query_every_responder(
         yield str(reply.replier_id and reply.replier_id.zid), reply.ok.payload.to_bytes()
 
 
-def query_all(
-    session: zenoh.Session, selectors: Iterable[str], timeout: float, payload: bytes | None = None,
-    stopped: Callable[[], bool] = lambda: False,
-) -> list[bytes]:  # fmt: skip
-    """The payloads of the good replies within `timeout` seconds, or until `stopped`: one for each key, unordered.
-
-    All queries run concurrently. Their `payload` is JSON.
-    """
-    return [reply.ok.payload.to_bytes() for reply in _replies(session, selectors, timeout, payload, stopped)]
+def query_all(session: zenoh.Session, selectors: Iterable[str], timeout: float) -> list[bytes]:
+    """The payloads of the good replies to concurrent queries within `timeout` seconds: one for each key, unordered."""
+    return [reply.ok.payload.to_bytes() for reply in _replies(session, selectors, timeout)]
 
 
 def _replies(
-    session: zenoh.Session, selectors: Iterable[str], timeout: float, payload: bytes | None,
-    stopped: Callable[[], bool], **options: Any,
+    session: zenoh.Session, selectors: Iterable[str], timeout: float, payload: bytes | None = None,
+    stopped: Callable[[], bool] = lambda: False, **options: Any,
 ) -> Iterator[Any]:  # fmt: skip
     """Yield good replies as they arrive."""
     replies: queue.SimpleQueue[Any] = queue.SimpleQueue()

@@ -55,13 +55,10 @@ def open_session(network: Network, *, timeout: float | None = CONNECT_TIMEOUT) -
     """
     check_room_for_session()
     check_clock(time())
-    with _password_file(network) as dictionary:
-        if network.listen or len(network.connect) < 2:
-            session = _open_or_explain(network, lambda: _open_zenoh(zenoh_config(network, timeout, dictionary)))
-        else:
-            session = _open_or_explain(
-                network, lambda: _open_zenoh(zenoh_config(_reachable_first(network, timeout or 0.0), CONNECT_TIMEOUT))
-            )
+    with _password_file(network) as dictionary, _errors_explained(network):
+        if not network.listen and len(network.connect) > 1:
+            network, timeout = _reachable_first(network, timeout or 0.0), CONNECT_TIMEOUT
+        session = _open_zenoh(zenoh_config(network, timeout, dictionary))
     if network.listen and network.credentials is not None:
         limit_connections(session, {int(each.rpartition(":")[2]) for each in network.listen})
     return session
@@ -82,9 +79,7 @@ def _reachable_first(network: Network, timeout: float) -> Network:
         for each in network.connect:
             try:
                 settings = zenoh_config(replace(network, connect=(each,)), CONNECT_TIMEOUT)
-                settings["connect"]["retry"]["period_init_ms"] = (
-                    0  # a single attempt; a session that stays must not have this setting
-                )
+                settings["connect"]["retry"]["period_init_ms"] = 0  # a single attempt; no session that stays has this
                 _open_zenoh(settings).close()  # type: ignore[no-untyped-call]
             except zenoh.ZError:
                 if monotonic() >= deadline and each == network.connect[-1]:
@@ -99,9 +94,10 @@ def _open_zenoh(settings: dict[str, Any]) -> zenoh.Session:
     return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
 
 
-def _open_or_explain(network: Network, begin: Callable[[], zenoh.Session]) -> zenoh.Session:
+@contextmanager
+def _errors_explained(network: Network) -> Iterator[None]:
     try:
-        return begin()
+        yield
     except zenoh.ZError as error:
         if "os error 24" in str(error):
             raise DreamfleetError(_NO_ROOM.format(_first_line(error))) from error
@@ -120,6 +116,7 @@ def zenoh_config(network: Network, timeout: float | None, dictionary: str | None
     router, credentials = bool(network.listen), network.credentials
     room = connection_budget()  # else strangers' connections could use up the descriptors for files
     bounds = {"max_sessions": min(MAX_SESSIONS, room * 3 // 4), "accept_pending": min(MAX_SESSIONS, room // 4)}
+    handshake = "" if credentials is None else f"#tls_handshake_timeout_ms={int(1000 * CONNECT_TIMEOUT)}"
     transport: dict[str, Any] = {
         "unicast": bounds if router else {},
         "shared_memory": {"enabled": False},
@@ -145,13 +142,18 @@ def zenoh_config(network: Network, timeout: float | None, dictionary: str | None
     if credentials is not None:
         transport["link"] |= {"protocols": ["tls"], "tls": _tls(credentials)}
         if credentials.uses_passwords:
-            transport["auth"] = {"usrpwd": _password_config(credentials, dictionary)}
+            own = credentials.password or derive_password(credentials.secret, credentials.identity)
+            others = {"dictionary_file": dictionary} if dictionary else {}
+            transport["auth"] = {"usrpwd": {"user": credentials.identity, "password": own, **others}}
         if router:
             guards["access_control"] = access_control_config(credentials.uses_passwords, network.revoked_seats)
     retry = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
     return {
         "mode": "router" if router else "client",
-        "listen": {"endpoints": _listen_endpoints(network), "exit_on_failure": True},
+        "listen": {
+            "endpoints": [with_interface_index(each) + handshake for each in network.listen],
+            "exit_on_failure": True,
+        },
         "connect": {
             "endpoints": [with_interface_index(each) for each in network.connect],
             "timeout_ms": -1 if timeout is None else int(timeout * 1000),
@@ -162,12 +164,6 @@ def zenoh_config(network: Network, timeout: float | None, dictionary: str | None
         "transport": transport,
         **guards,
     }
-
-
-def _listen_endpoints(network: Network) -> list[str]:
-    """A router's endpoints; a secured one closes connections whose handshake takes too long."""
-    patience = "" if network.credentials is None else f"#tls_handshake_timeout_ms={int(1000 * CONNECT_TIMEOUT)}"
-    return [with_interface_index(each) + patience for each in network.listen]
 
 
 def _tls(credentials: Credentials) -> dict[str, Any]:
@@ -183,11 +179,6 @@ def _tls(credentials: Credentials) -> dict[str, Any]:
 
 def _base64(text: str) -> str:
     return base64.b64encode(text.encode()).decode()
-
-
-def _password_config(credentials: Credentials, dictionary: str | None) -> dict[str, str]:
-    own = credentials.password or derive_password(credentials.secret, credentials.identity)
-    return {"user": credentials.identity, "password": own, **({"dictionary_file": dictionary} if dictionary else {})}
 
 
 @contextmanager

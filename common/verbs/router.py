@@ -13,8 +13,8 @@ from dreamfleet.common.cli.config import add_flags, load, option
 from dreamfleet.common.cli.global_config import GlobalConfig, add_global_flags, load_credentials
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.files.atomic_write import open_new
-from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking
 from dreamfleet.common.host.resource_limits import raise_open_file_limit
+from dreamfleet.common.host.standard_streams import make_stderr_nonblocking
 from dreamfleet.common.host.stop_signals import SIGNALS
 from dreamfleet.common.transport.network import DEFAULT_ENDPOINT, SECURED_ENDPOINT, Network
 

@@ -19,9 +19,8 @@ from dreamfleet.common.errors import NotWritableNowError
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.messages import Job, Result
-from dreamfleet.common.protocol.pause_kind import PauseKind
 from dreamfleet.common.protocol.result_bounds import MAX_SECONDS
-from dreamfleet.common.protocol.stop_kind import StopKind, StopReason
+from dreamfleet.common.protocol.stop_kind import PauseKind, StopKind, StopReason
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_folder import ENDING, EPISODE_LIMIT, STOP_KIND
 from dreamfleet.common.runs.scoring_params import ScheduleState

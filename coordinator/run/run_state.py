@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 from typing import NoReturn
 
 from dreamfleet.common.errors import InternalError
-from dreamfleet.common.protocol.pause_kind import PauseKind
-from dreamfleet.common.protocol.stop_kind import StopReason
+from dreamfleet.common.protocol.stop_kind import PauseKind, StopReason
 
 
 @dataclass(frozen=True)

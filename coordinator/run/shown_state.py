@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from dreamfleet.common.protocol.pause_kind import PauseKind
+from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.run.run_state import Ended
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.messages import ControlReply
-from dreamfleet.common.protocol.pause_kind import PauseKind
+from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.common.schema.validation import MAX_TEXT
 from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.packing import BatchContent, OutgoingBatch

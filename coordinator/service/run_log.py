@@ -8,7 +8,6 @@ import shlex
 import socket
 from collections.abc import Iterable
 from dataclasses import asdict
-from datetime import UTC, datetime
 from itertools import islice
 from time import monotonic, time
 from typing import Any
@@ -57,9 +56,9 @@ class RunLog:
         if run.settings.confirm_episodes and not is_function_task(run.settings.task.task):
             log.info("once its last generation is closed, %s or more confirm the best mean (--confirm-episodes)",
                      plural(run.settings.confirm_episodes, "whole episode"))  # fmt: skip
+        report(ADDRESS, listen or self._network.connect)
         if listen:
             log.info("listening on %s", ", ".join(listen))
-            report(ADDRESS, listen)
             if self._network.credentials is None and not all(is_loopback(each) for each in listen):
                 log.warning("this is neither encrypted nor authenticated: anyone who reaches the port controls the run "
                             "(docs/how-to/security.md)", extra={"facts": {"event": "insecure"}})  # fmt: skip
@@ -129,7 +128,7 @@ class RunLog:
 
 def _warn_of_expiry(credentials: Credentials) -> None:
     """Warn in the join file's last week: links break when a certificate expires."""
-    if (left := credentials.time_left(datetime.now(UTC))) < EXPIRY_WARNING:
+    if (left := credentials.time_left) < EXPIRY_WARNING:
         facts = {"event": "expiry", "seconds": left.total_seconds()}
         log.warning("this coordinator's join file: %s; issue another and start it again with that",
                     describe_time_left(left), extra={"facts": facts})  # fmt: skip

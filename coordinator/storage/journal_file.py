@@ -9,7 +9,7 @@ from pathlib import Path
 
 from dreamfleet.common.errors import DamagedJournalError, DreamfleetError, JournalError, NotWritableNowError
 from dreamfleet.common.files.file_system import lock_problem
-from dreamfleet.common.files.sqlite_verdicts import is_damage
+from dreamfleet.common.files.sqlite import is_damage
 from dreamfleet.common.printable import one_line
 
 REMEDIES = {

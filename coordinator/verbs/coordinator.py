@@ -17,8 +17,8 @@ from dreamfleet.common.cli.global_config import load_credentials
 from dreamfleet.common.cli.output import print_answer
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.logs import label_logs
-from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking
 from dreamfleet.common.host.resource_limits import check_room_for_session, raise_open_file_limit
+from dreamfleet.common.host.standard_streams import make_stderr_nonblocking
 from dreamfleet.common.host.trusted_modules import trust
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.tasks import module_of

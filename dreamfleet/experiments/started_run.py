@@ -27,7 +27,7 @@ from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.trusted_modules import check_trusted
 from dreamfleet.common.host.user_code import own_arguments
 from dreamfleet.common.protocol.keys import check_run_name
-from dreamfleet.common.protocol.pause_kind import PauseKind
+from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.common.protocol.tasks import module_of
 from dreamfleet.common.runs.own_runs import trust_own_run
 from dreamfleet.common.runs.records import StoredGeneration

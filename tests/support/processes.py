@@ -3,16 +3,19 @@
 import fcntl
 import io
 import os
+import queue
 import socket
 import subprocess
 import threading
+import time
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import ConnectionFailedError
-from dreamfleet.common.host.processes import VerbProcess, command
+from dreamfleet.common.host.processes import POLL_INTERVAL, VerbProcess, command
+from dreamfleet.common.host.reports import ADDRESS
 
 ROOT = Path(__file__).parents[2]
 DEADLINE = 300  # seconds to wait for an event: many times the usual, since a machine may be busy
@@ -51,6 +54,7 @@ class Process(VerbProcess):
     def __init__(self, arguments, cache, inside=(), root=ROOT):
         self._reading = threading.Event()
         self._reading.set()
+        self._new_lines = queue.SimpleQueue()
         super().__init__(*arguments, environment=environment(cache, root), inside=inside)
 
     def freeze(self, size=4096):
@@ -65,13 +69,25 @@ class Process(VerbProcess):
     def _add_line(self, line):
         self._reading.wait()
         super()._add_line(line)
+        self._new_lines.put(line)
 
     def wait_for(self, text, times=1, timeout=DEADLINE):
-        return super().wait_for(text, times, timeout)
+        """Block until stderr contained `text` in `times` new lines since the last wait; the last of them."""
+        deadline, line = time.monotonic() + timeout, ""
+        while times:
+            is_over = not self._readers[-1].is_alive()
+            try:
+                line = self._new_lines.get(timeout=POLL_INTERVAL)
+            except queue.Empty:
+                assert not is_over, f"ended before printing {text!r}:\n{''.join(self.lines)}"
+                assert time.monotonic() < deadline, f"{text!r} was not printed within {timeout} s; {self.last_line()}"
+            else:
+                times -= text in line
+        return line
 
     def wait_until_serving(self):
-        """Block until it serves: its address is reported a moment before it answers there."""
-        return self.wait_for("incarnation")
+        """Block until it answers at the address that it reports."""
+        return self.wait_for_report(ADDRESS, DEADLINE)
 
     def finish(self, timeout=DEADLINE):
         return super().finish(timeout)

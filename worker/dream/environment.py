@@ -17,7 +17,7 @@ from dreamfleet.common.artifacts.actions import Continuous
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.worker.dream.noise import EpisodeNoise, stack_draws
 from dreamfleet.worker.dream.world import DreamWorld
-from dreamfleet.worker.worldmodel.inference import Controllers, Decoder, DreamStep
+from dreamfleet.worker.worldmodel.inference import Decoder
 from dreamfleet.worker.worldmodel.observation import Observation, open_bundle
 
 Floats = NDArray[np.float32]
@@ -188,30 +188,3 @@ class VectorDream(gymnasium.vector.VectorEnv[Floats, Any, Any]):
         self._latent[index], self._memory[index] = self._noise[index].begin(self._world.start_states)
         self._state[index] = self._world.begin(1, self._memory[index])
         self._steps[index] = 0
-
-
-class DreamPolicy:
-    """A controller in a dream environment: it observes latents, and its memory advances as the dream's does."""
-
-    def __init__(self, bundle: Bundle) -> None:
-        self._controllers, self._step = Controllers(bundle), DreamStep(bundle)
-        self._state = self._step.zero_state(1)
-        self._parameters = np.zeros((1, self._step.shape.size), dtype=np.float32)
-
-    def begin(self, parameters: Floats) -> None:
-        """Start an episode with a controller's flat parameter vector `(size,)`."""
-        self._step.shape.check(parameters)
-        self._parameters = parameters.astype(np.float32).reshape(1, -1)
-        self._state = self._step.zero_state(1)
-
-    def set_memory(self, memory: Floats) -> None:
-        """Start with the model's memory `(memory,)`; an environment's `reset` returns it in `info`."""
-        self._state[:, : self._step.memory_size] = memory
-
-    def act(self, observation: Floats) -> Floats:
-        """The action `(actions,)` for a latent `(latent,)`."""
-        latent = observation[None]
-        action = self._controllers.act(self._parameters, latent, self._state)
-        self._state = self._step.advance(latent, action, self._state)
-        chosen: Floats = action[0]
-        return chosen

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.worker.dream.ends import DreamEnds
 from dreamfleet.worker.dream.noise import EpisodeNoise
-from dreamfleet.worker.dream.world import check_temperature
+from dreamfleet.worker.dream.world import DreamEnds, check_temperature
 from dreamfleet.worker.worldmodel.inference import DreamStep
 
 Floats = NDArray[np.float32]

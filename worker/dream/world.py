@@ -1,24 +1,51 @@
-"""A bundle's dream: its start, its steps, and their rewards."""
+"""A bundle's dream: its start, its steps, their rewards, and its end."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.artifacts.world_facts import RewardFacts
+from dreamfleet.common.artifacts.world_facts import DRAWN, EndRule, RewardFacts
 from dreamfleet.common.errors import BundleError, UsageError
-from dreamfleet.worker.dream.ends import DreamEnds
-from dreamfleet.worker.dream.noise import Draw
+from dreamfleet.worker.dream.noise import Bars, Draw
 from dreamfleet.worker.dream.start_states import StartStates
 from dreamfleet.worker.tasks.api import Assignment, World
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.worldmodel.inference import DreamOutput, DreamStep
 
 Floats = NDArray[np.float32]
+
+
+class DreamEnds:
+    """The ends of all dreams of a bundle at one temperature.
+
+    >>> from dreamfleet import find_bundle
+    >>> DreamEnds(find_bundle("tiny"), temperature=1.0, text="drawn").rule
+    EndRule(kind='drawn', at=0.5, odds_weight=1.0)
+    """
+
+    def __init__(self, bundle: Bundle, temperature: float, text: str = "") -> None:
+        """`text` is a rule in place of the bundle's, as in `EndRule.parse`; empty: the bundle's own."""
+        self.rule = bundle.manifest.facts.end
+        if text:
+            self.rule = replace(EndRule.parse(text), odds_weight=self.rule.odds_weight)
+        self.bars: Bars | None = None  # for the dreams' noise; thresholds need none
+        if self.rule.kind == DRAWN:
+            self.bars = partial(self.rule.bars, temperature=temperature)
+
+    def are_reached(self, predicted: Floats, bar: Floats | None) -> NDArray[np.bool_]:
+        """Whether each dream ends `(N,)`, by predicted probabilities `(N,)` and the bars `(N, 1)` of the step's draw.
+
+        Without bars, which every `EpisodeNoise` with drawn ends has, the threshold decides.
+        """
+        reached: NDArray[np.bool_] = predicted > (np.float32(self.rule.at) if bar is None else bar[:, 0])
+        return reached
 
 
 class DreamtStep(NamedTuple):

@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking, make_stdout_nonblocking
+from dreamfleet.common.host.standard_streams import make_stderr_nonblocking, make_stdout_nonblocking
 from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.host.user_code import keep_user_arguments
 

@@ -12,7 +12,7 @@ from time import monotonic
 from typing import Any
 
 from dreamfleet.common.errors import BundleError, DreamfleetError
-from dreamfleet.common.host.stall_watch import START_LIMIT, StallWatch, describe_slow_start, describe_stall
+from dreamfleet.common.host.stall_watch import START_LIMIT, StallWatch, describe_stall
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.messages import Job, Result
@@ -181,12 +181,9 @@ class Slot:
                 self.start()
             return
         quiet = self._watch.quiet_seconds(self.steps, now, gap)
-        if not self.ready:
-            limit = START_LIMIT * 2**self._failed_starts
-            self._kill_after(limit, quiet, describe_slow_start(limit))
-        elif self._groups:
-            limit = self._groups[0].stall
-            self._kill_after(limit, quiet, describe_stall(limit))
+        if self._groups or not self.ready:
+            limit = self._groups[0].stall if self.ready else START_LIMIT * 2**self._failed_starts
+            self._kill_after(limit, quiet, describe_stall(limit, is_ready=self.ready))
         self._check_exit(now)
 
     def abandon(self, digest: bytes) -> None:

@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from datetime import UTC, datetime
 from threading import Thread
 from time import monotonic
 
@@ -138,7 +137,7 @@ class Worker:
         credentials = self._network.credentials
         if credentials is None:
             return math.inf
-        return credentials.time_left(datetime.now(UTC)).total_seconds() - self._config.drain_timeout
+        return credentials.time_left.total_seconds() - self._config.drain_timeout
 
     def _new_membership(self) -> Membership:
         return Membership(self._conditions, self._started_at, self._stops)

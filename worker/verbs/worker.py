@@ -7,9 +7,9 @@ import argparse
 from dreamfleet.common.cli.config import add_flags, load
 from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
 from dreamfleet.common.host.logs import label_logs
-from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking
 from dreamfleet.common.host.reports import BEGUN, report
 from dreamfleet.common.host.resource_limits import check_room_for_session, raise_open_file_limit
+from dreamfleet.common.host.standard_streams import make_stderr_nonblocking
 from dreamfleet.common.host.stop_signals import END_LIMIT, call_on_signals, end_within
 from dreamfleet.worker.service.config import WorkerConfig
 

@@ -73,7 +73,7 @@ class _Chooser:
         if choices:
             size = self._actions.actions
             self._last, self._before, self._held = graph.split(choices, size, size, 1)
-            self._is_due = graph.node("Equal", self._held, graph.constant(np.array(0, np.float32)))
+            self._is_due = graph.node("Equal", self._held, graph.numbers(0))
 
     def choose(self, parameters: Floats, latent: str, hidden: str) -> str:
         """The action `(N, actions)`: a new one where it is due, else the held one."""
@@ -87,28 +87,28 @@ class _Chooser:
         for each in inner:
             value = graph.node("Tanh", self._affine(value, *each))
         action = self._to_action(self._affine(value, weights, biases))
-        return str(graph.node("Where", self._is_due, action, self._last)) if self._is_due else action
+        return graph.node("Where", self._is_due, action, self._last) if self._is_due else action
 
     def next_choices(self, action: str) -> str:
         """The state's columns after a step with this action; "" if there are none."""
         if not self._is_due:
             return ""
-        graph, one, every = self._graph, np.array(1, np.float32), np.array(self._driving.decide_every, np.float32)
+        graph, every = self._graph, self._driving.decide_every
         before = graph.node("Where", self._is_due, self._last, self._before)
-        held = graph.node("Mod", graph.node("Add", self._held, graph.constant(one)), graph.constant(every), fmod=1)
+        held = graph.node("Mod", graph.node("Add", self._held, graph.numbers(1)), graph.numbers(every), fmod=1)
         return graph.join(action, before, held)
 
     def _affine(self, value: str, weights: Floats, biases: Floats) -> str:
         """As the bundle's graphs compute it, so that the bits are theirs: each row by a matrix product of its own."""
         graph = self._graph
         product = graph.node("MatMul", graph.constant(weights[None]), graph.node("Unsqueeze", value, graph.shape(2)))
-        return str(graph.node("Add", graph.node("Squeeze", product, graph.shape(2)), graph.constant(biases[None])))
+        return graph.node("Add", graph.node("Squeeze", product, graph.shape(2)), graph.constant(biases[None]))
 
     def _to_action(self, logits: str) -> str:
         graph, actions = self._graph, self._actions
         if actions.choices:
             index = graph.node("ArgMax", logits, axis=1, keepdims=0)
-            return str(graph.node("Gather", graph.constant(np.array(actions.choices, np.float32)), index))
+            return graph.node("Gather", graph.numbers(actions.choices), index)
         if actions.groups:
             return self._choose_in_groups(logits)
         if not actions.squashed:
@@ -124,29 +124,24 @@ class _Chooser:
         groups, longest = layout.real.shape
         places = graph.node("Gather", logits, graph.shape(*layout.places.reshape(-1)), axis=1)
         table = graph.node("Reshape", places, graph.shape(-1, groups, longest))
-        lowest = graph.constant(np.array(-np.inf, np.float32))
+        lowest = graph.numbers(-np.inf)
         found = graph.node("Where", graph.constant(layout.real[None]), table, lowest)
         chosen = graph.node("Add", graph.node("ArgMax", found, axis=2, keepdims=0), graph.shape(*layout.starts))
-        depth, ends = graph.shape(outputs), graph.constant(np.array([0, 1], np.float32))
+        depth, ends = graph.shape(outputs), graph.numbers([0, 1])
         one_hot = graph.node("ReduceSum", graph.node("OneHot", chosen, depth, ends), graph.shape(1), keepdims=0)
-        return str(graph.node("Gather", one_hot, graph.shape(*layout.kept), axis=1))
+        return graph.node("Gather", one_hot, graph.shape(*layout.kept), axis=1)
 
     def _as_outputs(self, action: str) -> str:
         """`Continuous.to_outputs`."""
         graph, actions = self._graph, self._actions
         if actions.choices:
-            table = graph.constant(np.array([actions.choices], np.float32))
+            table = graph.numbers([actions.choices])
             equal = graph.node("Equal", graph.node("Unsqueeze", action, graph.shape(1)), table)
-            return str(graph.node("ReduceMin", graph.node("Cast", equal, to=TensorProto.FLOAT), axes=[2], keepdims=0))
+            return graph.node("ReduceMin", graph.node("Cast", equal, to=TensorProto.FLOAT), axes=[2], keepdims=0)
         if actions.groups:
-            other = graph.node("Sub", graph.constant(np.array(1, np.float32)), action)
-            return str(
-                graph.node("Gather", graph.join(action, other), graph.shape(*actions.group_layout.order), axis=1)
-            )
+            other = graph.node("Sub", graph.numbers(1), action)
+            return graph.node("Gather", graph.join(action, other), graph.shape(*actions.group_layout.order), axis=1)
         if actions.output_indices:
-            return str(
-                graph.node(
-                    "MatMul", action, graph.constant(actions.to_outputs(np.eye(actions.actions, dtype=np.float32)))
-                )
-            )
+            outputs = actions.to_outputs(np.eye(actions.actions, dtype=np.float32))
+            return graph.node("MatMul", action, graph.constant(outputs))
         return action

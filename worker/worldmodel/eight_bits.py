@@ -51,13 +51,13 @@ def add_convolution(
     whole_bias = np.rint(bias / (scales.astype(np.float64) * steps[0])).astype(np.int32)
     factor = [graph.constant(each) for each in (weights, scales, zeros)]
     inputs = [value, before, _zero(graph), *factor, after, _zero(graph), graph.constant(whole_bias)]
-    return str(graph.node("QLinearConv", *inputs, **window))
+    return graph.node("QLinearConv", *inputs, **window)
 
 
 def round_inputs(graph: GraphBuilder, value: str, ranges: Floats) -> str:
     """Round the columns of `value`, whose magnitudes are up to `ranges`, to integers for `add_input_product`."""
     scaled = graph.node("Mul", value, graph.constant(1 / ranges))
-    return str(graph.node("QuantizeLinear", scaled, graph.constant(np.array(INPUT_STEP)), _centre(graph)))
+    return graph.node("QuantizeLinear", scaled, graph.constant(np.array(INPUT_STEP)), _centre(graph))
 
 
 def add_product(graph: GraphBuilder, value: str, kernel: Floats, bias: Floats, step: np.float32) -> str:
@@ -77,7 +77,7 @@ def add_exponential(graph: GraphBuilder, value: str) -> str:
     """Raise e to `value`, up to 2^23, by a sigmoid: processors agree on it to the bit, and on the operator Exp not."""
     share = graph.node("Sigmoid", value)
     above_one = graph.constant(np.nextafter(np.ones((), np.float32), np.float32(2)))
-    return str(graph.node("Div", share, graph.node("Sub", above_one, share)))
+    return graph.node("Div", share, graph.node("Sub", above_one, share))
 
 
 def round_weights_exactly(kernel: Floats, step: np.float32, *, centred: bool) -> tuple[NDArray[np.int8], Floats]:
@@ -98,7 +98,7 @@ def round_weights_exactly(kernel: Floats, step: np.float32, *, centred: bool) ->
 def _add_product(graph: GraphBuilder, factor: Sequence[str], kernel: Floats, bias: Floats, step: np.float32) -> str:
     """Add the product, with the bias, and the product of what the first integers leave of the weights."""
     value, *centre = factor
-    one, no_zero, parts = graph.constant(np.array(1, np.float32)), "", list[str]()
+    one, no_zero, parts = graph.numbers(1), "", list[str]()
     for offset in (bias, np.zeros_like(bias)):
         weights, scales = round_weights_exactly(kernel, step, centred=bool(centre))
         kernel = kernel - weights * (scales / step)
@@ -106,7 +106,7 @@ def _add_product(graph: GraphBuilder, factor: Sequence[str], kernel: Floats, bia
         # The runtime's own operator is MatMulInteger, Cast, Mul and Add in one: the same bits, in less time.
         inputs = [value, constants[0], one, constants[1], *(centre or [no_zero]), no_zero, constants[2]]
         parts.append(graph.node("MatMulIntegerToFloat", *inputs, domain=RUNTIME))
-    return str(graph.node("Add", *parts))
+    return graph.node("Add", *parts)
 
 
 def _zero(graph: GraphBuilder) -> str:

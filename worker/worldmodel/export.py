@@ -74,7 +74,7 @@ def export_decoder(vae: Weights, config: VAEConfig) -> bytes:
         weights, offsets = _folded(vae, "decoder", index, config)
         value = graph.node("ConvTranspose", value, graph.weight(weights), graph.weight(offsets), **_window(layer))
         value = graph.node("Sigmoid", value) if index == last else _activate(graph, value, config)
-    value = graph.node("Mul", value, graph.constant(np.array(255, np.float32)))
+    value = graph.node("Mul", value, graph.numbers(255))
     value = graph.node("Cast", graph.node("Round", value), to=TensorProto.UINT8)
     value = graph.node("Transpose", value, perm=[0, 2, 3, 1])
     graph.add_output(value, "picture", TensorProto.UINT8, config.picture, config.picture, 3)
@@ -164,8 +164,8 @@ def _window(layer: ConvolutionLayer) -> dict[str, Any]:
 
 def _activate(graph: GraphBuilder, value: str, config: VAEConfig) -> str:
     if config.activation == "relu":
-        return str(graph.node("Relu", value))
-    return str(graph.node("LeakyRelu", value, alpha=LEAK))
+        return graph.node("Relu", value)
+    return graph.node("LeakyRelu", value, alpha=LEAK)
 
 
 def _folded(vae: Weights, part: str, layer: int, config: VAEConfig) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -195,7 +195,7 @@ def _layer(graph: GraphBuilder, features: str, weights: str, biases: str, *, ord
     else:
         product = graph.node("MatMul", weights, graph.node("Unsqueeze", features, graph.shape(2)))
         value = graph.node("Squeeze", product, graph.shape(2))
-    return str(graph.node("Tanh", graph.node("Add", value, biases)))
+    return graph.node("Tanh", graph.node("Add", value, biases))
 
 
 def squash(graph: GraphBuilder, squashed: str, actions: Continuous) -> str:

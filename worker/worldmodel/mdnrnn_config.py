@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.worldmodel.layer_sizes import check_sizes
-from dreamfleet.worker.worldmodel.loss_factors import added_option, check_factors, loss_factor
+from dreamfleet.worker.worldmodel.config_fields import added_option, check_factors, check_sizes, loss_factor
 
 Reward = Literal["none", "positive", "notebook", "value"]
 Probability = TypeVar("Probability", float, NDArray[np.float32], NDArray[np.float64])

@@ -56,7 +56,7 @@ class RecurrentGraph:
         scores = graph.node("MatMul", scores, graph.constant(rnn["score.weight"].T))
         self.attention = graph.node("Softmax", scores, axis=1)
         weighted = graph.node("Mul", self.attention, seen)
-        return str(graph.node("ReduceSum", weighted, graph.shape(1), keepdims=0))
+        return graph.node("ReduceSum", weighted, graph.shape(1), keepdims=0)
 
 
 def lstm(
@@ -147,7 +147,7 @@ def _heads(graph: GraphBuilder, hidden: str, rnn: Weights, config: MDNRNNConfig,
         widths = np.full(config.hidden, 1 / (1 - config.dropout), np.float32)  # the hidden state is below 1
         return add_input_product(graph, round_inputs(graph, hidden, widths), kernel, bias, widths)
     # In half precision: the bundle holds the LSTM twice already, and its size is limited.
-    return str(graph.node("Gemm", hidden, graph.weight(kernel), graph.constant(bias)))
+    return graph.node("Gemm", hidden, graph.weight(kernel), graph.constant(bias))
 
 
 def _is_rounded(ranges: Ranges | None) -> bool:
@@ -155,7 +155,7 @@ def _is_rounded(ranges: Ranges | None) -> bool:
 
 
 def _exponential(graph: GraphBuilder, value: str) -> str:
-    return str(graph.node("Exp", value))
+    return graph.node("Exp", value)
 
 
 def mixture_major_order(config: MDNRNNConfig) -> NDArray[Any]:
@@ -195,5 +195,5 @@ def _dreamt_reward_label(graph: GraphBuilder, reward: str, config: MDNRNNConfig)
     """The previous reward of a dream's next step: the predicted value, or the likelier label."""
     if config.reward == "value":
         return reward
-    positive = graph.node("Greater", reward, graph.constant(np.array(0, np.float32)))
-    return str(graph.node("Cast", positive, to=TensorProto.FLOAT))
+    positive = graph.node("Greater", reward, graph.numbers(0))
+    return graph.node("Cast", positive, to=TensorProto.FLOAT)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import onnx
 import onnx.utils
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 OPSET = 17
@@ -49,34 +49,39 @@ class GraphBuilder:
         self._constants.append(numpy_helper.from_array(np.ascontiguousarray(array), name))
         return name
 
+    def numbers(self, values: ArrayLike) -> str:
+        """Add a constant of numbers in single precision."""
+        return self.constant(np.array(values, np.float32))
+
     def weight(self, array: NDArray[Any]) -> str:
         """Add a weight in half precision; the runtime widens it once, as it loads."""
-        return str(self.node("Cast", self.constant(array.astype(np.float16)), to=TensorProto.FLOAT))
+        return self.node("Cast", self.constant(array.astype(np.float16)), to=TensorProto.FLOAT)
 
     def linear(self, value: str, kernel: NDArray[Any], bias: NDArray[Any] | None = None) -> str:
         """Multiply `value` by `kernel` (inputs, outputs) and add `bias`."""
         constants = [self.constant(each) for each in (kernel, bias) if each is not None]
-        return str(self.node("Gemm", value, *constants))
+        return self.node("Gemm", value, *constants)
 
     def split(self, value: str, *sizes: int) -> list[str]:
         """Split the columns of `value` into these sizes; a size of 0 gives an empty name."""
         real = [size for size in sizes if size]
-        if len(real) == 1:
-            names = iter([value])
-        else:
-            names = iter(self.node("Split", value, self.shape(*real), outputs=len(real), axis=1))
+        parts = [value] if len(real) == 1 else self._add("Split", [value, self.shape(*real)], len(real), axis=1)
+        names = iter(parts)
         return [next(names) if size else "" for size in sizes]
 
     def join(self, *values: str) -> str:
         """Concatenate columns; empty names are left out."""
         real = [value for value in values if value]
-        return str(self.node("Concat", *real, axis=1)) if len(real) > 1 else real[0]
+        return self.node("Concat", *real, axis=1) if len(real) > 1 else real[0]
 
-    def node(self, operator: str, *inputs: str, outputs: int = 1, **attributes: Any) -> Any:
-        """Add an operator; returns a tuple of names if it has several outputs."""
+    def node(self, operator: str, *inputs: str, **attributes: Any) -> str:
+        """Add an operator with one output."""
+        return self._add(operator, inputs, 1, **attributes)[0]
+
+    def _add(self, operator: str, inputs: Sequence[str], outputs: int, **attributes: Any) -> list[str]:
         names = [f"n{len(self._nodes)}_{index}" for index in range(outputs)]
         self._nodes.append(helper.make_node(operator, list(inputs), names, **attributes))
-        return names[0] if outputs == 1 else tuple(names)
+        return names
 
     def shape(self, *sizes: int) -> str:
         """Add a constant of integers: a shape, sizes or axes."""

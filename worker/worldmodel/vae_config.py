@@ -9,8 +9,7 @@ from typing import Literal, NamedTuple
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import plural
-from dreamfleet.worker.worldmodel.layer_sizes import check_sizes
-from dreamfleet.worker.worldmodel.loss_factors import MOST, added_option, check_factors, loss_factor
+from dreamfleet.worker.worldmodel.config_fields import MOST, added_option, check_factors, check_sizes, loss_factor
 
 LEAK = 0.2  # slope of the leaky activation below zero
 KERNEL, STRIDE = 4, 2

@@ -17,7 +17,7 @@ from dreamfleet.common.errors import DreamfleetError, StoppedError
 from dreamfleet.common.host.child import PATIENCE
 from dreamfleet.common.host.processes import VerbProcess
 from dreamfleet.common.host.stop_signals import Stop, signals_deferred
-from dreamfleet.common.protocol.pause_kind import PauseKind
+from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.settings.environment_check import CHECKED

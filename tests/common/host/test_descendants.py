@@ -78,12 +78,20 @@ def test_a_process_of_the_session_without_the_mark_ends():
     ours.forget()
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_daemons_end_with_the_process_that_started_their_parent(tmp_path, number):
+KILL_GUARD = (
+    "with descendants.Descendants().starting():\n    pass\ndescendants._guard.kill()\ndescendants._guard.wait()\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("before", "number"), [("", signal.SIGKILL), ("", signal.SIGTERM), (KILL_GUARD, signal.SIGKILL)]
+)
+def test_daemons_end_with_the_process_that_started_their_parent(tmp_path, before, number):
     script = (
         "import subprocess, sys, time\n"
-        "from dreamfleet.common.host.descendants import Descendants\n"
-        "with Descendants().starting():\n"
+        "from dreamfleet.common.host import descendants\n"
+        f"{before}"
+        "with descendants.Descendants().starting():\n"
         f"    subprocess.Popen([sys.executable, '-S', '-c', {DAEMON!r}])\n"
         "time.sleep(600)\n"
     )
@@ -92,28 +100,6 @@ def test_daemons_end_with_the_process_that_started_their_parent(tmp_path, number
     )
     pidfd = os.pidfd_open(int(parent.stdout.readline()))
     parent.send_signal(number)
-    parent.wait()
-    assert ends(pidfd)
-    parent.stdout.close()
-
-
-def test_a_guard_that_was_killed_is_replaced(tmp_path):
-    script = (
-        "import subprocess, sys, time\n"
-        "from dreamfleet.common.host import descendants\n"
-        "with descendants.Descendants().starting():\n"
-        "    pass\n"
-        "descendants._guard.kill()\n"
-        "descendants._guard.wait()\n"
-        "with descendants.Descendants().starting():\n"
-        f"    subprocess.Popen([sys.executable, '-S', '-c', {DAEMON!r}])\n"
-        "time.sleep(600)\n"
-    )
-    parent = subprocess.Popen(
-        [sys.executable, "-c", script], env=environment(tmp_path), stdout=subprocess.PIPE, text=True
-    )
-    pidfd = os.pidfd_open(int(parent.stdout.readline()))
-    parent.kill()
     parent.wait()
     assert ends(pidfd)
     parent.stdout.close()

@@ -1,4 +1,5 @@
 import re
+import subprocess
 import sys
 from importlib.metadata import packages_distributions, requires
 
@@ -53,3 +54,19 @@ def test_what_is_installed_here_is_what_is_required():
 def test_doctor_looks_for_all_that_every_role_requires():
     required = {re.match(r"[\w.-]+", each)[0] for each in requires("dreamfleet") if "extra ==" not in each}
     assert {name for name, (_, extra) in packages.PACKAGES.items() if not extra} == required
+
+
+@pytest.mark.parametrize(
+    "script",
+    [
+        "import dreamfleet.worker.worlds.car_racing.car",
+        "from dreamfleet.worker.worlds.gym.environments import make_environment as make; make('LunarLander-v3', {})",
+        "from dreamfleet.common.host.trusted_modules import import_trusted; import_trusted('Box2D', 'a test')",
+    ],
+    ids=["CarRacing", "gymnasium", "a module of the user"],
+)
+def test_box2d_is_imported_where_warnings_are_errors(script, monkeypatch):
+    monkeypatch.setenv("DREAMFLEET_TRUST", "Box2D")
+    command = [sys.executable, "-W", "error", "-c", script]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stderr

@@ -2,8 +2,8 @@
 
 import pytest
 
-from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.host.processes import VerbProcess
+from dreamfleet.common.host.reports import ADDRESS
 from tests.support import tasks
 from tests.support.processes import DEADLINE
 
@@ -29,7 +29,7 @@ def test_modules_in_the_current_folder_are_not_imported(tmp_path, monkeypatch):
 def test_a_child_gets_sigterm_before_sigkill(processes, random_bundle):
     words = ("coordinator", "--run", "asked", "--runs-dir", processes.runs, "--listen", processes.endpoint)
     with VerbProcess(*words, "--bundle", random_bundle.path, "--task", tasks.TOY) as child:
-        child.wait_for("incarnation")
+        child.wait_for_report(ADDRESS, DEADLINE)
     assert child.popen.returncode == 130
     assert " asked " in child.lines[-1]
 
@@ -41,18 +41,10 @@ def test_output_goes_to_the_log_file(tmp_path):
     assert "'absent'" in child.last_line()
 
 
-def test_waiting_for_missing_output_times_out(tmp_path):
-    with (
-        VerbProcess("runs", "list", "--runs-dir", tmp_path) as child,
-        pytest.raises(DreamfleetError, match="nothing of the kind"),
-    ):
-        child.wait_for("nothing of the kind")
-
-
 @pytest.mark.slow
-def test_the_last_line_of_a_killed_child_says_so():
-    with VerbProcess("worker", "--connect", "tcp/127.0.0.1:1") as child:
-        said = child.wait_for("tcp/127.0.0.1:1")
-        child.popen.kill()
-        child.finish(DEADLINE)
-        assert " 9" in child.last_line().removesuffix(said.strip())
+def test_the_last_line_of_a_killed_child_says_so(processes):
+    child = processes.start("worker", "--connect", "tcp/127.0.0.1:1")
+    said = child.wait_for("tcp/127.0.0.1:1")
+    child.popen.kill()
+    child.finish()
+    assert " 9" in child.last_line().removesuffix(said.strip())

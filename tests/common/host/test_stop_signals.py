@@ -4,10 +4,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from dreamfleet.common.host.stop_signals import never_stop, signals_deferred, stop_on_signals
+from dreamfleet.common.host.stop_signals import SIGNALS, never_stop, signals_deferred, stop_on_signals
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", SIGNALS)
 def test_the_first_signal_stops_and_the_second_interrupts(number):
     with pytest.raises(KeyboardInterrupt), stop_on_signals() as stop:  # noqa: PT012
         assert not stop()
@@ -17,14 +17,14 @@ def test_the_first_signal_stops_and_the_second_interrupts(number):
 
 
 def test_the_signal_handlers_are_restored():
-    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    before = [signal.getsignal(number) for number in SIGNALS]
     with stop_on_signals():
-        assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] != before
-    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+        assert [signal.getsignal(number) for number in SIGNALS] != before
+    assert [signal.getsignal(number) for number in SIGNALS] == before
     assert not never_stop()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", SIGNALS)
 def test_deferred_signals_arrive_after_the_operation(number):
     finished = []
     with pytest.raises(KeyboardInterrupt), stop_on_signals() as stop:  # noqa: PT012

@@ -36,18 +36,17 @@ def chosen():
     return tuple(os.environ.get(name) for name in VARIABLES)
 
 
-def test_egl_draws_and_without_it_osmesa(host):
-    assert chosen() == ("egl", "egl", "1")
-
-
-def test_osmesa_draws_where_egl_is_not(host):
-    host.remove("libEGL.so.1")
-    assert chosen() == ("osmesa", "osmesa", None)
-
-
-def test_nothing_is_chosen_where_no_library_is(host):
-    host.clear()
-    assert chosen() == (None, None, None)
+@pytest.mark.parametrize(
+    ("missing", "found"),
+    [
+        ((), ("egl", "egl", "1")),
+        (("libEGL.so.1",), ("osmesa", "osmesa", None)),
+        (("libEGL.so.1", "libOSMesa.so.8"), (None, None, None)),
+    ],
+)
+def test_egl_draws_and_without_it_osmesa(host, missing, found):
+    host.difference_update(missing)
+    assert chosen() == found
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,5 @@
 """One open run in many threads; and what of SQLite's errors is damage, and what is not.
-Tests common/files/sqlite_verdicts.py and common/files/thread_connections.py."""
+Tests common/files/sqlite.py."""
 
 import asyncio
 import gc

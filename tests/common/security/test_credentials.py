@@ -1,5 +1,5 @@
 """Join files: issued by an authority, validated strictly, and private.
-Tests authority.py, certificate_ledger.py and handshake.py."""
+Tests authority.py and certificate_ledger.py."""
 
 import errno
 import os
@@ -84,10 +84,12 @@ def test_an_invalid_join_file_is_an_error_that_names_it_without_its_secret(join,
     assert "BEGIN" not in str(refused.value)
 
 
-def test_a_readable_expired_or_invalid_join_file_is_refused(join, tmp_path):
-    for path, later in ((join, 31), (tmp_path / "nowhere", 0), (tmp_path, 0)):
+def test_a_readable_expired_or_invalid_join_file_is_refused(access, join, tmp_path):
+    old = tmp_path / "old.join"
+    access.issue("worker", "old", old, connect=HERE, days=1, now=datetime.now(UTC) - timedelta(days=2))
+    for path in (old, tmp_path / "nowhere", tmp_path):
         with pytest.raises(AccessError, match=re.escape(str(path))):
-            read_join_file(path, datetime.now(UTC) + timedelta(days=later))
+            read_join_file(path)
     for mode in (0o640, 0o604):
         join.chmod(mode)
         with pytest.raises(AccessError, match="600"):
@@ -112,25 +114,6 @@ def test_a_name_keeps_its_seat_until_revoked_and_seats_are_not_reused(access, tm
         access.revoke("carl")
 
 
-def test_the_watcher_sees_revocations_and_keeps_them_if_the_ledger_is_damaged(access, join, tmp_path):
-    folder = tmp_path / "carried"
-    folder.mkdir()
-    watched = RevocationWatcher(folder, read_join_file(join))
-    assert not watched.revoked_seats
-    ledger = CertificateLedger.load(access._folder / LEDGER_FILE)
-    ledger.with_revoked([each for each in ledger.issued if each.name == "box"], 1.0).save(folder / LEDGER_FILE)
-    watched.reload_if_changed(10.0)
-    assert "worker.1" in watched.revoked_seats
-    (folder / LEDGER_FILE).write_text("{")
-    watched.reload_if_changed(20.0)
-    assert "worker.1" in watched.revoked_seats
-    with pytest.raises(AccessError, match=LEDGER_FILE):  # who begins with it would let everybody in
-        RevocationWatcher(folder, read_join_file(join))
-    replace(ledger, authority="0" * 64).save(folder / LEDGER_FILE)
-    with pytest.raises(AccessError, match="--access-dir"):
-        RevocationWatcher(folder, read_join_file(join))
-
-
 @pytest.fixture
 def revoked(access, tmp_path):
     """The folder of a ledger in which the worker `box` is revoked."""
@@ -139,6 +122,23 @@ def revoked(access, tmp_path):
     ledger = CertificateLedger.load(access._folder / LEDGER_FILE)
     ledger.with_revoked([each for each in ledger.issued if each.name == "box"], 1.0).save(folder / LEDGER_FILE)
     return folder
+
+
+def test_the_watcher_sees_revocations_and_keeps_them_if_the_ledger_is_damaged(access, join, revoked, tmp_path):
+    folder = tmp_path / "carried"
+    watched = RevocationWatcher(folder, read_join_file(join))
+    assert not watched.revoked_seats
+    revoked.rename(folder)
+    watched.reload_if_changed(10.0)
+    assert "worker.1" in watched.revoked_seats
+    (folder / LEDGER_FILE).write_text("{")
+    watched.reload_if_changed(20.0)
+    assert "worker.1" in watched.revoked_seats
+    with pytest.raises(AccessError, match=LEDGER_FILE):  # who begins with it would let everybody in
+        RevocationWatcher(folder, read_join_file(join))
+    replace(CertificateLedger.load(access._folder / LEDGER_FILE), authority="0" * 64).save(folder / LEDGER_FILE)
+    with pytest.raises(AccessError, match="--access-dir"):
+        RevocationWatcher(folder, read_join_file(join))
 
 
 def test_what_is_known_to_be_revoked_stays_so_without_its_ledger_and_with_an_older_one(access, join, tmp_path):
@@ -281,14 +281,14 @@ def test_an_unreadable_folder_is_an_error(access, join, tmp_path, monkeypatch):
 
 def test_an_existing_authority_is_not_overwritten_even_in_a_race(tmp_path, monkeypatch):
     folder = tmp_path / "access"
-    begun = authority._certificate_builder
+    begun = authority._certify
 
     def late(*args, **more):
-        monkeypatch.setattr(authority, "_certificate_builder", begun)
+        monkeypatch.setattr(authority, "_certify", begun)
         Authority.create(folder)
         return begun(*args, **more)
 
-    monkeypatch.setattr(authority, "_certificate_builder", late)
+    monkeypatch.setattr(authority, "_certify", late)
     with pytest.raises(UsageError, match="--access-dir"):
         Authority.create(folder)
     Authority(folder)

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from dreamfleet.common.protocol.codec import encode_json
 from dreamfleet.common.protocol.messages import MAX_SLOTS, HelloRequest, Result
-from dreamfleet.common.protocol.pause_kind import PauseKind
 from dreamfleet.common.protocol.result_bounds import (
     LARGEST_FITNESS,
     MAX_COUNT,
@@ -23,7 +22,7 @@ from dreamfleet.common.protocol.result_bounds import (
     rejection_reason,
     to_finite,
 )
-from dreamfleet.common.protocol.stop_kind import StopKind
+from dreamfleet.common.protocol.stop_kind import PauseKind, StopKind
 from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
 from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.service.status import encode_part

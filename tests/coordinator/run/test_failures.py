@@ -12,7 +12,7 @@ import pytest
 
 from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.messages import Result, ResultBatch
-from dreamfleet.common.protocol.pause_kind import PauseKind
+from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.seeds import CONFIRMING_OFFSET, training_seed
 from dreamfleet.coordinator.jobs import generation

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from dreamfleet.common.protocol.messages import Result
-from dreamfleet.common.protocol.pause_kind import PauseKind
+from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.coordinator.run.recall import recall
 from tests.support.failing_runs import SETTINGS, Failing, pause_kinds
 from tests.support.failures import failure

@@ -11,8 +11,7 @@ from dreamfleet.common.protocol.messages import (
     Result,
     ResultBatch,
 )
-from dreamfleet.common.protocol.pause_kind import PauseKind
-from dreamfleet.common.protocol.stop_kind import StopKind
+from dreamfleet.common.protocol.stop_kind import PauseKind, StopKind
 from dreamfleet.common.runs.records import StoredEvaluation
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.jobs.evaluation import Evaluation

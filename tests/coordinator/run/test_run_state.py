@@ -1,7 +1,4 @@
-"""The states of a run: the protocol's reference draws the transitions that exist, and in any order none is wrong.
-
-Tests common/protocol/pause_kind.py, too.
-"""
+"""The states of a run: the protocol's reference draws the transitions that exist, and in any order none is wrong."""
 
 import re
 
@@ -10,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dreamfleet.common.errors import InternalError
-from dreamfleet.common.protocol.pause_kind import PauseKind
-from dreamfleet.common.protocol.stop_kind import StopKind, StopReason
+from dreamfleet.common.protocol.stop_kind import PauseKind, StopKind, StopReason
 from dreamfleet.coordinator.run.run_state import Ended, Ending, Pause, Paused, Rewound, Running, Stalled
 from tests.support.processes import ROOT
 

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from dreamfleet.common.protocol import keys
-from dreamfleet.common.protocol.pause_kind import PauseKind
+from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.coordinator.run.failure_limit import LIMIT_FROM
 from dreamfleet.coordinator.run.run import BY_HAND, PAUSED
 from dreamfleet.coordinator.run.run_state import Pause

@@ -11,7 +11,7 @@ import pytest
 from dreamfleet.common.client.equal_fitness import ENOUGH
 from dreamfleet.common.client.status import PARTS, Population, WorkerStatus, read_status
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, MAX_OPTIONS, Result
-from dreamfleet.common.protocol.pause_kind import PauseKind
+from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
 from dreamfleet.common.schema.validation import from_plain, from_plain_lenient
 from dreamfleet.common.transport.network import Network

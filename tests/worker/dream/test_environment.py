@@ -109,11 +109,12 @@ def test_a_choice_may_be_its_number_or_its_row(choices_bundle):
 
 
 @pytest.mark.parametrize("action", [3, -1, [0.0, np.nan, 1.0], [1.0, 0.0], 1.0], ids=str)
-def test_what_is_no_choice_is_refused(choices_bundle, action):
-    environment = Dream(choices_bundle)
-    environment.reset(seed=1)
-    with pytest.raises(ValueError):
-        environment.step(action)
+def test_what_is_no_action_is_refused(choices_bundle, random_bundle, action):
+    for bundle in (choices_bundle, random_bundle):
+        environment = Dream(bundle)
+        environment.reset(seed=1)
+        with pytest.raises(ValueError):
+            environment.step(action)
 
 
 def test_a_described_world_dreams_where_its_package_is_missing(tmp_path):
@@ -143,10 +144,3 @@ def test_another_rule_of_the_end_may_be_given(choices_bundle):
 def test_an_invalid_temperature_is_refused(random_bundle, temperature):
     with pytest.raises(UsageError):
         Dream(random_bundle, temperature=temperature)
-
-
-def test_an_invalid_action_is_refused(random_bundle):
-    environment = Dream(random_bundle)
-    environment.reset(seed=1)
-    with pytest.raises(ValueError):
-        environment.step(np.array([np.nan, 0, 0]))

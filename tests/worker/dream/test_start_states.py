@@ -7,16 +7,16 @@ from dreamfleet.common.artifacts.bundle import RECORDED_STATES, write_bundle
 from dreamfleet.common.errors import BundleError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.dream.batch import DreamBatch
-from dreamfleet.worker.dream.environment import Dream, DreamPolicy, VectorDream
+from dreamfleet.worker.dream.environment import Dream, VectorDream
 from dreamfleet.worker.dream.noise import EpisodeNoise
 from dreamfleet.worker.dream.start_states import StartStates
 from dreamfleet.worker.dream.world import DreamWorld
-from dreamfleet.worker.tasks.api import Score
 from dreamfleet.worker.worldmodel.inference import NoiseSize
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import npy, states, write_random_bundle
+from tests.support.dreams import dreams_of, same_bits
 from tests.support.variants import VARIANTS
 
 RANDOM = np.random.default_rng(0)
@@ -44,12 +44,6 @@ def spec(bundle, recorded=0.5, **changes):
     return dataclasses.replace(TaskSpec("dream", bundle.sha256, HORIZON, 0, recorded=recorded), **changes)
 
 
-def dreams_of(bundle, candidates, seeds):
-    random = np.random.default_rng(4)
-    vectors = [random.normal(0, 0.3, bundle.controller_shape.size).astype(np.float32) for _ in range(candidates)]
-    return [(vector, seed) for vector in vectors for seed in seeds]
-
-
 def test_the_configured_share_of_dreams_starts_at_recorded_states():
     for share in (0.0, 0.25, 1.0):
         recorded = np.mean([begun(seed, share)[1].any() for seed in range(400)])
@@ -75,12 +69,8 @@ def test_a_dream_from_a_first_picture_is_the_same_at_every_share():
 
 
 def test_a_fitness_is_the_same_bits_alone_in_any_batch_and_in_any_order(bundle):
-    dreamer, dreams = DreamBatch(bundle, spec(bundle)), dreams_of(bundle, 9, range(6))
-    together = dreamer.score(dreams)
-    assert len({score.fitness for score in together}) == len(dreams)
-    assert dreamer.score(dreams[::-1])[::-1] == together
-    assert [dreamer.score([dream])[0] for dream in dreams[:13]] == together[:13]
-    assert DreamBatch(bundle, spec(bundle)).score(dreams[11:16]) == together[11:16]
+    dreams = dreams_of(bundle, 9, range(6))
+    assert len({score.fitness for score in same_bits(bundle, spec(bundle), dreams)}) == len(dreams)
 
 
 def test_recorded_states_change_only_the_dreams_that_start_there(bundle):
@@ -108,34 +98,17 @@ MEMORIES = {
 }
 
 
-def dreamt(environment, policy, vector, seed):
-    """The score of a dream step by step."""
-    latent, info = environment.reset(seed=seed)
-    policy.begin(vector)
-    policy.set_memory(info["memory"])
-    fitness, steps, over = 0.0, 0, False
-    while not over:
-        latent, reward, done, truncated, _ = environment.step(policy.act(latent))
-        fitness, steps, over = fitness + reward, steps + 1, done or truncated
-    return Score(fitness, steps)
-
-
 @pytest.mark.parametrize("variant", ["plain", "all"])
 @pytest.mark.parametrize("memory", MEMORIES)
 def test_the_environment_dreams_the_same_bits_with_any_memory(tmp_path, memory, variant):
     rnn = MEMORIES[memory]
     bundle = write_random_bundle(tmp_path / "b.zip", vae=SMALL, rnn=rnn, recorded=states(5, SMALL, rnn))
     bundle = bundle if variant == "plain" else bundle.with_controllers(None, VARIANTS[variant])
-    dreams = dreams_of(bundle, 2, range(6))
-    environment, policy = Dream(bundle, horizon=HORIZON, recorded=0.5), DreamPolicy(bundle)
-    assert [dreamt(environment, policy, *dream) for dream in dreams] == DreamBatch(bundle, spec(bundle)).score(dreams)
+    same_bits(bundle, spec(bundle), dreams_of(bundle, 2, range(6)))
 
 
 def test_in_any_world_dreams_start_at_recorded_states_with_the_same_bits(world_bundle):
-    dreams = dreams_of(world_bundle, 2, range(8))
-    environment, policy = Dream(world_bundle, horizon=HORIZON, recorded=0.5), DreamPolicy(world_bundle)
-    found = DreamBatch(world_bundle, spec(world_bundle)).score(dreams)
-    assert [dreamt(environment, policy, *dream) for dream in dreams] == found
+    same_bits(world_bundle, spec(world_bundle), dreams_of(world_bundle, 2, range(8)))
 
 
 @pytest.mark.parametrize(("memory", "reward"), [("rewarded", 0), ("rewarded first", 1)])

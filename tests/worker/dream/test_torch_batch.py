@@ -18,6 +18,7 @@ from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.torch_dream_step import TorchDreamStep
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
+from tests.support.dreams import dreams_of
 from tests.support.variants import VARIANTS
 
 DEVICE = os.environ.get("DREAMFLEET_TEST_TORCH_DEVICE", "cpu")
@@ -35,16 +36,10 @@ def spec(bundle, **changes):
     return dataclasses.replace(TaskSpec("dream", bundle.sha256, HORIZON, 0, temperature=1.3), **changes)
 
 
-def dreams(bundle, candidates=3, seeds=3):
-    random = np.random.default_rng(4)
-    vectors = [random.normal(0, 0.3, bundle.controller_shape.size).astype(np.float32) for _ in range(candidates)]
-    return [(vector, seed) for vector in vectors for seed in range(seeds)]
-
-
 def check(bundle, **changes):
     """The torch dream of a bundle is that of ONNX Runtime but for its last bits, and the same bits alone."""
     asked = spec(bundle, **changes)
-    batch, episodes = TorchDreamBatch(bundle, asked, DEVICE), dreams(bundle)
+    batch, episodes = TorchDreamBatch(bundle, asked, DEVICE), dreams_of(bundle, 3, range(3))
     found, wanted = batch.score(episodes), DreamBatch(bundle, asked).score(episodes)
     assert [score.steps for score in found] == [score.steps for score in wanted]
     np.testing.assert_allclose([s.fitness for s in found], [s.fitness for s in wanted], rtol=1e-3, atol=1e-3)
@@ -76,7 +71,7 @@ def test_measures_are_those_of_the_dream(random_bundle):
 
 def test_more_dreams_than_rows_are_dreamt_in_turn(random_bundle):
     batch = TorchDreamBatch(random_bundle, spec(random_bundle, horizon=2), DEVICE)
-    few, done = dreams(random_bundle, candidates=4, seeds=2), []
+    few, done = dreams_of(random_bundle, 4, range(2)), []
     assert batch.score(few * (ROWS // 8 + 1), done.append) == batch.score(few) * (ROWS // 8 + 1)
     assert done == [2 * ROWS, 2 * ROWS + 16]
 
@@ -89,7 +84,7 @@ def test_a_watched_dream_has_the_same_score_and_shows_each_step_that_is_due(rand
         def observe(self, episode, look):
             self.append((episode, look()))
 
-    seen, episodes = Seen(), dreams(random_bundle)
+    seen, episodes = Seen(), dreams_of(random_bundle, 3, range(3))
     batch = TorchDreamBatch(random_bundle, spec(random_bundle), DEVICE)
     assert batch.watched(seen).score(episodes) == batch.score(episodes)
     assert [(episode, snapshot.step) for episode, snapshot in seen] == [(0, step) for step in range(HORIZON)]
@@ -104,7 +99,7 @@ def test_a_watched_dream_has_the_same_score_and_shows_each_step_that_is_due(rand
 
 
 def test_a_scorer_on_a_torch_device_is_of_a_class_of_its_own(random_bundle):
-    asked, (vector, seed) = spec(random_bundle), dreams(random_bundle)[0]
+    asked, (vector, seed) = spec(random_bundle), dreams_of(random_bundle, 3, range(3))[0]
     own, plain = Scorer(asked, random_bundle, DEVICE), Scorer(asked, random_bundle)
     assert own.host_class != plain.host_class
     assert Scorer(asked, random_bundle, DEVICE).host_class == own.host_class

@@ -1,5 +1,5 @@
 """Factors weight the parts of a loss; the default 1 is not serialised, and reported losses are unweighted.
-Tests worker/worldmodel/loss_factors.py."""
+Tests worker/worldmodel/config_fields.py."""
 
 import json
 from dataclasses import replace

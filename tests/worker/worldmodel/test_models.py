@@ -1,5 +1,5 @@
 """The sources' models: their sizes, and that the export equals the trained model.
-Tests export.py, layer_sizes.py, vae.py and vae_config.py."""
+Tests config_fields.py, export.py, vae.py and vae_config.py."""
 
 from dataclasses import asdict, replace
 

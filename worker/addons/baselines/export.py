@@ -65,7 +65,7 @@ def export_network(weights: Weights, config: AgentConfig) -> bytes:
         graph.add_input("state", TensorProto.FLOAT, 2 * config.hidden), config.hidden, config.hidden
     )
     value = graph.node("Cast", graph.node("Transpose", picture, perm=[0, 3, 1, 2]), to=TensorProto.FLOAT)
-    value = graph.node("Div", value, graph.constant(np.array(255, np.float32)))
+    value = graph.node("Div", value, graph.numbers(255))
     for layer, stride in enumerate(config.strides):
         kernel, bias = (graph.constant(weights[f"look.{2 * layer}.{each}"]) for each in ("weight", "bias"))
         value = graph.node("Relu", graph.node("Conv", value, kernel, bias, strides=[stride, stride]))

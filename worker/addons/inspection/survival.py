@@ -20,9 +20,8 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.addons.inspection.encoded_rollout import ConstantDriver
 from dreamfleet.worker.addons.inspection.probe import Estimate
 from dreamfleet.worker.dream.batch import MAX_ROWS
-from dreamfleet.worker.dream.ends import DreamEnds
 from dreamfleet.worker.dream.noise import SharedNoise
-from dreamfleet.worker.dream.world import DreamWorld
+from dreamfleet.worker.dream.world import DreamEnds, DreamWorld
 from dreamfleet.worker.scoring.disturbance import numbered_choices
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.api import Assignment, Driver, Task, World

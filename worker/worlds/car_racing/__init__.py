@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import gymnasium
 
-from dreamfleet.common.host.swig_types import allow_swig_types
+from dreamfleet.common.host.packages import allow_swig_types
 
 ENVIRONMENT = "dreamfleet/CarRacing-v3"
 LATENT = "dreamfleet/CarRacingLatent-v0"

@@ -19,8 +19,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.foreign_code import contained
-from dreamfleet.common.host.packages import GYMNASIUM, find_distributions
-from dreamfleet.common.host.swig_types import allow_swig_types
+from dreamfleet.common.host.packages import GYMNASIUM, allow_swig_types, find_distributions
 from dreamfleet.common.host.trusted_modules import check_trusted
 from dreamfleet.common.host.unseen_drawing import draw_offscreen
 from dreamfleet.common.host.user_code import describe_error, user_code

@@ -1,4 +1,4 @@
-"""Configuration fields for factors that weight the parts of a loss."""
+"""Fields of a model's configuration: the bounds of its sizes, and factors that weight the parts of a loss."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.schema.validation import OPTIONAL
 
+LARGEST = 2**14  # of a layer, a kernel or a window: beyond it torch overflows, or the memory
 LEAST, MOST = 1e-6, 1e6  # beyond these, float32 loses the smaller part of the sum
 
 
@@ -26,3 +27,11 @@ def check_factors(config: Any, *names: str) -> None:
     for name in names:
         if not LEAST <= getattr(config, name) <= MOST:
             raise UsageError(f"{name} must be from {LEAST:g} to {MOST:g}, not {getattr(config, name):g}")
+
+
+def check_sizes(config: object) -> None:
+    """`UsageError` if a whole number of the configuration, alone or in a list, is above `LARGEST`."""
+    for name, value in vars(config).items():
+        numbers = value if isinstance(value, tuple) else (value,)
+        if any(isinstance(each, int) and each > LARGEST for each in numbers):
+            raise UsageError(f"--{name.replace('_', '-')} must be at most {LARGEST}, not {max(numbers)}")

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from dreamfleet.common.host.nonblocking_io import MAX_WAITING_CHARS, NonblockingStream
+from dreamfleet.common.host.standard_streams import MAX_WAITING_CHARS, NonblockingStream
 from tests.support.processes import DEADLINE, environment
 
 
@@ -73,7 +73,7 @@ def test_a_closed_reader_is_no_error(pipe):
 def test_a_process_exits_although_nobody_reads_its_output():
     program = (
         "import os, sys, logging\n"
-        "from dreamfleet.common.host.nonblocking_io import make_stderr_nonblocking\n"
+        "from dreamfleet.common.host.standard_streams import make_stderr_nonblocking\n"
         "os.set_blocking(2, False)\n"
         "try:\n"
         "    while True: os.write(2, bytes(4096))\n"
