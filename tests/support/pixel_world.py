@@ -9,9 +9,10 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from dreamfleet.worker.tasks.api import DreamReward, Mirror, Preprocessing, Task, World, one_hot
+from dreamfleet.worker.tasks.api import DreamReward, Mirror, Task, World, one_hot
 from dreamfleet.worker.tasks.drivers import HeldActions, UniformActions
 from dreamfleet.worker.tasks.pictures import CropAndResize, VectorActions, box_resize
+from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.worldmodel.policy import ModelPolicy
 
 MODULE = "tests.support.pixel_world"

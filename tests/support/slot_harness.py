@@ -1,16 +1,16 @@
 """A slot with a real child, and the events that it sends."""
 
 import queue
+from contextlib import suppress
 from functools import cache
 from time import monotonic
+
+from msgspec.structs import replace
 
 from dreamfleet.common.artifacts.bundle import hash_file
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.service.child import ScorerArguments
-from dreamfleet.worker.service.slot import (
-    MAX_STARVED_DELAY,
-    Slot,
-)
+from dreamfleet.worker.service.slot import MAX_STARVED_DELAY, Slot
 from tests.support import tasks
 from tests.support.processes import DEADLINE
 from tests.support.samples import VECTOR, job
@@ -28,10 +28,11 @@ def spec(task, bundle):
 class Harness:
     """A slot and its worker's queue."""
 
-    def __init__(self, task, bundle, memory_limit, **more):
+    def __init__(self, task, bundle, memory_limit=0, **more):
         self.spec = spec(task, bundle)
         self.events = queue.SimpleQueue()
-        self.slot = Slot(0, ScorerArguments(self.spec, bundle, tasks.ALL), self.events, memory_limit, **more)
+        arguments = ScorerArguments(self.spec, bundle, (*tasks.ALL, task))
+        self.slot = Slot(0, arguments, self.events, memory_limit, **more)
 
     def pass_time(self):
         """The longest pause before a start, in no time."""
@@ -42,17 +43,24 @@ class Harness:
             self.take()
 
     def take(self):
-        """The slot's next event, handled; a child that waits to be started is."""
-        self.slot.check(monotonic(), 0.0)
-        if self.slot.pid == 0:
-            self.pass_time()
-        return self.slot.handle(self.events.get(timeout=DEADLINE)[1])
+        """What the slot's next event brings; as a worker does, it looks at the slot often, and starts a child."""
+        until = monotonic() + DEADLINE
+        while monotonic() < until:
+            self.slot.check(monotonic(), 0.0)
+            if self.slot.pid == 0:
+                self.pass_time()
+            with suppress(queue.Empty):
+                return self.slot.handle(self.events.get(timeout=0.05)[1])
+        raise AssertionError("no event")
+
+    def results(self):
+        while not (results := self.take()):
+            pass
+        return results
 
     def result(self):
-        while True:
-            if results := self.take():
-                (result,) = results
-                return result
+        (result,) = self.results()
+        return result
 
     def outcome(self):
         """The result, and the file that came with it."""
@@ -67,7 +75,8 @@ class Harness:
             self.slot.handle(event)
         return event
 
-    def score(self, episode=0):
+    def score(self, episode=0, stall=0.0, vector=VECTOR):
         self.wait_ready()
-        self.slot.submit([(job(episode, spec=self.spec), VECTOR)])
+        made = job(episode, spec=self.spec)
+        self.slot.submit([(replace(made, stall=stall) if stall else made, vector)])
         return self.result()

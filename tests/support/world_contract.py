@@ -3,8 +3,9 @@
 import numpy as np
 
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
-from dreamfleet.worker.tasks.api import Continuous, RecordableTask
+from dreamfleet.worker.tasks.api import Continuous
 from dreamfleet.worker.tasks.policy import DriverPolicy
+from dreamfleet.worker.tasks.recordable import RecordableTask
 
 STEPS = 40
 SEED = 2**53 - 1  # the longest

@@ -14,8 +14,10 @@ from dreamfleet.common.protocol.measures import check_dreamt
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.dream.noise import SharedNoise
 from dreamfleet.worker.dream.world import DreamWorld
-from dreamfleet.worker.tasks.api import Episode, Score, StepObserver, StepSnapshot
+from dreamfleet.worker.tasks.api import Score
+from dreamfleet.worker.tasks.batches import Episode
 from dreamfleet.worker.tasks.measures import Measurer
+from dreamfleet.worker.tasks.watching import StepObserver, StepSnapshot
 
 DEFAULT_TEMPERATURE = 1.0
 MAX_ROWS = 256  # episodes that are dreamt together: larger batches are slower

@@ -21,7 +21,9 @@ from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.dream.batch import TORCH_ROWS as ROWS
 from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.dream.noise import BLOCK_STEPS, Draw, SharedNoise
-from dreamfleet.worker.tasks.api import Episode, Score, StepSnapshot
+from dreamfleet.worker.tasks.api import Score
+from dreamfleet.worker.tasks.batches import Episode
+from dreamfleet.worker.tasks.watching import StepSnapshot
 from dreamfleet.worker.worldmodel.inference import NoiseSize
 from dreamfleet.worker.worldmodel.torch_dream_step import StepNoise, TorchDreamStep
 

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ControllerError, UsageError
-from dreamfleet.worker.tasks.api import Policy, RecordableTask, TaskWithPolicies
+from dreamfleet.worker.tasks.api import Policy
 from dreamfleet.worker.tasks.policy import ALL_DRIVERS, DriverPolicy
+from dreamfleet.worker.tasks.recordable import RecordableTask, TaskWithPolicies
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.worldmodel.inference import Controllers
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState

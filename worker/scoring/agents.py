@@ -18,13 +18,13 @@ from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.own_runs import trust_own_run
 from dreamfleet.common.worlds.known_score import KnownScore, find_known_score
 from dreamfleet.worker.scoring.scorer import find_checked_world
-from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, Assignment, Policy, Task, TaskWithTrueState, World
+from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, Assignment, Policy, Task, World
 from dreamfleet.worker.tasks.registry import find_scored_task, find_task, known_tasks
+from dreamfleet.worker.tasks.true_state import TaskWithTrueState, Truth
 
 Floats = NDArray[np.float32]
 Policies = Callable[[int], Policy]
 """A function from an episode's seed to its policy; the caller calls `begin`."""
-Truth = Callable[[gymnasium.Env[Any, Any]], dict[str, float]]
 
 
 class Agent(Protocol):
@@ -59,10 +59,6 @@ class Agent(Protocol):
         """Name of the task of the world that it is evaluated in; after a dream, another than `task`."""
 
     @property
-    def threshold(self) -> float | None:
-        """Mean score at which gymnasium considers that world solved; `None`: unknown."""
-
-    @property
     def known_score(self) -> KnownScore | None:
         """Its mean score, where it was measured before."""
 
@@ -79,11 +75,7 @@ class Agent(Protocol):
 
 @runtime_checkable
 class TaskWithTrainedAgents(Protocol):
-    """Optional: a task in which trained agents drive.
-
-    >>> isinstance(find_task("car-racing"), TaskWithTrainedAgents)
-    True
-    """
+    """Optional: a task in which trained agents drive."""
 
     def make_trained_agent(self, trained: TrainedAgent, /) -> Agent:
         """The agent of a file; `ControllerError` if it cannot drive in this task."""
@@ -95,7 +87,12 @@ def make_agent(controller: Controller | TrainedAgent, bundle: Bundle | None = No
     `ControllerError`, `BundleError` or `UsageError` if it does not fit the tasks and packages of this host.
     """
     if isinstance(controller, TrainedAgent):
-        return _make_trained_agent(controller)
+        # Other names could load any code.
+        task = find_task(controller.task) if controller.task in known_tasks() else None
+        if isinstance(task, TaskWithTrainedAgents):
+            return task.make_trained_agent(controller)
+        seen = f"the agent sees {controller.manifest.preprocessing!r} of {controller.task!r}"
+        raise ControllerError(f"{seen}, and no task of this name takes trained agents here")
     trust_own_run(controller.provenance.get("run_uid"), controller.task, controller.options)
     fitting = None if bundle is None else bundle.for_controller(controller)
     agent = EvolvedAgent(
@@ -104,14 +101,6 @@ def make_agent(controller: Controller | TrainedAgent, bundle: Bundle | None = No
     )  # fmt: skip
     find_checked_world(agent.assignment)
     return agent
-
-
-def _make_trained_agent(trained: TrainedAgent) -> Agent:
-    task = find_task(trained.task) if trained.task in known_tasks() else None  # other names could load any code
-    if not isinstance(task, TaskWithTrainedAgents):
-        seen = f"the agent sees {trained.manifest.preprocessing!r} of {trained.task!r}"
-        raise ControllerError(f"{seen}, and no task of this name takes trained agents here")
-    return task.make_trained_agent(trained)
 
 
 def make_evaluation_spec(controller: Controller, bundle: Bundle | None) -> TaskSpec:
@@ -156,11 +145,6 @@ class EvolvedAgent:
     def reality(self) -> str:
         """Name of the task that it is evaluated in."""
         return self._reality.name
-
-    @property
-    def threshold(self) -> float | None:
-        """That of the world that it is evaluated in."""
-        return self._reality.world_of(self.assignment).threshold
 
     def make_evaluation_environment(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         """Its task's evaluation environment; a task without pictures may have no parameter `render_mode`."""

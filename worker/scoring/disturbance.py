@@ -23,36 +23,29 @@ class Disturbance:
 
     def __init__(self, seed: int, actions: Continuous, noise: float) -> None:
         """`noise` is the standard deviation, in halves of an action's range; of choices the share of steps pushed."""
-        self._actions = actions
-        random = np.random.default_rng(seed)
-        self._source: _OtherChoices | _CorrelatedNoise = _CorrelatedNoise(random, actions, noise)
-        if len(choices := numbered_choices(actions)):
-            share = min(noise, 1.0)
-            self._source = _OtherChoices(random, choices, share / (share + MEAN_LENGTH * (1 - share)))
-
-    def next(self) -> Floats:
-        """The push `(1, actions)` of the next step: noise, or the choice that replaces another; zeros: none."""
-        return self._source.next()
-
-    def apply(self, chosen: Floats, push: Floats) -> Floats:
-        """The chosen actions under the `push`, as `add_disturbance`."""
-        return add_disturbance(self._actions, chosen, push)
-
-
-class _CorrelatedNoise:
-    """First-order autoregressive noise."""
-
-    def __init__(self, random: np.random.Generator, actions: Continuous, noise: float) -> None:
-        self._random = random
+        self._actions, self._random = actions, np.random.default_rng(seed)
         self._scale = noise * (np.array(actions.high) - np.array(actions.low)) / 2
         self._value = np.zeros(actions.actions)
+        self._other: _OtherChoices | None = None
+        if len(choices := numbered_choices(actions)):
+            share = min(noise, 1.0)
+            self._other = _OtherChoices(self._random, choices, share / (share + MEAN_LENGTH * (1 - share)))
 
     def next(self) -> Floats:
-        """The noise `(1, actions)` of the next step."""
+        """The push `(1, actions)` of the next step: noise, or the choice that replaces another; zeros: none.
+
+        The noise is autoregressive, of first order.
+        """
+        if self._other is not None:
+            return self._other.next()
         fresh = self._random.standard_normal(len(self._value))
         self._value = CORRELATION * self._value + (1 - CORRELATION**2) ** 0.5 * fresh
         push: Floats = (self._value * self._scale).astype(np.float32)[None]
         return push
+
+    def apply(self, chosen: Floats, push: Floats) -> Floats:
+        """The chosen actions under the `push`, as `add_disturbance`."""
+        return add_disturbance(self._actions, chosen, push)
 
 
 class _OtherChoices:

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.worker.scoring.rollout import Rollout
-from dreamfleet.worker.tasks.api import Policies, Policy, Score
+from dreamfleet.worker.tasks.api import Policy, Score
 from dreamfleet.worker.tasks.reset import reset_folded
+from dreamfleet.worker.tasks.side_by_side import Policies
 
 MAX_OFF_COURSE_STEPS = 100  # most steps off the course that are charged: a lost course is one loss, however long
 

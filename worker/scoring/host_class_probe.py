@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.scoring.watched_policy import WatchedPolicy
-from dreamfleet.worker.tasks.api import Batch, Policy, StepSnapshot, WatchableBatch
+from dreamfleet.worker.tasks.api import Policy
+from dreamfleet.worker.tasks.batches import Batch, WatchableBatch
+from dreamfleet.worker.tasks.watching import StepSnapshot
 
 SEED = 0  # used by no run
 REPEAT_LIMIT = 10.0  # seconds of the first probe from which on it is not repeated: a child must be ready in time

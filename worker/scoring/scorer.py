@@ -24,21 +24,13 @@ from dreamfleet.worker.scoring.episode import EpisodeConfig, score, score_togeth
 from dreamfleet.worker.scoring.host_class_probe import REPEAT_LIMIT, HostClassProbe
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld, Rollout
 from dreamfleet.worker.scoring.watched_policy import WatchedPolicy
-from dreamfleet.worker.tasks.api import (
-    Assignment,
-    Batch,
-    BatchedTask,
-    Policies,
-    PolicySideBySide,
-    Score,
-    StepObserver,
-    Task,
-    WatchableBatch,
-    World,
-)
+from dreamfleet.worker.tasks.api import Assignment, Score, Task, World
+from dreamfleet.worker.tasks.batches import Batch, BatchedTask, WatchableBatch
 from dreamfleet.worker.tasks.closing import close_environment
-from dreamfleet.worker.tasks.measures import Measurer
+from dreamfleet.worker.tasks.measures import EpisodeMeasurer, Measurer
 from dreamfleet.worker.tasks.registry import find_scored_task
+from dreamfleet.worker.tasks.side_by_side import Policies, PolicySideBySide
+from dreamfleet.worker.tasks.watching import StepObserver
 
 DRIVER_NAME = "controller"  # the driver's name in collected rollouts
 
@@ -96,7 +88,10 @@ class Scorer(Displayed):
 
     def _display(self) -> tuple[str, dict[str, object]]:
         spec, size = self.spec, self._assignment.controller.size
-        facts = {
+        title = (
+            f"Scorer of {spec.task}: {plural(size, 'parameter')}, episodes of {plural(spec.horizon, 'step')} at most"
+        )
+        return title, {
             "task": spec.task,
             "parameters": size,
             "horizon": spec.horizon,
@@ -105,10 +100,6 @@ class Scorer(Displayed):
             "world model": spec.bundle[:12] or "none",
             "options": spec.options or None,
         }
-        return (
-            f"Scorer of {spec.task}: {plural(size, 'parameter')}, episodes of {plural(spec.horizon, 'step')} at most",
-            facts,
-        )
 
     def score(
         self, kind: Kind, parameters: NDArray[np.float32], seed: int, on_step: Callable[[int], None] = lambda _: None,
@@ -130,8 +121,13 @@ class Scorer(Displayed):
             if self.observer is not None and isinstance(batch, WatchableBatch):
                 batch = batch.watched(self.observer)
             return batch.score([(parameters, seed) for _, parameters, seed in jobs], on_step)
-        if (policies := self._policies_for(jobs)) is not None:
-            return self._drive_together(policies, jobs, on_step, spec)
+        if 1 < len(jobs) <= self.together and self.observer is None:
+            assert self._policies is not None  # `together` has made them
+            return score_together(
+                (self._environment, *self._more_environments), self._policies,
+                [parameters for _, parameters, _ in jobs],
+                [self.episode_config(kind, seed, spec) for kind, _, seed in jobs], on_step,
+            )  # fmt: skip
         scores: list[Score] = []
         for kind, parameters, seed in jobs:
             before = sum(each.steps for each in scores)
@@ -142,9 +138,8 @@ class Scorer(Displayed):
             if (alone := self._batch((kind,), spec)) is not None:
                 scores += alone.score([(parameters, seed)], report_steps)
             else:
-                scores.append(
-                    self._run_episode(len(scores), parameters, self.episode_config(kind, seed, spec), report_steps)
-                )
+                episode_config = self.episode_config(kind, seed, spec)
+                scores.append(self._run_episode(len(scores), parameters, episode_config, report_steps))
         return scores
 
     def collect(
@@ -191,15 +186,9 @@ class Scorer(Displayed):
         spec, world = spec or self.spec, self.world
         time_cost, off_course_cost = (world.time_cost, world.off_course_cost) if kind == "score" else (0.0, 0.0)
         return EpisodeConfig(
-            seed,
-            spec.horizon,
-            spec.patience,
-            world.idle_cost,
-            time_cost,
-            world.finish,
-            off_course_cost,
+            seed, spec.horizon, spec.patience, world.idle_cost, time_cost, world.finish, off_course_cost,
             world.off_course,
-        )
+        )  # fmt: skip
 
     def _batch(self, kinds: Iterable[Kind], spec: TaskSpec | None) -> Batch | None:
         """The batch that scores jobs of these kinds; `None` if they are driven one by one."""
@@ -215,10 +204,6 @@ class Scorer(Displayed):
         if (watched := self.__dict__.get("_watched_environment")) is not None:  # made on first use
             close_environment(watched)
 
-    def _policies_for(self, jobs: Sequence[object]) -> Policies | None:
-        """The policies that drive these jobs side by side; `None` if they are driven one by one."""
-        return self._policies if 1 < len(jobs) <= self.together and self.observer is None else None
-
     @cached_property
     def together(self) -> int:
         """How many candidates' drives it does side by side. Their environments are made when this is first asked."""
@@ -232,26 +217,10 @@ class Scorer(Displayed):
             return 1 + len(self._more_environments)
         return 1
 
-    def _drive_together(
-        self, policies: Policies, jobs: Sequence[tuple[Kind, NDArray[np.float32], int]],
-        on_step: Callable[[int], None], spec: TaskSpec | None,
-    ) -> list[Score]:  # fmt: skip
-        return score_together(
-            (self._environment, *self._more_environments),
-            policies,
-            [parameters for _, parameters, _ in jobs],
-            [self.episode_config(kind, seed, spec) for kind, _, seed in jobs],
-            on_step,
-        )
-
     def _run_episode(
-        self,
-        episode: int,
-        parameters: NDArray[np.float32],
-        episode_config: EpisodeConfig,
-        on_step: Callable[[int], None],
-        rollout: Rollout | None = None,
-    ) -> Score:
+        self, episode: int, parameters: NDArray[np.float32], episode_config: EpisodeConfig,
+        on_step: Callable[[int], None], rollout: Rollout | None = None,
+    ) -> Score:  # fmt: skip
         """Drive the episode with this index in its group, and let the observer watch if there is one."""
         environment, policy = self._environment, self._policy
         if self.observer is not None:
@@ -260,7 +229,7 @@ class Scorer(Displayed):
             environment = environment if shown is None else shown
         if not self.spec.measures:
             return score(environment, policy, parameters, episode_config, on_step, rollout)
-        watch = self._measurer.watch(environment)
+        watch = EpisodeMeasurer(self._measurer, environment)
         found = score(
             environment, policy, parameters, episode_config, on_step, rollout,
             lambda moment: watch.on_transition(moment.action, moment.info),

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from time import monotonic
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from dreamfleet.common.cli.task_check import LAST_STEP, LEAVE_OPEN, DryRunReport
 from dreamfleet.common.errors import DreamfleetError, UsageError
@@ -24,9 +24,6 @@ from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.host.user_code import describe_error, keep_user_arguments
 from dreamfleet.common.printable import one_line, plural
 from dreamfleet.common.protocol.tasks import Description, describe_task
-
-if TYPE_CHECKING:
-    from dreamfleet.worker.tasks.api import Actions, Policy, Task
 
 MEND = "fix the environment, or wrap it"
 SLOW_RESET = 2.0  # seconds; gymnasium's checker resets a dozen times, so it is left out where resets are slower
@@ -90,12 +87,11 @@ class CheckedEnvironment:
             )
         numbers = np.asarray(observation, dtype=np.float64)
         finite = bool(np.isfinite(numbers).all())
-        text = "an observation holds NaN or infinity, from which no controller can act"
-        if finite and (np.abs(numbers) > np.finfo(np.float32).max).any():
-            text = (
-                "an observation holds a number beyond 3.4e38, which is infinity in the single precision of controllers"
-            )
-        elif finite:
+        if not finite:
+            text = "an observation holds NaN or infinity, from which no controller can act"
+        elif (np.abs(numbers) > np.finfo(np.float32).max).any():
+            text = "an observation holds a number beyond 3.4e38, infinite in the single precision of controllers"
+        else:
             return True
         if text not in self.warnings:
             self.warnings.append(text)
@@ -143,7 +139,7 @@ def dry_run(
     from dreamfleet.worker.scoring.host_class_probe import REPEAT_LIMIT  # needs gymnasium, as the task may not
     from dreamfleet.worker.tasks import closing
 
-    trial = _prepare(name, description, announce, measures)
+    trial = _Trial(name, description, announce, measures)
     checked = trial.checked
     began = monotonic()
     report = DryRunReport(description, episode=trial.drive(), first=_digest(checked.first))
@@ -157,9 +153,7 @@ def dry_run(
         if checked.reset_seconds >= SLOW_RESET:
             checked.warnings.append(f"a reset took {checked.reset_seconds:.0f} s, so gymnasium's checker was left out")
     if thorough and options.get("normalise"):
-        closing.close_environment(
-            checked.environment
-        )  # the description makes its own, and many simulators allow one a process
+        closing.close_environment(checked.environment)  # many simulators allow one a process, and this makes another
         announce("")
         report.description = describe_task(name, options)
         announce("making it")
@@ -176,25 +170,37 @@ def dry_run(
         yield report
 
 
-@dataclass(frozen=True)
 class _Trial:
     """A task's environment under its policy."""
 
-    checked: CheckedEnvironment
-    make: Callable[[], Any]  # its environment anew
-    policy: Policy
-    actions: Actions
-    parameters: int
-    probe_steps: int
+    def __init__(
+        self, name: str, description: Description, announce: Callable[[str], None], measures: Sequence[str]
+    ) -> None:
+        from dreamfleet.common.artifacts.controller import ControllerShape
+        from dreamfleet.common.protocol.messages import TaskSpec
+        from dreamfleet.worker.tasks.api import Assignment
+        from dreamfleet.worker.tasks.measures import Measurer
+        from dreamfleet.worker.tasks.registry import find_task
+
+        task, shape = find_task(name), ControllerShape(description.observations, description.outputs)
+        assignment = Assignment(
+            TaskSpec(name, "", 1000, 0, shape, options=description.options, version=description.version)
+        )
+        world = task.world_of(assignment)
+        Measurer(measures, world.actions, world.action_names, getattr(task, "truth", None))
+        self.make: Callable[[], Any] = lambda: task.make_environment(assignment)  # its environment anew
+        self.checked = CheckedEnvironment(self.make(), description.observations, announce)
+        self._policy, self._actions = task.make_policy(assignment), world.actions
+        self._size, self._probe_steps = shape.size, task.probe_steps
 
     def drive(self) -> str:
         """Drive the probe episode and return its digest; empty: there is none."""
         from dreamfleet.worker.scoring.host_class_probe import HostClassProbe
 
-        if self.probe_steps <= 0:
+        if self._probe_steps <= 0:
             return ""
         probe, environment = HostClassProbe(), cast("Any", self.checked)
-        probe.add_episode(environment, self.policy, self.parameters, self.probe_steps)
+        probe.add_episode(environment, self._policy, self._size, self._probe_steps)
         return probe.host_class
 
     def drive_extremes(self) -> None:
@@ -203,9 +209,9 @@ class _Trial:
 
         from dreamfleet.worker.tasks.policy import FlatPolicy
 
-        if not isinstance(self.policy, FlatPolicy) or not getattr(self.actions, "squashed", True):
+        if not isinstance(self._policy, FlatPolicy) or not getattr(self._actions, "squashed", True):
             return  # others may take other outputs, and those without tanh have no bounds
-        size, is_over, slow_resets = self.actions.outputs, True, False
+        size, is_over, slow_resets = self._actions.outputs, True, False
         corners = np.random.default_rng(0).choice([-1.0, 1.0], (CORNERS, size))
         last = np.arange(size) == size - 1  # of numbered actions
         for signs in (np.full(size, -1.0), np.full(size, 1.0), np.where(last, 1.0, -1.0), *corners):
@@ -214,36 +220,10 @@ class _Trial:
             if is_over:
                 self.checked.reset(seed=0)
                 slow_resets = self.checked.reset_seconds >= SLOW_RESET
-            action = self.actions.to_action((SATURATED * signs).astype(np.float32))
+            action = self._actions.to_action((SATURATED * signs).astype(np.float32))
             self.checked.announce(f"a step with the action {one_line(str(action))[:MAX_ACTION]}")
             _, _, terminated, truncated, _ = self.checked.step(action)
             is_over = bool(terminated or truncated)
-
-
-def _prepare(name: str, description: Description, announce: Callable[[str], None], measures: Sequence[str]) -> _Trial:
-    """The task's environment and policy."""
-    from dreamfleet.common.artifacts.controller import ControllerShape
-    from dreamfleet.common.protocol.messages import TaskSpec
-    from dreamfleet.worker.tasks.api import Assignment
-    from dreamfleet.worker.tasks.measures import Measurer
-    from dreamfleet.worker.tasks.registry import find_task
-
-    task: Task = find_task(name)
-    shape = ControllerShape(description.observations, description.outputs)
-    assignment = Assignment(
-        TaskSpec(name, "", 1000, 0, shape, options=description.options, version=description.version)
-    )
-    world = task.world_of(assignment)
-    Measurer(measures, world.actions, world.action_names, getattr(task, "truth", None))
-    checked = CheckedEnvironment(task.make_environment(assignment), description.observations, announce)
-    return _Trial(
-        checked,
-        lambda: task.make_environment(assignment),
-        task.make_policy(assignment),
-        world.actions,
-        shape.size,
-        task.probe_steps,
-    )
 
 
 def _digest(value: Any) -> str:

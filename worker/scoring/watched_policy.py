@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.worker.tasks.api import Policy, StepObserver, StepSnapshot
+from dreamfleet.worker.tasks.api import Policy
 from dreamfleet.worker.tasks.pictures import drawn_pixels
+from dreamfleet.worker.tasks.watching import StepObserver, StepSnapshot
 
 Picture = NDArray[np.uint8]
 

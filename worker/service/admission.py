@@ -44,63 +44,60 @@ class Admission:
     package: str = ""  # the coordinator's version
 
 
-def request_admission(
-    session: zenoh.Session,
-    run: str | None,
-    request: HelloRequest,
-    inbox: CountingDecoder,
-    joined_run_uid: str = "",
-    *,
-    secured: bool = False,
-    torch_device: str = "",
-) -> Admission | None:
-    """Say hello to `run`, or to the only live run; `None` if nobody answers, `RefusedError` if the answer is a refusal.
+@dataclass(frozen=True)
+class CoordinatorLink:
+    """How this worker reaches coordinators: its session, its hello and its decoder."""
 
-    `joined_run_uid` is the uid of the run that this worker has joined, if any. In a `secured` fleet the request goes to
-    this worker's own key. If the run's fingerprint covers other packages than the request's, hello is sent again
-    with a fingerprint of those. A run whose task the request does not announce is refused, so that an answer never
-    makes this worker import code.
-    """
-    reply = _send_hello(session, run, request, inbox, joined_run_uid, secured=secured)
-    if reply is not None and not reply.accepted and reply.packages != request.packages:
-        named = fingerprint(reply.packages, torch_device)[:MAX_TEXT]  # the coordinator chooses how many
-        about = replace(request, packages=reply.packages, fingerprint=named)
-        reply = _send_hello(session, reply.run, about, inbox, joined_run_uid, secured=secured)
-    if reply is None:
-        return None
-    admission = _read_admission(reply)
-    check_task_allowed(admission.spec.task, request.tasks)
-    return admission
+    session: zenoh.Session
+    hello: HelloRequest
+    inbox: CountingDecoder
+    secured: bool = False  # whether the fleet has join files; hello then goes to this worker's own key
+    torch_device: str = ""  # that the fingerprint covers
 
+    @property
+    def identity(self) -> str:
+        """The worker's name and life."""
+        return self.hello.worker
 
-def _send_hello(
-    session: zenoh.Session,
-    run: str | None,
-    request: HelloRequest,
-    inbox: CountingDecoder,
-    joined_run_uid: str,
-    *,
-    secured: bool,
-) -> HelloReply | None:
-    """The answer to one hello request.
+    def request_admission(self, run: str | None, host_class: str = "", joined_run_uid: str = "") -> Admission | None:
+        """Say hello to `run`, or to the only live run; `None` if nobody answers, `RefusedError` if that is refused.
 
-    R23: a single refusal decides nothing, because anybody on the network can answer. The joined run comes first, then a
-    welcome, then a refusal. Of equal answers one is drawn at random, so that no stranger always wins.
-    """
-    key = keys.secured_hello(run or "*", request.worker) if secured else keys.hello(run or "*")
-    request, replies = replace(request, anchor=anchor_proof(request.worker)), []
-    for _, payload in query_every_responder(session, [key], HELLO_TIMEOUT, encode_json(request)):
-        reply = inbox.decode_json(HelloReply, payload)
-        if reply is not None and _is_reply_of(reply, run):
-            replies.append(reply)
-            if reply.accepted and reply.run_uid == joined_run_uid:  # no need to wait for others
-                break
-    if not replies:
-        return None
-    if len(names := sorted({reply.run for reply in replies})) > 1:
-        listed = ", ".join(names[:MAX_RUNS_LISTED])
-        raise RefusedError(f"several runs are live, {listed}; choose one", ("--run", names[0]))
-    return max(replies, key=lambda reply: (reply.run_uid == joined_run_uid, reply.accepted, random.random()))  # noqa: S311
+        `joined_run_uid` is the uid of the run that this worker has joined, if any. If the run's fingerprint covers
+        other packages than the request's, hello is sent again with a fingerprint of those. A run whose task the hello
+        does not announce is refused, so that an answer never makes this worker import code.
+        """
+        request = replace(self.hello, host_class=host_class)
+        reply = self._send_hello(run, request, joined_run_uid)
+        if reply is not None and not reply.accepted and reply.packages != request.packages:
+            named = fingerprint(reply.packages, self.torch_device)[:MAX_TEXT]  # the coordinator chooses how many
+            about = replace(request, packages=reply.packages, fingerprint=named)
+            reply = self._send_hello(reply.run, about, joined_run_uid)
+        if reply is None:
+            return None
+        admission = _read_admission(reply)
+        check_task_allowed(admission.spec.task, request.tasks)
+        return admission
+
+    def _send_hello(self, run: str | None, request: HelloRequest, joined_run_uid: str) -> HelloReply | None:
+        """The answer to one hello request.
+
+        R23: a single refusal decides nothing, because anybody on the network can answer. The joined run comes first,
+        then a welcome, then a refusal. Of equal answers one is drawn at random, so that no stranger always wins.
+        """
+        key = keys.secured_hello(run or "*", request.worker) if self.secured else keys.hello(run or "*")
+        request, replies = replace(request, anchor=anchor_proof(request.worker)), []
+        for _, payload in query_every_responder(self.session, [key], HELLO_TIMEOUT, encode_json(request)):
+            reply = self.inbox.decode_json(HelloReply, payload)
+            if reply is not None and _is_reply_of(reply, run):
+                replies.append(reply)
+                if reply.accepted and reply.run_uid == joined_run_uid:  # no need to wait for others
+                    break
+        if not replies:
+            return None
+        if len(names := sorted({reply.run for reply in replies})) > 1:
+            listed = ", ".join(names[:MAX_RUNS_LISTED])
+            raise RefusedError(f"several runs are live, {listed}; choose one", ("--run", names[0]))
+        return max(replies, key=lambda reply: (reply.run_uid == joined_run_uid, reply.accepted, random.random()))  # noqa: S311
 
 
 def _is_reply_of(reply: HelloReply, run: str | None) -> bool:

@@ -72,9 +72,14 @@ def fetch_bundle_of(controller: Controller, session: zenoh.Session, run: str) ->
     """The world model of a controller of `run`: cached, shipped, or fetched; `None` if it needs none."""
     if not controller.bundle:
         return None
-    bundle = fetch_bundle(session, run, controller.bundle, BundleStore(default_cache()), CountingDecoder())
+    return fetch_bundle_now(session, run, controller.bundle).for_controller(controller)
+
+
+def fetch_bundle_now(session: zenoh.Session, run: str, sha256: str) -> Bundle:
+    """The bundle, from this host's cache or from the coordinator of `run`; errors as in `fetch_bundle`."""
+    bundle = fetch_bundle(session, run, sha256, BundleStore(default_cache()), CountingDecoder())
     assert bundle is not None  # it cannot be stopped
-    return bundle.for_controller(controller)
+    return bundle
 
 
 def _download(

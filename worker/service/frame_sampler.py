@@ -10,14 +10,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from time import perf_counter, thread_time
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dreamfleet.common.protocol.frame_pictures import pack_picture
-
-if TYPE_CHECKING:  # `tasks.api` imports gymnasium, which the parent process does not need
-    from dreamfleet.worker.tasks.api import StepSnapshot
+from dreamfleet.worker.tasks.watching import StepSnapshot
 
 FRAME_INTERVAL = 0.1  # seconds between two frames, at least
 MAX_TIME_SHARE = 0.01  # of the child's processor time, at most

@@ -14,6 +14,9 @@ NEXT_RUN_PATIENCE = 60.0  # the same for one that has jobs or results of the run
 SEARCH_INTERVAL = 5.0  # seconds without a coordinator after which, and then between which, it looks for its run
 SILENT_BEATS = 5  # heartbeat intervals in which a coordinator that knows this worker would have answered
 UPLOAD_GRACE = 30.0  # seconds more while a rollout is being sent: the verdict comes only after it
+# Seconds until a run that refused is asked again: the first pause, and the longest; each refusal doubles it.
+FIRST_DELAY, MAX_DELAY = 15.0, 600.0  # of a worker that may serve any run
+SINGLE_RUN_DELAYS = 1.0, 60.0  # of a worker that serves one run
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,7 @@ class Membership:
     """
 
     def __init__(self, conditions: LeaveConditions, now: float, stops: StopRequests | None = None) -> None:
-        self._conditions = conditions
+        self.conditions = conditions
         self._ends_at = now + (conditions.lifetime or math.inf)
         self._stops = stops or StopRequests()
         self._drain_until: float | None = None
@@ -64,7 +67,7 @@ class Membership:
         """Record that a run welcomed this worker: its coordinator's life `nonce`, and the heartbeat interval `beat`."""
         self._beat = beat
         self._coordinators: set[str] = set()  # nonces of the coordinators in sight
-        self._run_is_over = ""
+        self.run_is_over = ""  # why the joined run is over and its workers leave; empty: it is not
         self.ending = ""  # how the joined run ended by a limit, in words; empty: it has not
         self._no_coordinator_since: float | None = now  # `None` while one is in sight
         self._next_hello_at = now
@@ -94,7 +97,7 @@ class Membership:
 
     def end_run(self, why: str, ending: str = "") -> None:
         """Record that the joined run is over and its workers leave; `ending` is how a limit ended it."""
-        self._run_is_over, self.ending = why, ending
+        self.run_is_over, self.ending = why, ending
 
     def add_coordinator(self, nonce: str) -> bool:
         """Record that a coordinator came into sight; return whether it is the joined one that is back."""
@@ -121,22 +124,12 @@ class Membership:
     @property
     def plan_without_coordinator(self) -> str:
         """What it does while its coordinator is out of sight, in words."""
-        if self._conditions.serves_any:
+        if self.conditions.serves_any:
             after = f"{NEXT_RUN_AFTER:g} s, with results of it after {NEXT_RUN_PATIENCE:g} s"
             return f"leaves this run after {after}, and serves others"
-        if self._conditions.leaves_with_run:
-            return f"leaves unless it is back within {self._conditions.coordinator_timeout:g} s"
+        if self.conditions.leaves_with_run:
+            return f"leaves unless it is back within {self.conditions.coordinator_timeout:g} s"
         return "waits for this run only, even under another name (--any takes the next run)"
-
-    @property
-    def run_is_over(self) -> bool:
-        """Whether the joined run is over and its workers leave."""
-        return bool(self._run_is_over)
-
-    @property
-    def drain_timeout(self) -> float:
-        """Seconds that draining may take."""
-        return self._conditions.drain_timeout
 
     @property
     def draining(self) -> bool:
@@ -150,7 +143,7 @@ class Membership:
         """
         if self.draining or not self.is_leaving(now):
             return False
-        self._drain_until = now + self._conditions.drain_timeout
+        self._drain_until = now + self.conditions.drain_timeout
         return True
 
     def find_end(self, now: float, busy: bool) -> str:
@@ -161,23 +154,23 @@ class Membership:
         """
         if self._stops.count > 1:
             return "stopped by two signals, without draining"
-        if self._run_is_over:
-            return self._run_is_over
+        if self.run_is_over:
+            return self.run_is_over
         if self._drain_until is not None:
             if busy and now <= self._drain_until:
                 return ""
             why = "drained after a stop signal" if self._stops.count else "drained at the end of its lifetime"
             return f"{why}, but jobs or results were left when --drain-timeout was over" if busy else why
         if self.gives_up(now):
-            return f"no coordinator was reachable for {self._conditions.coordinator_timeout:g} s"
-        if self._conditions.serves_any and self._is_alone(now, NEXT_RUN_PATIENCE if busy else NEXT_RUN_AFTER):
+            return f"no coordinator was reachable for {self.conditions.coordinator_timeout:g} s"
+        if self.conditions.serves_any and self._is_alone(now, NEXT_RUN_PATIENCE if busy else NEXT_RUN_AFTER):
             return "it takes another run"
         return ""
 
     def gives_up(self, now: float) -> bool:
         """Whether the coordinator has been out of sight for so long that waiting for it makes no sense."""
-        alone = self._is_alone(now, self._conditions.coordinator_timeout)
-        return self._conditions.leaves_with_run and alone and not self.is_leaving(now)
+        alone = self._is_alone(now, self.conditions.coordinator_timeout)
+        return self.conditions.leaves_with_run and alone and not self.is_leaving(now)
 
     def _is_alone(self, now: float, seconds: float) -> bool:
         """Whether no coordinator has been in sight for longer than `seconds`."""
@@ -202,3 +195,38 @@ class Membership:
             return True
         patience = SILENT_BEATS * self._beat + (UPLOAD_GRACE if load.uploading else 0.0)
         return now - self._silent_since > patience and (load.idle or load.awaits_verdict)
+
+
+class RefusalBackoff:
+    """The runs that refused this worker, with their reasons and pauses."""
+
+    def __init__(self, first: float = FIRST_DELAY, longest: float = MAX_DELAY) -> None:
+        self._first, self._longest = first, longest
+        self._reasons: dict[str, str] = {}  # the last one of each run
+        self._pause: dict[str, float] = {}
+        self._until: dict[str, float] = {}
+
+    def add(self, run: str, now: float) -> float:
+        """Record a refusal; return the seconds until the run may be asked again.
+
+        R23: a refused worker asks again for as long as it lives, because the reason may pass and anybody could have
+        answered. Pauses grow, so that asking costs little.
+        """
+        pause = min(2 * self._pause.get(run, self._first / 2), self._longest)
+        self._pause[run], self._until[run] = pause, now + pause
+        return pause
+
+    def is_news(self, run: str, reason: str) -> bool:
+        """Whether a run refuses for another reason than the last time."""
+        before = self._reasons.get(run)
+        self._reasons[run] = reason
+        return reason != before
+
+    def forget(self, run: str) -> None:
+        """Forget a run's refusals: it has accepted this worker."""
+        for each in (self._reasons, self._pause, self._until):
+            each.pop(run, None)
+
+    def refusing_runs(self, now: float) -> set[str]:
+        """Runs that must not be asked now."""
+        return {run for run, until in self._until.items() if now < until}

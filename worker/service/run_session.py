@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import logging
 import queue
-from collections.abc import Callable
+import random
 from contextlib import suppress
-from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
@@ -21,10 +20,9 @@ from dreamfleet.common.host.error_counter import ErrorCounter
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.printable import one_line, plural
 from dreamfleet.common.protocol import keys
-from dreamfleet.common.protocol.codec import CountingDecoder
 from dreamfleet.common.protocol.messages import MAX_LEASES, JobBatch, Result
 from dreamfleet.common.transport.session import enqueue_into
-from dreamfleet.worker.service.admission import Admission, find_names_of_run
+from dreamfleet.worker.service.admission import Admission, CoordinatorLink, find_names_of_run
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.frame_publisher import FramePublisher
 from dreamfleet.worker.service.frame_sampler import SampledFrame
@@ -37,22 +35,10 @@ from dreamfleet.worker.service.wording import describe_failure
 
 log = logging.getLogger(__name__)
 MAX_WAITING_BATCHES = 1024  # R26: more batches are dropped unread; the coordinator sends unconfirmed ones again
+RETRY = 1.0  # seconds between two hellos, about
 CLOCK_GAP = 2.0  # seconds between two passes of the loop that mean that the host was suspended
 
 Events = queue.SimpleQueue[tuple[str, Any]]
-
-
-@dataclass(frozen=True)
-class CoordinatorLink:
-    """How this worker reaches coordinators: its session, its identity and its decoder."""
-
-    session: zenoh.Session
-    identity: str
-    inbox: CountingDecoder
-    # Says hello: run name, host class (empty if unknown), uid of the joined run; `None` if nobody answers.
-    request_admission: Callable[[str, str, str], Admission | None]
-    retry_delay: Callable[[], float]  # seconds until the next hello
-    secured: bool = False  # whether the fleet has join files
 
 
 class RunSession:
@@ -132,7 +118,7 @@ class RunSession:
             if self._membership.start_draining_if_due(now):
                 self._return_unstarted_jobs()
                 log.info("draining for at most %g s, a second signal leaves at once: running episodes finish, queued "
-                         "jobs go back", self._membership.drain_timeout)  # fmt: skip
+                         "jobs go back", self._membership.conditions.drain_timeout)  # fmt: skip
             self._fill_slots(now)
             self._send(now)
             if self._membership.must_rejoin(now, self._load()):
@@ -302,16 +288,8 @@ class RunSession:
             self._sender.send_part(part)
 
     def _send_heartbeat(self, now: float, capacity: int, reason: str = "") -> None:
-        self._sender.send_heartbeat(
-            self._slots,
-            numbering=self._backlog.numbering,
-            seen=self._backlog.seen,
-            capacity=capacity,
-            queued=self._backlog.queued,
-            unacked=self._outbox.digests,
-            rate=self._rate.update(now, self._steps_finished + self._slots.steps),
-            reason=reason,
-        )
+        rate = self._rate.update(now, self._steps_finished + self._slots.steps)
+        self._sender.send_heartbeat(self._slots, self._backlog, self._outbox, capacity, rate, reason)
 
     def _load(self) -> WorkerLoad:
         idle = self._slots.idle and not len(self._backlog)  # with jobs queued, other runs have the slots
@@ -323,17 +301,13 @@ class RunSession:
         R22: an extra hello is harmless. Running jobs go on and results without a verdict are kept; if the answer starts
         a new numbering, queued jobs are dropped and given again.
         """
-        self._membership.note_hello_sent(now, self._link.retry_delay())
+        self._membership.note_hello_sent(now, RETRY * random.uniform(0.5, 1.5))  # noqa: S311 - no secret
         admission = self._link.request_admission(self._admission.run, self._slots.host_class, self._admission.run_uid)
         if admission is None:
             return
         if (admission.run_uid, admission.spec) != (self._admission.run_uid, self._admission.spec):
             raise RefusedError(f"run {admission.run} is another run now")
-        restarted = admission.nonce != self._admission.nonce
-        self._admission = admission
-        self._sender = CoordinatorSender(self._link.session, self._link.identity, admission)
-        if restarted or admission.numbering != self._backlog.numbering:
-            self._restart_numbering(admission.numbering)
+        restarted = self._adopt(admission)
         self._membership.rejoin(admission.nonce, monotonic())
         level = logging.INFO if restarted else logging.DEBUG  # an idle worker of a paused run says hello repeatedly
         log.log(level, "joined run %s again, incarnation %d", admission.run, admission.incarnation)
@@ -369,19 +343,22 @@ class RunSession:
         for each in self._declared:
             each.undeclare()
         self._slots.show(False)
-        self._admission = admission
-        self._sender = CoordinatorSender(self._link.session, self._link.identity, admission)
-        self._restart_numbering(admission.numbering)
+        self._adopt(admission)
         self._startup()
 
-    def _restart_numbering(self, numbering: int) -> None:
-        """Start a new numbering of batches.
+    def _adopt(self, admission: Admission) -> bool:
+        """Go on under another admission to the same run; return whether its coordinator is in another life.
 
-        R12: the coordinator gives the queued jobs again under it, so they are dropped here.
+        R12: under a new numbering of batches the coordinator gives the queued jobs again, so they are dropped here.
         R7: every result without a verdict is sent again at once, because the coordinator may not have the last sending.
         """
-        self._backlog.start_numbering(numbering)
-        self._backlog.clear()
-        self._outbox.resend_all()
-        self._uploads.resend_all()
-        self._next_heartbeat_at = 0.0
+        restarted = admission.nonce != self._admission.nonce
+        self._admission = admission
+        self._sender = CoordinatorSender(self._link.session, self._link.identity, admission)
+        if restarted or admission.numbering != self._backlog.numbering:
+            self._backlog.start_numbering(admission.numbering)
+            self._backlog.clear()
+            self._outbox.resend_all()
+            self._uploads.resend_all()
+            self._next_heartbeat_at = 0.0
+        return restarted

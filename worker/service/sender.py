@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import zenoh
 
@@ -17,11 +18,11 @@ from dreamfleet.common.protocol.messages import (
     Message,
     Result,
     ResultBatch,
-    RunningJob,
     UploadPart,
 )
 from dreamfleet.worker.service.admission import Admission
-from dreamfleet.worker.service.outbox import FilePart
+from dreamfleet.worker.service.backlog import Backlog
+from dreamfleet.worker.service.outbox import FilePart, Outbox
 from dreamfleet.worker.service.slot_pool import SlotPool
 
 MAX_STEPS_PER_SECOND = 1e9  # the largest rate that a heartbeat can report
@@ -50,54 +51,35 @@ class CoordinatorSender:
         self._session = session
         self._identity = identity
         self._admission = admission
+        self._life: dict[str, Any] = {"run_uid": admission.run_uid, "incarnation": admission.incarnation}
 
     def send_results(self, slots: SlotPool, results: tuple[Result, ...]) -> None:
         """Send results in one message."""
-        batch = ResultBatch(
-            run_uid=self._admission.run_uid,
-            incarnation=self._admission.incarnation,
-            fingerprint=fingerprint(self._admission.packages, slots.torch_device),
-            results=results,
-            host_class=slots.host_class,
-        )
-        self._publish(keys.result(self._admission.run, self._identity), batch)
+        named = fingerprint(self._admission.packages, slots.torch_device)
+        batch = ResultBatch(**self._life, fingerprint=named, results=results, host_class=slots.host_class)
+        self._publish(keys.result, batch)
 
     def send_part(self, part: FilePart) -> None:
         """Send one part of a job's rollout file."""
-        message = UploadPart(
-            run_uid=self._admission.run_uid,
-            incarnation=self._admission.incarnation,
-            digest=part.digest,
-            sha256=part.sha256,
-            offset=part.offset,
-            total=part.total,
-            data=part.data,
-        )
-        self._publish(keys.upload(self._admission.run, self._identity), message)
+        self._publish(keys.upload, UploadPart(**self._life, **vars(part)))
 
     def send_heartbeat(
-        self, slots: SlotPool, *, numbering: int, seen: int, capacity: int, queued: Sequence[bytes],
-        unacked: Sequence[bytes], rate: float, reason: str = "",
-    ) -> None:  # fmt: skip
-        """Send a heartbeat: batches received up to `seen`, queued and running jobs, results without a verdict.
+        self, slots: SlotPool, backlog: Backlog, outbox: Outbox, capacity: int, rate: float, reason: str
+    ) -> None:
+        """Send a heartbeat: batches received so far, queued and running jobs, results without a verdict.
 
         R10: `seen` confirms batches, so that the coordinator does not send them again.
         R12: `numbering` names the numbering that `seen` belongs to, so it confirms no batch of another one.
         R20: every job that this worker has is listed, because a job that is not listed is given to another worker.
         """
-        running: list[RunningJob] = slots.running
-        beat = Heartbeat(
-            run_uid=self._admission.run_uid,
-            incarnation=self._admission.incarnation,
-            nonce=self._admission.nonce,
-            numbering=numbering,
-            seen=seen,
+        self._beat(
+            numbering=backlog.numbering,
+            seen=backlog.seen,
             capacity=capacity,
             slots=len(slots),
-            queued=_tags([*queued, *(job.digest for job in slots.waiting)]),
-            running=tuple(running[:MAX_LEASES]),
-            unacked=_tags(unacked),
-            load=os.getloadavg()[0],
+            queued=_tags([*backlog.queued, *(job.digest for job in slots.waiting)]),
+            running=tuple(slots.running[:MAX_LEASES]),
+            unacked=_tags(outbox.digests),
             steps_per_second=min(rate, MAX_STEPS_PER_SECOND),
             drawn_by=slots.drawn_by,
             host_class=slots.host_class,
@@ -105,31 +87,22 @@ class CoordinatorSender:
             taken=min(slots.taken, capacity),
             together=slots.together,
         )
-        self._publish(keys.heartbeat(self._admission.run, self._identity), beat)
 
     def send_farewell(self, slots: int, reason: str) -> None:
         """Send the first and last heartbeat of a worker that fails before it can score (R24)."""
-        beat = Heartbeat(
-            run_uid=self._admission.run_uid,
-            incarnation=self._admission.incarnation,
-            nonce=self._admission.nonce,
-            numbering=self._admission.numbering,
-            seen=0,
-            capacity=0,
-            slots=slots,
-            queued=(),
-            running=(),
-            unacked=(),
-            load=os.getloadavg()[0],
-            steps_per_second=0.0,
-            drawn_by="-",
-            reason=reason,
-        )
-        self._publish(keys.heartbeat(self._admission.run, self._identity), beat)
+        self._beat(
+            numbering=self._admission.numbering, seen=0, capacity=0, slots=slots, queued=(), running=(), unacked=(),
+            steps_per_second=0.0, drawn_by="-", reason=reason,
+        )  # fmt: skip
 
-    def _publish(self, key: str, message: Message) -> None:
-        self._session.put(key, encode(message), encoding=encoding(type(message)))
+    def _beat(self, **fields: Any) -> None:
+        beat = Heartbeat(**self._life, nonce=self._admission.nonce, load=os.getloadavg()[0], **fields)
+        self._publish(keys.heartbeat, beat)
+
+    def _publish(self, key: Callable[[str, str], str], message: Message) -> None:
+        address = key(self._admission.run, self._identity)
+        self._session.put(address, encode(message), encoding=encoding(type(message)))
 
 
-def _tags(digests: Iterable[bytes]) -> tuple[bytes, ...]:
-    return tuple(digest[:TAG_BYTES] for digest in list(digests)[:MAX_LEASES])
+def _tags(digests: Sequence[bytes]) -> tuple[bytes, ...]:
+    return tuple(digest[:TAG_BYTES] for digest in digests[:MAX_LEASES])

@@ -14,11 +14,10 @@ from typing import Any
 from dreamfleet.common.errors import BundleError, DreamfleetError
 from dreamfleet.common.host.stall_watch import START_LIMIT, StallWatch, describe_stall
 from dreamfleet.common.printable import truncate
-from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.messages import Job, Result
-from dreamfleet.worker.scoring.failure_cause import crash, is_hosts_fault
+from dreamfleet.worker.scoring.failure_cause import is_hosts_fault
 from dreamfleet.worker.service.child import ChildReady, ScorerArguments
-from dreamfleet.worker.service.child_process import EXIT_GRACE, ChildMessage, ChildProcess
+from dreamfleet.worker.service.child_process import EXIT_GRACE, LOOK_INTERVAL, ChildMessage, ChildProcess
 from dreamfleet.worker.service.failure_log import ScoringFailure
 from dreamfleet.worker.service.frame_sampler import SampledFrame
 from dreamfleet.worker.service.job_group import GroupDone, JobGroup, JobWithVector, describe_jobs
@@ -31,7 +30,6 @@ MAX_STARVED_DELAY = 60.0  # the longest of these pauses
 MAX_NAME_LENGTH = 100  # characters of `drawn_by`
 REMEDY = "give it fewer --slots, or this host more room (ulimit -n, ulimit -u, memory, the disk of temporary files)"
 MAX_START_DELAY = 30.0  # the longest pause before a new child, where children end one after another without a result
-LOOK_INTERVAL = 0.5  # seconds between two looks whether the child still runs
 SHORT_GROUP = 0.25  # seconds; after a group that was shorter, a second group is queued in the child
 MAX_PIPELINED_BYTES = 64 * 1024  # bytes of vectors that a pipe accepts while its child is busy
 
@@ -91,12 +89,7 @@ class Slot:
         self._useless_children = 0  # children in a row that ended without a finished group
         self._start_at = 0.0
         self._child: ChildProcess | None = None  # `None` until `_start_at`
-        self._kill_reason = ""
-        self._start_failure: Failure | None = None  # that the child reported
-        self._looked_at = 0.0
         self._weigh_at = 0.0  # when the child's memory is looked at next
-        self._given_up_at = math.inf  # when a child that was killed or has exited counts as gone in any case
-        self._sent = 0  # groups sent to this child
         self._is_watched = False
         if parked:
             self._clear_child(math.inf)
@@ -151,12 +144,9 @@ class Slot:
 
     def _send(self, group: JobGroup) -> None:
         assert self._child is not None  # the caller has seen one
-        self._sent += 1
-        group.number = self._sent
         if group is self._groups[0]:
             self._watch.restart()
-        if not self._child.send_group(group.number, group.work):
-            self._kill("it read no job")
+        group.number = self._child.send_group(group.work)
 
     def show(self, wanted: bool) -> None:
         """Start sending frames with the next group, also after the child is replaced; or stop."""
@@ -183,8 +173,10 @@ class Slot:
         quiet = self._watch.quiet_seconds(self.steps, now, gap)
         if self._groups or not self.ready:
             limit = self._groups[0].stall if self.ready else START_LIMIT * 2**self._failed_starts
-            self._kill_after(limit, quiet, describe_stall(limit, is_ready=self.ready))
-        self._check_exit(now)
+            if quiet > limit > 0:
+                self._child.kill_for(describe_stall(limit, is_ready=self.ready))
+        if self._child.is_gone_unheard(now):
+            self._events.put(("slot", SlotEvent(self.number, self._child_number, None)))
 
     def abandon(self, digest: bytes) -> None:
         """Mark a job as unwanted.
@@ -210,7 +202,8 @@ class Slot:
             running = self._groups[0].number if self._groups else None  # a forked copy of the child may answer again
             return self._finish_group(event.message) if event.message.group == running else ()
         elif isinstance(event.message, ScoringFailure):
-            self._start_failure = event.message.error
+            assert self._child is not None  # it has sent this
+            self._child.start_failure = event.message.error
         elif not isinstance(event.message, SampledFrame):
             return self._replace_child()
         return ()
@@ -231,28 +224,6 @@ class Slot:
         self._child_number += 1
         if self._child is not None:
             self._child.close(seconds)
-
-    def _kill_after(self, limit: float, quiet: float, why: str) -> None:
-        """Kill a child that has been quiet for longer than `limit` seconds; 0: never."""
-        if quiet > limit > 0:
-            self._kill(why)
-
-    def _kill(self, why: str) -> None:
-        if self._child is not None and not self._kill_reason:
-            self._kill_reason = why
-            self._child.kill()
-            self._given_up_at = monotonic() + EXIT_GRACE
-
-    def _check_exit(self, now: float) -> None:
-        """Report a child as gone whose reader does not: a process that it left behind holds its pipe, for example."""
-        if self._child is None or 0 <= now - self._looked_at < LOOK_INTERVAL:
-            return
-        self._looked_at = now
-        if self._given_up_at == math.inf and self._child.exit_code is not None:
-            self._child.kill()  # what it left behind, so that the reader hears the pipe's end after the last message
-            self._given_up_at = monotonic() + EXIT_GRACE
-        elif monotonic() > self._given_up_at:
-            self._events.put(("slot", SlotEvent(self.number, self._child_number, None)))
 
     def _finish_group(self, done: GroupDone) -> tuple[Result, ...]:
         """Take a group's results.
@@ -294,11 +265,7 @@ class Slot:
         fresh, the new one scores them first.
         """
         assert self._child is not None  # it has just sent its last event
-        if self._given_up_at == math.inf:
-            self._child.wait(EXIT_GRACE)
-        steps, status = self.steps, self._child.exit_code
-        self._child.close(LOOK_INTERVAL)
-        failure = self._why_ended(status)
+        steps, failure = self.steps, self._child.close_ended()
         reason = failure.cause if failure.kind == "crash" else failure.text
         running = self.running if self.ready else []  # before it was ready it ran nothing
         if not self._was_ready and failure.kind == "usage":  # another child would say the same
@@ -317,12 +284,6 @@ class Slot:
             self._groups.popleft()
         self._start_after_pause()
         return tuple(Result(job.digest, None, steps // len(running), 0.0, failure, None) for job in running)
-
-    def _why_ended(self, status: int | None) -> Failure:
-        """Why the child is gone; `status` is its exit status, `None` if it still runs."""
-        if self._kill_reason or status is None:
-            return crash(self._kill_reason or "it closed its pipe and ran on")
-        return self._start_failure or crash(status)
 
     def _count_failed_start(self, reason: str) -> None:
         self._failed_starts += 1
@@ -345,25 +306,21 @@ class Slot:
     def _start_after_pause(self) -> None:
         """Start a child: at once after the first useless one in a row, then after growing pauses."""
         self._useless_children += 1
-        self._clear_child(
-            0.0 if self._useless_children < 2 else min(2.0 ** (self._useless_children - 3), MAX_START_DELAY)
-        )
         if self._useless_children < 2:
             self.start()
+        else:
+            self._clear_child(min(2.0 ** (self._useless_children - 3), MAX_START_DELAY))
 
     def _clear_child(self, pause: float) -> None:
         self.ready = self._groups_are_short = False
         self._child_number += 1
         self._child = None
-        self._given_up_at = math.inf
         self._weigh_at = 0.0
         self._start_at = monotonic() + pause
 
     def start(self) -> None:
         """Start a child and send it the groups that waited for the last one."""
         self._clear_child(0.0)
-        self._kill_reason, self._start_failure = "", None
-        self._sent = 0
         number, child_number, events = self.number, self._child_number, self._events
         try:
             if self._failed_starts or self._starved_starts:

@@ -20,7 +20,7 @@ from dreamfleet.worker.service.frame_sampler import SampledFrame
 from dreamfleet.worker.service.job_group import JobWithVector
 from dreamfleet.worker.service.slot import Slot, SlotEvent
 from dreamfleet.worker.service.slot_budget import RunSlots
-from dreamfleet.worker.tasks.api import BatchedTask
+from dreamfleet.worker.tasks.batches import BatchedTask
 from dreamfleet.worker.tasks.registry import check_task_allowed, find_task
 
 log = logging.getLogger(__name__)

@@ -26,9 +26,6 @@ def describe_refusal(error: RefusedError, typed: Sequence[str]) -> str:
     """A refusal, with the command that may be accepted: as it was `typed`, with the flag that was lacking.
 
     Nothing typed, as in a program: the command has that flag alone.
-
-    >>> describe_refusal(RefusedError("choose one", ("--run", "day")), ())
-    'choose one: `dreamfleet worker --run day`'
     """
     if error.flag is None or not typed:
         return str(error)

@@ -9,7 +9,6 @@ import random
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from threading import Thread
 from time import monotonic
 
@@ -33,17 +32,22 @@ from dreamfleet.common.transport.network import wait_for_listener
 from dreamfleet.common.transport.session import CONNECT_TIMEOUT, Network, open_session
 from dreamfleet.worker.service.admission import (
     Admission,
+    CoordinatorLink,
     find_live_names,
     find_run_with_fewest_slots,
     make_request,
-    request_admission,
 )
 from dreamfleet.worker.service.bundle_fetch import fetch_bundle
 from dreamfleet.worker.service.child import ScorerArguments
 from dreamfleet.worker.service.config import WorkerConfig
-from dreamfleet.worker.service.membership import LeaveConditions, Membership, StopRequests
-from dreamfleet.worker.service.refusal_backoff import SINGLE_RUN_DELAYS, RefusalBackoff
-from dreamfleet.worker.service.run_session import CoordinatorLink, Events, RunSession
+from dreamfleet.worker.service.membership import (
+    SINGLE_RUN_DELAYS,
+    LeaveConditions,
+    Membership,
+    RefusalBackoff,
+    StopRequests,
+)
+from dreamfleet.worker.service.run_session import Events, RunSession
 from dreamfleet.worker.service.sender import CoordinatorSender
 from dreamfleet.worker.service.slot_budget import SharedSlots
 from dreamfleet.worker.service.slot_pool import SlotPool
@@ -94,9 +98,8 @@ class Worker:
         self._network = network
         self._slot_count = config.slots or (1 if config.torch_device else usable_cores())
         self._hello = make_request(
-            self.identity, (*known_tasks(), *tasks), self._slot_count,
-            torch_device=config.torch_device,
-        )  # fmt: skip
+            self.identity, (*known_tasks(), *tasks), self._slot_count, torch_device=config.torch_device
+        )
         lifetime = min(config.lifetime or math.inf, self._seconds_until_expiry)
         self._conditions = LeaveConditions(
             lifetime, config.drain_timeout, config.exit_when_done, config.any, config.coordinator_timeout
@@ -119,8 +122,10 @@ class Worker:
         """Work until stopped, or until the run is over if configured so; `AccessError` if the join file expired."""
         session = self._startup()
         if session is not None:
+            secured = self._network.credentials is not None
+            self._link = CoordinatorLink(session, self._hello, self.inbox, secured, self._config.torch_device)
             try:
-                self._main_loop(session)
+                self._main_loop()
             finally:
                 session.close()  # type: ignore[no-untyped-call]
         credentials = self._network.credentials
@@ -175,20 +180,16 @@ class Worker:
                 "is served, or give it more --coordinator-timeout"
             )
 
-    def _main_loop(self, session: zenoh.Session) -> None:
+    def _main_loop(self) -> None:
         """Serve one run, or several side by side."""
-        link = CoordinatorLink(
-            session, self.identity, self.inbox, lambda *of: self._request_admission(session, *of), _jittered_retry,
-            secured=self._network.credentials is not None,
-        )  # fmt: skip
         self._waiting = self._waiting_text()
         if self._config.any:
-            self._serve_any(link)
+            self._serve_any()
             return
-        while (admission := self._join(session)) is not None:
+        while (admission := self._join()) is not None:
             served = self._register(admission)
             try:
-                self._serve_run(link, served)
+                self._serve_run(served)
             except (RefusedError, DownloadError) as error:
                 self._waiting = self._waiting_text()
                 self._handle_refusal(admission.run, error)
@@ -199,14 +200,14 @@ class Worker:
             finally:
                 self._served.clear()
 
-    def _serve_any(self, link: CoordinatorLink) -> None:
+    def _serve_any(self) -> None:
         """Serve up to `--runs` runs, each in a thread of its own, so that none waits for another's coordinator."""
         pause = RETRY
         try:
             while not self._is_leaving():
-                joined = self._has_room and self._start_next_run(link)
+                joined = self._has_room and self._start_next_run()
                 if not self._served and not joined:
-                    self._log_waiting(link.session)
+                    self._log_waiting()
                 pause = RETRY if joined or not self._served else min(2 * pause, MAX_RETRY)
                 if not joined and self._pause(pause):
                     pause = RETRY
@@ -223,13 +224,13 @@ class Worker:
             return not served
         return served < most or (served < most + MAX_IDLE_RUNS and self._slots.busy_runs(IDLE_RUN) < most)
 
-    def _start_next_run(self, link: CoordinatorLink) -> bool:
+    def _start_next_run(self) -> bool:
         """Join another run, if one is live, and serve it in its thread."""
-        admission = self._request_any_run(link.session)
+        admission = self._request_any_run()
         if admission is None:
             return False
         served = self._register(admission)
-        served.thread = Thread(target=self._serve_in_thread, args=(link, served), name=f"run {admission.run}")
+        served.thread = Thread(target=self._serve_in_thread, args=(served,), name=f"run {admission.run}")
         served.thread.start()
         return True
 
@@ -238,10 +239,10 @@ class Worker:
         self._served.append(served)
         return served
 
-    def _serve_in_thread(self, link: CoordinatorLink, served: ServedRun) -> None:
+    def _serve_in_thread(self, served: ServedRun) -> None:
         """Serve a run; the main thread learns how it ended."""
         try:
-            self._serve_run(link, served)
+            self._serve_run(served)
         except Exception as error:
             served.error = error
         self._events.put(("over", served))
@@ -258,21 +259,20 @@ class Worker:
         elif error is not None:
             raise error
 
-    def _serve_run(self, link: CoordinatorLink, served: ServedRun) -> None:
+    def _serve_run(self, served: ServedRun) -> None:
         """Work for a run until it is over or this worker leaves."""
         admission, bundle = served.admission, None
-        with self._farewell(link.session, admission):
-            if admission.spec.bundle and (bundle := self._fetch_bundle(link.session, admission)) is None:
-                return
         with ExitStack() as stack:
-            with self._farewell(link.session, admission):
-                slots = self._open_slots(link.session, served, bundle)
+            with self._farewell(admission):
+                if admission.spec.bundle and (bundle := self._fetch_bundle(admission)) is None:
+                    return
+                slots = self._open_slots(served, bundle)
             stack.callback(slots.stop)
             self._events.put(("serving", served))
-            served.session = RunSession(link, admission, served.membership, slots, served.events)
+            served.session = RunSession(self._link, admission, served.membership, slots, served.events)
             served.session.serve()
 
-    def _open_slots(self, session: zenoh.Session, served: ServedRun, bundle: Bundle | None) -> SlotPool:
+    def _open_slots(self, served: ServedRun, bundle: Bundle | None) -> SlotPool:
         if bundle is not None:
             check_world_allowed(bundle, self._hello.tasks)
         admission, events, config = served.admission, served.events, self._config
@@ -282,7 +282,7 @@ class Worker:
         try:
             return SlotPool(
                 share, arguments, events, config.slot_memory << 20,
-                lambda: self._fetch_bundle(session, admission) if bundle else None,
+                lambda: self._fetch_bundle(admission) if bundle else None,
                 all_at_once=not config.any or config.runs == 1,
             )  # fmt: skip
         except BaseException:
@@ -290,12 +290,12 @@ class Worker:
             raise
 
     @contextmanager
-    def _farewell(self, session: zenoh.Session, admission: Admission) -> Iterator[None]:
+    def _farewell(self, admission: Admission) -> Iterator[None]:
         """Tell the coordinator why this worker fails before it can score."""
         try:
             yield
         except Exception as error:
-            sender = CoordinatorSender(session, self.identity, admission)
+            sender = CoordinatorSender(self._link.session, self.identity, admission)
             sender.send_farewell(self._slot_count, describe_failure(error))
             raise
 
@@ -305,47 +305,40 @@ class Worker:
         ended = f"run {served.name} {ending}" if served is not None and ending else ""
         return WaitingText(self._config, self._network, monotonic(), ended)
 
-    def _join(self, session: zenoh.Session) -> Admission | None:
+    def _join(self) -> Admission | None:
         """The configured run, once it welcomed this worker; `None` if this worker stops first."""
         pause = FIRST_RETRY
         while not self._is_leaving():
-            admission = self._request_configured_run(session)
-            if admission is not None:
-                return admission
+            if not self._refusals.refusing_runs(monotonic()):
+                try:
+                    if (admission := self._link.request_admission(self._config.run)) is not None:
+                        return admission
+                except RefusedError as error:
+                    self._handle_refusal("", error)
             if pause > FIRST_RETRY:
-                self._log_waiting(session)
+                self._log_waiting()
             self._check_patience()
             self._pause(pause)
             pause = min(2 * pause, RETRY)
         return None
 
-    def _log_waiting(self, session: zenoh.Session) -> None:
+    def _log_waiting(self) -> None:
         """Log, as is due, that no run is served."""
-        now = monotonic()
-        if not self._refusals.refusing_runs(now) and (
-            text := self._waiting.next(
-                now, answered=bool(session.info.routers_zid()), others=lambda: find_live_names(session)
-            )
-        ):
+        now, session = monotonic(), self._link.session
+        if self._refusals.refusing_runs(now):
+            return
+        answered = bool(session.info.routers_zid())
+        if text := self._waiting.next(now, answered=answered, others=lambda: find_live_names(session)):
             log.log(logging.INFO if self._waiting.ended else logging.WARNING, "%s", text)
 
-    def _request_configured_run(self, session: zenoh.Session) -> Admission | None:
-        if self._refusals.refusing_runs(monotonic()):
-            return None
-        try:
-            return self._request_admission(session, self._config.run)
-        except RefusedError as error:
-            self._handle_refusal("", error)
-            return None
-
-    def _request_any_run(self, session: zenoh.Session) -> Admission | None:
+    def _request_any_run(self) -> Admission | None:
         served, now = {each.name for each in self._served}, monotonic()
         passed_over = self._refusals.refusing_runs(now) | self._silences.refusing_runs(now)
-        run = find_run_with_fewest_slots(session, served | passed_over)
+        run = find_run_with_fewest_slots(self._link.session, served | passed_over)
         if run is None:
             return None
         try:
-            admission = self._request_admission(session, run)
+            admission = self._link.request_admission(run)
         except RefusedError as error:
             self._handle_refusal(run, error)
             return None
@@ -373,16 +366,8 @@ class Worker:
         """The key of a refusal in `RefusalBackoff`: a worker of one run remembers only one."""
         return run if self._config.any else ""
 
-    def _request_admission(
-        self, session: zenoh.Session, run: str | None, host_class: str = "", joined_run_uid: str = ""
-    ) -> Admission | None:
-        request, secured = replace(self._hello, host_class=host_class), self._network.credentials is not None
-        return request_admission(
-            session, run, request, self.inbox, joined_run_uid, secured=secured, torch_device=self._config.torch_device
-        )
-
-    def _fetch_bundle(self, session: zenoh.Session, admission: Admission) -> Bundle | None:
-        store = BundleStore(default_cache())
+    def _fetch_bundle(self, admission: Admission) -> Bundle | None:
+        session, store = self._link.session, BundleStore(default_cache())
         return fetch_bundle(session, admission.run, admission.spec.bundle, store, self.inbox, stopped=self._is_leaving)
 
     def _is_leaving(self) -> bool:
@@ -402,7 +387,3 @@ class Worker:
                 self._end_run(served)
                 return True
         return False
-
-
-def _jittered_retry() -> float:
-    return RETRY * random.uniform(0.5, 1.5)  # noqa: S311 - no secret

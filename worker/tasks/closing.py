@@ -16,12 +16,8 @@ from dreamfleet.common.printable import one_line
 
 log = logging.getLogger(__name__)
 MAX_TEXT = 300  # characters of a fault
-
-
 CLOSE_LIMIT = 10.0  # seconds
 _hung: dict[type, str] = {}  # classes of environments whose `close` hung in this process, and what was said of it
-
-
 _leaves_open = False
 
 

@@ -14,11 +14,7 @@ Floats = NDArray[np.float32]
 
 
 class UniformActions:
-    """Draws another action at every step.
-
-    >>> UniformActions(np.random.default_rng(1), Continuous.between([-1, 0], [1, 1])).act().shape
-    (2,)
-    """
+    """Draws another action at every step."""
 
     def __init__(self, random: np.random.Generator, actions: Continuous) -> None:
         self._random = random
@@ -33,12 +29,7 @@ class UniformActions:
 
 
 class HeldActions:
-    """Draws an action and holds it for a drawn number of steps, from `shortest` to `longest`.
-
-    >>> driver = HeldActions(np.random.default_rng(1), Continuous.between([-1], [1]), shortest=2)
-    >>> bool((driver.act() == driver.act()).all())
-    True
-    """
+    """Draws an action and holds it for a drawn number of steps, from `shortest` to `longest`."""
 
     def __init__(self, random: np.random.Generator, actions: Continuous, shortest: int = 1, longest: int = 10) -> None:
         self._random = random

@@ -14,7 +14,7 @@ The first four are there in a dream too. Components have the names of the world'
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.actions import Actions, Discrete
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.measures import INFO, STEPS, TRUTH
+from dreamfleet.worker.tasks.true_state import Truth
 
 KINDS = ("", ".abs", ".share")  # of an action's measures, in the order of the tally's sums
-Truth = Callable[[gymnasium.Env[Any, Any]], dict[str, float]]
 
 
 class ActionTally:
@@ -55,7 +55,8 @@ class Measurer:
     def __init__(
         self, names: Sequence[str], actions: Actions, action_names: Sequence[str], truth: Truth | None = None
     ) -> None:  # fmt: skip
-        self.names, self._actions, self._truth = tuple(names), actions, truth
+        self.names, self.truth = tuple(names), truth
+        self._actions = actions
         words = action_names or [f"action{number}" for number in range(action_count(actions))]
         self._columns = {
             f"{word}{kind}": (place, number) for number, word in enumerate(words) for place, kind in enumerate(KINDS)
@@ -73,26 +74,19 @@ class Measurer:
 
     def values(self, tally: ActionTally, row: int, steps: int) -> tuple[float, ...]:
         """The measures of a tally's row, after so many steps."""
-        return tuple(
-            float(steps) if name == STEPS else tally.mean(row, self._columns[name], steps) for name in self.names
-        )
+        return tuple(self.value(name, tally, row, steps) for name in self.names)
 
-    def watch(self, environment: gymnasium.Env[Any, Any]) -> EpisodeMeasurer:
-        """What measures one episode in an environment."""
-        return EpisodeMeasurer(self.names, self._columns, self.begin(1), environment, self._truth)
+    def value(self, name: str, tally: ActionTally, row: int, steps: int) -> float:
+        """The number of steps, or the measure of an action, of a tally's row."""
+        return float(steps) if name == STEPS else tally.mean(row, self._columns[name], steps)
 
 
 class EpisodeMeasurer:
     """Measures one episode in an environment."""
 
-    def __init__(
-        self, names: Sequence[str], columns: dict[str, tuple[int, int]], tally: ActionTally,
-        environment: gymnasium.Env[Any, Any], truth: Truth | None,
-    ) -> None:  # fmt: skip
-        self._names, self._columns, self._tally = names, columns, tally
-        self._environment, self._truth = environment, truth
-        self._true_names = [name.removeprefix(TRUTH) for name in names if name.startswith(TRUTH)]
-        self._true_sums = dict.fromkeys(self._true_names, 0.0)
+    def __init__(self, measurer: Measurer, environment: gymnasium.Env[Any, Any]) -> None:
+        self._measurer, self._environment, self._tally = measurer, environment, measurer.begin(1)
+        self._true_sums = {name.removeprefix(TRUTH): 0.0 for name in measurer.names if name.startswith(TRUTH)}
         self._info: dict[str, Any] = {}
         self._steps = 0
 
@@ -101,24 +95,22 @@ class EpisodeMeasurer:
         self._steps += 1
         self._tally.add(np.zeros(1, dtype=np.intp), np.asarray(action)[None])
         self._info = info
-        if self._true_names and self._truth is not None:
-            state = self._truth(self._environment)
-            for name in self._true_names:
+        if self._true_sums and self._measurer.truth is not None:
+            state = self._measurer.truth(self._environment)
+            for name in self._true_sums:
                 self._true_sums[name] += _number(state, name, "task's true state")
 
     @property
     def values(self) -> tuple[float, ...]:
         """The measures of the episode; `ValueError` if the last `info` lacks a number."""
-        return tuple(map(self._value, self._names))
+        return tuple(map(self._value, self._measurer.names))
 
     def _value(self, name: str) -> float:
-        if name == STEPS:
-            return float(self._steps)
         if name.startswith(INFO):
             return _number(self._info, name.removeprefix(INFO), "environment's last info")
         if name.startswith(TRUTH):
             return self._true_sums[name.removeprefix(TRUTH)] / self._steps
-        return self._tally.mean(0, self._columns[name], self._steps)
+        return self._measurer.value(name, self._tally, 0, self._steps)
 
 
 def action_count(actions: Actions) -> int:

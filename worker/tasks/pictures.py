@@ -7,6 +7,7 @@ A recordable task chains them in the order in which they stand here. What is lef
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
@@ -22,6 +23,7 @@ from dreamfleet.common.errors import UsageError
 Floats = NDArray[np.float32]
 Pixels = NDArray[np.uint8]
 Crop = tuple[int, int, int, int]  # first row, row after the last, first column, column after the last
+_CROP = re.compile(r"(\d{1,5}):(\d{1,5}),(\d{1,5}):(\d{1,5})", re.ASCII)
 SHORTEST = 8  # pixels of a side; smaller boxes hold codes, such as MiniGrid's of 7x7 cells
 MIDDLE = 128  # the difference of equal pictures
 COLOURS = (1, 3, 4)  # channels: grey, colours, colours and opacity
@@ -31,6 +33,18 @@ KINDS = (
     "uint8 up to 255, or float from 0 to 1, of shape (height, width), with 1, 3 or 4 colours behind or 1 or 3 before, "
     f"or a stack of up to {MOST_FRAMES} of these; at least {SHORTEST} pixels a side"
 )
+
+
+def parse_crop(text: str) -> Crop | None:
+    """The crop of `top:bottom,left:right`; `None` if the text is none.
+
+    >>> parse_crop("0:400,0:640"), parse_crop("0:400")
+    ((0, 400, 0, 640), None)
+    """
+    if (found := _CROP.fullmatch(text)) is None:
+        return None
+    top, bottom, left, right = map(int, found.groups())
+    return top, bottom, left, right
 
 
 def is_crop(crop: Crop, height: int, width: int) -> bool:
@@ -215,13 +229,7 @@ def frame_difference(now: Pixels, before: Pixels) -> Pixels:
 
 
 class SkipFrames(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Repeats each action for `frames` steps, fewer if the episode ends, and adds their rewards.
-
-    >>> with SkipFrames(gymnasium.make("CartPole-v1"), 4) as environment:
-    ...     _ = environment.reset(seed=1)
-    ...     environment.step(0)[1]
-    4.0
-    """
+    """Repeats each action for `frames` steps, fewer if the episode ends, and adds their rewards."""
 
     def __init__(self, environment: gymnasium.Env[Any, Any], frames: int) -> None:
         super().__init__(environment)
@@ -267,31 +275,10 @@ class LookAtDrawn(gymnasium.Wrapper[Pixels, Any, Any, Any]):
         return found
 
 
-class TileFrames(gymnasium.ObservationWrapper[NDArray[Any], Any, NDArray[Any]]):
-    """Observes all frames of a stack in one picture, as `tile_frames` sets them."""
-
-    def __init__(self, environment: gymnasium.Env[Any, Any]) -> None:
-        super().__init__(environment)
-        space: Any = environment.observation_space
-        self.observation_space = spaces.Box(tile_frames(space.low), tile_frames(space.high), dtype=space.dtype)
-
-    def observation(self, observation: NDArray[Any]) -> NDArray[Any]:
-        """The picture of all frames."""
-        return tile_frames(np.asarray(observation))
-
-
 class CropAndResize(gymnasium.ObservationWrapper[Pixels, Any, NDArray[Any]]):
     """Observes uint8 `(size, size, 3)`: a part of each picture, or all of it, as `cut_and_resize` makes it.
 
     `UsageError` if the environment observes no pictures, or the part lies outside of them.
-
-    >>> frame = gymnasium.spaces.Box(0, 255, (48, 40), np.uint8)
-    >>> class Grey(gymnasium.Env):
-    ...     observation_space, action_space = frame, gymnasium.spaces.Discrete(2)
-    ...     def reset(self, *, seed=None, options=None):
-    ...         return np.zeros((48, 40), np.uint8), {}
-    >>> CropAndResize(Grey(), 64, crop=(8, 48, 0, 40)).reset()[0].shape
-    (64, 64, 3)
     """
 
     def __init__(self, environment: gymnasium.Env[Any, Any], size: int, crop: Crop | None = None) -> None:
@@ -342,12 +329,6 @@ class VectorActions(gymnasium.ActionWrapper[Any, Floats, Any]):
     """Takes float32 vectors `(A,)` as actions; `convert` makes of each what the simulator takes.
 
     `InvalidAction` for another shape or NaN.
-
-    >>> one_of_two = Continuous((1, 1), (0, 0), (0, 0), (1, 1), choices=((1, 0), (0, 1)))
-    >>> with VectorActions(gymnasium.make("CartPole-v1"), one_of_two, np.argmax) as environment:
-    ...     _ = environment.reset(seed=1)
-    ...     environment.step(np.array([0, 1], np.float32))[1]
-    1.0
     """
 
     def __init__(

@@ -1,7 +1,9 @@
-"""Policies without a world model: a controller on flat observations, and a driver that ignores observations."""
+"""Policies without a world model: of a controller on flat observations, of a driver, and of a choice that is held."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -65,3 +67,39 @@ class DriverPolicy:
     def act(self, _observation: Any) -> Any:
         """The driver's next action."""
         return self._driver.act()
+
+
+class FrameSkipPolicy(ABC):
+    """Chooses by a picture, and repeats the choice for `frame_skip` steps."""
+
+    def __init__(self, choices: Sequence[Sequence[float]], frame_skip: int) -> None:
+        """`choices`: the action of each choice."""
+        self._actions, self._frame_skip = np.array(choices, np.float32), frame_skip
+        self._steps_held = 0
+        self.choice = 0
+
+    @property
+    def is_new_decision(self) -> bool:
+        """Whether the last action was a new decision rather than a repeated one."""
+        return self._steps_held == 1
+
+    def begin(self, _parameters: Floats) -> None:
+        """Begin an episode: drop the held choice and the memory."""
+        self._steps_held = 0
+        self.reset_memory()
+
+    def act(self, observation: NDArray[np.uint8]) -> Floats:
+        """Return the action `(actions,)` for one picture `(side, side, 3)`."""
+        if self._steps_held in (0, self._frame_skip):
+            self.choice, self._steps_held = self.choose(observation), 0
+        self._steps_held += 1
+        action: Floats = self._actions[self.choice]
+        return action
+
+    @abstractmethod
+    def reset_memory(self) -> None:
+        """Forget the last episode."""
+
+    @abstractmethod
+    def choose(self, picture: NDArray[np.uint8]) -> int:
+        """Return the number of the next choice."""

@@ -13,7 +13,8 @@ from dreamfleet.common.artifacts.actions import Continuous, Discrete
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import BundleError, RefusedError, UsageError
 from dreamfleet.common.protocol.tasks import family_of, load_task, registered_tasks
-from dreamfleet.worker.tasks.api import Preprocessing, RecordableTask, Task, TaskWithOptions, World
+from dreamfleet.worker.tasks.api import Task, World
+from dreamfleet.worker.tasks.recordable import Preprocessing, RecordableTask, TaskWithOptions
 
 REQUIRED_METHODS = ("make_environment", "make_evaluation_environment", "make_policy", "world_of")
 
@@ -50,11 +51,7 @@ def find_task(name: str) -> Task:
 
 
 def find_world(name: str, options: str = "") -> RecordableTask:
-    """A task by name, under `options` as its `parse_options` writes them; `UsageError` if it cannot be recorded.
-
-    >>> find_world("car-racing").world.score_word
-    'track'
-    """
+    """A task by name, under `options` as its `parse_options` writes them; `UsageError` if it cannot be recorded."""
     task = _bind(find_task(name), options)
     if not isinstance(task, RecordableTask):
         raise UsageError(
@@ -64,12 +61,7 @@ def find_world(name: str, options: str = "") -> RecordableTask:
 
 
 def task_of(bundle: Bundle) -> Task:
-    """The task that a bundle was trained on, under the options in its manifest; errors as in `find_world`.
-
-    >>> from dreamfleet import find_bundle
-    >>> task_of(find_bundle("tiny")).name
-    'car-racing'
-    """
+    """The task that a bundle was trained on, under the options in its manifest; errors as in `find_world`."""
     manifest = bundle.manifest
     return _bind(find_task(manifest.task), manifest.facts.options)
 
@@ -80,12 +72,7 @@ def find_scored_task(name: str, bundle: Bundle | None) -> Task:
 
 
 def preprocessing_for(bundle: Bundle, task: RecordableTask) -> Preprocessing:
-    """The preprocessing of the bundle's pictures; `BundleError` if they are not of this task.
-
-    >>> from dreamfleet import find_bundle
-    >>> preprocessing_for(find_bundle("tiny"), find_world("car-racing")).name
-    'box-64'
-    """
+    """The preprocessing of the bundle's pictures; `BundleError` if they are not of this task."""
     manifest, known = bundle.manifest, task.preprocessings
     found = known.get(manifest.preprocessing)
     if manifest.task != task.name or found is None or manifest.picture != found.shape:

@@ -96,7 +96,7 @@ def run_evaluation(
     return EvaluationReport(
         name, agent.sha256, agent.task, agent.reality, agent.bundle.sha256 if agent.bundle else "",
         fingerprint(world.packages), package_version("dreamfleet") or "", perf_counter() - began,
-        results.drives, judge=world.judge or agent.reality, threshold=agent.threshold, failed=results.failed,
+        results.drives, judge=world.judge or agent.reality, threshold=world.threshold, failed=results.failed,
         marks=tuple(map(float, world.marks)), options=agent.options,
     )  # fmt: skip
 

@@ -37,7 +37,7 @@ from dreamfleet.common.files.regular_files import read_regular
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld
-from dreamfleet.worker.tasks.api import Preprocessing
+from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
 from dreamfleet.worker.training.data.data_folder import explain_write_errors

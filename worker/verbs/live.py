@@ -134,11 +134,9 @@ def _open_pictures(args: argparse.Namespace) -> Iterator[Iterator[CaptionedFrame
 @contextmanager
 def _worker_pictures(args: argparse.Namespace, client: Client) -> Iterator[Iterator[CaptionedFrame | None]]:
     """Pictures of what a worker of the run scores."""
-    from dreamfleet.common.artifacts.bundle_store import BundleStore, default_cache
     from dreamfleet.common.client.live import LiveView
-    from dreamfleet.common.protocol.codec import CountingDecoder
     from dreamfleet.common.protocol.tasks import DREAM
-    from dreamfleet.worker.service.bundle_fetch import fetch_bundle
+    from dreamfleet.worker.service.bundle_fetch import fetch_bundle_now
     from dreamfleet.worker.tools.live_sources import worker_frames
     from dreamfleet.worker.tools.live_view import LiveCanvas, LiveDreamer
 
@@ -146,10 +144,7 @@ def _worker_pictures(args: argparse.Namespace, client: Client) -> Iterator[Itera
         spec = view.status.settings.task
         glass = LiveCanvas(view.run, task=spec.task)
         if spec.bundle:
-            bundle = fetch_bundle(
-                client.session, view.run, spec.bundle, BundleStore(default_cache()), CountingDecoder()
-            )
-            assert bundle is not None  # it is never stopped
+            bundle = fetch_bundle_now(client.session, view.run, spec.bundle)
             fitting = bundle.with_options(spec.controller, spec.options)
             manifest, dreamer = bundle.manifest, LiveDreamer(fitting, args.temperature)
             glass = LiveCanvas(view.run, dreamer=dreamer, task=manifest.task)

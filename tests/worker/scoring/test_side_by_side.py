@@ -1,4 +1,4 @@
-"""Episodes that a slot drives side by side have the bits that they have alone."""
+"""Episodes that a slot drives side by side have the bits that they have alone. Tests worker/tasks/side_by_side.py."""
 
 import dataclasses
 from types import SimpleNamespace

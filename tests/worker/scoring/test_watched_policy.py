@@ -1,4 +1,5 @@
-"""Watching episodes while they are scored: what the observer gets, and that no score changes by a bit."""
+"""Watching episodes while they are scored: what the observer gets, and that no score changes by a bit.
+Tests worker/tasks/watching.py."""
 
 from dataclasses import replace
 

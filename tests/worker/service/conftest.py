@@ -1,3 +1,5 @@
+import hashlib
+
 import numpy as np
 import pytest
 
@@ -18,7 +20,8 @@ def small_bundle(tmp_path_factory):
     parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
     manifest = BundleManifest("small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3, world=FACTS)
     path = tmp_path_factory.mktemp("bundle") / "small.zip"
-    return write_bundle(path, manifest, {**parts, "dream.onnx": bytes((PARTS - 1) * MAX_PART)})
+    content = hashlib.sha256(b"a").digest() * ((PARTS - 1) * MAX_PART // 32)  # no part of it is plain
+    return write_bundle(path, manifest, {**parts, "dream.onnx": content})
 
 
 @pytest.fixture

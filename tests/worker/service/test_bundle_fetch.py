@@ -1,16 +1,12 @@
 """Interrupted downloads over a real router: parts on disk stay, and the whole file is verified."""
 
-import hashlib
 import resource
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
-import numpy as np
 import pytest
 
-from dreamfleet.common.artifacts.bundle import BundleManifest, write_bundle
 from dreamfleet.common.artifacts.bundle_store import BundleStore
-from dreamfleet.common.artifacts.car_racing_variants import FACTS
 from dreamfleet.common.errors import BundleError
 from dreamfleet.common.protocol.codec import CountingDecoder
 from dreamfleet.common.protocol.messages import MAX_PART
@@ -18,20 +14,13 @@ from dreamfleet.common.transport.session import Network, open_session
 from dreamfleet.worker.service import bundle_fetch
 from dreamfleet.worker.service.bundle_fetch import WINDOW, fetch_bundle
 from tests.support import tasks
-from tests.support.bundles import npy
 from tests.support.hand import DEADLINE, Hand
 from tests.support.processes import free_port
 
-PARTS = 5
-
 
 @pytest.fixture(scope="module")
-def bundle(tmp_path_factory):
-    parts = dict.fromkeys(("encoder.onnx", "decoder.onnx"), b"x")
-    parts["initial_latents.npy"] = npy(np.zeros((1, 2, 4), np.float32))
-    manifest = BundleManifest("small", "toy", "none", (64, 64, 3), latent=4, hidden=4, actions=3, world=FACTS)
-    content = hashlib.sha256(b"a").digest() * ((PARTS - 1) * MAX_PART // 32)
-    return write_bundle(tmp_path_factory.mktemp("bundle") / "small.zip", manifest, {**parts, "dream.onnx": content})
+def bundle(small_bundle):
+    return small_bundle
 
 
 @pytest.fixture(scope="module")
@@ -143,8 +132,9 @@ def test_a_silent_coordinator_is_an_error_and_the_parts_stay(session, hand, stor
 
 def test_a_window_of_parts_is_requested_at_once(session, hand, store, bundle):
     fetch(session, hand, store)
-    assert PARTS < WINDOW
-    assert sorted(asked(hand)) == [index * MAX_PART for index in range(-(-bundle.path.stat().st_size // MAX_PART))]
+    parts = -(-bundle.path.stat().st_size // MAX_PART)
+    assert 1 < parts < WINDOW
+    assert sorted(asked(hand)) == [index * MAX_PART for index in range(parts)]
 
 
 def test_a_bundle_of_absurd_length_writes_nothing(session, hand, store, bundle, monkeypatch):

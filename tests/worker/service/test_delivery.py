@@ -27,32 +27,6 @@ def test_a_result_is_repeated_until_its_verdict(stage, cached):
         assert hand.results(second) == {second.digest}
 
 
-def test_a_repeated_batch_number_is_ignored(stage, cached):
-    hand = stage.hand()
-    stage.worker()
-    hand.ready()
-    first, smuggled, last = hand.job(0), hand.job(1), hand.job(2)
-    hand.send(1, first)
-    hand.send(1, smuggled)
-    hand.send(2, last)
-    assert hand.results(first, last) == {first.digest, last.digest}
-    assert hand.beat(lambda beat: beat.seen == 2 and not beat.running).unacked == (tag(first), tag(last))
-
-
-def test_heartbeats_show_a_lost_batch_until_it_is_sent_again(stage, cached):
-    hand = stage.hand()
-    stage.worker()
-    hand.ready()
-    lost, later = hand.job(0), hand.job(1)
-    hand.send(1)
-    hand.send(3, later)
-    hand.result(later)
-    assert hand.beat().seen == 1
-    hand.send(2, lost)
-    hand.result(lost)
-    assert hand.beat(lambda beat: beat.seen != 1).seen == 3
-
-
 def test_foreign_and_malformed_messages_are_dropped_and_counted(stage, cached):
     hand = stage.hand()
     made, _ = stage.worker()
@@ -90,17 +64,6 @@ def test_a_rollout_is_uploaded_repeatedly_until_its_verdict(stage, cached):
     hand.beat(lambda beat: beat.seen == 2 and tag(kept) not in beat.unacked)
     for _ in range(3):
         assert isinstance(hand.next((UploadPart, Heartbeat)), Heartbeat)
-
-
-def test_a_cancelled_job_is_not_started(stage, cached):
-    hand = stage.hand(tasks.SLOW_TOY)
-    stage.worker()
-    hand.ready()
-    running, cancelled, last = (hand.job(number) for number in range(3))
-    hand.send(1, running, cancelled, last)
-    hand.beat(lambda beat: tag(cancelled) in beat.queued and tag(running) in {each.tag for each in beat.running})
-    hand.send(2, cancels=(cancelled.digest,))
-    assert hand.results(running, last) == {running.digest, last.digest}
 
 
 def test_nothing_starts_while_too_many_results_have_no_verdict(stage, cached):

@@ -16,7 +16,7 @@ from dreamfleet.common.transport.session import Network, open_session
 from dreamfleet.worker.service.child import ScorerArguments
 from dreamfleet.worker.service.frame_sampler import FRAME_INTERVAL, MAX_TIME_SHARE, FrameSampler
 from dreamfleet.worker.service.slot import Slot
-from dreamfleet.worker.tasks.api import StepSnapshot
+from dreamfleet.worker.tasks.watching import StepSnapshot
 from tests.support import tasks
 from tests.support.hand import DEADLINE, tag
 from tests.support.samples import VECTOR, job

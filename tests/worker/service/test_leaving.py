@@ -8,9 +8,8 @@ import pytest
 
 from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.transport.session import Network, open_session
-from dreamfleet.worker.service import membership, worker
+from dreamfleet.worker.service import membership
 from dreamfleet.worker.service.config import WorkerConfig
-from dreamfleet.worker.service.run_session import CoordinatorLink
 from dreamfleet.worker.service.worker import Worker
 from tests.support import tasks
 from tests.support.hand import DEADLINE, SECOND, tag
@@ -80,11 +79,10 @@ def test_with_exit_when_done_it_also_ends_where_no_coordinator_ever_let_it_in(th
 
 def test_a_worker_that_a_secured_router_shows_nothing_says_so_once(stage, said, cached, monkeypatch):
     monkeypatch.setattr(membership, "SEARCH_INTERVAL", 0.05)
-    secured = lambda *parts, **more: CoordinatorLink(*parts, **{**more, "secured": True})  # noqa: E731
-    monkeypatch.setattr(worker, "CoordinatorLink", secured)
     hand = stage.hand()
-    stage.worker()
+    made, _ = stage.worker()
     hand.ready()
+    object.__setattr__(made._link, "secured", True)  # frozen; a hand answers only hellos of an open fleet
     hand.vanish()
     wait_for(said, "revoked")
     hand.appear()

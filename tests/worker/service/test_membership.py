@@ -8,13 +8,17 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from dreamfleet.worker.service.membership import (
+    FIRST_DELAY,
+    MAX_DELAY,
     NEXT_RUN_AFTER,
     NEXT_RUN_PATIENCE,
     SEARCH_INTERVAL,
     SILENT_BEATS,
+    SINGLE_RUN_DELAYS,
     UPLOAD_GRACE,
     LeaveConditions,
     Membership,
+    RefusalBackoff,
     WorkerLoad,
 )
 
@@ -36,18 +40,12 @@ def joined(visible=True, **terms):
     return made
 
 
-def test_it_says_no_hello_while_its_coordinator_is_in_sight_and_active():
-    member = joined()
-    for second in range(1, 20):
-        member.note_activity(float(second))
-        assert not any(member.must_rejoin(float(second), hands) for hands in (IDLE, BUSY, OWED))
-
-
 def test_it_leaves_a_run_that_ends_at_once_and_not_the_next_one():
     member = joined()
     member.end_run("the run has ended")
-    assert member.find_end(1.0, busy=True)
+    assert member.run_is_over == member.find_end(1.0, busy=True) == "the run has ended"
     member.join("another run's", BEAT, now=2.0)
+    assert not member.run_is_over
     assert not member.find_end(3.0, busy=False)
 
 
@@ -58,17 +56,6 @@ def test_silence_of_a_coordinator_that_owes_an_answer_makes_it_say_hello(hands, 
     assert member.must_rejoin(after + 0.1, hands)
 
 
-def test_a_run_that_its_coordinator_ended_is_over():
-    member = joined()
-    assert not member.run_is_over
-    member.end_run("the run has ended")
-    assert (member.run_is_over, member.find_end(0.0, busy=True)) == (True, "the run has ended")
-
-
-def test_silence_while_jobs_run_means_nothing():
-    assert not joined().must_rejoin(1e6, BUSY)
-
-
 def test_it_says_hello_when_the_coordinator_is_back_in_sight():
     member = joined()
     member.remove_coordinator("first", 1.0)
@@ -76,26 +63,8 @@ def test_it_says_hello_when_the_coordinator_is_back_in_sight():
     assert member.add_coordinator("first")
     assert not member.add_coordinator("first")
     assert member.must_rejoin(1.0, BUSY)
-    member.rejoin("first", 1.1)
-    assert not member.must_rejoin(1.1, BUSY)
-
-
-def test_it_says_hello_to_another_life_of_the_coordinator():
-    member = joined()
     member.remove_coordinator("first", 1.0)
-    assert not member.add_coordinator("second")
-    assert member.must_rejoin(1.0, BUSY)
-    member.rejoin("second", 1.1)
-    assert not member.must_rejoin(1.1, BUSY)
-
-
-def test_an_unanswered_hello_is_repeated_after_a_pause():
-    member = joined()
-    member.remove_coordinator("first", 1.0)
-    member.add_coordinator("first")
-    member.note_hello_sent(1.0, pause=2.0)
-    assert not member.must_rejoin(2.9, BUSY)
-    assert member.must_rejoin(3.0, BUSY)
+    assert not member.add_coordinator("second"), "another life"
 
 
 def test_it_looks_for_its_run_in_intervals_while_no_coordinator_is_in_sight():
@@ -118,13 +87,6 @@ def test_stopped_once_it_drains_until_all_is_delivered():
     assert not member.find_end(30.9, busy=True)
     assert member.find_end(1.1, busy=False)
     assert member.find_end(31.1, busy=True), "but not for ever"
-
-
-def test_stopped_twice_it_leaves_at_once():
-    member = joined()
-    member.stop()
-    member.stop()
-    assert member.find_end(0.0, busy=True)
 
 
 def test_it_drains_at_the_end_of_its_lifetime_which_begins_before_any_run():
@@ -174,6 +136,40 @@ def test_a_drained_worker_names_why():
     assert stopped.find_end(2.0, busy=False) != expired.find_end(2.0, busy=False)
     assert "--drain-timeout" in stopped.find_end(32.0, busy=True)
     assert expired.find_end(2.0, busy=False)
+
+
+def test_a_run_that_refused_is_asked_again_with_growing_pauses():
+    refusals, now, pauses = RefusalBackoff(), 0.0, []
+    for _ in range(10):
+        pauses.append(refusals.add("night", now))
+        assert refusals.refusing_runs(now + pauses[-1] - 0.1) == {"night"}
+        now += pauses[-1]
+        assert refusals.refusing_runs(now) == set()
+    assert pauses[:3] == [FIRST_DELAY, 2 * FIRST_DELAY, 4 * FIRST_DELAY]
+    assert pauses[-1] == MAX_DELAY
+
+
+def test_each_run_has_its_own_pause():
+    refusals = RefusalBackoff()
+    refusals.add("night", 0.0)
+    refusals.add("night", FIRST_DELAY)
+    refusals.add("day", FIRST_DELAY)
+    assert refusals.refusing_runs(2 * FIRST_DELAY - 0.1) == {"night", "day"}
+    assert refusals.refusing_runs(2 * FIRST_DELAY + 0.1) == {"night"}
+
+
+def test_a_reason_is_news_once_and_again_after_another_one():
+    refusals = RefusalBackoff()
+    assert [refusals.is_news("night", why) for why in "aabba"] == [True, False, True, False, True]
+    assert refusals.is_news("day", "a")
+
+
+def test_a_run_that_accepted_the_worker_has_the_shortest_pause_again():
+    refusals = RefusalBackoff(*SINGLE_RUN_DELAYS)
+    assert [refusals.add("night", 0.0) for _ in range(8)] == [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 60.0]
+    refusals.forget("night")
+    assert refusals.refusing_runs(0.0) == set()
+    assert refusals.add("night", 0.0) == 1.0
 
 
 class AnyOrder(RuleBasedStateMachine):

@@ -15,47 +15,14 @@ from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.scoring.failure_cause import crash
 from dreamfleet.worker.service.child import ScorerArguments
 from dreamfleet.worker.service.job_group import MOST_TRIED_ALONE
-from dreamfleet.worker.service.slot import Slot
 from dreamfleet.worker.service.slot_budget import SharedSlots
 from dreamfleet.worker.service.slot_pool import SlotPool
 from tests.support import rough_tasks, tasks
 from tests.support.processes import DEADLINE
 from tests.support.samples import VECTOR, job
+from tests.support.slot_harness import Harness
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="Linux")
-
-
-class Harness:
-    def __init__(self, task, bundle):
-        self.spec = TaskSpec(task=task, bundle=bundle.sha256, horizon=100, patience=0)
-        self.events = queue.SimpleQueue()
-        self.slot = Slot(0, ScorerArguments(self.spec, bundle.path, (task,)), self.events)
-
-    def take(self, ahead=0.0):
-        """What the slot's next event brings; the worker looks at its slots every moment, here `ahead` of its time."""
-        until = monotonic() + DEADLINE
-        while monotonic() < until:
-            self.slot.check(monotonic() + ahead, 0.0)
-            try:
-                return self.slot.handle(self.events.get(timeout=0.05)[1])
-            except queue.Empty:
-                continue
-        raise AssertionError("no event")
-
-    def wait_ready(self):
-        while not self.slot.ready:
-            self.take()
-
-    def score(self, number=0, stall=0.0, vector=VECTOR):
-        self.wait_ready()
-        made = job(number, spec=self.spec)
-        self.slot.submit([(replace(made, stall=stall) if stall else made, vector)])
-        return self.results()[0]
-
-    def results(self):
-        while not (results := self.take()):
-            pass
-        return results
 
 
 @pytest.fixture
@@ -76,7 +43,7 @@ def harness(random_bundle):
     made = []
 
     def make(task):
-        made.append(Harness(task if isinstance(task, str) else rough_tasks.name_of(task), random_bundle))
+        made.append(Harness(task if isinstance(task, str) else rough_tasks.name_of(task), random_bundle.path))
         return made[-1]
 
     yield make

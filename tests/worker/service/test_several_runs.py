@@ -73,16 +73,6 @@ def test_a_run_that_answers_no_hello_holds_up_no_other(stage, cached):
     good.ready()
 
 
-def test_a_run_that_ends_makes_room_for_the_next(stage, cached):
-    one = stage.hand(run="one")
-    stage.worker(run=None, any=True, runs=1)
-    one.ready()
-    two = stage.also(one, run="two")
-    one.send(1, ended=True)
-    one.leave()
-    two.ready()
-
-
 def test_no_more_than_runs_are_served_at_once(stage, said, cached):
     first = stage.hand(run="r0")
     second = stage.also(first, run="r1")

@@ -93,13 +93,6 @@ def test_an_exception_in_a_fresh_child_is_the_jobs_error(harness, task, cause):
     assert len(set(pids)) == 3
 
 
-def test_a_crash_costs_one_job_and_another_child_takes_its_place(harness):
-    slot = harness(tasks.CRASHING)
-    for _ in range(2):
-        result = slot.score()
-        assert (result.fitness, result.error) == (None, crash(-signal.SIGSEGV))
-
-
 @pytest.mark.slow
 def test_a_child_that_lives_but_closed_its_pipe_is_replaced(harness):
     slot = harness(tasks.SILENT)
@@ -116,16 +109,6 @@ def test_nobody_reads_from_a_slot_that_was_stopped(harness):
     slot.score()
     slot.slot.stop()
     assert threading.active_count() == before - 1
-
-
-@pytest.mark.slow
-def test_a_killed_child_is_replaced_alone(harness):
-    slot = harness(tasks.SLOW_TOY)
-    slot.wait_ready()
-    slot.slot.submit([(job(0, spec=slot.spec), VECTOR)])
-    os.kill(slot.slot.pid, signal.SIGKILL)
-    assert slot.result().error == OUT_OF_MEMORY
-    assert slot.score().fitness is not None
 
 
 def test_an_abandoned_job_has_no_result_and_the_child_lives_on(harness):

@@ -1,4 +1,4 @@
-"""Tests api.py, policy.py, common/protocol/tasks.py and worker/scoring/scorer.py."""
+"""Tests api.py, batches.py, policy.py, common/protocol/tasks.py and worker/scoring/scorer.py."""
 
 from dataclasses import replace
 
@@ -14,22 +14,12 @@ from dreamfleet.common.protocol.tasks import check_task, describe_task, is_self_
 from dreamfleet.worker.scoring.episode import run_episode, score
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tasks.api import Assignment
-from dreamfleet.worker.tasks.registry import find_task, known_tasks
+from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from dreamfleet.worker.worlds.car_racing.preprocessing import BOX, RAW
-from tests.support import tasks
 from tests.support.bundles import npy, write_random_bundle
 from tests.support.variants import VARIANTS
-
-
-def test_car_racing_is_registered():
-    assert "car-racing" in known_tasks()
-    assert find_task("car-racing").name == "car-racing"
-
-
-def test_a_task_is_found_by_its_reference():
-    assert find_task(tasks.TOY).name == tasks.TOY
 
 
 @pytest.mark.parametrize(
@@ -227,11 +217,6 @@ def test_a_variant_is_dreamt_and_driven(random_bundle):
     assert scorer.score_all([("score", vector, 3), ("score", -vector, 3)], lambda _: None)[0] == alone
     assert scorer.world.actions == VARIANTS["all"].controls
     scorer.close()
-
-
-def test_a_controller_of_another_size_is_refused(random_bundle):
-    with pytest.raises(ControllerError, match="15 parameters"):
-        find_task("car-racing").make_policy(Assignment.of("car-racing", random_bundle)).begin(np.zeros(15, np.float32))
 
 
 @pytest.mark.parametrize(("task", "horizons"), [("dream", (20, 7, 20)), ("car-racing", (4, 2, 4))])

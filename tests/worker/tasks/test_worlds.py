@@ -1,4 +1,5 @@
-"""Worlds that are recorded under options, and bundles that describe them. Tests worker/worlds/car_racing/task.py."""
+"""Worlds that are recorded under options, and bundles that describe them.
+Tests recordable.py, world.py and worker/worlds/car_racing/task.py."""
 
 import json
 from typing import ClassVar
@@ -12,19 +13,8 @@ from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
 from dreamfleet.common.errors import BundleError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.scoring.scorer import Scorer
-from dreamfleet.worker.tasks.api import (
-    Assignment,
-    Continuous,
-    Discrete,
-    Mirror,
-    Preprocessing,
-    RecordableTask,
-    Task,
-    TaskWithBeginnings,
-    TaskWithOptions,
-    World,
-    one_hot,
-)
+from dreamfleet.worker.tasks.api import Assignment, Continuous, Discrete, Mirror, Task, World, one_hot
+from dreamfleet.worker.tasks.recordable import Preprocessing, RecordableTask, TaskWithBeginnings, TaskWithOptions
 from dreamfleet.worker.tasks.registry import find_scored_task, find_task, find_world, preprocessing_for, task_of
 from dreamfleet.worker.worldmodel.policy import ModelPolicy
 from tests.support.bundles import write_world_bundle

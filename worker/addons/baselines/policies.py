@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import Actions, Discrete, one_hot
 from dreamfleet.worker.tasks.drivers import UniformActions
-from dreamfleet.worker.tasks.frame_skip_policy import FrameSkipPolicy
+from dreamfleet.worker.tasks.policy import FrameSkipPolicy
 
 if TYPE_CHECKING:
     from dreamfleet.worker.addons.baselines.network import Memory, QNetwork

@@ -11,7 +11,7 @@ from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.addons.bench.matrix_products import Size, fastest, product_cases
 from dreamfleet.worker.addons.bench.measurement import TimedCall, time_alternately
 from dreamfleet.worker.dream.batch import TORCH_ROWS, DreamBatch
-from dreamfleet.worker.tasks.api import Episode
+from dreamfleet.worker.tasks.batches import Episode
 
 BATCHES = (1, 256, 1024)
 CANDIDATES = 64  # of a batch; fewer in smaller batches

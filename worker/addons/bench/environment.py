@@ -29,11 +29,7 @@ from dreamfleet.worker.worlds.car_racing.native_check import (
     random_action,
 )
 from dreamfleet.worker.worlds.car_racing.preprocessing import BOX
-from dreamfleet.worker.worlds.car_racing.task import (
-    CarRacingTask,
-    PictureObservation,
-    make_reference_environment,
-)
+from dreamfleet.worker.worlds.car_racing.task import CarRacingTask, make_reference_environment
 
 STEPS = 1000
 Policy = Callable[[NDArray[np.uint8]], Any]
@@ -78,9 +74,7 @@ def _cases(bundle: Bundle) -> tuple[dict[str, Callable[[RecordedDrive], float]],
     cases: dict[str, Callable[[RecordedDrive], float]] = {
         "gymnasium": lambda recorded_drive: seconds_a_step(gymnasium.make("CarRacing-v3"), recorded_drive),
         "observation": lambda recorded_drive: seconds_a_step(make_car_racing(), recorded_drive),
-        "gymnasium_picture": lambda recorded_drive: seconds_a_step(
-            PictureObservation(gymnasium.make("CarRacing-v3"), BOX), recorded_drive
-        ),
+        "gymnasium_picture": lambda recorded_drive: seconds_a_step(make_reference_environment(BOX), recorded_drive),
         "picture": lambda recorded_drive: seconds_a_step(make_car_racing(preprocessing=BOX.name), recorded_drive),
         "fitness_step_alone": lambda recorded_drive: seconds_a_step(
             task.make_environment(assignment), recorded_drive, make_random_policy(bundle).act

@@ -26,7 +26,7 @@ from dreamfleet.common.protocol.messages import (
 )
 from dreamfleet.common.transport.session import Network, enqueue_into, open_session
 from dreamfleet.worker.addons.bench.sleep_tasks import NULL_TASK
-from dreamfleet.worker.service.admission import Admission, make_request, request_admission
+from dreamfleet.worker.service.admission import Admission, CoordinatorLink, make_request
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.outbox import Outbox
 
@@ -96,8 +96,8 @@ def run_simulated_workers(endpoint: str, count: int, slots: int, seconds: float 
     declarations: list[Any] = []
     for number in range(count):
         identity = keys.new_worker_identity(f"crowd-{number}")
-        request = make_request(identity, (NULL_TASK,), slots)
-        while (admission := request_admission(session, None, request, inbox)) is None:
+        link = CoordinatorLink(session, make_request(identity, (NULL_TASK,), slots), inbox)
+        while (admission := link.request_admission(None)) is None:
             time.sleep(0.1)
         crowd[identity] = SimulatedWorker(identity, admission, slots, seconds)
         declarations.append(session.declare_subscriber(keys.job(admission.run, identity), enqueue_into(events, "job")))

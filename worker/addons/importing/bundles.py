@@ -13,7 +13,7 @@ from dreamfleet.common.host.packages import package_version
 from dreamfleet.worker.addons.importing import checkpoints
 from dreamfleet.worker.addons.importing.json_weights import Weights, read_initial_latents, read_mdnrnn, read_vae
 from dreamfleet.worker.addons.importing.sources import MDRNN, PLACES, VAE, find_checkpoint, find_json
-from dreamfleet.worker.tasks.api import Preprocessing
+from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.training.assemble import export_graphs, make_manifest  # needs the extra `train`
 from dreamfleet.worker.training.data.data_folder import explain_write_errors
 from dreamfleet.worker.training.data.dataset import find_world

@@ -22,7 +22,7 @@ from dreamfleet.common.files.regular_files import open_regular
 from dreamfleet.common.printable import plural
 from dreamfleet.worker.addons.importing.sources import drive_paths
 from dreamfleet.worker.scoring.rollout import write_episode
-from dreamfleet.worker.tasks.api import Preprocessing
+from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.training.data.data_folder import explain_folder_errors, explain_write_errors, store_preset
 from dreamfleet.worker.training.data.dataset import episode_path, existing_episodes, find_world, preprocessing_of_size
 

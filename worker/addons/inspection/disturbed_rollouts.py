@@ -18,9 +18,11 @@ from dreamfleet.common.runs.seeds import VALIDATION
 from dreamfleet.worker.scoring.actors import Actor
 from dreamfleet.worker.scoring.disturbance import Disturbance, DisturbedPolicy
 from dreamfleet.worker.scoring.episode import EpisodeConfig, ResetHook, run_episode
-from dreamfleet.worker.tasks.api import Assignment, Task, TaskWithBeginnings, TaskWithTrueState
+from dreamfleet.worker.tasks.api import Assignment, Task
 from dreamfleet.worker.tasks.closing import close_environment
+from dreamfleet.worker.tasks.recordable import TaskWithBeginnings
 from dreamfleet.worker.tasks.registry import task_of
+from dreamfleet.worker.tasks.true_state import TaskWithTrueState
 from dreamfleet.worker.worldmodel.observation import join_features
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 

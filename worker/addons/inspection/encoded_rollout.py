@@ -18,9 +18,10 @@ from dreamfleet.common.runs.seeds import VALIDATION
 from dreamfleet.worker.scoring.actors import check_same_pictures
 from dreamfleet.worker.scoring.disturbance import numbered_choices
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
-from dreamfleet.worker.tasks.api import Assignment, Continuous, Policy, RecordableTask, World
+from dreamfleet.worker.tasks.api import Assignment, Continuous, Policy, World
 from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tasks.policy import DriverPolicy
+from dreamfleet.worker.tasks.recordable import RecordableTask
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.worldmodel.inference import Encoder
 

@@ -95,7 +95,7 @@ def measure(
     pin_thread_pools()  # of NumPy, which a verb has not loaded yet
     from dreamfleet.worker.addons.inspection.disturbed_rollouts import DisturbedDriveConfig
     from dreamfleet.worker.dream.world import world_of
-    from dreamfleet.worker.tasks.api import TaskWithBeginnings
+    from dreamfleet.worker.tasks.recordable import TaskWithBeginnings
     from dreamfleet.worker.tasks.registry import task_of
 
     with ExitStack() as held:

@@ -24,7 +24,7 @@ from dreamfleet.worker.addons.inspection.tables import measured_rows
 from dreamfleet.worker.addons.inspection.training_curves import MODELS, TrainingCurves, load_trainings
 from dreamfleet.worker.addons.inspection.vae_sections import own_pictures
 from dreamfleet.worker.addons.inspection.vae_view import CHECKPOINT, VAEView, held_out_drive
-from dreamfleet.worker.tasks.api import Preprocessing
+from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.training.data.dataset import find_world, world_of_folder
 

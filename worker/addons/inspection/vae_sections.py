@@ -17,7 +17,7 @@ from dreamfleet.worker.addons.inspection.charts import FONT, draw_heatmap, new_f
 from dreamfleet.worker.addons.inspection.encoded_rollout import EncodedRollout
 from dreamfleet.worker.addons.inspection.page import Section
 from dreamfleet.worker.addons.inspection.vae_view import VAEView
-from dreamfleet.worker.tasks.api import Preprocessing
+from dreamfleet.worker.tasks.recordable import Preprocessing
 
 SHOWN = 8  # pictures per row, latents per table
 TRAVERSED = np.linspace(-3, 3, 7)

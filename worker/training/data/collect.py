@@ -24,9 +24,10 @@ from dreamfleet.worker.scoring.episode import EpisodeConfig, ResetHook, run_epis
 from dreamfleet.worker.scoring.failure_cause import crash, failure_of
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld, Rollout, write_episode
 from dreamfleet.worker.scoring.scorer import DRIVER_NAME
-from dreamfleet.worker.tasks.api import Policy, RecordableTask, TaskWithBeginnings
+from dreamfleet.worker.tasks.api import Policy
 from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tasks.policy import ALL_DRIVERS, DriverPolicy
+from dreamfleet.worker.tasks.recordable import RecordableTask, TaskWithBeginnings
 from dreamfleet.worker.training.data.collect_config import CollectConfig, source_policies
 from dreamfleet.worker.training.data.data_folder import explain_folder_errors, explain_write_errors
 from dreamfleet.worker.training.data.dataset import (

@@ -10,8 +10,9 @@ import numpy as np
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.scoring.rollout import DataWorld
-from dreamfleet.worker.tasks.api import Policy, RecordableTask, TaskWithBeginnings, TaskWithPolicies
+from dreamfleet.worker.tasks.api import Policy
 from dreamfleet.worker.tasks.policy import ALL_DRIVERS
+from dreamfleet.worker.tasks.recordable import RecordableTask, TaskWithBeginnings, TaskWithPolicies
 from dreamfleet.worker.training.data.dataset import find_world, preprocessing_of_size
 
 MAX_NOISE = 10.0  # in halves of an action's range

@@ -13,7 +13,7 @@ from dreamfleet.common.cli.presets import check_preset
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write, reporting_unwritable_folder
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld
-from dreamfleet.worker.tasks.api import TaskWithOptions
+from dreamfleet.worker.tasks.recordable import TaskWithOptions
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.training.data.dataset import (
     BEGUN,

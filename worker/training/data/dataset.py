@@ -18,7 +18,7 @@ from dreamfleet.common.files.archives import NPY, ArchiveLimits, Arrays, Damaged
 from dreamfleet.common.files.regular_files import open_regular, read_text
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld
 from dreamfleet.worker.tasks import registry
-from dreamfleet.worker.tasks.api import Preprocessing, RecordableTask
+from dreamfleet.worker.tasks.recordable import Preprocessing, RecordableTask
 
 BEGUN = "preset.json"  # what a data set was begun with
 BEGUN_BYTES = 10_000

@@ -11,13 +11,14 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.box2d.car_dynamics import Car
-from numpy.typing import NDArray
+from gymnasium.wrappers import TransformObservation
 
 from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, Mirror
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.car_racing_variants import FACTS
-from dreamfleet.worker.tasks.api import Assignment, DreamReward, Driver, Policy, Preprocessing, Task, World
+from dreamfleet.worker.tasks.api import Assignment, DreamReward, Driver, Policy, Task, World
 from dreamfleet.worker.tasks.policy import DriverPolicy
+from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.tasks.registry import preprocessing_for
 from dreamfleet.worker.worldmodel.policy import ModelPolicy
 from dreamfleet.worker.worlds.car_racing.drivers import DRIVERS, PushedDriver, UniformDriver
@@ -147,20 +148,8 @@ def make_judging_environment(preprocessing: Preprocessing, render_mode: str | No
 
 def make_reference_environment(preprocessing: Preprocessing, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
     """Make gymnasium's unmodified environment, observing the pictures of a preprocessing."""
-    return PictureObservation(gymnasium.make(ENVIRONMENT, render_mode=render_mode), preprocessing)
-
-
-class PictureObservation(gymnasium.ObservationWrapper[NDArray[np.uint8], Any, NDArray[np.uint8]]):
-    """Turns CarRacing's observation into the picture of a preprocessing."""
-
-    def __init__(self, environment: gymnasium.Env[Any, Any], preprocessing: Preprocessing) -> None:
-        super().__init__(environment)
-        self._preprocessing = preprocessing
-        self.observation_space = spaces.Box(0, 255, preprocessing.shape, np.uint8)
-
-    def observation(self, observation: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the picture."""
-        return self._preprocessing.picture(observation)
+    made = gymnasium.make(ENVIRONMENT, render_mode=render_mode)
+    return TransformObservation(made, preprocessing.picture, spaces.Box(0, 255, preprocessing.shape, np.uint8))
 
 
 class OffRoadInfo(gymnasium.Wrapper[Any, Any, Any, Any]):

@@ -63,9 +63,7 @@ def make_environment(name: str, arguments: Mapping[str, Any], render_mode: str |
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", ".*render_mode")  # gymnasium's: the error says it
             return _make(name, {**arguments, "render_mode": render_mode})
-    except UsageError as error:
-        if not isinstance(error, ArgumentsError):
-            raise
+    except ArgumentsError as error:
         close_environment(_make(name, arguments))  # without pictures it is sound
         raise UsageError(
             f"{name} draws no pictures: it must take `render_mode`, and in the render mode {render_mode} its `render` "

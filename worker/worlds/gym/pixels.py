@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
@@ -22,7 +21,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.user_code import describe_error
 from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.common.schema.validation import OPTIONAL, MalformedError, from_plain, to_plain
-from dreamfleet.worker.tasks.api import Assignment, Driver, Policy, Preprocessing, Task, World
+from dreamfleet.worker.tasks.api import Assignment, Driver, Policy, Task, World
 from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tasks.drivers import HeldActions, UniformActions
 from dreamfleet.worker.tasks.pictures import (
@@ -33,14 +32,15 @@ from dreamfleet.worker.tasks.pictures import (
     LookAtDrawn,
     Pixels,
     SkipFrames,
-    TileFrames,
     VectorActions,
     cut_and_resize,
     frame_difference,
     is_picture,
     is_stack,
+    parse_crop,
     tile_frames,
 )
+from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.tasks.registry import preprocessing_for
 from dreamfleet.worker.worldmodel.policy import ModelPolicy
 from dreamfleet.worker.worlds.gym.environments import (
@@ -55,7 +55,6 @@ from dreamfleet.worker.worlds.gym.spaces import make_converter, vector_actions
 RENDERED = "render"  # as an observation: what the environment draws
 EVERY_FRAME = "all"  # as an observation: all frames of the only picture, which is a stack
 SIZES = (64, 96)
-_CROP = re.compile(r"(\d{1,5}):(\d{1,5}),(\d{1,5}):(\d{1,5})", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ class PixelOptions:
     def __post_init__(self) -> None:
         if self.size not in SIZES:
             raise UsageError(f"pictures are {' or '.join(map(str, SIZES))} pixels wide, not {self.size}")
-        if self.crop and not _CROP.fullmatch(self.crop):
+        if self.crop and self.rows_and_columns is None:
             raise UsageError(f"a crop is top:bottom,left:right, such as 0:400,0:640, not {self.crop!r:.50}")
 
     @classmethod
@@ -107,11 +106,7 @@ class PixelOptions:
     @property
     def rows_and_columns(self) -> Crop | None:
         """The crop's first row, row after the last, first column and column after the last; `None`: no crop."""
-        found = _CROP.fullmatch(self.crop)
-        if found is None:
-            return None
-        top, bottom, left, right = map(int, found.groups())
-        return top, bottom, left, right
+        return parse_crop(self.crop)
 
     @property
     def preprocessing(self) -> str:
@@ -241,7 +236,7 @@ class GymPixelTask(Task):
             seen = environment
             if isinstance(space, spaces.Dict):
                 seen = TransformObservation(environment, lambda observation: observation[key], entries[key])
-            return TileFrames(seen) if self._tiles else seen
+            return _tile(seen, entries[key]) if self._tiles else seen
         if wanted == RENDERED:
             try:
                 return LookAtDrawn(environment)
@@ -254,6 +249,12 @@ class GymPixelTask(Task):
             f"{self._id} observes {space}, where {repr(wanted) if wanted else 'the picture'} is no picture or not the "
             f"only one: {remedy}. A picture is {KINDS}"
         )
+
+
+def _tile(environment: gymnasium.Env[Any, Any], stack: Any) -> gymnasium.Env[Any, Any]:
+    """The environment with all frames of its stack in one picture."""
+    space = spaces.Box(tile_frames(stack.low), tile_frames(stack.high), dtype=stack.dtype)
+    return TransformObservation(environment, lambda frames: tile_frames(np.asarray(frames)), space)
 
 
 @lru_cache(maxsize=64)

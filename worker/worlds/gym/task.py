@@ -52,19 +52,11 @@ class GymTask(Task):
         self._id = environment
 
     def with_options(self, options: str) -> GymPixelTask:
-        """The task of the environment's pictures under options as `parse_options` writes them; `UsageError` for others.
-
-        >>> GymTask("CartPole-v1").with_options('{"observation": "render"}').name
-        'gym:CartPole-v1'
-        """
+        """The task of the environment's pictures under options that `parse_options` writes; `UsageError` for others."""
         return GymPixelTask.of(self._id, options)
 
     def parse_options(self, arguments: Mapping[str, Any]) -> str:
-        """Canonical JSON of the arguments that `PixelOptions` has and that differ from its defaults; empty for none.
-
-        >>> GymTask("CartPole-v1").parse_options({"observation": "render", "skip": 1})
-        '{"observation": "render"}'
-        """
+        """Canonical JSON of the arguments that `PixelOptions` has and that differ from its defaults; empty for none."""
         return PixelOptions.of(arguments).text
 
     def world_of(self, assignment: Assignment) -> World:

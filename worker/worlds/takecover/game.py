@@ -1,4 +1,4 @@
-"""Take Cover as a gymnasium environment on ViZDoom's `DoomGame`."""
+"""Take Cover as a gymnasium environment on ViZDoom's `DoomGame`, and what is seen of it without a world model."""
 
 from __future__ import annotations
 
@@ -21,7 +21,11 @@ LIMIT = 2100  # tics of an episode at most: a minute
 SKILL = 4  # the one to which published scores fit
 STAY, LEFT, RIGHT = range(3)
 BUTTONS = ([0, 0], [1, 0], [0, 1])  # pressed for each action
+FIRST_ROW, ROWS, COLUMNS = 48, 4, 32  # of the band: its first row in the picture, and its numbers
+CELL = (6, WIDTH // COLUMNS)  # rows and columns of the picture for each of its numbers
+BAND = ROWS * COLUMNS
 Pixels = NDArray[np.uint8]
+Floats = NDArray[np.float32]
 
 
 class TakeCover(gymnasium.Env[Pixels, int]):
@@ -100,3 +104,12 @@ class TakeCover(gymnasium.Env[Pixels, int]):
         game.set_render_hud(False)
         start_game(game, Path(vizdoom.__file__).with_name("vizdoom"))
         return game
+
+
+def observe_band(picture: Pixels) -> Floats:
+    """Brightness from 0 to 1 in 4 x 32 cells of the rows at the height of the eyes, `(128,)`."""
+    height, width = CELL
+    band = picture[FIRST_ROW : FIRST_ROW + ROWS * height].reshape(ROWS, height, COLUMNS, width, 3)
+    sums = band.sum(axis=(1, 3, 4), dtype=np.int64).reshape(-1)  # whole numbers: the same bits on every host
+    brightness: Floats = (sums / (255 * 3 * height * width)).astype(np.float32)
+    return brightness

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any, Literal
 
 from dreamfleet.common.artifacts.task_options import check_options, read_options, write_options
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.tasks.pictures import SHORTEST, Crop, is_crop
+from dreamfleet.worker.tasks.pictures import SHORTEST, Crop, cut_and_resize, is_crop, parse_crop
+from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.worlds.takecover.game import HEIGHT, LIMIT, TICS_PER_SECOND, WIDTH
 
 OPTION_HELP = {
@@ -19,7 +20,7 @@ OPTION_HELP = {
 }
 FLAGS = {"skip": "tics", "crop": "crop"}  # of any world, and what they are here
 KNOWN = ("environment", *FLAGS)
-_CROP = re.compile(r"(\d{1,3}):(\d{1,3}),(\d{1,3}):(\d{1,3})", re.ASCII)
+SIZES = (64, 96)  # of the pictures that a world model sees, the usual one first
 
 
 @dataclass(frozen=True)
@@ -87,17 +88,19 @@ class TakeCoverOptions:
     @property
     def part(self) -> Crop:
         """The crop's first row and the one after its last, then its columns."""
-        return _read_crop(self.crop)
+        part = parse_crop(self.crop)
+        assert part is not None  # `__post_init__` has checked it
+        return part
 
-
-def _read_crop(text: str) -> Crop:
-    found = _CROP.fullmatch(text)
-    assert found is not None
-    top, bottom, left, right = map(int, found.groups())
-    return top, bottom, left, right
+    @property
+    def preprocessings(self) -> dict[str, Preprocessing]:
+        """What a world model sees, in the sizes that it may have: the crop, resized."""
+        crop = "" if self.crop == TakeCoverOptions.crop else f" of {self.crop}"
+        names = {size: f"box-{size}{crop}" for size in SIZES}
+        cut = partial(cut_and_resize, crop=self.part)
+        return {name: Preprocessing(name, size, partial(cut, size=size)) for size, name in names.items()}
 
 
 def _is_crop(text: Any) -> bool:
-    if not isinstance(text, str) or not _CROP.fullmatch(text):
-        return False
-    return is_crop(_read_crop(text), HEIGHT, WIDTH)
+    crop = parse_crop(text) if isinstance(text, str) else None
+    return crop is not None and is_crop(crop, HEIGHT, WIDTH)

@@ -7,27 +7,20 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium import spaces
+from gymnasium.wrappers import TransformObservation
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import Continuous, Mirror, one_hot
-from dreamfleet.worker.tasks.api import (
-    Assignment,
-    Description,
-    DreamReward,
-    Driver,
-    Policy,
-    Preprocessing,
-    Task,
-    World,
-)
+from dreamfleet.worker.tasks.api import Assignment, Description, DreamReward, Driver, Policy, Task, World
 from dreamfleet.worker.tasks.drivers import HeldActions, UniformActions
 from dreamfleet.worker.tasks.pictures import CropAndResize, VectorActions
 from dreamfleet.worker.tasks.policy import DriverPolicy, FlatPolicy
+from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.tasks.registry import preprocessing_for
 from dreamfleet.worker.worldmodel.policy import ModelPolicy
-from dreamfleet.worker.worlds.takecover.game import LEFT, RIGHT, STAY, TakeCover
+from dreamfleet.worker.worlds.takecover.game import BAND, LEFT, RIGHT, STAY, TakeCover, observe_band
 from dreamfleet.worker.worlds.takecover.options import TakeCoverOptions
-from dreamfleet.worker.worlds.takecover.picture import BAND, ObserveBand, make_preprocessings
 
 PACKAGES = ("numpy", "onnxruntime", "vizdoom")
 SOLVED = 750.0  # tics, the mean of 100 episodes: OpenAI Gym's DoomTakeCover-v0
@@ -56,11 +49,7 @@ def actions_of(options: TakeCoverOptions) -> Continuous:
 
 
 def make_world(options: TakeCoverOptions) -> World:
-    """The world under these options.
-
-    >>> make_world(TakeCoverOptions(tics=1)).horizon
-    2100
-    """
+    """The world under these options."""
     actions = actions_of(options)
     return World(
         actions=actions,
@@ -93,7 +82,7 @@ class TakeCoverTask(Task):
         self.policies: Mapping[str, Callable[[np.random.Generator], Policy]] = {
             "uniform": lambda random: DriverPolicy(UniformActions(random, actions))
         }
-        self.preprocessings: Mapping[str, Preprocessing] = make_preprocessings(self._options)
+        self.preprocessings: Mapping[str, Preprocessing] = self._options.preprocessings
 
     def with_options(self, options: str) -> TakeCoverTask:
         """The same task under the options in a JSON object; `UsageError` for unknown ones."""
@@ -117,7 +106,8 @@ class TakeCoverTask(Task):
         """The game in the world model's pictures, or without a world model as a band of pixels."""
         task = self._bound_to(assignment)
         if assignment.bundle is None:
-            return task._with_actions(ObserveBand(task._make_game()))
+            band = spaces.Box(0, 1, (BAND,), np.float32)
+            return task._with_actions(TransformObservation(task._make_game(), observe_band, band))
         return task.make_recorded(preprocessing_for(assignment.bundle, task).name)
 
     def make_recorded(self, preprocessing: str) -> gymnasium.Env[Any, Any]:

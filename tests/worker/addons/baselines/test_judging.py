@@ -1,5 +1,5 @@
 """Baselines are evaluated and recorded in gymnasium's own environment, like controllers.
-Tests worker/worlds/car_racing/agents.py and worker/tasks/frame_skip_policy.py."""
+Tests worker/worlds/car_racing/agents.py and worker/tasks/policy.py."""
 
 import json
 from pathlib import Path

@@ -26,17 +26,6 @@ def test_the_picture_is_the_exact_integer_box_filter(seed):
     assert np.array_equal(BOX.picture(observation), slow_picture(observation))
 
 
-@pytest.mark.parametrize("value", [0, 1, 127, 254, 255])
-def test_a_plain_colour_stays(value):
-    assert (BOX.picture(np.full((96, 96, 3), value, np.uint8)) == value).all()
-
-
-def test_the_indicator_bar_is_not_seen():
-    observation = np.zeros((96, 96, 3), np.uint8)
-    observation[84:] = 255
-    assert (BOX.picture(observation) == 0).all()
-
-
 def test_the_raw_picture_is_the_whole_observation():
     observation = np.random.default_rng(0).integers(0, 256, (96, 96, 3), dtype=np.uint8)
     assert np.array_equal(RAW.picture(observation), observation)

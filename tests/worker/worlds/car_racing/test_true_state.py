@@ -1,4 +1,5 @@
-"""The true state of car and road: on roads of a known shape, and in the real environment."""
+"""The true state of car and road: on roads of a known shape, and in the real environment.
+Tests worker/tasks/true_state.py."""
 
 import math
 
@@ -6,8 +7,8 @@ import numpy as np
 import pytest
 from gymnasium.envs.box2d.car_dynamics import Car
 
-from dreamfleet.worker.tasks.api import TaskWithTrueState
 from dreamfleet.worker.tasks.registry import find_task
+from dreamfleet.worker.tasks.true_state import TaskWithTrueState
 from dreamfleet.worker.worlds.car_racing.native_check import make_car_racing
 from dreamfleet.worker.worlds.car_racing.true_state import LOOK_AHEAD, CentreLine, read_true_state, wrap_angle
 

@@ -15,8 +15,9 @@ from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.seeds import fold_seed
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.scoring.scorer import Scorer
-from dreamfleet.worker.tasks.api import Assignment, RecordableTask
+from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.policy import DriverPolicy
+from dreamfleet.worker.tasks.recordable import RecordableTask
 from dreamfleet.worker.tasks.registry import check_world_allowed, find_task, task_of
 from tests.support import pixel_fakes
 from tests.support.bundles import write_world_bundle

@@ -1,4 +1,4 @@
-"""Take Cover as a task and as an environment. Tests game.py, options.py and picture.py."""
+"""Take Cover as a task and as an environment. Tests game.py and options.py."""
 
 import json
 import os
@@ -9,20 +9,15 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import BundleError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import describe_task
 from dreamfleet.common.runs.seeds import fold_seed
 from dreamfleet.worker.scoring.scorer import Scorer
-from dreamfleet.worker.tasks.api import (
-    Assignment,
-    EndRule,
-    RecordableTask,
-    RewardFacts,
-    TaskWithOptions,
-    TaskWithPolicies,
-)
+from dreamfleet.worker.tasks.api import Assignment
+from dreamfleet.worker.tasks.recordable import RecordableTask, TaskWithOptions, TaskWithPolicies
 from dreamfleet.worker.tasks.registry import find_task, find_world
 from dreamfleet.worker.worlds.takecover.game import LEFT, LIMIT, RIGHT, STAY, TakeCover
 from dreamfleet.worker.worlds.takecover.options import TakeCoverOptions
