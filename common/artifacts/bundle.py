@@ -20,13 +20,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.actions import MAX_OUTPUTS
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape, import_hint
 from dreamfleet.common.artifacts.driving import Driving, Variant, facts_left_out, parse_driving
-from dreamfleet.common.artifacts.onnx_checks import (
-    UnsafeModelError,
-    check_model,
-    has_finite_weights,
-    is_empty_graph,
-    read_float_array,
-)
+from dreamfleet.common.artifacts.onnx_checks import find_fault, read_float_array
 from dreamfleet.common.artifacts.world_facts import WorldFacts
 from dreamfleet.common.errors import BundleError, ControllerError, UsageError
 from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive, write_archive
@@ -283,57 +277,33 @@ def hash_file(path: Path) -> str:
 
 def _check_part(path: Path, manifest: BundleManifest, name: str, data: bytes) -> None:
     """`BundleError` for a part that would fail, or give nonsense, only during scoring."""
-    if name.endswith(".onnx"):
-        try:
-            check_model(data)
-        except UnsafeModelError as error:
-            raise BundleError(f"{path}: {name} {error}; build the bundle again") from error
-    if name.endswith(".onnx") and is_empty_graph(data):
-        raise BundleError(
-            f"{path}: {name} is an empty graph; fetch the bundle again, or build it again from its models"
-        )
-    if name.endswith(".onnx") and not has_finite_weights(data):
-        raise BundleError(f"{path}: {name} has weights that are NaN or infinite; train the model again")
-    if name in (INITIAL_LATENTS_PART, RECORDED_STATES) and len(data) > MAX_ARRAY:
+    if name.endswith(".onnx") and (fault := find_fault(data)):
+        raise BundleError(f"{path}: {name} {fault}; fetch the bundle again, or build it again from sound models")
+    if name in (INITIAL_LATENTS_PART, RECORDED_STATES):
+        _check_states(path, manifest, name, data)
+
+
+def _check_states(path: Path, manifest: BundleManifest, name: str, data: bytes) -> None:
+    """`BundleError` for states that no dream can begin at.
+
+    The exact width of recorded ones is in the dream's graph, which is not read here.
+    """
+    if len(data) > MAX_ARRAY:
         raise BundleError(f"{path}: {name} unpacks to {len(data) >> 20} MiB, and at most {MAX_ARRAY >> 20} are read")
-    if name == INITIAL_LATENTS_PART:
-        _check_latents(path, manifest, data)
-    if name == RECORDED_STATES:
-        _check_recorded_states(path, manifest, data)
-
-
-def _check_latents(path: Path, manifest: BundleManifest, data: bytes) -> None:
-    try:
-        latents = read_float_array(data)
-    except ValueError as error:
-        raise BundleError(
-            f"{path}: {INITIAL_LATENTS_PART} is not an array of latents ({error}); build the bundle again"
-        ) from error
-    if latents.ndim != 3 or latents.shape[1:] != (2, manifest.latent) or not len(latents):
-        raise BundleError(
-            f"{path}: {INITIAL_LATENTS_PART} must be (N, 2, {manifest.latent}) with N at least 1, not {latents.shape}; "
-            "build the bundle again from encoded rollouts"
-        )
-    if not np.isfinite(latents).all():
-        raise BundleError(f"{path}: {INITIAL_LATENTS_PART} holds NaN or infinity; encode the rollouts again")
-
-
-def _check_recorded_states(path: Path, manifest: BundleManifest, data: bytes) -> None:
-    """`BundleError` for unusable states; their exact width is in the dream's graph, which is not read here."""
     try:
         states = read_float_array(data)
     except ValueError as error:
-        raise BundleError(
-            f"{path}: {RECORDED_STATES} is not an array of states ({error}); build the bundle again"
-        ) from error
-    min_width = 2 * (manifest.latent + manifest.hidden)
-    if states.ndim != 2 or not 1 <= len(states) <= MAX_RECORDED_STATES or states.shape[1] < min_width:
-        raise BundleError(
-            f"{path}: {RECORDED_STATES} must be (N, W) with N from 1 to {MAX_RECORDED_STATES} and W at least "
-            f"{min_width}, not {states.shape}; build the bundle again"
-        )
+        raise BundleError(f"{path}: {name} is not an array of states ({error}); build the bundle again") from error
+    count, width = len(states) if states.ndim else 0, 2 * (manifest.latent + manifest.hidden)
+    if name == INITIAL_LATENTS_PART:
+        wanted, fits = f"(N, 2, {manifest.latent}) with N at least 1", states.shape[1:] == (2, manifest.latent)
+    else:
+        wanted = f"(N, W) with N from 1 to {MAX_RECORDED_STATES} and W at least {width}"
+        fits = states.ndim == 2 and count <= MAX_RECORDED_STATES and states.shape[1] >= width
+    if not (count and fits):
+        raise BundleError(f"{path}: {name} must be {wanted}, not {states.shape}; build the bundle again")
     if not np.isfinite(states).all():
-        raise BundleError(f"{path}: {RECORDED_STATES} holds NaN or infinity; build the bundle again")
+        raise BundleError(f"{path}: {name} holds NaN or infinity; build the bundle again")
 
 
 def read_bytes_or_none(path: Path) -> bytes | None:

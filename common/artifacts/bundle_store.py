@@ -3,35 +3,40 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import re
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
-from dreamfleet.common.artifacts.bundle import LIMITS, MANIFEST, Bundle, hash_file, read_bytes_or_none
-from dreamfleet.common.artifacts.delta_bundle import (
-    DELTA_SUFFIX,
-    DeltaManifest,
-    read_delta_manifest,
-    rebuild_bundle,
-    write_delta,
-)
+from dreamfleet.common.artifacts.bundle import LIMITS, Bundle, hash_file, read_bytes_or_none
 from dreamfleet.common.errors import BundleError, CacheError, UsageError
+from dreamfleet.common.files.archives import DamagedArchiveError, open_archive, write_archive
 from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
 from dreamfleet.common.files.locks import wait_for_lock
-from dreamfleet.common.files.regular_files import open_append, path_exists
+from dreamfleet.common.files.regular_files import open_append, open_regular, path_exists
+from dreamfleet.common.schema.validation import MalformedError, from_plain
 
 INT8_SUFFIX = "-int8"  # in the name of a shipped bundle: NAME rounded to eight bits
 CACHE_REMEDY = "make room in the cache, or point $DREAMFLEET_CACHE elsewhere"
+DELTA_SUFFIX, DELTA_MANIFEST = ".lean", "lean.json"
+_MAX_DELTA_MANIFEST = 10_000  # bytes
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
-def write_shipped_delta(bundle: Bundle, base: str, path: Path) -> None:
-    """Write the bundle as a delta to the shipped bundle `base`: without the parts that both hold."""
-    delta = DeltaManifest(bundle.sha256, base, (MANIFEST, *sorted(bundle.manifest.parts)))
-    write_delta(path, delta, bundle.path, shipped_bundles()[base], LIMITS)
+@dataclass(frozen=True)
+class DeltaManifest:
+    """The manifest of a delta: a zip like a bundle, without the parts that another shipped bundle, its base, holds too.
+
+    Rebuilding gives the original bundle to the byte.
+    """
+
+    sha256: str  # of the whole bundle's file, hexadecimal
+    base: str  # name of the shipped bundle that holds the other parts
+    parts: tuple[str, ...]  # all members of the whole bundle, in order
 
 
 class BundleStore:
@@ -61,15 +66,18 @@ class BundleStore:
 
     def rebuild(self, path: Path) -> Bundle:
         """The whole bundle of a shipped delta; it is assembled once, in the cache."""
-        delta = read_delta_manifest(path, LIMITS)
+        delta = _read_delta_manifest(path)
         base = shipped_bundles().get(delta.base)
         if base is None:
             raise BundleError(f"{path} needs the bundle {delta.base}, which does not ship: install dreamfleet again")
         with self.lock_download(delta.sha256) as partial:
             if (found := self._find_cached(delta.sha256)) is not None:
                 return found
+            members = {**_read_members(base), **_read_members(path)}
+            if missing := [name for name in delta.parts if name not in members]:
+                raise _damage_error(path, f"{', '.join(missing)} is in neither it nor {base.name}")
             with self.reporting_write_errors(), partial.open("wb") as file:
-                rebuild_bundle(path, base, file, LIMITS)
+                write_archive(file, [(name, members[name]) for name in delta.parts])
             return self.finish_download(delta.sha256)
 
     @contextmanager
@@ -140,7 +148,29 @@ def shipped_bundles() -> dict[str, Path]:
 def _shipped_deltas() -> Iterator[tuple[Path, DeltaManifest]]:
     """The deltas that ship, each with its manifest."""
     for path in sorted(pretrained_folder().glob(f"*{DELTA_SUFFIX}")):
-        yield path, read_delta_manifest(path, LIMITS)
+        yield path, _read_delta_manifest(path)
+
+
+def _read_delta_manifest(path: Path) -> DeltaManifest:
+    """`BundleError` if it is damaged."""
+    try:
+        with open_regular(path, LIMITS.size) as file, open_archive(file, LIMITS) as archive:
+            return from_plain(DeltaManifest, json.loads(archive.read(DELTA_MANIFEST, _MAX_DELTA_MANIFEST)))
+    except (OSError, DamagedArchiveError, ValueError, MalformedError, RecursionError) as error:
+        raise _damage_error(path, error) from error
+
+
+def _read_members(path: Path) -> dict[str, bytes]:
+    """All members of a zip, by name."""
+    try:
+        with open_regular(path, LIMITS.size) as file, open_archive(file, LIMITS) as archive:
+            return {name: archive.read(name) for name in archive.names}
+    except (OSError, DamagedArchiveError) as error:
+        raise _damage_error(path, error) from error
+
+
+def _damage_error(path: Path, why: object) -> BundleError:
+    return BundleError(f"{path} is damaged ({why}): install dreamfleet again")
 
 
 def shipped_names() -> tuple[str, ...]:

@@ -6,10 +6,9 @@ default variant has the specification of a run that names none.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 from dreamfleet.common.artifacts.actions import (
     FIVE_CHOICES,
@@ -18,9 +17,9 @@ from dreamfleet.common.artifacts.actions import (
     STEERING_GAS_BRAKE_AS_THEY_ARE,
     Continuous,
 )
-from dreamfleet.common.artifacts.task_options import check_options, read_options, write_options
+from dreamfleet.common.artifacts.task_options import read_options
+from dreamfleet.common.artifacts.world_driving import Driving
 from dreamfleet.common.artifacts.world_facts import RewardFacts, WorldFacts
-from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 
 CAR_RACING = "car-racing"  # the task; its dream has the same options
@@ -34,74 +33,44 @@ FACTS = WorldFacts.of(
     marks=(800.0, 900.0),
     action_names=("steer", "gas", "brake"),
 )
-OPTION_HELP = {
-    "actions": "continuous, or linear or discrete with pedals=two",
-    "pedals": "two, half or one",
-    "pedal_shift": "a number from -1 to 1, and 0 unless pedals=one",
-    "decide_every": "a whole number from 1 to 50",
-    "feedback": "none or last",
-    "time_cost": "a number from 0 to 100",
-    "offroad_cost": "a number from 0 to 100",
-}
 
 
 @dataclass(frozen=True)
-class Variant:
+class Variant(Driving):
     """How a controller drives, and the penalties of its candidates; `UsageError` for a value out of range."""
 
+    HELP: ClassVar[dict[str, str]] = {
+        "actions": "continuous, or linear or discrete with pedals=two",
+        "pedals": "two, half or one",
+        "pedal_shift": "a number from -1 to 1, and 0 unless pedals=one",
+        **Driving.HELP,
+        "time_cost": "a number from 0 to 100",
+        "offroad_cost": "a number from 0 to 100",
+    }
+    WHOSE: ClassVar[str] = f"{CAR_RACING}'s "
     COSTS: ClassVar[tuple[str, ...]] = ("time_cost", "offroad_cost")  # options by which candidates pay
 
     # linear: the outputs are the action, without tanh; discrete: one of gymnasium's five
     actions: Literal["continuous", "linear", "discrete"] = "continuous"
     pedals: Literal["two", "half", "one"] = "two"  # half: output 0 presses both halfway; one: > 0 is gas, < 0 brake
     pedal_shift: float = 0.0  # added to the one pedal
-    decide_every: int = 1  # steps for which an action is repeated
-    feedback: Literal["none", "last"] = "none"  # last: the last action and its change are features too
     time_cost: float = 0.0  # a candidate's penalty for each step before its lap is over
     offroad_cost: float = 0.0  # a candidate's penalty for each step with a wheel off the road
 
-    def __post_init__(self) -> None:
-        valid = {
+    def _valid(self) -> dict[str, bool]:
+        return super()._valid() | {
             "actions": self.actions == "continuous"
             or (self.actions in ("linear", "discrete") and self.pedals == "two"),
             "pedals": self.pedals in ("two", "half", "one"),
             "pedal_shift": _within(self.pedal_shift, -1, 1) and (self.pedals == "one" or not self.pedal_shift),
-            "decide_every": type(self.decide_every) is int and 1 <= self.decide_every <= 50,
-            "feedback": self.feedback in ("none", "last"),
             "time_cost": _within(self.time_cost, 0, 100),
             "offroad_cost": _within(self.offroad_cost, 0, 100),
         }
-        for name, is_valid in valid.items():
-            if not is_valid:
-                raise UsageError(f"{CAR_RACING}'s {name} must be {OPTION_HELP[name]}, not {getattr(self, name)!r}")
 
     @classmethod
     def from_json(cls, options: str) -> Variant:
         """Parse a specification's options, a JSON object or an empty text; `UsageError` lists the known options."""
         return _parse_options(options)
-
-    @classmethod
-    def from_values(cls, names: Mapping[str, Any]) -> Variant:
-        """The variant with these option values; `UsageError` for an unknown name or an invalid value."""
-        check_options(CAR_RACING, names, OPTION_HELP)
-        found = cls(**names)
-        shift, time, offroad = map(float, (found.pedal_shift, found.time_cost, found.offroad_cost))
-        return replace(found, pedal_shift=shift, time_cost=time, offroad_cost=offroad)
-
-    @property
-    def options(self) -> str:
-        """The options that differ from the defaults as canonical JSON; empty for the default variant."""
-        return write_options(self._non_default)
-
-    @property
-    def option_texts(self) -> tuple[str, ...]:
-        """The options that differ from the defaults, each as NAME=VALUE."""
-        return tuple(f"{name}={value}" for name, value in self._non_default.items())
-
-    @property
-    def is_default(self) -> bool:
-        """Whether no option differs from its default."""
-        return self == DEFAULT_VARIANT
 
     @property
     def version(self) -> int:
@@ -112,7 +81,7 @@ class Variant:
         return 3 if self.without_costs.is_default else 2
 
     @property
-    def without_costs(self) -> Variant:
+    def without_costs(self) -> Self:
         """This variant without penalties, on which a controller's parameters do not depend."""
         return replace(self, time_cost=0.0, offroad_cost=0.0)
 
@@ -130,20 +99,12 @@ class Variant:
         shift = (0.0, self.pedal_shift, -self.pedal_shift)
         return Continuous((1, 1, -1), shift, low=(-1, 0, 0), high=(1, 1, 1), output_indices=(0, 1, 1))
 
-    @property
-    def extra_features(self) -> int:
-        """Number of features beside the world model's: each output's last value and its change."""
-        return 2 * self.controls.outputs if self.feedback == "last" else 0
-
-    @property
-    def _non_default(self) -> dict[str, Any]:
-        values = asdict(self)
-        return {each.name: values[each.name] for each in fields(self) if values[each.name] != each.default}
-
 
 @lru_cache
 def _parse_options(options: str) -> Variant:
-    return Variant.from_values(read_options(CAR_RACING, options, OPTION_HELP))
+    found = Variant(**read_options(CAR_RACING, options, Variant.HELP))
+    shift, time, offroad = map(float, (found.pedal_shift, found.time_cost, found.offroad_cost))
+    return replace(found, pedal_shift=shift, time_cost=time, offroad_cost=offroad)
 
 
 def _within(value: Any, low: float, high: float) -> bool:

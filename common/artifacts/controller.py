@@ -197,14 +197,10 @@ class Controller(Displayed):
         """The variant of CarRacing in the options; `UsageError` if they name none."""
         return Variant.from_json(self.options)
 
-    @property
-    def _task_details(self) -> dict[str, Any]:
-        return {"options": self.options, "version": self.version}
-
     def save(self, path: Path | str) -> None:
         """Write an `.npz` that `load` reads, atomically."""
         about = {"format": FORMAT, "shape": to_plain(self.shape), "task": self.task, "bundle": self.bundle}
-        about |= {name: value for name, value in self._task_details.items() if value != _TASK_DEFAULTS[name]}
+        about |= {name: own for name, default in _TASK_DEFAULTS.items() if (own := getattr(self, name)) != default}
         text = json.dumps({**about, "provenance": self.provenance}, sort_keys=True)
         with atomic_write(Path(path)) as file:
             np.savez(file, parameters=self.parameters, about=np.array(text))

@@ -57,17 +57,20 @@ class UnsafeModelError(ValueError):
     """An ONNX model is unsafe to load; the text follows the model's name."""
 
 
-def check_model(model: bytes) -> None:
-    """`UnsafeModelError` if an ONNX model refers to other files, or is too large to check.
+def find_fault(model: bytes) -> str:
+    """Why an ONNX model is unsafe to load or computes nonsense, a text that follows its name; empty if it is sound.
 
     Bytes that are no model pass; call `check_self_contained` before running one.
     """
     try:
         check_self_contained(model)
-    except UnsafeModelError:
-        raise
+    except UnsafeModelError as error:
+        return str(error)
     except ValueError:
-        return
+        pass
+    if _is_empty_graph(model):
+        return "is an empty graph"
+    return "" if has_finite_weights(model) else "has weights that are NaN or infinite"
 
 
 def check_self_contained(model: bytes) -> None:
@@ -83,7 +86,7 @@ def check_self_contained(model: bytes) -> None:
         raise ValueError("not a message") from error
 
 
-def is_empty_graph(model: bytes) -> bool:
+def _is_empty_graph(model: bytes) -> bool:
     """Whether an ONNX model computes nothing: it is empty, or a graph without nodes.
 
     False for bytes that are no message; the runtime refuses them. GraphProto.node is field 1.

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from dreamfleet.common.artifacts.onnx_checks import UnsafeModelError, check_model, has_finite_weights, is_empty_graph
+from dreamfleet.common.artifacts.onnx_checks import find_fault
 from dreamfleet.common.errors import ControllerError
 from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive, write_archive
 from dreamfleet.common.files.atomic_write import open_output
@@ -104,7 +104,8 @@ class TrainedAgent(Displayed):
         sha256, network = about.pop("network"), archive.read(NETWORK)
         if hashlib.sha256(network).hexdigest() != sha256:
             raise ValueError(f"the hash of {NETWORK} is not the one in its manifest")
-        _check_network(network)
+        if fault := find_fault(network):
+            raise ValueError(f"{NETWORK} {fault}")
         return cls(from_plain(AgentManifest, about), network)
 
 
@@ -115,15 +116,3 @@ def is_agent(path: Path) -> bool:
             return MANIFEST in archive.names
     except (OSError, DamagedArchiveError):
         return False
-
-
-def _check_network(network: bytes) -> None:
-    """`ValueError` for a network that would give nonsense only while driving."""
-    try:
-        check_model(network)
-    except UnsafeModelError as error:
-        raise ValueError(f"{NETWORK} {error}") from error
-    if is_empty_graph(network):
-        raise ValueError(f"{NETWORK} is an empty graph")
-    if not has_finite_weights(network):
-        raise ValueError(f"{NETWORK} has weights that are NaN or infinite")

@@ -42,7 +42,7 @@ def has_score_panel(run: RunFolder) -> bool:
     """Whether evaluated means need a panel of their own: candidates only dream, and a dream's fitness is no score."""
     evaluations = run.evaluations()
     dreams = run.settings.task.task == DREAM
-    return bool(evaluations) and dreams and not any(each.stage.driven for each in _stages(run))
+    return bool(evaluations) and dreams and not any(each.stage.settings.driven for each in _stages(run))
 
 
 def draw_fitness(panels: Sequence[Any], run: RunFolder) -> list[Any]:
@@ -92,7 +92,7 @@ def draw_fitness(panels: Sequence[Any], run: RunFolder) -> list[Any]:
 
 def seeds_note(run: RunFolder) -> str:
     """What a reader must know of a candidate's few episodes; empty if it has many."""
-    episodes = sorted({each.stage.episodes for each in _stages(run)})
+    episodes = sorted({each.stage.settings.episodes for each in _stages(run)})
     if (
         run.settings.is_external
         or is_function_task(run.spec.task)

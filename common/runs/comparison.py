@@ -49,21 +49,18 @@ class ComparedRun:
     def of(cls, run: RunFolder) -> ComparedRun:
         """Read a run's journal."""
         with run.read_transaction():
-            return cls._read(run)
-
-    @classmethod
-    def _read(cls, run: RunFolder) -> ComparedRun:
-        evaluations, confirmed = run.evaluations(), run.confirmation()
-        curve = LearningCurve.of(run) if evaluations else None
-        evaluated_means = tuple(
-            EvaluatedMean(each.generation, point, run.scores(each.generation))
-            for each, point in zip(evaluations, curve.points if curve else (), strict=True)
-        )
-        scores = {} if confirmed is None else run.scores(confirmed.generation, confirming=True)
-        world = None if curve is None else curve.world
-        return cls(
-            run.name, run.settings, world, run.total_effort(), run.start_effort(), evaluated_means, confirmed, scores
-        )
+            evaluations, confirmed = run.evaluations(), run.confirmation()
+            curve = LearningCurve.of(run) if evaluations else None
+            evaluated_means = tuple(
+                EvaluatedMean(each.generation, point, run.scores(each.generation))
+                for each, point in zip(evaluations, curve.points if curve else (), strict=True)
+            )
+            scores = {} if confirmed is None else run.scores(confirmed.generation, confirming=True)
+            world = None if curve is None else curve.world
+            return cls(
+                run.name, run.settings, world, run.total_effort(), run.start_effort(),
+                evaluated_means, confirmed, scores,
+            )  # fmt: skip
 
     @property
     def in_values(self) -> ComparedRun:

@@ -76,7 +76,7 @@ class EvaluationReport:
             self._describe_score(word),
             ", ".join([*self._describe_marks(), *_describe_driving(self.results)]),
             self._describe_threshold(word),
-            self._describe_origin,
+            self._describe_origin(),
         )
         return "\n".join(filter(None, lines))
 
@@ -113,7 +113,6 @@ class EvaluationReport:
             return []
         return [f"above {mark:g}: {self.results.above(mark):.0%}" for mark in self.marks]
 
-    @property
     def _describe_origin(self) -> str:
         model = f", world model {self.bundle[:12]}" if self.bundle else ""
         made = f"{self.results.steps:,} environment steps in {self.seconds:.0f} s"
@@ -135,7 +134,11 @@ def read_evaluation_report(path: Path) -> EvaluationReport:
     """Read a file that `evaluate --out` wrote; `UsageError` for anything else."""
     try:
         found = from_plain_lenient(EvaluationReport, json.loads(read_text(path, MAX_BYTES)))
-        _check_episodes(found)
+        seeds = [*(each.seed for each in found.drives), *(each.seed for each in found.failed)]
+        if len(set(seeds)) < len(seeds):
+            raise ValueError("a seed occurs twice")
+        if not all(abs(each.score) <= LARGEST_FITNESS for each in found.drives):  # false for NaN too
+            raise ValueError(f"a score is beyond ±{LARGEST_FITNESS:g}")
         return found
     except FileNotFoundError:
         raise UsageError(f"no report at {path}: `dreamfleet evaluate --out {path}` writes one") from None
@@ -147,15 +150,6 @@ def check_seed_range(first_seed: int, episodes: int) -> None:
     """`UsageError` for seeds that no report can hold; call it before the episodes run."""
     if episodes > MAX_EPISODES or first_seed + episodes > MAX_SEED:
         raise UsageError(f"--episodes must be at most {MAX_EPISODES}, and seeds below {MAX_SEED}")
-
-
-def _check_episodes(report: EvaluationReport) -> None:
-    """`ValueError` for duplicate seeds and scores out of range."""
-    seeds = [*(each.seed for each in report.drives), *(each.seed for each in report.failed)]
-    if len(set(seeds)) < len(seeds):
-        raise ValueError("a seed occurs twice")
-    if not all(abs(each.score) <= LARGEST_FITNESS for each in report.drives):  # false for NaN too
-        raise ValueError(f"a score is beyond ±{LARGEST_FITNESS:g}")
 
 
 def _describe_driving(found: EpisodeResults) -> list[str]:

@@ -35,8 +35,7 @@ class PairedDifference:
         if len(shared) < 2:
             raise UsageError(
                 f"a difference needs 2 seeds that are in both, not {len(shared)}: evaluate both with equal "
-                "--first-seed and "
-                "--episodes"
+                "--first-seed and --episodes"
             )
         differences = [other[seed] - one[seed] for seed in shared]
         error = standard_error(differences)
@@ -65,11 +64,8 @@ class PairedDifference:
     @property
     def threshold_text(self) -> str:
         """The critical value as a text."""
-        return (
-            "two standard errors"
-            if self.seeds >= MANY_SEEDS
-            else f"{self.critical_value:.1f} standard errors of so few seeds"
-        )
+        few = f"{self.critical_value:.1f} standard errors of so few seeds"
+        return "two standard errors" if self.seeds >= MANY_SEEDS else few
 
     @property
     def is_significant(self) -> bool:

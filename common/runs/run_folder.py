@@ -7,15 +7,15 @@ from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from difflib import SequenceMatcher
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.files.regular_files import path_exists
-from dreamfleet.common.printable import join_some, plural
-from dreamfleet.common.protocol.check_counts import MAX_BARRED, CheckCounts
+from dreamfleet.common.printable import join_some
+from dreamfleet.common.protocol.check_counts import CheckCounts
 from dreamfleet.common.protocol.host_classes import HostClasses, count_results
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.protocol.messages import TaskSpec
@@ -24,7 +24,7 @@ from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.common.runs.effort import START_EFFORT, Effort, GenerationEffort, parse_start_effort
 from dreamfleet.common.runs.journal.candidate_counts import CandidateCounts
 from dreamfleet.common.runs.journal.journal_check import JournalCheck
-from dreamfleet.common.runs.journal_reader import (
+from dreamfleet.common.runs.journal.journal_reader import (
     CLASS_COUNTS_QUERY,
     RESULTS_QUERY,
     WORK_QUERY,
@@ -42,14 +42,11 @@ from dreamfleet.common.runs.records import (
     StoredResult,
     StoredWork,
     best_evaluation,
-    format_mean,
-    in_values,
 )
 from dreamfleet.common.runs.run_lock import is_run_locked
 from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, rollout_path, run_paths
 from dreamfleet.common.runs.seeds import CHOOSING_OFFSET, CONFIRMING_OFFSET, VALIDATION, count_reseeds
-from dreamfleet.common.runs.stages import begun_stages
-from dreamfleet.common.schema.display import Displayed
+from dreamfleet.common.runs.stages import BegunStage, begun_stages, stage_at
 from dreamfleet.common.schema.times import elapsed_seconds
 
 MAX_LISTED_RUNS = 8  # in the error for an unknown run name
@@ -73,7 +70,7 @@ def open_run(runs_dir: Path, name: str) -> RunFolder:
     return RunFolder(path)
 
 
-class RunFolder(Displayed):
+class RunFolder:
     """A run's folder, read-only; close it, or use it in a `with`."""
 
     def __init__(self, path: Path) -> None:
@@ -81,25 +78,6 @@ class RunFolder(Displayed):
         self.name = path.name
         self._journal = JournalReader(path / JOURNAL)
         self._check = JournalCheck(self._journal)
-
-    def _display(self) -> tuple[str, dict[str, object]]:
-        facts: dict[str, object] = {"folder": str(self.path)}
-        try:
-            with self.read_transaction():
-                count, confirmed, best = len(self.history()), self.confirmation(), best_evaluation(self.evaluations())
-                spec, state = self.spec, self.state
-        except JournalError as error:  # closed, or damaged
-            return f"Run {self.name}: {error}", facts
-        generations = plural(count, "generation")
-        facts |= {
-            "task": spec.task,
-            "state": state,
-            "generations": count,
-            "best evaluation": best and format_mean(in_values(best, spec)),
-            "confirmed": confirmed and format_mean(in_values(confirmed, spec)),
-            "begun": self.created,
-        }
-        return f"Run {self.name} of {spec.task}: {generations}, {state}", facts
 
     def __enter__(self) -> Self:
         return self
@@ -192,21 +170,11 @@ class RunFolder(Displayed):
     @property
     def checks(self) -> CheckCounts | None:
         """What came of checking results on other hosts; `None` if nothing was checked and nobody is barred."""
-        counts = dict(self._journal.rows("si", "SELECT outcome, count(*) FROM verification GROUP BY 1"))
-        rows = self._journal.rows("si", "SELECT host, by_operator FROM barred ORDER BY happened")
-        barred = rows[-MAX_BARRED:]
-        (recalled,) = self._journal.row("SELECT count(*) FROM recalled WHERE because = 'barred'")
-        if not (counts or barred or recalled):
-            return None
         try:
             share = float(json.loads(self.fact("network") or "{}").get("verify", 0.0))
         except (ValueError, TypeError, AttributeError):
             share = 0.0
-        differing = counts.get("differs", 0)
-        return CheckCounts(
-            share, counts.get("equal", 0) + differing, differing, counts.get("unchecked", 0), recalled,
-            tuple(host for host, _ in barred), tuple(host for host, named in barred if named),
-        )  # fmt: skip
+        return self._journal.check_counts(share)
 
     @property
     def bundle_path(self) -> Path:
@@ -220,17 +188,13 @@ class RunFolder(Displayed):
 
     def candidate(self, generation: int, number: int) -> NDArray[np.float32]:
         """A candidate's parameters `(size,)`, as the workers received them."""
-        row = self._journal.row("SELECT vector FROM candidate WHERE generation = ? AND number = ?", generation, number)
-        if row is None:
-            raise JournalError(f"run {self.name} has no candidate {generation}/{number}")
-        return self._vector(row[0], "a candidate")
+        query = "SELECT vector FROM candidate WHERE generation = ? AND number = ?"
+        return self._vector(f"candidate {generation}/{number}", query, generation, number)
 
     def evaluated_mean(self, generation: int) -> NDArray[np.float32]:
         """The mean `(size,)` after an evaluated generation, as the workers received it."""
-        row = self._journal.row("SELECT vector FROM evaluation WHERE generation = ?", generation)
-        if row is None:
-            raise JournalError(f"run {self.name} has no evaluation of generation {generation}")
-        return self._vector(row[0], "an evaluated mean")
+        query = "SELECT vector FROM evaluation WHERE generation = ?"
+        return self._vector(f"evaluation of generation {generation}", query, generation)
 
     def fitness(self, generation: int, number: int) -> float | None:
         """A candidate's fitness; `None` while its generation is open, or if it failed."""
@@ -312,14 +276,15 @@ class RunFolder(Displayed):
             "SELECT number, mean, std, best, worst, sigma, steps, seconds, failed FROM generation "
             "WHERE closed IS NOT NULL AND number >= ? ORDER BY number"
         )
-        found = []
         self._check.check_generations(since)
         rows = self._journal.rows("iFFFFfiFi", query, since)
-        for number, mean, std, best, worst, sigma, steps, seconds, failed in rows:
-            fitness = to_finite(mean), to_finite(std), to_finite(best), to_finite(worst)
-            effort = clamp_count(steps), to_finite(seconds)
-            found.append(StoredGeneration(number, *fitness, to_finite(sigma), *effort, clamp_count(failed)))
-        return found
+        return [
+            StoredGeneration(
+                number, to_finite(mean), to_finite(std), to_finite(best), to_finite(worst), to_finite(sigma),
+                clamp_count(steps), to_finite(seconds), clamp_count(failed),
+            )
+            for number, mean, std, best, worst, sigma, steps, seconds, failed in rows
+        ]  # fmt: skip
 
     def unscored_generations(self) -> set[int]:
         """The closed generations without a mean fitness, which `history` gives as 0."""
@@ -329,13 +294,10 @@ class RunFolder(Displayed):
     def quartiles(self, generations: Iterable[int]) -> dict[int, tuple[float, float]]:
         """The lower and upper quartile of the candidates' fitness, by generation; open generations are left out."""
         query = "SELECT fitness FROM candidate WHERE generation = ? AND fitness IS NOT NULL"
-        found = {}
-        for number in generations:
-            rows = self._journal.rows("f", query, number)
-            if rows:
-                low, high = np.percentile([to_finite(fitness) for (fitness,) in rows], (25, 75))
-                found[number] = float(low), float(high)
-        return found
+        rows = ((number, self._journal.rows("f", query, number)) for number in generations)
+        scored = {number: [to_finite(fitness) for (fitness,) in found] for number, found in rows if found}
+        quartiles = {number: np.percentile(fitness, (25, 75)).tolist() for number, fitness in scored.items()}
+        return {number: (low, high) for number, (low, high) in quartiles.items()}
 
     def evaluations(self) -> list[StoredEvaluation]:
         """Every finished evaluation of a mean, oldest first."""
@@ -393,12 +355,9 @@ class RunFolder(Displayed):
 
     def work_by_worker(self) -> list[StoredWork]:
         """What each worker did for each generation."""
-        return [
-            StoredWork(worker, generation, kind, bool(confirming), results, to_finite(steps), to_finite(seconds))
-            for worker, generation, kind, confirming, results, steps, seconds in self._journal.rows(
-                "sisiiff", WORK_QUERY
-            )
-        ]
+        rows = self._journal.rows("sisiiff", WORK_QUERY)
+        return [StoredWork(worker, generation, kind, bool(confirming), results, to_finite(steps), to_finite(seconds))
+                for worker, generation, kind, confirming, results, steps, seconds in rows]  # fmt: skip
 
     def generation_times(self) -> dict[int, tuple[float, float | None]]:
         """When each generation was opened and closed, in seconds since 1970; `None` while it is open."""
@@ -416,6 +375,10 @@ class RunFolder(Displayed):
         rows = self._journal.rows("b", "SELECT state FROM strategy ORDER BY generation DESC LIMIT 1")
         return bytes(rows[0][0]) if rows else None
 
+    def stage_at(self, generation: int) -> BegunStage:
+        """The stage of a generation, which says how its candidates are scored."""
+        return stage_at(generation, self.settings, self.history(), self.evaluations())
+
     @property
     def episode_limit(self) -> int | None:
         """Steps after which the environment itself ends an episode; `None` if it has no limit, or none is known."""
@@ -427,7 +390,10 @@ class RunFolder(Displayed):
         self._check.check_record()
         return self._journal.fact(key)
 
-    def _vector(self, data: Any, what: str) -> NDArray[np.float32]:
-        if not isinstance(data, bytes) or len(data) % 4:
-            raise self._journal.damage_error(f"{what} is not a vector")
-        return np.frombuffer(data, dtype="<f4").astype(np.float32)
+    def _vector(self, what: str, query: str, *values: int) -> NDArray[np.float32]:
+        row = self._journal.row(query, *values)
+        if row is None:
+            raise JournalError(f"run {self.name} has no {what}")
+        if not isinstance(row[0], bytes) or len(row[0]) % 4:
+            raise self._journal.damage_error(f"{what} has no vector")
+        return np.frombuffer(row[0], dtype="<f4").astype(np.float32)

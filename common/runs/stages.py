@@ -1,14 +1,16 @@
 """The stages of a run's schedule, and the stage of each generation.
 
-A generation's stage is a pure function of the run's settings, of the generations before it, and of evaluations that
-are at least one interval old. So a run that is interrupted anywhere continues bit-identically.
+A generation's stage, and so how its candidates are scored, is a pure function of the run's settings, of the generations
+before it, and of evaluations that are at least one interval old. So a run that is interrupted anywhere continues
+bit-identically.
 """
 
 from __future__ import annotations
 
+import hashlib
 from bisect import bisect
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any
 
@@ -23,19 +25,15 @@ from dreamfleet.common.runs.records import (
     best_evaluation,
 )
 
+TASK_FIELDS = ("horizon", "patience")  # of what stages change, the settings of the task
+
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage with all its settings, those of earlier stages included."""
+    """One stage, with the run's settings as they are in it: changed by its own schedule entry and by earlier ones."""
 
     number: int  # from 1
-    horizon: int
-    patience: int
-    episodes: int
-    population: int
-    sigma0: float
-    racing: bool
-    driven: float  # share of a candidate's episodes in a dream task that are scored in reality
+    settings: RunSettings
     search: int  # number of the stage that started this stage's search
     end: StageSettings
     whole: bool = True  # whether it searches all parameters, not the run's subspace
@@ -61,23 +59,41 @@ class Stage:
     @property
     def description(self) -> str:
         """The settings as a text."""
-        patience = f", patience {self.patience}" if self.patience else ""
+        own, share = self.settings, self.settings.driven
+        patience = f", patience {own.task.patience}" if own.task.patience else ""
         anew = "a search from the start" if self.restart else "a new search"
-        search = f"{anew} with step size {self.sigma0:g}" if self.starts_new_search else "the search continues"
-        raced = ", racing" if self.racing else ""
-        driven = ", all driven" if self.driven == 1 else f", {self.driven:.0%} of them driven" if self.driven else ""
+        search = f"{anew} with step size {own.sigma0:g}" if self.starts_new_search else "the search continues"
+        raced = ", racing" if own.racing else ""
+        driven = ", all driven" if share == 1 else f", {share:.0%} of them driven" if share else ""
         search += "" if self.whole else " in the subspace"
-        size = f"{self.population} x {plural(self.episodes, 'episode')}"
-        return f"{plural(self.horizon, 'step')}{patience}, {size}{driven}{raced}, {search}"
+        size = f"{own.population} x {plural(own.episodes, 'episode')}"
+        return f"{plural(own.task.horizon, 'step')}{patience}, {size}{driven}{raced}, {search}"
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """What stages may change, by name, with its values in this one."""
+        own = self.settings
+        return {name: getattr(own.task if name in TASK_FIELDS else own, name) for name in STAGE_FIELDS}
 
     @property
     def driven_episodes(self) -> int:
         """The number of a candidate's episodes in a dream task that are scored in reality: its first ones."""
-        return round(self.driven * self.episodes)
+        return round(self.settings.driven * self.settings.episodes)
 
-    def spec(self, run_spec: TaskSpec) -> TaskSpec:
-        """The run's specification with this stage's horizon and patience."""
-        return run_spec.with_overrides(horizon=self.horizon, patience=self.patience)
+    def episode_spec(self, episode: int) -> TaskSpec:
+        """The specification of one episode of a candidate."""
+        return self.settings.task.with_overrides(driven=episode < self.driven_episodes or None)
+
+    def job_digests(self, vectors: Iterable[bytes], seeds: Sequence[int]) -> Iterator[list[bytes]]:
+        """The digests of each candidate's jobs, one a seed, from its float32 vector.
+
+        R1: a digest names the vector and the seed, so a result that counts has another one than that of a
+        discarded vector or of a replaced seed in the same place.
+        """
+        texts = [self.episode_spec(each).digest_text("score", (seed,)) for each, seed in enumerate(seeds)]
+        for vector in vectors:
+            identity = hashlib.sha256(vector).digest()
+            yield [hashlib.sha256(identity + text).digest() for text in texts]
 
 
 @dataclass(frozen=True)
@@ -97,26 +113,22 @@ class BegunStage:
 
 def stages_of(settings: RunSettings) -> tuple[Stage, ...]:
     """A run's stages in order; a run without a schedule has one."""
-    spec = settings.task
-    found = [
-        Stage(
-            1, spec.horizon, spec.patience, settings.episodes, settings.population, settings.sigma0, settings.racing,
-            settings.driven, search=1, end=settings.stages[0].end if settings.stages else StageSettings(),
-            whole=not settings.subspace,
-        )
-    ]  # fmt: skip
+    end = settings.stages[0].end if settings.stages else StageSettings()
+    found = [Stage(1, settings, search=1, end=end, whole=not settings.subspace)]
     for each in settings.stages[1:]:
         found.append(_next_stage(found[-1], each))
     return tuple(found)
 
 
 def _next_stage(before: Stage, each: StageSettings) -> Stage:
-    named: dict[str, Any] = {name: getattr(before, name) for name in STAGE_FIELDS} | each.overrides
-    whole = before.whole or each.whole
-    is_changed = each.sigma0 is not None or named["population"] != before.population or whole != before.whole
+    task = before.settings.task.with_overrides(each.horizon, each.patience)
+    named = {name: value for name, value in each.overrides.items() if name not in TASK_FIELDS}
+    settings, whole = replace(before.settings, task=task, **named), before.whole or each.whole
+    is_other_size = settings.population != before.settings.population
+    is_changed = each.sigma0 is not None or is_other_size or whole != before.whole
     number = before.number + 1
     search = number if is_changed or each.restart else before.search
-    return Stage(number, **named, search=search, end=each.end, whole=whole, restart=each.restart)
+    return Stage(number, settings, search=search, end=each.end, whole=whole, restart=each.restart)
 
 
 def is_try(stages: Sequence[Stage | StageSettings], number: int) -> bool:
@@ -131,6 +143,15 @@ def begun_stages(
     stages = StageTracker(settings)
     stages.advance_to(len(history), history, {each.generation: each for each in evaluations})
     return stages.begun
+
+
+def stage_at(
+    generation: int, settings: RunSettings, history: Sequence[StoredGeneration],
+    evaluations: Iterable[StoredEvaluation],
+) -> BegunStage:  # fmt: skip
+    """The stage of one `generation`, as `StageTracker` computes it."""
+    finished = {each.generation: each for each in evaluations}
+    return StageTracker(settings).advance_to(generation, history, finished)
 
 
 def describe_stages(settings: RunSettings, begun: Sequence[BegunStage]) -> dict[str, str]:

@@ -49,8 +49,8 @@ class EvolutionConfig:
         """As a run's settings say for the search that goes on in this stage; `subspace` is the run's."""
         return cls(
             settings.controller.size,
-            stage.population,
-            stage.sigma0,
+            stage.settings.population,
+            stage.settings.sigma0,
             settings.covariance,
             search_seed(settings.seed, stage.search),
             settings.optimiser,

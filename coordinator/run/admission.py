@@ -28,7 +28,7 @@ class WorkerAdmission:
         self.refused_workers = RefusedWorkers()
         # Of the first accepted result; `None` before it.
         self.fingerprint, self.host_class = journal.fingerprint(), journal.host_class()
-        self.barred = journal.barred()  # by host
+        self.barred = journal.verification.barred()  # by host
         self._journal = journal
         self._settings = settings
         self._fleet = fleet
@@ -97,7 +97,7 @@ class WorkerAdmission:
 
     def bar(self, host: str, bar: StoredBar, incarnation: int) -> None:
         """Keep a host out of this run from now on, by the journal too; its workers are removed."""
-        self._journal.bar(host, bar, incarnation)
+        self._journal.verification.bar(host, bar, incarnation)
         self.barred[host], why = bar, bar.why
         for worker in [each for each in self._fleet.members if host_of(each) == host]:
             self._fleet.remove_worker(worker)
@@ -106,7 +106,7 @@ class WorkerAdmission:
 
     def unbar(self, host: str) -> None:
         """Let a host join this run again, by the journal too."""
-        self._journal.unbar(host)
+        self._journal.verification.unbar(host)
         del self.barred[host]
         self.refused_workers.remove(host)
 

@@ -10,7 +10,7 @@ from dreamfleet.common.protocol.messages import Job
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation
 from dreamfleet.common.runs.run_folder import CONFIRMED
 from dreamfleet.common.runs.run_paths import CONTROLLER
-from dreamfleet.common.runs.scoring_params import ScheduleState
+from dreamfleet.common.runs.stages import StageTracker
 from dreamfleet.coordinator.jobs.confirmation import FINALISTS, Confirmation, total_episodes
 from dreamfleet.coordinator.jobs.evaluation import Evaluation, Evaluations
 from dreamfleet.coordinator.jobs.history import History
@@ -27,10 +27,10 @@ class BackgroundJobs:
 
     def __init__(
         self, journal: Journal, settings: RunSettings, run_uid: str, history: History,
-        evaluations: Iterable[StoredEvaluation], agenda: ScheduleState,
+        evaluations: Iterable[StoredEvaluation], agenda: StageTracker,
         verification: Verification,
     ) -> None:  # fmt: skip
-        """`agenda` knows the scoring parameters of each generation when it closes.
+        """`agenda` knows the stage of each generation when it closes.
 
         An evaluation is not finished before its results are checked, as far as `verification` draws them.
         """
@@ -108,7 +108,7 @@ class BackgroundJobs:
             self.report.withdraw()
         if (judged := self.confirmed or self.evaluations.best) is not None:
             self.report.set_judged(judged, self._journal.evaluated_vector(judged.generation), self._history.steps)
-        self.rollout_collections.remove(self._journal.recalled_rollouts())  # not before the recall was durable
+        self.rollout_collections.remove(self._journal.recalls.rollouts())  # not before the recall was durable
         evaluations = [
             each for evaluation in self._journal.pending_evaluations() for each in self._evaluate(evaluation)
         ]
@@ -200,8 +200,8 @@ class BackgroundJobs:
             self.report.set_judged(found.found, found.vector, self._history.steps)
 
     def _collect(self, collection: RolloutCollection) -> list[Work]:
-        known = self._journal.results_of("collect", collection.generation)
-        spec, settings = self._agenda.spec(collection.generation), self._settings
+        known = self._journal.results.of("collect", collection.generation)
+        spec, settings = self._agenda.stage_of(collection.generation).stage.settings.task, self._settings
         return self.rollout_collections.open(collection.work(spec, settings.seed, settings.task), known)
 
 

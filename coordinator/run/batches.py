@@ -63,7 +63,7 @@ class Batches:
             "submit": lambda: self._submit(BatchHeader.from_parameters(get), read_count(get, "offset"), payload, now),
             "read": lambda: self._describe(self._find(get), read_count(get, "offset")),
             "cancel": lambda: self._cancel(self._find(get)),
-            "list": lambda: replace(self._head(), batches=tuple(self._journal.list_batches(MAX_LISTED))),
+            "list": lambda: replace(self._head(), batches=tuple(self._journal.batches.lines(MAX_LISTED))),
         }
         try:
             if not self._run.settings.is_external:
@@ -86,10 +86,10 @@ class Batches:
         """An event for each closed generation, and with `progress` one for the open batch if it has new scores."""
         if not self._run.settings.is_external:
             return []
-        found = [batch for number in closed if (batch := self._journal.batch_of(number)) is not None]
+        found = [batch for number in closed if (batch := self._journal.batches.of(number)) is not None]
         events = [self._event(batch, batch.population) for batch in found]
         generation = self._run.generation
-        batch = self._journal.batch_of(generation.number) if progress and generation.population else None
+        batch = self._journal.batches.of(generation.number) if progress and generation.population else None
         if batch is not None:
             *_, done = self._page(batch, 0)
             if (batch.id, done) != self._announced:
@@ -103,7 +103,7 @@ class Batches:
 
     def _find(self, get: Parameters) -> StoredBatch:
         batch_id = check_batch_id(get("id") or "")
-        batch = self._journal.batch(batch_id)
+        batch = self._journal.batches.find(batch_id)
         if batch is None:
             raise BatchError("unknown", f"run {self._name} has no batch {batch_id}: submit it")
         return batch
@@ -113,7 +113,7 @@ class Batches:
 
         R30: an id names one content, so a repeated submission changes nothing.
         """
-        stored = self._journal.batch(header.id)
+        stored = self._journal.batches.find(header.id)
         if stored is not None:
             if stored.content != header.content:
                 raise BatchError(
@@ -137,7 +137,7 @@ class Batches:
                 f"the vectors have {plural(header.size, 'number')}, and a candidate of run {self._name} has {size}",
             )
         header.check_episodes(self._episodes(header))
-        count, waiting = self._journal.waiting_batches()
+        count, waiting = self._journal.batches.waiting()
         if count >= MAX_WAITING or waiting + header.total > MAX_WAITING_SIZE:
             raise BatchError("busy", f"{plural(count, 'batch', 'batches')} wait already: submit it again later")
 
@@ -170,23 +170,23 @@ class Batches:
         seeds: Sequence[int] = unpack_seeds(header, body)
         check_vectors(vectors, header.size)
         if not seeds:
-            first, number = self._run.settings.seed, self._journal.batch_count()
+            first, number = self._run.settings.seed, self._journal.batches.count()
             seeds = [training_seed(first, number, each) for each in range(self._episodes(header))]
         if (remark := remark_on_seeds(seeds)) and not self._remarked:
             self._remarked = True
             log.warning("batch %s: %s", header.id, remark)
-        self._journal.add_batch(header.id, header.content, seeds, header.population, vectors)
-        batch = self._journal.batch(header.id)
+        self._journal.batches.add(header.id, header.content, seeds, header.population, vectors)
+        batch = self._journal.batches.find(header.id)
         assert batch is not None
         return replace(self._describe(batch, 0), is_new=True)
 
     def _cancel(self, batch: StoredBatch) -> BatchReply:
         """Cancel a batch that waits or is being scored; a finished one stays as it is."""
         if batch.state not in FINAL:
-            self._journal.cancel_batch(batch.id)
+            self._journal.batches.cancel(batch.id)
             if batch.generation is not None:
                 self._run.cancel_generation()
-        return self._describe(self._journal.batch(batch.id) or batch, 0)
+        return self._describe(self._journal.batches.find(batch.id) or batch, 0)
 
     def _describe(self, batch: StoredBatch, offset: int) -> BatchReply:
         fitness, errors, done = self._page(batch, offset)
@@ -204,7 +204,7 @@ class Batches:
                 return [None] * limit, {}, 0
             return [None] * limit, dict.fromkeys(range(offset, offset + limit), CANCELLED), batch.population
         if batch.generation != generation.number:
-            fitness = self._journal.fitness_page(batch.generation, offset, limit)
+            fitness = self._journal.batches.fitness_page(batch.generation, offset, limit)
             return fitness, dict(batch.errors), batch.population
         assert isinstance(generations, ExternalGenerations)
         scores = generation.candidate_scores()

@@ -43,18 +43,18 @@ class ExternalGenerations(Generations):
     @property
     def has_waiting(self) -> bool:  # type: ignore[override]
         """Whether a batch waits."""
-        return self._journal.next_batch() is not None
+        return self._journal.batches.next_waiting() is not None
 
     @property
     def open_batches(self) -> int:  # type: ignore[override]
         """How many batches wait or are scored."""
-        return self._journal.open_batch_count()
+        return self._journal.batches.open_count()
 
     def begin(self) -> Generation:
         """Restore the open batch of the last incarnation, or open the next one."""
-        self._journal.index_scores()
+        self._journal.results.index_scores()
         stored = self._journal.last_generation()
-        self.scoring_params = self._terms(len(self.history))
+        self.begun = self._stage_at(len(self.history))
         if stored is None or self._journal.is_closed(stored.number):
             return self.open(len(self.history))
         self.seconds = stored.seconds
@@ -62,33 +62,33 @@ class ExternalGenerations(Generations):
 
     def open(self, number: int) -> Generation:
         """Open the batch that has waited longest as generation `number`; without one, an empty generation."""
-        self.scoring_params = self._terms(number)
-        batch = self._journal.next_batch()
+        self.begun = self._stage_at(number)
+        batch = self._journal.batches.next_waiting()
         if batch is None:
-            return self._generation(number, (), (), self.scoring_params)
-        vectors, search = self._journal.batch_vectors(batch), self._strategy
+            return self._generation(number, (), (), self.begun)
+        vectors, search = self._journal.batches.vectors(batch), self._strategy
         self._journal.open_generation(number, search.state(), search.sigma, batch.seeds, vectors)
-        self._journal.begin_batch(batch.id, number)
-        return self._with_known_results(self._generation(number, vectors, batch.seeds, self.scoring_params))
+        self._journal.batches.begin(batch.id, number)
+        return self._with_known_results(self._generation(number, vectors, batch.seeds, self.begun))
 
     def reload(self, number: int) -> Generation:
         """The open generation as the journal has it."""
         generation = self._with_known_results(super().reload(number))
-        batch = self._journal.batch_of(number)
+        batch = self._journal.batches.of(number)
         if batch is not None and batch.state == "cancelled":
             generation.cancel()
         return generation
 
     def close(self, generation: Generation, seconds: float) -> StoredGeneration:
         """Journal the batch's fitness and the generation, which took `seconds`."""
-        fitness, batch = generation.fitness(), self._journal.batch_of(generation.number)
+        fitness, batch = generation.fitness(), self._journal.batches.of(generation.number)
         closed = StoredGeneration(
             number=generation.number, **fitness_statistics(fitness), sigma=self._strategy.sigma,
             steps=generation.steps, seconds=seconds, failed=len(generation.failed),
         )  # fmt: skip
         self._journal.close_generation(closed, fitness)
         if batch is not None:
-            self._journal.finish_batch(batch.id, self.find_errors(generation, generation.failed))
+            self._journal.batches.finish(batch.id, self.find_errors(generation, generation.failed))
         self.history.append(closed)
         self.last, self._scored_before = generation.candidate_scores(), generation.find_scored() or self._scored_before
         return closed
@@ -97,7 +97,7 @@ class ExternalGenerations(Generations):
         """Why each of these failed candidates of the open generation failed."""
         wanted = set(candidates)
         digests = [each.digest for each in generation.work if each.template.candidate in wanted]
-        found = self._journal.errors_of(digests)
+        found = self._journal.results.errors_of(digests)
         named: dict[int, str] = {}
         for work in generation.work:
             if work.template.candidate in wanted and work.digest in found:
@@ -110,7 +110,7 @@ class ExternalGenerations(Generations):
 
     def batch_of(self, generation: Generation) -> StoredBatch | None:
         """The batch that the generation scores; `None` for an empty one."""
-        return self._journal.batch_of(generation.number)
+        return self._journal.batches.of(generation.number)
 
     def _search(self, _stage: Stage, _start: NDArray[np.float64] | None) -> Evolution:
         return cast(Evolution, NoSearch(self._settings.controller.size))

@@ -11,9 +11,8 @@ from dreamfleet.common.client.elites import EliteArchive
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.protocol.tasks import is_function_task
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
-from dreamfleet.common.runs.scoring_params import ScheduleState, ScoringParams
 from dreamfleet.common.runs.seeds import MAX_RESEEDS, count_reseeds, training_seeds
-from dreamfleet.common.runs.stages import BegunStage, Stage, stages_of
+from dreamfleet.common.runs.stages import BegunStage, Stage, StageTracker, stages_of
 from dreamfleet.coordinator.jobs.generation import CandidateScores, Generation
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.jobs.work import Work, vector_bytes
@@ -34,11 +33,11 @@ class Generations:
     open_batches = 0  # how many of theirs wait or are scored
 
     def __init__(
-        self, journal: Journal, settings: RunSettings, agenda: ScheduleState, history: History,
+        self, journal: Journal, settings: RunSettings, agenda: StageTracker, history: History,
         evaluations: Mapping[int, StoredEvaluation],
     ) -> None:  # fmt: skip
         self.history = history
-        self.scoring_params: ScoringParams  # of the open generation
+        self.begun: BegunStage  # of the open generation
         self.last: CandidateScores | None = None  # of the last closed generation
         self.redrawn: set[int] = set()  # candidates of the open generation that failed and were drawn anew
         self.seconds = 0.0  # for which the restored generation could be scored before
@@ -81,10 +80,10 @@ class Generations:
         if stored is None:
             return self.open(0)
         before = self._journal.generation(stored.number - 1)
-        earlier = None if before is None else self._terms(before.number)
-        self.scoring_params = self._terms(stored.number)
-        if self.scoring_params.stage.search > 1:
-            self._strategy = self._search(self.scoring_params.stage, self._strategy.mean)
+        earlier = None if before is None else self._stage_at(before.number)
+        self.begun = self._stage_at(stored.number)
+        if self.begun.stage.search > 1:
+            self._strategy = self._search(self.begun.stage, self._strategy.mean)
         self._strategy.restore(stored.state)
         population = self._strategy.ask()
         for indices in stored.redrawn:
@@ -102,21 +101,21 @@ class Generations:
         if before is not None and earlier is not None:
             closed = self._recall(before, earlier)
             self.last, self._scored_before = closed.candidate_scores(), closed.find_scored()
-        return self._recall(stored, self.scoring_params)
+        return self._recall(stored, self.begun)
 
     def open(self, number: int) -> Generation:
         """Ask for the next population and journal it with the strategy's state before that."""
-        scoring_params = self._begin_search(number)
+        begun = self._begin_search(number)
         state, sigma = self._strategy.state(), self._strategy.sigma
         vectors = [vector_bytes(x) for x in self._strategy.ask()]
-        seeds = self._seeds(number, scoring_params.stage.episodes)
+        seeds = self._seeds(number, begun.stage.settings.episodes)
         self._journal.open_generation(number, state, sigma, seeds, vectors)
         self.redrawn, self._rounds, self._reseeds = set(), 0, 0
-        may_have_results = self._journal.has_set_aside
-        generation = self._generation(number, vectors, seeds, scoring_params, in_parts=not may_have_results)
+        may_have_results = self._journal.recalls.has_set_aside
+        generation = self._generation(number, vectors, seeds, begun, in_parts=not may_have_results)
         if may_have_results:
-            self._journal.take_back([each.digest for each in generation.work])
-            generation.recall(self._journal.results_of("score", number))
+            self._journal.recalls.count_again([each.digest for each in generation.work])
+            generation.recall(self._journal.results.of("score", number))
         return generation
 
     def replay(self, number: int) -> Checkpoint:
@@ -159,7 +158,7 @@ class Generations:
             failed=len(self.redrawn.union(generation.failed)),
         )
         self._strategy.tell(_ranked(fitness, statistics["worst"]), measures)
-        self._journal.set_surplus_aside(generation.number, generation.surplus)
+        self._journal.recalls.set_surplus_aside(generation.number, generation.surplus)
         self._journal.close_generation(closed, fitness, measures)
         self._add_elites(closed.number, fitness, measures)
         self.history.append(closed)
@@ -217,7 +216,7 @@ class Generations:
 
         They are at most `RECENT` generations of one stage, from `since` on.
         """
-        first = max(since, self.scoring_params.begun.since, generation.number - RECENT + 1)
+        first = max(since, self.begun.since, generation.number - RECENT + 1)
         counted = range(first, generation.number + 1)
         opened = len(self.redrawn.union(generation.failed)) if counted else 0
         return sum(each.failed for each in self.history.rows[first:]) + opened, counted
@@ -230,14 +229,14 @@ class Generations:
         """The open generation as the journal has it."""
         stored = self._journal.generation(number)
         assert stored is not None  # the open generation is never deleted
-        return self._recall(stored, self.scoring_params)
+        return self._recall(stored, self.begun)
 
-    def _begin_search(self, number: int) -> ScoringParams:
-        """The scoring parameters of a generation that opens; a stage may begin with a new search."""
-        self.scoring_params = scoring_params = self._terms(number)
-        if number and scoring_params.begun.since == number and scoring_params.stage.starts_new_search:
-            self._strategy = self._search(scoring_params.stage, self._start_of(scoring_params.begun))
-        return scoring_params
+    def _begin_search(self, number: int) -> BegunStage:
+        """The stage of a generation that opens; it may begin with a new search."""
+        self.begun = begun = self._stage_at(number)
+        if number and begun.since == number and begun.stage.starts_new_search:
+            self._strategy = self._search(begun.stage, self._start_of(begun))
+        return begun
 
     def _start_of(self, begun: BegunStage) -> NDArray[np.float64] | None:
         """Where a new search starts; `None`: at zeros."""
@@ -245,8 +244,8 @@ class Generations:
             return np.frombuffer(self._journal.evaluated_vector(begun.origin), dtype="<f4").astype(np.float64)
         return self._first_mean if begun.stage.restart else self._strategy.mean
 
-    def _terms(self, number: int) -> ScoringParams:
-        return self._agenda.scoring_params(number, self.history.rows, self._evaluations)
+    def _stage_at(self, number: int) -> BegunStage:
+        return self._agenda.advance_to(number, self.history.rows, self._evaluations)
 
     def _search(self, stage: Stage, start: NDArray[np.float64] | None) -> Evolution:
         return Evolution(EvolutionConfig.of(self._settings, stage, self._subspace), start)
@@ -254,22 +253,22 @@ class Generations:
     def _seeds(self, number: int, episodes: int, reseeds: int = 0) -> list[int]:
         return training_seeds(self._settings.seed, number, episodes, reseeds)
 
-    def _recall(self, stored: StoredOpenGeneration, scoring_params: ScoringParams) -> Generation:
-        generation = self._generation(stored.number, stored.vectors, stored.seeds, scoring_params)
-        generation.recall(self._journal.results_of("score", stored.number))
+    def _recall(self, stored: StoredOpenGeneration, begun: BegunStage) -> Generation:
+        generation = self._generation(stored.number, stored.vectors, stored.seeds, begun)
+        generation.recall(self._journal.results.of("score", stored.number))
         return generation
 
     def _generation(
-        self, number: int, vectors: Sequence[bytes], seeds: Sequence[int], scoring_params: ScoringParams, *,
+        self, number: int, vectors: Sequence[bytes], seeds: Sequence[int], begun: BegunStage, *,
         in_parts: bool = False,
     ) -> Generation:  # fmt: skip
-        run_spec, stage = self._settings.task, scoring_params.stage
+        run_spec, stage = self._settings.task, begun.stage
         return Generation(
             number,
-            scoring_params.spec,
+            stage.settings.task,
             vectors,
             seeds,
-            racing=stage.racing,
+            racing=stage.settings.racing,
             run_spec=run_spec,
             driven=stage.driven_episodes,
             in_parts=in_parts,

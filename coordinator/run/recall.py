@@ -14,7 +14,7 @@ from dreamfleet.common.printable import plural, printable
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL
-from dreamfleet.common.runs.scoring_params import ScheduleState
+from dreamfleet.common.runs.stages import StageTracker
 from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollections
@@ -35,19 +35,19 @@ def recall(journal: Journal, settings: RunSettings, hosts: Collection[str]) -> s
     from the fitness that the journal holds of the generations before.
     """
     if settings.is_external:
-        return f"{plural(journal.recall_results(hosts), 'result')} of {', '.join(sorted(hosts))} recalled; what was " \
+        return f"{plural(journal.recalls.recall(hosts), 'result')} of {', '.join(sorted(hosts))} recalled; what was " \
                "handed out of complete batches stays"  # fmt: skip
     closed, evaluations = journal.read_closed()
-    first = _first_affected(journal.first_brought(hosts), settings)
-    words = f"{plural(journal.recall_results(hosts), 'result')} of {', '.join(sorted(hosts))} recalled"
+    first = _first_affected(journal.recalls.first_brought(hosts), settings)
+    words = f"{plural(journal.recalls.recall(hosts), 'result')} of {', '.join(sorted(hosts))} recalled"
     last = journal.last_generation()
     if last is None or first is None or first > last.number:
         return words
     finished = {each.generation: each for each in evaluations}
-    replayed = Generations(journal, settings, ScheduleState(settings), History(closed), finished)
+    replayed = Generations(journal, settings, StageTracker(settings), History(closed), finished)
     stored = journal.generation(first)  # only of the last two
     state = replayed.replay(first) if stored is None else stored.state
-    journal.rewind(first, state, replayed.first_seeds(first))
+    journal.recalls.rewind(first, state, replayed.first_seeds(first))
     forget_acceptance(journal, first)
     return f"{words}: the run goes on from generation {first}" + (f" (of {last.number})" if last.number > first else "")
 
@@ -84,22 +84,22 @@ def bar_stored(folder: Path, host: str, *, is_barred: bool) -> str:
     nothing to do.
     """
     with run_lock(folder), closing(Journal(folder / JOURNAL)) as journal:
-        known = {*map(host_of, journal.workers(recalled=True))}
-        if problem := find_bar_problem(host, journal.barred(), known, is_barred=is_barred):
+        known = {*map(host_of, journal.results.workers(recalled=True))}
+        if problem := find_bar_problem(host, journal.verification.barred(), known, is_barred=is_barred):
             raise UsageError(problem)
         incarnation = journal.begin_incarnation()
         if is_barred:
-            journal.bar(host, BAR_BY_OPERATOR, incarnation)
+            journal.verification.bar(host, BAR_BY_OPERATOR, incarnation)
             withdraw_controller(folder / CONTROLLER)
             words = recall(journal, RunSettings.from_json(journal.fact("settings") or ""), {host})
             text = f"host {printable(host)} is barred from this run: {BAR_BY_OPERATOR.why}; {words}"
         else:
-            journal.unbar(host)
+            journal.verification.unbar(host)
             text = unbar_words(host)
         journal.add_event(text)
         journal.end_incarnation()
         journal.commit()
-        RolloutCollections(folder).remove(journal.recalled_rollouts())  # not before the recall was durable
+        RolloutCollections(folder).remove(journal.recalls.rollouts())  # not before the recall was durable
     return text
 
 

@@ -23,7 +23,7 @@ from dreamfleet.common.protocol.result_bounds import MAX_SECONDS
 from dreamfleet.common.protocol.stop_kind import PauseKind, StopKind, StopReason
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_folder import ENDING, EPISODE_LIMIT, STOP_KIND
-from dreamfleet.common.runs.scoring_params import ScheduleState
+from dreamfleet.common.runs.stages import StageTracker
 from dreamfleet.common.schema.times import elapsed_seconds
 from dreamfleet.coordinator.dispatch.failures import JobFailure, host_of, shorten
 from dreamfleet.coordinator.dispatch.fleet import Fleet
@@ -78,7 +78,7 @@ class Run:
         self.state: RunState = Running() if reached is None else Running().reach_limit(reached)
         closed, evaluations = journal.read_closed()
         self.history = History(closed)
-        self._agenda = ScheduleState(settings)
+        self._agenda = StageTracker(settings)
         self.background_jobs = BackgroundJobs(
             journal, settings, self.uid, self.history, evaluations, self._agenda, self.verification
         )
@@ -88,7 +88,7 @@ class Run:
         self.failure_limit = FailureLimit(journal, self.generations, network.failure_limit)
         self.generation = self.generations.begin()
         self.work_clock = WorkClock(now, self.generations.seconds)  # of the open generation
-        self.fleet.failure_judge.working_hosts.update(map(host_of, journal.workers()))
+        self.fleet.failure_judge.working_hosts.update(map(host_of, journal.results.workers()))
         if self.incarnation > 1:  # the last incarnation may have sent the next generation's jobs before it was durable
             self.fleet.jobs.previous_epoch_until = self.generation.number + 1
         self._begin(now)
@@ -117,7 +117,7 @@ class Run:
     @property
     def classes(self) -> HostClasses:
         """The host classes of the accepted results."""
-        return self._journal.classes
+        return self._journal.results.classes
 
     @property
     def dropped(self) -> Counter[str]:
@@ -130,7 +130,7 @@ class Run:
 
     def record_result(self, work: Work, result: Result, worker: str, fingerprint: str, host_class: str) -> None:
         """Journal an accepted result, then count it for the generation or the background job that wants it."""
-        self._journal.add_result(work.job, result, worker, fingerprint, self.incarnation, host_class)
+        self._journal.results.add(work.job, result, worker, fingerprint, self.incarnation, host_class)
         self.admission.adopt_class(host_class, fingerprint)
         self.verification.note_accepted(work.job, result, worker)
         assert result.fitness is not None
@@ -295,7 +295,9 @@ class Run:
         """
         if self.state.is_rewound or self.state.stalled or not self._take_lock():
             return f"the run cannot be changed now: {self.obstacle}; ask again"
-        known = {*map(host_of, (*self._journal.workers(recalled=True), *self.fleet.members, *self.fleet.departed))}
+        known = {
+            *map(host_of, (*self._journal.results.workers(recalled=True), *self.fleet.members, *self.fleet.departed))
+        }
         if problem := find_bar_problem(host, self.admission.barred, known, is_barred=is_barred):
             return problem
         if is_barred:
@@ -430,7 +432,7 @@ class Run:
 
     def _begin(self, now: float) -> None:
         generation = self.generation
-        if len(self._agenda.stages) > 1:
+        if len(self._agenda) > 1:
             self.fleet.note(f"generation {generation.number} is in {self._stage_text}")
         self.fleet.jobs.begin_generation(generation.number)
         self.verification.restore(generation.counted)
@@ -466,15 +468,15 @@ class Run:
 
     def _note_stage_changes(self, generation: Generation) -> None:
         """Note for the log that a generation opens in another stage, and why."""
-        begun, number = self.generations.scoring_params.begun, generation.number
+        begun, number = self.generations.begun, generation.number
         if begun.since == number:
             origin = "" if begun.origin is None else f", from the mean of generation {begun.origin}"
             self.fleet.note(f"{self._stage_text} begins with generation {number} after {begun.why}{origin}")
 
     @property
     def _stage_text(self) -> str:
-        stage = self.generations.scoring_params.stage
-        return f"stage {stage.number} of {len(self._agenda.stages)} ({stage.description})"
+        stage = self.generations.begun.stage
+        return f"stage {stage.number} of {len(self._agenda)} ({stage.description})"
 
     def _stop_reason(self, generation: Generation) -> StopReason | None:
         if self.settings.is_external:

@@ -47,7 +47,7 @@ class Verification:
         self, journal: Journal, fleet: Fleet, admission: WorkerAdmission, share: float, incarnation: int
     ) -> None:
         self.share = share
-        self.counts = journal.verification_counts()
+        self.counts = journal.verification.counts()
         self._journal = journal
         self._fleet = fleet
         self._jobs = fleet.jobs
@@ -59,7 +59,7 @@ class Verification:
         self._due_since: dict[bytes, float] = {}
         self._findings: dict[bytes, _Finding] = {}  # checks that found hosts wrong, before these are barred
         if share:
-            self._key = journal.verify_key()
+            self._key = journal.verification.key()
             fleet.jobs.is_drawn = self.is_drawn
 
     def is_drawn(self, work: Work) -> bool:
@@ -110,7 +110,7 @@ class Verification:
         if not self.share:
             return
         drawn = {each.digest: each for each in work if each.digest not in self._jobs and self.is_drawn(each)}
-        for digest, known in self._journal.unverified([each.job for each in drawn.values()]).items():
+        for digest, known in self._journal.verification.unverified([each.job for each in drawn.values()]).items():
             self._jobs.offer_check(drawn[digest], Check(known.host_class, {known.answer.host}))
             self._answers[digest], self._workers[digest] = [known.answer], known.worker
 
@@ -248,7 +248,7 @@ class Verification:
         return hosts
 
     def _write(self, found: _Finding) -> None:
-        self._journal.add_verification(found.job, found.worker, found.checkers, found.outcome)
+        self._journal.verification.add(found.job, found.worker, found.checkers, found.outcome)
         self.counts[found.outcome] += 1
 
     def _describe_values(self, digest: bytes) -> str:

@@ -33,6 +33,7 @@ from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.service.service import OpenRun, Service
 from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, RunConfig
 from dreamfleet.coordinator.settings.environment_check import check_environment
+from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.settings.resume_settings import serving_facts
@@ -244,7 +245,7 @@ def _resolve_new_settings(
         config = start.apply_to(config)
     bundle = None if config.needs_no_bundle else find_bundle(config.bundle or DEFAULT_BUNDLE)
     config = check_environment(config, bundle, strict=strict)
-    settings = config.settings(bundle)
+    settings = freeze(config, bundle)
     if start is not None:
         start.check(settings, bundle)
     return settings, bundle, _episode_limit(config, bundle)

@@ -168,12 +168,12 @@ def _open_generation(run: Run) -> GenerationStatus:
 
 
 def _stage(run: Run) -> StageStatus | None:
-    total, begun = len(run.settings.stages), run.generations.scoring_params.begun
-    stage = begun.stage
+    total, begun = len(run.settings.stages), run.generations.begun
     if not total:
         return None
-    within = stage.horizon, stage.patience, stage.population, stage.episodes, stage.racing
-    return StageStatus(stage.number, total, begun.since, *within, stage.driven)
+    own = begun.stage.settings
+    within = own.task.horizon, own.task.patience, own.population, own.episodes, own.racing, own.driven
+    return StageStatus(begun.stage.number, total, begun.since, *within)
 
 
 def _empty_population(candidate_scores: CandidateScores) -> Population:

@@ -6,19 +6,15 @@ Each setting is one field. The bounds are in its annotation; `frozen_option` nam
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.bundle_store import find_bundle
-from dreamfleet.common.artifacts.controller import ControllerShape
-from dreamfleet.common.artifacts.driving import FIRST_WORLD, Driving, Variant
+from dreamfleet.common.artifacts.driving import FIRST_WORLD, Variant
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.artifacts.world_facts import EndRule
 from dreamfleet.common.cli.config import option
@@ -26,29 +22,11 @@ from dreamfleet.common.cli.key_values import parse_arguments
 from dreamfleet.common.cli.presets import preset_help_text
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import plural
-from dreamfleet.common.protocol.measures import NO_ARCHIVE, check_dreamt, parse_axes
-from dreamfleet.common.protocol.messages import (
-    MAX_OPTIONS,
-    OWN_END_VERSION,
-    Horizon,
-    Patience,
-    Share,
-    TaskSpec,
-    Temperature,
-)
-from dreamfleet.common.protocol.tasks import (
-    DREAM,
-    GYM,
-    Description,
-    check_task,
-    describe_task,
-    is_function_task,
-    is_self_describing,
-    is_shipped,
-)
+from dreamfleet.common.protocol.measures import NO_ARCHIVE, parse_axes
+from dreamfleet.common.protocol.messages import Horizon, Patience, Share, TaskSpec, Temperature
+from dreamfleet.common.protocol.tasks import DREAM, Description, check_task, is_self_describing
 from dreamfleet.common.runs.records import (
     EXTERNAL,
-    STAGE_FIELDS,
     ConfirmationEpisodes,
     EpisodesPerCandidate,
     OnFailure,
@@ -56,18 +34,10 @@ from dreamfleet.common.runs.records import (
     RunSettings,
     StageSettings,
 )
-from dreamfleet.common.runs.stages import stages_of
 from dreamfleet.common.schema.validation import Count
 from dreamfleet.coordinator.settings.bounds import check_bounds
-from dreamfleet.coordinator.settings.presets import check_preset_fits
-from dreamfleet.coordinator.settings.run_checks import check_subspace, try_optimiser
-from dreamfleet.coordinator.settings.schedule import check_schedule, split_first_stage
-from dreamfleet.coordinator.settings.task_options import (
-    check_normalisation,
-    parse_described,
-)
 
-DEFAULT_BUNDLE, NO_BUNDLE = "tiny", "none"
+DEFAULT_BUNDLE, NO_BUNDLE, NO_SUBSPACE = "tiny", "none", "none"
 DEFAULT_HORIZON = 1000  # steps
 LARGEST_STEP = 1e6  # of sigma0: parameters travel in single precision
 Interval = Annotated[int, Meta(ge=0, le=10**6)]  # generations; 0: never
@@ -225,7 +195,7 @@ class RunConfig:
         if self.end:
             EndRule.parse(self.end)
         if 0 < self.driven < 1:
-            self._check_driven()
+            self._check_mixture()
         if self.optimiser == EXTERNAL:
             self._check_external()
 
@@ -248,13 +218,12 @@ class RunConfig:
                 f"{' and '.join(named)}: a run with --optimiser {EXTERNAL} has no search of its own, so leave this out"
             )
 
-    def _check_driven(self) -> None:
+    def _check_mixture(self) -> None:
         """`UsageError` for a mixture of dreams and drives that no candidate can have."""
         if round(self.driven * self.episodes) in (0, self.episodes):
             raise UsageError(
                 f"--driven {self.driven:g} of {plural(self.episodes, 'episode')} is none of them, or all: give "
-                "another share, or "
-                "more --episodes"
+                "another share, or more --episodes"
             )
         if self.racing:
             raise UsageError(
@@ -269,157 +238,35 @@ class RunConfig:
             return self.bundle == NO_BUNDLE
         return self.task != default_world() and is_self_describing(self.task)
 
-    def settings(self, bundle: Bundle | None) -> RunSettings:
-        """The settings to store in the journal; `config_values` is the inverse.
-
-        They hold the bundle's hash, or without a bundle the task's description of itself.
-        """
-        named, stages = split_first_stage(self.stages)
-        if stages != self.stages:
-            with _naming_stage(1):
-                own = replace(self, **named, stages=stages)
-            return own.settings(bundle)
-        if self.task is None and bundle is not None:
-            return replace(self, task=bundle.manifest.task).settings(bundle)
-        if self.task is not None and is_function_task(self.task) and self.horizon != 1:
-            return replace(self, horizon=1).settings(bundle)
-        if self.horizon is None:
-            limit = DEFAULT_HORIZON if bundle is None else bundle.manifest.facts.horizon
-            return replace(self, horizon=min(limit, DEFAULT_HORIZON)).settings(bundle)
-        spec, shape, packages = self._resolve_without_bundle() if bundle is None else self._resolve_with_bundle(bundle)
-        if names := self.measures:
-            if self.task == DREAM:
-                check_dreamt(names)
-            spec = replace(spec, measures=names)
-        if self.loaded_subspace is not None:
-            check_subspace(self.loaded_subspace, spec, shape, bundle)
-        derived = {
-            "task": spec,
-            "packages": packages,
-            "controller": shape,
-            "confirm_episodes": self._confirm_episodes,
-            "optimiser_options": tuple(filter(None, self.optimiser_options)),
-            "archive": self._archive,
-            "subspace": "" if self.loaded_subspace is None else self.loaded_subspace.sha256,
-            "evaluate_every": 0 if self.optimiser == EXTERNAL else self.evaluate_every,
-        }
-        settings = RunSettings(**{**frozen_values(RunSettings, self), **derived})
-        check_schedule(settings)
-        for stage in stages_of(settings):
-            with _naming_stage(stage.number if self.stages else None):
-                replace(self, **{name: getattr(stage, name) for name in STAGE_FIELDS})  # checks each value
-                if stage.starts_new_search and not settings.is_external:
-                    try_optimiser(settings, stage, self.loaded_subspace)
-        return settings
-
-    @property
-    def _confirm_episodes(self) -> int:
-        """0 where nothing is evaluated: there is nothing to choose among."""
-        if not self.evaluate_every or self.optimiser == EXTERNAL:
-            return 0
-        return max(self.evaluation_episodes, 2) if self.confirm_episodes is None else self.confirm_episodes
-
     @property
     def measures(self) -> tuple[str, ...]:
         """The measures of the archive's axes; empty without an archive."""
-        return tuple(axis.measure for axis in parse_axes(self._archive))
+        return tuple(axis.measure for axis in parse_axes(self.axes))
 
     @property
-    def _archive(self) -> tuple[str, ...]:
+    def axes(self) -> tuple[str, ...]:
+        """The archive's axes; empty without an archive."""
         return tuple(each for each in self.archive if each not in ("", NO_ARCHIVE))
-
-    @property
-    def _hidden(self) -> int:
-        return self.hidden_units if self.controller == "hidden" else 0
-
-    def _resolve_with_bundle(self, bundle: Bundle) -> tuple[TaskSpec, ControllerShape, tuple[str, ...]]:
-        self._check_world(bundle)
-        if self.environment or self.observation or self.normalise or self.task_options:
-            raise UsageError(
-                "--environment, --observation, --normalise and --task-options are of tasks without a world model"
-            )
-        if self.recorded:
-            bundle.check_recorded()
-        driving, facts = self._driving(bundle), bundle.manifest.facts
-        shape = bundle.with_controllers(
-            bundle.shape_of(self.features, self._hidden, driving), driving
-        ).controller_shape  # fmt: skip
-        own_shape = None if shape == bundle.default_shape else shape
-        end = self.end and EndRule.parse(self.end).text
-        end = "" if end == facts.end.text else end  # so that it scores as a run that names none
-        version = driving.version + (OWN_END_VERSION if end else 0)
-        spec = replace(self._spec(bundle.sha256, own_shape, driving.options, version), end=end)
-        return spec, shape, facts.packages
-
-    def _check_world(self, bundle: Bundle) -> None:
-        """`UsageError` for a world model that the task surely cannot use; other packages' tasks may use CarRacing's."""
-        task, world = str(self.task), bundle.manifest.task
-        check_preset_fits(self.preset, world, bundle.path.name)
-        if task in (DREAM, world):
-            return
-        if world != FIRST_WORLD or is_shipped(task):
-            without = "; or without a world model: --bundle none" if task.partition(":")[0] == GYM else ""
-            raise UsageError(
-                f"{bundle.path.name} is a world model of {world}, and not of {task}: name one of that with --bundle"
-                f"{without}"
-            )
-
-    def _spec(self, bundle: str, shape: ControllerShape | None, options: str, version: int) -> TaskSpec:
-        values = frozen_values(TaskSpec, self)
-        return TaskSpec(**values, bundle=bundle, controller=shape, options=options, version=version)
-
-    def _driving(self, bundle: Bundle) -> Driving:
-        """How the run's controllers drive."""
-        given, preset = (
-            parse_arguments("--variant", each, "pedals=one") for each in (self.variant, self.preset_variant)
-        )
-        values, world = preset | given, bundle.manifest.task
-        driving = bundle.driving_of(json.dumps(values, sort_keys=True) if values else "")
-        if not driving.is_default and self.task not in (world, DREAM):
-            raise UsageError(f"task {self.task} has no variants: {world} has, and its dream")
-        costs = [each for each in driving.option_texts if each not in driving.without_costs.option_texts]
-        drives = self.driven > 0 or any(each.driven for each in self.stages)
-        if costs and self.task == DREAM and not drives:
-            cost = costs[0].partition("=")[0]
-            remedy = "omit it from --variant" if cost in given else f"pass --variant {cost}=0 over the preset's"
-            raise UsageError(
-                f"{cost} needs candidates that drive in the world: a dream has no lap and no road; {remedy}"
-            )
-        return driving
-
-    def _resolve_without_bundle(self) -> tuple[TaskSpec, ControllerShape, tuple[str, ...]]:
-        check_preset_fits(self.preset, str(self.task))
-        if self.temperature is not None or self.collect_every or self.variant:
-            given = {
-                "--temperature": self.temperature is not None,
-                "--collect-every": self.collect_every,
-                "--variant": self.variant,
-            }
-            named = " and ".join(flag for flag, is_given in given.items() if is_given)
-            raise UsageError(f"{named}: only tasks with a world model take this; omit it for {self.task}")
-        assert self.task is not None
-        description = self.description or describe_task(self.task, self.description_options())
-        options = description.options if self.task_options is None else self.task_options
-        if self._hidden and not description.observations:
-            raise UsageError(f"{self.task} observes nothing, so there is no controller: leave --controller out")
-        shape = ControllerShape(description.observations, description.outputs, self._hidden)
-        if len(options) > MAX_OPTIONS:
-            raise UsageError(
-                f"the options of {self.task} to freeze with the run have {len(options)} characters, {MAX_OPTIONS} at "
-                "most: omit --normalise, or give smaller arguments"
-            )
-        check_normalisation(options, description.observations)
-        return self._spec("", shape, options, description.version), shape, description.packages
 
     def description_options(self) -> dict[str, Any]:
         """The options under which the task describes itself."""
         if self.task_options is not None:
-            return parse_described(self.task_options)
+            return _parse_described(self.task_options)
         arguments = parse_arguments("--environment", self.environment, "continuous=true")
         options: dict[str, Any] = {"environment": arguments} if arguments else {}
         if self.observation:
             options["observation"] = list(self.observation)
         return options | ({"normalise": True, "seed": self.seed} if self.normalise else {})
+
+
+def _parse_described(text: str) -> dict[str, Any]:
+    """The options by which a task describes itself, of those in the JSON object of --task-options."""
+    try:
+        plain = json.loads(text or "{}")
+        observation = {"observation": list(plain["observation"])} if plain.get("observation") else {}
+        return {"environment": dict(plain.get("environment", {})), **observation}
+    except (ValueError, AttributeError, TypeError, RecursionError) as error:
+        raise UsageError(f"--task-options must be a JSON object, not {text!r}") from error
 
 
 @lru_cache
@@ -443,12 +290,3 @@ def config_values(run: RunSettings, bundle: Path) -> dict[str, Any]:
     if not spec.bundle:
         return {**values, "bundle": NO_BUNDLE, "task_options": spec.options}
     return {**values, "bundle": str(bundle), "variant": Variant.from_json(spec.options).option_texts}
-
-
-@contextmanager
-def _naming_stage(number: int | None) -> Iterator[None]:
-    """Name the stage in an error; `None`: the run has no schedule."""
-    try:
-        yield
-    except UsageError as error:
-        raise error if number is None else UsageError(f"stage {number}: {error}") from error

@@ -9,7 +9,6 @@ from typing import Any
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.common.runs.scoring_params import scoring_params_of
 from dreamfleet.common.runs.stages import is_try
 from dreamfleet.coordinator.settings.config import RunConfig, config_values
 from dreamfleet.coordinator.settings.schedule import remaining_settings
@@ -38,8 +37,7 @@ class Fork:
                     f"run {source} has no search of its own, and no mean to begin at: begin with --init CONTROLLER"
                 )
             start, (_, sigma) = start_from_run(stored), latest_mean_and_sigma(stored)
-            scoring_params = scoring_params_of(stored, len(stored.history()))
-            stage = scoring_params.stage
+            stage = stored.stage_at(len(stored.history())).stage
             if is_try(stored.settings.stages, stage.number) and "schedule" not in given:
                 raise UsageError(
                     f"run {source} is in stage {stage.number}, one of several searches of which the best counts, and a "
@@ -48,7 +46,7 @@ class Fork:
             present = {
                 **remaining_settings(stored.settings, stage),
                 "sigma0": sigma,
-                "temperature": scoring_params.spec.temperature,
+                "temperature": stage.settings.task.temperature,
             }
             settings = {**config_values(stored.settings, stored.bundle_path), **present}
             if not stage.whole:

@@ -17,6 +17,7 @@ from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL
 from dreamfleet.common.runs.run_provenance import RunProvenance, read_run_provenance, read_run_settings
 from dreamfleet.coordinator.settings.config import RunConfig, config_values
+from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.resume_settings import stored_network
 from dreamfleet.coordinator.settings.run_provenance import versions
@@ -116,7 +117,7 @@ class Rerun:
     def _config(self) -> RunConfig:
         path = self.bundle.path if self.bundle is not None else Path()
         config = replace(RunConfig(**config_values(self.settings, path)), loaded_subspace=self._subspace)
-        made = config.settings(self.bundle)
+        made = freeze(config, self.bundle)
         others = [each.name for each in fields(made) if getattr(made, each.name) != getattr(self.settings, each.name)]
         if others:
             raise UsageError(

@@ -23,9 +23,10 @@ def build_provenance(
 
     It costs the same however long the run is.
     """
+    classes = journal.results.classes
     return RunProvenance(
-        generations, journal.effort, _start(journal), journal.fingerprint(), journal.classes.mixed, versions(),
-        validation_seed_ranges(settings), journal.fact(SUBSPACE_FACT), journal.classes, failed, checks,
+        generations, journal.results.effort, _start(journal), journal.fingerprint(), classes.mixed, versions(),
+        validation_seed_ranges(settings), journal.fact(SUBSPACE_FACT), classes, failed, checks,
     )  # fmt: skip
 
 

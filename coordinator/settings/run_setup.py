@@ -10,11 +10,10 @@ from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.records import EXTERNAL
-from dreamfleet.coordinator.settings.config import RunConfig
+from dreamfleet.coordinator.settings.config import NO_SUBSPACE, RunConfig
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.settings.presets import find_preset
-from dreamfleet.coordinator.settings.run_checks import NO_SUBSPACE
 from dreamfleet.coordinator.settings.schedule import find_schedule, split_first_stage
 
 DEFAULT_NAME = "run"

@@ -10,7 +10,7 @@ from typing import Any
 from dreamfleet.common.cli.config import Table, read_table, read_toml
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import plural
-from dreamfleet.common.runs.records import MAX_STAGES, STAGE_FIELDS, RunSettings, StageSettings
+from dreamfleet.common.runs.records import MAX_STAGES, RunSettings, StageSettings
 from dreamfleet.common.runs.stages import Stage, stages_of
 
 STAGE, NO_SCHEDULE = "stage", "none"
@@ -60,7 +60,7 @@ def split_first_stage(stages: tuple[StageSettings, ...]) -> tuple[dict[str, Any]
 def remaining_settings(settings: RunSettings, stage: Stage) -> dict[str, Any]:
     """The settings of a run that begins with this stage of another, counted anew, and goes on as that would."""
     stages = (stage.end, *settings.stages[stage.number :]) if stage.number < len(settings.stages) else ()
-    return {**{name: getattr(stage, name) for name in STAGE_FIELDS}, "stages": stages}
+    return {**stage.values, "stages": stages}
 
 
 def check_schedule(settings: RunSettings) -> None:
@@ -107,10 +107,10 @@ def _check_end(stage: Stage, every: int) -> None:
     if end.score is not None and 0 < end.generations <= every:
         raise UsageError(
             f"{name} never ends by its score: an evaluation counts {plural(every, 'generation')} later "
-            "(--evaluate-every), and "
-            f"it has {end.generations}: give it more, or omit the score"
+            f"(--evaluate-every), and it has {end.generations}: give it more, or omit the score"
         )
-    most = end.generations * stage.population * stage.episodes * stage.horizon
+    own = stage.settings
+    most = end.generations * own.population * own.episodes * own.task.horizon
     if end.generations and end.steps > most:
         raise UsageError(
             f"{name} never ends by its steps: {plural(end.generations, 'generation')} have {most} at most; omit "

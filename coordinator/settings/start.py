@@ -82,8 +82,7 @@ class StartPoint:
         if len(self.mean) != shape.size:
             raise ControllerError(
                 f"{self.source} has {plural(len(self.mean), 'parameter')}, this run's controllers {shape.size}: "
-                "give its own "
-                "--controller, --hidden-units and --features"
+                "give its own --controller, --hidden-units and --features"
             )
         if not (np.abs(self.mean) <= np.finfo(np.float32).max).all():
             raise ControllerError(f"{self.source} has parameters that no single-precision number can hold")

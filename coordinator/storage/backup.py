@@ -10,7 +10,7 @@ import os
 import shutil
 import sqlite3
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 
 from dreamfleet.common.errors import JournalError, UsageError
@@ -36,7 +36,8 @@ def back_up(source: RunFolder, target: Path) -> None:
         try:
             aside.mkdir(mode=0o700)
             _copy_run(source, aside)
-            with _hold_target(target):
+            # Nobody goes on from the earlier copy while it is replaced.
+            with run_lock(target) if target.exists() else nullcontext():
                 if target.exists():
                     target.rename(former)
                 aside.rename(target)
@@ -137,16 +138,6 @@ def _copy_journal(source: RunFolder, path: Path) -> None:
         raise JournalError(f"the journal of run {source.name} cannot be copied to {path.parent}: {error}") from error
     if found != "ok":
         raise JournalError(f"the journal of run {source.name} is damaged: {found}; the earlier copy is kept")
-
-
-@contextmanager
-def _hold_target(target: Path) -> Iterator[None]:
-    """Hold the earlier copy, so that nobody goes on from it while it is replaced."""
-    if not target.exists():
-        yield
-        return
-    with run_lock(target):
-        yield
 
 
 @contextmanager

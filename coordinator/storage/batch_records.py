@@ -10,10 +10,9 @@ from time import time
 from dreamfleet.common.errors import DamagedJournalError
 from dreamfleet.common.protocol.batches import BatchLine, BatchState
 from dreamfleet.common.protocol.result_bounds import to_finite
-from dreamfleet.coordinator.storage.checksum_records import ChecksumRecords
+from dreamfleet.coordinator.storage.journal_connection import JournalConnection
 
 OPEN = "('running', 'waiting')"  # states, as the index has them
-MOST_VARIABLES = 500  # of one SQL statement
 
 
 @dataclass(frozen=True)
@@ -30,104 +29,94 @@ class StoredBatch:
     errors: Mapping[int, str]  # why a candidate has no fitness, once the batch is complete
 
 
-class BatchRecords(ChecksumRecords):
+class BatchRecords:
     """Reads and writes a journal's batches."""
 
-    def add_batch(self, batch_id: str, content: bytes, seeds: Sequence[int], population: int, vectors: bytes) -> None:
+    def __init__(self, journal: JournalConnection) -> None:
+        self._journal = journal
+
+    def add(self, batch_id: str, content: bytes, seeds: Sequence[int], population: int, vectors: bytes) -> None:
         """Write a batch that waits; `vectors` are float32, row by row."""
-        self._write(
+        self._journal.write(
             "INSERT INTO batch (number, id, content, seeds, population, vectors, submitted, state) "
             "VALUES (?, ?, ?, ?, ?, ?, ?, 'waiting')",
-            self.batch_count(), batch_id, content, json.dumps(list(seeds)), population, vectors, time(),
+            self.count(), batch_id, content, json.dumps(list(seeds)), population, vectors, time(),
         )  # fmt: skip
 
-    def begin_batch(self, batch_id: str, generation: int) -> None:
+    def begin(self, batch_id: str, generation: int) -> None:
         """Write that a generation scores the batch; its vectors are that generation's candidates."""
-        self._write(
+        self._journal.write(
             "UPDATE batch SET state = 'running', generation = ?, vectors = NULL WHERE id = ?", generation, batch_id
         )
 
-    def cancel_batch(self, batch_id: str) -> None:
+    def cancel(self, batch_id: str) -> None:
         """Write that nobody wants the batch any more."""
-        self._write("UPDATE batch SET state = 'cancelled', vectors = NULL WHERE id = ?", batch_id)
+        self._journal.write("UPDATE batch SET state = 'cancelled', vectors = NULL WHERE id = ?", batch_id)
 
-    def finish_batch(self, batch_id: str, errors: Mapping[int, str]) -> None:
+    def finish(self, batch_id: str, errors: Mapping[int, str]) -> None:
         """Write that the batch's generation is closed; a cancelled one stays cancelled."""
-        self._write(
+        self._journal.write(
             "UPDATE batch SET errors = ?, state = CASE state WHEN 'running' THEN 'complete' ELSE state END "
             "WHERE id = ?",
             json.dumps(errors), batch_id,
         )  # fmt: skip
 
-    def batch_count(self) -> int:
+    def count(self) -> int:
         """How many batches were ever submitted."""
-        (count,) = self._read_row("SELECT ifnull(max(number) + 1, 0) FROM batch")
+        (count,) = self._journal.read_row("SELECT ifnull(max(number) + 1, 0) FROM batch")
         return int(count)
 
-    def batch(self, batch_id: str) -> StoredBatch | None:
+    def find(self, batch_id: str) -> StoredBatch | None:
         """The batch of this id; `None` if there is none."""
-        return self._find_batch("id = ?", batch_id)
+        return self._find("id = ?", batch_id)
 
-    def batch_of(self, generation: int) -> StoredBatch | None:
+    def of(self, generation: int) -> StoredBatch | None:
         """The batch that a generation scores; `None` if there is none."""
-        return self._find_batch("generation = ?", generation)
+        return self._find("generation = ?", generation)
 
-    def next_batch(self) -> StoredBatch | None:
+    def next_waiting(self) -> StoredBatch | None:
         """The batch that has waited longest; `None` if none waits."""
-        return self._find_batch("state = 'waiting' ORDER BY number LIMIT 1")
+        return self._find("state = 'waiting' ORDER BY number LIMIT 1")
 
-    def list_batches(self, most: int) -> list[BatchLine]:
+    def lines(self, most: int) -> list[BatchLine]:
         """The open batches in their order, then finished ones, the last first."""
         query = "SELECT id, state, population, generation FROM batch WHERE state"
         found = [
             BatchLine(*row)
             for where in (f"IN {OPEN} ORDER BY number", f"NOT IN {OPEN} ORDER BY number DESC")
-            for row in self._read(f"{query} {where} LIMIT ?", most)
+            for row in self._journal.read(f"{query} {where} LIMIT ?", most)
         ]
         return found[:most]
 
-    def open_batch_count(self) -> int:
+    def open_count(self) -> int:
         """How many batches wait or are scored."""
-        return int(self._read_row(f"SELECT count(*) FROM batch WHERE state IN {OPEN}")[0])  # noqa: S608
+        return int(self._journal.read_row(f"SELECT count(*) FROM batch WHERE state IN {OPEN}")[0])  # noqa: S608
 
-    def waiting_batches(self) -> tuple[int, int]:
+    def waiting(self) -> tuple[int, int]:
         """How many batches wait, and the bytes of their vectors."""
         query = "SELECT count(*), ifnull(sum(length(vectors)), 0) FROM batch WHERE state = 'waiting'"
-        count, size = self._read_row(query)
+        count, size = self._journal.read_row(query)
         return int(count), int(size)
 
-    def batch_vectors(self, batch: StoredBatch) -> list[bytes]:
+    def vectors(self, batch: StoredBatch) -> list[bytes]:
         """The vectors of a batch that waits, each as float32 bytes."""
-        (data,) = self._read_row("SELECT vectors FROM batch WHERE id = ?", batch.id)
+        (data,) = self._journal.read_row("SELECT vectors FROM batch WHERE id = ?", batch.id)
         size, rest = divmod(len(data or b""), batch.population)
         if rest or not size:
             raise DamagedJournalError(
-                f"{self.path} is damaged: batch {batch.id} lacks its vectors; restore it from a copy"
+                f"{self._journal.path} is damaged: batch {batch.id} lacks its vectors; restore it from a copy"
             )
         return [bytes(data[start : start + size]) for start in range(0, len(data), size)]
-
-    def is_closed(self, generation: int) -> bool:
-        """Whether a generation has its fitness."""
-        return self._read_row("SELECT closed FROM generation WHERE number = ?", generation) not in (None, (None,))
 
     def fitness_page(self, generation: int, offset: int, limit: int) -> list[float | None]:
         """The fitness of a closed generation's candidates from `offset` on; `None` for those that have none."""
         query = "SELECT fitness FROM candidate WHERE generation = ? AND number >= ? ORDER BY number LIMIT ?"
-        rows = self._read(query, generation, offset, limit)
+        rows = self._journal.read(query, generation, offset, limit)
         return [None if fitness is None else to_finite(fitness) for (fitness,) in rows]
 
-    def errors_of(self, digests: Sequence[bytes]) -> dict[bytes, str]:
-        """Why those of these jobs failed that failed for good."""
-        found: dict[bytes, str] = {}
-        for start in range(0, len(digests), MOST_VARIABLES):
-            some = digests[start : start + MOST_VARIABLES]
-            marks = ", ".join("?" * len(some))
-            found.update(self._read(f"SELECT digest, error FROM failure WHERE digest IN ({marks})", *some))  # noqa: S608
-        return found
-
-    def _find_batch(self, where: str, *values: object) -> StoredBatch | None:
+    def _find(self, where: str, *values: object) -> StoredBatch | None:
         columns = "number, id, content, seeds, population, generation, state, errors"
-        row = self._read_row(f"SELECT {columns} FROM batch WHERE {where}", *values)  # noqa: S608
+        row = self._journal.read_row(f"SELECT {columns} FROM batch WHERE {where}", *values)  # noqa: S608
         if row is None:
             return None
         try:
@@ -137,4 +126,4 @@ class BatchRecords(ChecksumRecords):
                 number, batch_id, content, tuple(json.loads(seeds)), population, generation, state, named
             )
         except (ValueError, TypeError, AttributeError) as error:
-            raise DamagedJournalError(f"{self.path} is damaged: {error}; restore it from a copy") from error
+            raise DamagedJournalError(f"{self._journal.path} is damaged: {error}; restore it from a copy") from error

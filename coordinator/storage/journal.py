@@ -10,7 +10,9 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import groupby
 from math import nan
+from operator import itemgetter
 from pathlib import Path
 from time import time
 
@@ -20,28 +22,24 @@ from numpy.typing import NDArray
 from dreamfleet.common.errors import DamagedJournalError, JournalError
 from dreamfleet.common.files.atomic_write import atomic_write, fsync_path, reporting_unwritable_folder
 from dreamfleet.common.protocol.failures import Failure
-from dreamfleet.common.protocol.host_classes import HostClasses, count_results
-from dreamfleet.common.protocol.messages import Job, Kind, Result
+from dreamfleet.common.protocol.messages import Job, Kind
 from dreamfleet.common.protocol.result_bounds import to_finite
-from dreamfleet.common.runs import schema
-from dreamfleet.common.runs.effort import Effort
+from dreamfleet.common.runs.journal import schema
 from dreamfleet.common.runs.journal.checksums import RECORD, REST, record_checksum, state_checksum
-from dreamfleet.common.runs.journal_reader import CLASS_COUNTS_QUERY, efforts_query
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_folder import ENDED_AT, RunFolder
 from dreamfleet.common.runs.run_paths import BUNDLE, JOURNAL
-from dreamfleet.common.runs.stages import begun_stages
 from dreamfleet.coordinator.jobs.confirmation import Finalist
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
-from dreamfleet.coordinator.jobs.generation import KnownResult
 from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollection
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
-from dreamfleet.coordinator.storage.batch_records import MOST_VARIABLES
-from dreamfleet.coordinator.storage.journal_file import (
-    journal_errors,
-    sqlite_side_files,
-)
+from dreamfleet.coordinator.storage.batch_records import BatchRecords
+from dreamfleet.coordinator.storage.checksum_records import ChecksumRecords
+from dreamfleet.coordinator.storage.journal_connection import JournalConnection
+from dreamfleet.coordinator.storage.journal_file import journal_errors, sqlite_side_files
 from dreamfleet.coordinator.storage.recall_records import RecallRecords
+from dreamfleet.coordinator.storage.result_records import ResultRecords
+from dreamfleet.coordinator.storage.verification_records import VerificationRecords
 
 sqlite3.register_adapter(Checkpoint, Checkpoint.packed)  # when it is written, not while workers wait
 
@@ -64,16 +62,23 @@ class StoredOpenGeneration:
     seconds: float = 0.0  # for which it could be scored so far
 
 
-class Journal(RecallRecords):
-    """The journal of one coordinator's life."""
+class Journal(JournalConnection):
+    """The journal of one coordinator's life: facts, generations, evaluations and events here, the rest in its parts."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
+        self.checksums = ChecksumRecords(self)
+        self.results = ResultRecords(self)
+        self.batches = BatchRecords(self)
+        self.verification = VerificationRecords(self, self.results)
+        self.recalls = RecallRecords(self, self.checksums, self.results)
         self._incarnation = 0
-        self._effort = None
-        self._made: dict[tuple[str, str, bool], list[int]] = {}  # steps and microseconds that `_effort` lacks
-        self._counted = None
-        self._digest_indices: dict[Kind, str] = {"evaluate": "evaluation_digest"}
+
+    def commit(self) -> None:
+        """Make everything durable with its checksums; errors as of `JournalConnection.commit`."""
+        if not self.is_log_cut:
+            self.checksums.write()
+        super().commit()
 
     @classmethod
     def create(
@@ -115,7 +120,7 @@ class Journal(RecallRecords):
 
     def check_incarnation(self) -> None:
         """`JournalError` if another coordinator began a life in this journal: a lock held neither of them back."""
-        rows = self._read_written("SELECT value FROM run WHERE key = 'incarnation'")
+        rows = self.read_written("SELECT value FROM run WHERE key = 'incarnation'")
         found = int(rows[0][0]) if rows else 0
         if found != self._incarnation:
             raise JournalError(
@@ -125,19 +130,12 @@ class Journal(RecallRecords):
 
     def fingerprint(self) -> str | None:
         """The fingerprint of the host of the first accepted result; `None` before it."""
-        scored = self._read_row("SELECT 1 FROM result LIMIT 1") is not None
+        scored = self.read_row("SELECT 1 FROM result LIMIT 1") is not None
         return self.fact(FINGERPRINT) if scored else None
 
     def host_class(self) -> str | None:
         """The class of the host of the first accepted result; `None` before it."""
         return None if self.fingerprint() is None else self.fact(HOST_CLASS)
-
-    @property
-    def classes(self) -> HostClasses:
-        """The host classes of all results: read once, then counted with each."""
-        if self._counted is None:
-            self._counted = count_results(self._read(CLASS_COUNTS_QUERY))
-        return HostClasses.of(self._counted)
 
     def end(self, why: str) -> None:
         """The run ended, now; one that had ended before, with nothing left to do, keeps its time."""
@@ -148,7 +146,7 @@ class Journal(RecallRecords):
     def begin_incarnation(self) -> int:
         """Number of this life of the coordinator, from 1; durable before anything is published."""
         number = int(self.fact("incarnation") or 0) + 1
-        last = self._read_row("SELECT what FROM event ORDER BY number DESC LIMIT 1")
+        last = self.read_row("SELECT what FROM event ORDER BY number DESC LIMIT 1")
         killed = "; the last one was killed, crashed or could not write" if last not in (None, (LEAVES,)) else ""
         self._incarnation = number
         self.set_fact("incarnation", str(number))
@@ -156,7 +154,7 @@ class Journal(RecallRecords):
         self.add_event(f"incarnation {number} begins{killed}")
         self.commit()
         self.set_patience(SERVING_PATIENCE)
-        self._opened = self._committed = self._read_row("SELECT max(number) FROM generation")[0]
+        self.opened = self._committed = self.read_row("SELECT max(number) FROM generation")[0]
         return number
 
     def end_incarnation(self) -> None:
@@ -164,21 +162,21 @@ class Journal(RecallRecords):
         self.set_patience(LEAVING_PATIENCE)
         self.add_event("the coordinator leaves", LEAVES)
         if self.fact("ended") is not None:
-            self.set_rest_checksum()
+            self.checksums.write_rest()
 
     def open_generation(
         self, number: int, state: Checkpoint, sigma: float, seeds: Sequence[int], vectors: Sequence[bytes]
     ) -> None:
         """Write a population, and the strategy's state before `ask`; the two latest states stay."""
-        self._write(
+        self.write(
             "INSERT INTO generation (number, seeds, opened, sigma) VALUES (?, ?, ?, ?)",
             number, json.dumps(list(seeds)), time(), sigma,
         )  # fmt: skip
         rows = [(number, index, vector) for index, vector in enumerate(vectors)]
-        self._write_all("INSERT INTO candidate (generation, number, vector) VALUES (?, ?, ?)", rows)
-        self._write_state(number, state)
-        self._write("DELETE FROM strategy WHERE generation < ?", number - 1)
-        self._opened = number
+        self.write_all("INSERT INTO candidate (generation, number, vector) VALUES (?, ?, ?)", rows)
+        self.checksums.write_state(number, state)
+        self.write("DELETE FROM strategy WHERE generation < ?", number - 1)
+        self.opened = number
 
     def close_generation(
         self, closed: StoredGeneration, fitness: NDArray[np.float64], measures: NDArray[np.float64] | None = None
@@ -186,12 +184,12 @@ class Journal(RecallRecords):
         """Write fitness and measures, which update the strategy, and the generation's statistics, if it has any."""
         is_scored = bool(np.isfinite(fitness).any())
         statistics = (closed.mean, closed.std, closed.best, closed.worst) if is_scored else (None,) * 4
-        self._write_all(
+        self.write_all(
             "UPDATE candidate SET fitness = ? WHERE generation = ? AND number = ?",
             [(float(value), closed.number, index) for index, value in enumerate(fitness)],  # SQLite has NULL for NaN
         )
         if measures is not None:
-            self._write_all(
+            self.write_all(
                 "UPDATE candidate SET measures = ? WHERE generation = ? AND number = ?",
                 [
                     (json.dumps(row.tolist()), closed.number, index)
@@ -199,37 +197,37 @@ class Journal(RecallRecords):
                     if np.isfinite(row).all()
                 ],
             )
-        self._write(
+        self.write(
             "UPDATE generation SET closed = ?, mean = ?, std = ?, best = ?, worst = ?, steps = ?, seconds = ?, "
             "failed = ? WHERE number = ?",
             time(), *statistics, closed.steps, closed.seconds, closed.failed, closed.number,
         )  # fmt: skip
-        self._closed_now.append(closed.number)
+        self.checksums.closed.append(closed.number)
 
     def set_seconds(self, generation: int, seconds: float) -> None:
         """Write for how long the open generation could be scored so far."""
-        self._write("UPDATE generation SET seconds = ? WHERE number = ?", seconds, generation)
+        self.write("UPDATE generation SET seconds = ? WHERE number = ?", seconds, generation)
 
     def set_seeds(self, generation: int, seeds: Sequence[int]) -> None:
         """Write other seeds of the open generation."""
-        self._write("UPDATE generation SET seeds = ? WHERE number = ?", json.dumps(list(seeds)), generation)
+        self.write("UPDATE generation SET seeds = ? WHERE number = ?", json.dumps(list(seeds)), generation)
 
     def redraw(self, generation: int, indices: Sequence[int], vectors: Sequence[bytes]) -> None:
         """Write the new vectors of candidates that failed; the old ones are kept by round."""
-        (rounds,) = self._read_row("SELECT count(DISTINCT round) FROM redraw WHERE generation = ?", generation)
-        self._write_all(
+        (rounds,) = self.read_row("SELECT count(DISTINCT round) FROM redraw WHERE generation = ?", generation)
+        self.write_all(
             "INSERT INTO redraw (generation, round, candidate, vector) "
             "SELECT generation, ?, number, vector FROM candidate WHERE generation = ? AND number = ?",
             [(rounds, generation, index) for index in indices],
         )
-        self._write_all(
+        self.write_all(
             "UPDATE candidate SET vector = ? WHERE generation = ? AND number = ?",
             [(vector, generation, index) for vector, index in zip(vectors, indices, strict=True)],
         )
 
     def add_failure(self, job: Job, error: Failure, workers: Sequence[str], attempts: int) -> None:
         """Write that a job's episode failed for good."""
-        self._write(
+        self.write(
             "INSERT INTO failure (digest, kind, generation, candidate, episode, seed, error, cause, fault, workers, "
             "attempts, incarnation, happened) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             job.digest, job.kind, job.generation, job.candidate, job.episode, job.seeds[0], error.text, error.cause,
@@ -238,70 +236,37 @@ class Journal(RecallRecords):
 
     def add_event(self, text: str, what: str = "", worker: str = "") -> None:
         """Write what happened to the run, for people, and to which worker; the last `MAX_EVENTS` are kept."""
-        self._write(
+        self.write(
             "INSERT INTO event (happened, incarnation, text, what, worker) VALUES (?, ?, ?, ?, ?)",
             time(), self._incarnation, text, what, worker,
         )  # fmt: skip
-        self._write("DELETE FROM event WHERE number <= (SELECT max(number) FROM event) - ?", MAX_EVENTS)
+        self.write("DELETE FROM event WHERE number <= (SELECT max(number) FROM event) - ?", MAX_EVENTS)
 
     def drop_failures(self, generation: int) -> None:
         """Forget the failures of a generation's candidates, so that they are scored again."""
-        self._write("DELETE FROM failure WHERE kind = 'score' AND generation = ?", generation)
-
-    def add_result(
-        self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int, host_class: str
-    ) -> None:
-        """Write an accepted result."""
-        self._write(
-            "INSERT INTO result (digest, kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, "
-            "fingerprint, incarnation, host_class, measures) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            job.digest, job.kind, job.generation, job.candidate, job.episode, job.seeds[0], result.fitness,
-            result.steps, result.seconds, worker, fingerprint, incarnation, host_class,
-            json.dumps(result.measures) if result.measures else None,
-        )  # fmt: skip
-        if self._counted is not None:
-            self._counted[host_class, fingerprint] += 1
-        if self._effort is not None:
-            made = self._made.setdefault((job.task, job.kind, bool(job.driven)), [0, 0])
-            made[0] += result.steps
-            made[1] += int(result.seconds * 1e6)
-
-    @property
-    def effort(self) -> Effort:
-        """The effort of all results: summed once, then counted with each, so that its cost does not grow."""
-        if self._effort is None:
-            settings = RunSettings.from_json(self.fact("settings") or "")
-            rows = self._read(efforts_query(begun_stages(settings, *self.read_closed())))
-            task = settings.task.task
-            efforts = (Effort.of(task, kind, *made, driven=bool(driven)) for kind, _, _, driven, *made in rows)
-            self._effort = sum(efforts, Effort())
-            self._made.clear()
-        while self._made:
-            (task, kind, driven), made = self._made.popitem()
-            self._effort += Effort.of(task, kind, *made, driven=driven)
-        return self._effort
+        self.write("DELETE FROM failure WHERE kind = 'score' AND generation = ?", generation)
 
     def schedule_evaluation(self, evaluation: Evaluation) -> None:
         """Write that the mean of a generation is to be evaluated."""
-        self._write(
+        self.write(
             "INSERT INTO evaluation (generation, vector, episodes) VALUES (?, ?, ?)",
             evaluation.generation, evaluation.vector, evaluation.episodes,
         )  # fmt: skip
 
     def drop_failures_of(self, digests: Sequence[bytes]) -> None:
         """Forget the failures of these jobs, so that they are scored again."""
-        self._write_all("DELETE FROM failure WHERE digest = ?", [(digest,) for digest in digests])
+        self.write_all("DELETE FROM failure WHERE digest = ?", [(digest,) for digest in digests])
 
     def finish_evaluation(self, generation: int, found: StoredEvaluation | None, failed: int) -> None:
         """Write what an evaluation gave: `None` if each of its episodes `failed`."""
         mean, std = (None, None) if found is None else (found.mean, found.std)
         query = "UPDATE evaluation SET mean = ?, std = ?, failed = ? WHERE generation = ?"
-        self._write(query, mean, std, failed, generation)
-        self._finished_now.append(generation)
+        self.write(query, mean, std, failed, generation)
+        self.checksums.finished.append(generation)
 
     def schedule_collection(self, collection: RolloutCollection) -> None:
         """Write that drives of a generation's mean are to be kept."""
-        self._write(
+        self.write(
             "INSERT INTO collection (generation, vector, episodes) VALUES (?, ?, ?)",
             collection.generation, collection.vector, collection.episodes,
         )  # fmt: skip
@@ -309,16 +274,16 @@ class Journal(RecallRecords):
     def scheduled_collections(self) -> list[RolloutCollection]:
         """Everything that was scheduled to be kept, oldest first."""
         query = "SELECT generation, vector, episodes FROM collection ORDER BY generation"
-        return [RolloutCollection(*row) for row in self._read(query)]
+        return [RolloutCollection(*row) for row in self.read(query)]
 
     def last_generation(self) -> StoredOpenGeneration | None:
         """The generation that was open when the last incarnation ended; `None` in a new run."""
-        (number,) = self._read_row("SELECT max(number) FROM generation")
+        (number,) = self.read_row("SELECT max(number) FROM generation")
         return None if number is None else self.generation(number)
 
     def generation(self, number: int) -> StoredOpenGeneration | None:
         """One of the last two generations, with the population that was sampled; `None` if its state is deleted."""
-        row = self._read_row(
+        row = self.read_row(
             "SELECT state, seeds, generation.seconds, strategy.checksum FROM generation JOIN strategy "
             "ON number = strategy.generation WHERE number = ?", number
         )  # fmt: skip
@@ -328,55 +293,54 @@ class Journal(RecallRecords):
             raise DamagedJournalError(
                 f"{self.path} is damaged: the optimiser's state differs from its checksum; restore it from a copy"
             )
-        vectors = self._read("SELECT vector FROM candidate WHERE generation = ? ORDER BY number", number)
-        rounds: dict[int, list[int]] = {}
-        query = "SELECT round, candidate FROM redraw WHERE generation = ? ORDER BY round, candidate"
-        for each, candidate in self._read(query, number):
-            rounds.setdefault(each, []).append(candidate)
+        state, seeds, seconds, _ = row
+        vectors, redrawn = self.vectors_of(number), self.redraws_of(number)
         try:
-            if not all(each in range(len(vectors)) for candidates in rounds.values() for each in candidates):
+            if not all(0 <= each < len(vectors) for candidates in redrawn for each in candidates):
                 raise ValueError(f"generation {number} lacks a candidate that was redrawn")
             return StoredOpenGeneration(
-                number, row[0], tuple(json.loads(row[1])), tuple(vector for (vector,) in vectors),
-                tuple(map(tuple, rounds.values())), to_finite(row[2] or 0.0),
-            )  # fmt: skip
+                number, state, tuple(json.loads(seeds)), vectors, tuple(map(tuple, redrawn)), to_finite(seconds or 0.0)
+            )
         except (ValueError, TypeError) as error:
             raise DamagedJournalError(f"{self.path} is damaged: {error}; restore it from a copy") from error
+
+    def is_closed(self, number: int) -> bool:
+        """Whether a generation has its fitness."""
+        return self.read_row("SELECT closed FROM generation WHERE number = ?", number) not in (None, (None,))
+
+    def vectors_of(self, number: int) -> tuple[bytes, ...]:
+        """The population of a generation, the latest vectors of candidates that were drawn anew."""
+        rows = self.read("SELECT vector FROM candidate WHERE generation = ? ORDER BY number", number)
+        return tuple(vector for (vector,) in rows)
+
+    def redraws_of(self, number: int) -> list[list[int]]:
+        """The candidates of a generation that were drawn anew, by round."""
+        rows = self.read("SELECT round, candidate FROM redraw WHERE generation = ? ORDER BY round, candidate", number)
+        return [[candidate for _, candidate in redrawn] for _, redrawn in groupby(rows, key=itemgetter(0))]
+
+    def seeds_of(self, number: int) -> list[int]:
+        """The seeds of a generation."""
+        (seeds,) = self.read_row("SELECT seeds FROM generation WHERE number = ?", number)
+        return list(json.loads(seeds))
+
+    def scores_of(self, number: int, axes: int) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+        """Fitness of a closed generation, as the strategy took it, and measures if it has `axes` of them."""
+        query = "SELECT fitness, measures FROM candidate WHERE generation = ? ORDER BY number"
+        rows = self.read(query, number)
+        fitness = np.array([nan if each is None else each for each, _ in rows], dtype=np.float64)
+        if not axes:
+            return fitness, None
+        return fitness, np.array([[nan] * axes if each is None else json.loads(each) for _, each in rows])
 
     def read_closed(self) -> tuple[list[StoredGeneration], list[StoredEvaluation]]:
         """Every closed generation and finished evaluation, oldest first."""
         with RunFolder(self.path.parent) as folder:
             return folder.history(), folder.evaluations()
 
-    def workers(self, *, recalled: bool = False) -> list[str]:
-        """The workers that have scored jobs of the run; with `recalled` also those whose results count no more."""
-        query = "SELECT DISTINCT worker FROM result"
-        if recalled:
-            query += " UNION SELECT worker FROM recalled"
-        return [str(worker) for (worker,) in self._read(query)]
-
-    def results_of(self, kind: str, generation: int) -> dict[bytes, KnownResult]:
-        """Fitness, steps and measures of a generation's accepted results, by digest; NaN for what failed for good."""
-        query = "SELECT digest, fitness, steps, measures FROM result WHERE kind = ? AND generation = ?"
-        found: dict[bytes, KnownResult] = {
-            digest: (to_finite(fitness), steps, tuple(json.loads(measures or "[]")))
-            for digest, fitness, steps, measures in self._read(query, kind, generation)
-        }
-        query = "SELECT digest FROM failure WHERE kind = ? AND generation = ?"
-        return found | {digest: (nan, 0, ()) for (digest,) in self._read(query, kind, generation)}
-
     def fitness_of(self, kind: Kind, digests: Sequence[bytes]) -> dict[bytes, float]:
-        """Fitness of those of these jobs that have an accepted result, whichever generation asked for it.
-
-        NaN for those that failed for good. Of candidates' episodes, only after `index_scores`.
-        """
-        self.take_back(digests)
-        found: dict[bytes, float] = dict(self._with_digests(kind, "digest, fitness", digests))
-        for start in range(0, len(digests), MOST_VARIABLES):
-            some = digests[start : start + MOST_VARIABLES]
-            query = f"SELECT digest FROM failure WHERE digest IN ({', '.join('?' * len(some))})"  # noqa: S608
-            found.update((digest, nan) for (digest,) in self._read(query, *some))
-        return found
+        """As `ResultRecords.fitness_of`; results of dropped generations that these jobs want count again."""
+        self.recalls.count_again(digests)
+        return self.results.fitness_of(kind, digests)
 
     def pending_evaluations(self) -> list[Evaluation]:
         """Evaluations that were scheduled and not finished, oldest first."""
@@ -384,7 +348,7 @@ class Journal(RecallRecords):
             "SELECT generation, vector, episodes FROM evaluation WHERE mean IS NULL AND failed < episodes "
             "ORDER BY generation"
         )
-        return [Evaluation(*row) for row in self._read(query)]
+        return [Evaluation(*row) for row in self.read(query)]
 
     def finalists(self, count: int) -> list[Finalist]:
         """The best evaluated means, best first; of generations with one mean and of equals the earliest."""
@@ -392,13 +356,13 @@ class Journal(RecallRecords):
             "SELECT min(generation), vector, episodes - failed, mean, failed FROM evaluation WHERE mean IS NOT NULL "
             "GROUP BY vector ORDER BY failed, mean DESC, 1 LIMIT ?"
         )
-        rows = self._read(query, count)
+        rows = self.read(query, count)
         return [Finalist(generation, vector, episodes, to_finite(mean), failed)
                 for generation, vector, episodes, mean, failed in rows]  # fmt: skip
 
     def evaluated_vector(self, generation: int) -> bytes:
         """The mean after a generation that was scheduled to be evaluated."""
-        (vector,) = self._read_row("SELECT vector FROM evaluation WHERE generation = ?", generation)
+        (vector,) = self.read_row("SELECT vector FROM evaluation WHERE generation = ?", generation)
         return bytes(vector)
 
 

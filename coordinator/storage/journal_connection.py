@@ -10,7 +10,8 @@ from typing import Any
 
 from dreamfleet.common.errors import JournalError, NotWritableNowError
 from dreamfleet.common.files.atomic_write import fsync_path
-from dreamfleet.common.runs import schema
+from dreamfleet.common.runs.journal import schema
+from dreamfleet.common.runs.journal.checksums import state_checksum
 from dreamfleet.coordinator.storage.journal_file import (
     check_database,
     copy_database,
@@ -33,13 +34,14 @@ class JournalConnection:
         self._log_size = 0  # of the write-ahead log, as the last commit left it
         self._is_log_cut = False
         self._committed: int | None = None  # the latest generation on disk
-        self._opened: int | None = None  # the latest generation
+        self.opened: int | None = None  # the latest generation
+        self.has_changed_facts = False  # since their checksum was written
         self._writes: list[tuple[str, list[tuple[Any, ...]]]] = []  # a statement, and a row for each time it runs
         self._uncommitted: list[tuple[str, list[tuple[Any, ...]]]] = []  # those that ran since the last commit
         with journal_errors(path):
             self._connection = sqlite3.connect(path, timeout=5)
             try:
-                self._prepare(self._connection)
+                self._connection.create_function("state_checksum", 2, state_checksum, deterministic=True)
                 schema.check_schema(self._connection, path)
                 self._connection.execute("PRAGMA journal_mode = WAL")
                 self._connection.execute("PRAGMA synchronous = FULL")
@@ -48,9 +50,6 @@ class JournalConnection:
             except BaseException:
                 self._connection.close()
                 raise
-
-    def _prepare(self, connection: sqlite3.Connection) -> None:
-        """Add the functions that statements of a subclass call."""
 
     def close(self) -> None:
         """Fold the write-ahead log into the journal and release it.
@@ -72,7 +71,7 @@ class JournalConnection:
         if self._stamp in (None, file_stamp(self.path)):
             return False
         self._stamp = file_stamp(self.path)
-        return self._check_files() != ("ok", self._opened)
+        return self._check_files() != ("ok", self.opened)
 
     @property
     def is_log_cut(self) -> bool:
@@ -130,23 +129,26 @@ class JournalConnection:
             raise JournalError(f"the write-ahead log of {self.path} was truncated while it was served")
         own = self._stamp in (None, file_stamp(self.path))
         self.flush()
-        with self._kept_writes(), journal_errors(self.path):
+        with self._kept_writes():
             self._connection.commit()
         self._uncommitted = []
-        self._committed, self._log_size = self._opened, self._current_log_size() or 0
+        self._committed, self._log_size = self.opened, self._current_log_size() or 0
         if own:  # else somebody wrote there since the last commit, which `is_overwritten` looks into
             self._stamp = file_stamp(self.path)
 
     def flush(self) -> None:
         """Send everything written so far to the database; after `NotWritableNowError` it may be called again."""
         with self._kept_writes():
-            self._flush()
+            writes, self._writes = self._writes, []
+            self._uncommitted += writes
+            for statement, rows in writes:
+                self._connection.executemany(statement, rows)
 
     def forget_writes(self) -> None:
         """Drop everything written since the last commit."""
         with suppress(sqlite3.Error):
             self._connection.rollback()
-        self._writes, self._uncommitted, self._opened = [], [], self._committed
+        self._writes, self._uncommitted, self.opened = [], [], self._committed
 
     def take_lock(self) -> None:
         """Flush in a transaction: until its commit no other program can lock the journal. Errors as of `flush`."""
@@ -157,9 +159,10 @@ class JournalConnection:
 
     @contextmanager
     def _kept_writes(self) -> Iterator[None]:
-        """Keep all writes since the last commit for another try, should this one fail."""
+        """Raise errors as `journal_errors` does; keep all writes since the last commit for another try."""
         try:
-            yield
+            with journal_errors(self.path):
+                yield
         except NotWritableNowError:
             with suppress(sqlite3.Error):
                 self._connection.rollback()
@@ -177,43 +180,40 @@ class JournalConnection:
 
     def fact(self, key: str) -> str | None:
         """One of the run's facts, such as `uid` or `fingerprint`."""
-        row = self._read_row("SELECT value FROM run WHERE key = ?", key)
+        row = self.read_row("SELECT value FROM run WHERE key = ?", key)
         return None if row is None else str(row[0])
 
     def set_fact(self, key: str, value: str) -> None:
         """Write one of the run's facts."""
-        self._write("INSERT OR REPLACE INTO run (key, value) VALUES (?, ?)", key, value)
+        self.write("INSERT OR REPLACE INTO run (key, value) VALUES (?, ?)", key, value)
+        self.has_changed_facts = True
 
     def drop_fact(self, key: str) -> None:
         """Forget one of the run's facts."""
-        self._write("DELETE FROM run WHERE key = ?", key)
+        self.write("DELETE FROM run WHERE key = ?", key)
+        self.has_changed_facts = True
 
-    def _write(self, statement: str, *values: Any) -> None:
-        self._write_all(statement, [values])
+    def write(self, statement: str, *values: Any) -> None:
+        """Run a statement before the next read or commit."""
+        self.write_all(statement, [values])
 
-    def _write_all(self, statement: str, rows: list[tuple[Any, ...]]) -> None:
+    def write_all(self, statement: str, rows: list[tuple[Any, ...]]) -> None:
+        """Run a statement once for each row of values, before the next read or commit."""
         if self._writes and self._writes[-1][0] == statement:
             self._writes[-1][1].extend(rows)
         else:
             self._writes.append((statement, rows))
 
-    def _flush(self) -> None:
-        writes, self._writes = self._writes, []
-        self._uncommitted += writes
-        with journal_errors(self.path):
-            for statement, rows in writes:
-                self._connection.executemany(statement, rows)
-
-    def _read(self, query: str, *values: Any) -> list[Any]:
+    def read(self, query: str, *values: Any) -> list[Any]:
         """All rows of a query: a damaged page raises its error here, not in the code that iterates over the rows."""
         self.flush()
-        return self._read_written(query, *values)
+        return self.read_written(query, *values)
 
-    def _read_written(self, query: str, *values: Any) -> list[Any]:
+    def read_written(self, query: str, *values: Any) -> list[Any]:
         """All rows of a query, without what waits to be written: a locked journal does not hold it up."""
         with journal_errors(self.path):
             return self._connection.execute(query, values).fetchall()
 
-    def _read_row(self, query: str, *values: Any) -> Any:
+    def read_row(self, query: str, *values: Any) -> Any:
         """The first row of a query; `None` if there is none."""
-        return next(iter(self._read(query, *values)), None)
+        return next(iter(self.read(query, *values)), None)

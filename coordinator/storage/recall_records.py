@@ -1,74 +1,67 @@
-"""Taking back in a journal what barred hosts brought, and what followed from it."""
+"""Removes results of barred hosts from a journal, and everything computed from them."""
 
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Collection, Sequence
-from math import nan
 from time import time
 
-import numpy as np
-from numpy.typing import NDArray
-
-from dreamfleet.common.runs.effort import Effort
+from dreamfleet.common.runs.journal.journal_reader import digest_terms
 from dreamfleet.common.runs.run_folder import CONFIRMED, ENDED_AT, ENDING, STOP_KIND
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
-from dreamfleet.coordinator.storage.batch_records import MOST_VARIABLES
-from dreamfleet.coordinator.storage.verification_records import VerificationRecords
+from dreamfleet.coordinator.storage.checksum_records import ChecksumRecords
+from dreamfleet.coordinator.storage.journal_connection import JournalConnection
+from dreamfleet.coordinator.storage.result_records import COLUMNS, ResultRecords
 
 # Why a result does not count: its host is barred, its generation was dropped, or its closed race did not want it.
 BARRED, REWOUND, SURPLUS = "barred", "rewound", "surplus"
 WAS_CLOSED = "EXISTS (SELECT 1 FROM generation WHERE number = result.generation AND closed IS NOT NULL)"
-COLUMNS = (
-    "digest, kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, fingerprint, incarnation, "
-    "host_class, measures"
-)
 HOST = "substr(worker, 1, instr(worker || '/', '/') - 1)"
 
 
-class RecallRecords(VerificationRecords):
+class RecallRecords:
     """Takes results back, and rewinds to an earlier generation; nothing is durable before the caller's commit.
 
     What is taken back stays in the table `recalled`. Results of honest hosts in dropped generations count again once a
     generation wants the same jobs, unless their host is barred later: a job's digest names its content (R1).
     """
 
-    _effort: Effort | None  # of every result, once somebody asked
-    _counted: Counter[tuple[str, str]] | None  # results by class and fingerprint, likewise
-    _has_set_aside: bool | None = None  # whether `recalled` may hold results that could count again
+    def __init__(self, journal: JournalConnection, checksums: ChecksumRecords, results: ResultRecords) -> None:
+        self._journal = journal
+        self._checksums = checksums
+        self._results = results
+        self._has_set_aside: bool | None = None  # whether `recalled` may hold results that could count again
 
     def first_brought(self, hosts: Collection[str]) -> dict[str, int]:
         """The first generation to which these hosts brought a result or a lasting failure, by kind.
 
         Or in which they alone confirmed a result: of hosts that lie alike, each confirms what the other brings.
         """
-        marks = ", ".join("?" * len(hosts))
-        query = f"SELECT kind, min(generation) FROM result WHERE {HOST} IN ({marks}) GROUP BY 1"  # noqa: S608
-        first: dict[str, int] = dict(self._read(query, *hosts))
+        query = f"SELECT kind, min(generation) FROM result WHERE {_of(hosts)} GROUP BY 1"  # noqa: S608
+        first: dict[str, int] = dict(self._journal.read(query, *hosts))
         for _, kind, generation in (*self._failures_of(hosts), *self._confirmed_by(hosts)):
             first[kind] = min(generation, first.get(kind, generation))
         return first
 
-    def recall_results(self, hosts: Collection[str]) -> int:
+    def recall(self, hosts: Collection[str]) -> int:
         """Take back all that these hosts brought, and reopen the evaluations that it was part of; returns how much."""
-        marks = ", ".join("?" * len(hosts))
+        write, mine = self._journal.write, _of(hosts)
         reopened = (
             "UPDATE evaluation SET mean = NULL, std = NULL, failed = 0, checksum = NULL WHERE vector IN "
             "(SELECT vector FROM evaluation WHERE generation IN "
         )
         failed = self._failures_of(hosts)
-        mine = f"(SELECT generation FROM result WHERE kind = 'evaluate' AND {HOST} IN ({marks}))"  # noqa: S608
-        self._write(f"{reopened} {mine})", *hosts)
+        write(f"{reopened} (SELECT generation FROM result WHERE kind = 'evaluate' AND {mine}))", *hosts)  # noqa: S608
         others = (*failed, *self._confirmed_by(hosts))
-        self._write_all(f"{reopened} (?))", [(number,) for _, kind, number in others if kind == "evaluate"])
-        self._write_all("DELETE FROM failure WHERE digest = ?", [(digest,) for digest, *_ in failed])
-        (count,) = self._read_row(f"SELECT count(*) FROM result WHERE {HOST} IN ({marks})", *hosts)  # noqa: S608
-        scored = f"SELECT DISTINCT generation FROM result WHERE kind = 'score' AND {HOST} IN ({marks})"  # noqa: S608
-        self._closed_now += [number for (number,) in self._read(scored, *hosts)]  # a closed batch keeps its fitness
-        self._set_aside(BARRED, f"{HOST} IN ({marks})", *hosts)
-        earlier = f"UPDATE recalled SET because = ? WHERE because != ? AND {HOST} IN ({marks})"  # noqa: S608
-        self._write(earlier, BARRED, BARRED, *hosts)  # such as of generations that an earlier recall dropped
+        self._journal.write_all(f"{reopened} (?))", [(number,) for _, kind, number in others if kind == "evaluate"])
+        self._journal.write_all("DELETE FROM failure WHERE digest = ?", [(digest,) for digest, *_ in failed])
+        (count,) = self._journal.read_row(f"SELECT count(*) FROM result WHERE {mine}", *hosts)  # noqa: S608
+        scored = f"SELECT DISTINCT generation FROM result WHERE kind = 'score' AND {mine}"  # noqa: S608
+        # A closed batch keeps its fitness.
+        self._checksums.closed += [number for (number,) in self._journal.read(scored, *hosts)]
+        self._set_aside(BARRED, mine, *hosts)
+        # Such as of generations that an earlier recall dropped.
+        write(f"UPDATE recalled SET because = ? WHERE because != ? AND {mine}", BARRED, BARRED, *hosts)  # noqa: S608
         self._void_checks(hosts)
         self._settle_recall()
         return int(count)
@@ -79,99 +72,70 @@ class RecallRecords(VerificationRecords):
         `state` is the strategy's before that `ask`. Results of the generation itself stay, and those that its race
         did not want are here again: its barrier may be another.
         """
+        write = self._journal.write
         self._count_again("because = ? AND generation = ?", SURPLUS, number)
-        self._write("UPDATE recalled SET because = ? WHERE because = ? AND generation > ?", REWOUND, SURPLUS, number)
+        write("UPDATE recalled SET because = ? WHERE because = ? AND generation > ?", REWOUND, SURPLUS, number)
         self._set_aside(REWOUND, "generation > ? OR (generation = ? AND kind != 'score')", number, number)
-        self._write("DELETE FROM failure WHERE generation > ? OR (generation = ? AND kind != 'score')", number, number)
+        write("DELETE FROM failure WHERE generation > ? OR (generation = ? AND kind != 'score')", number, number)
         for table in ("evaluation", "collection"):
-            self._write(f"DELETE FROM {table} WHERE generation >= ?", number)  # noqa: S608
+            write(f"DELETE FROM {table} WHERE generation >= ?", number)  # noqa: S608
         first = "SELECT vector FROM redraw WHERE redraw.generation = ? AND redraw.candidate = candidate.number"
-        self._write(
+        write(
             f"UPDATE candidate SET vector = ({first} ORDER BY round LIMIT 1) WHERE generation = ? "  # noqa: S608
             f"AND EXISTS ({first})",
             number, number, number,
         )  # fmt: skip
-        self._write("DELETE FROM redraw WHERE generation >= ?", number)
-        self._write("DELETE FROM candidate WHERE generation > ?", number)
-        self._write("UPDATE candidate SET fitness = NULL, measures = NULL WHERE generation = ?", number)
-        self._write("DELETE FROM strategy")
-        self._write("DELETE FROM generation WHERE number > ?", number)
-        self._write(
+        write("DELETE FROM redraw WHERE generation >= ?", number)
+        write("DELETE FROM candidate WHERE generation > ?", number)
+        write("UPDATE candidate SET fitness = NULL, measures = NULL WHERE generation = ?", number)
+        write("DELETE FROM strategy")
+        write("DELETE FROM generation WHERE number > ?", number)
+        write(
             "UPDATE generation SET closed = NULL, mean = NULL, std = NULL, best = NULL, worst = NULL, steps = NULL, "
             "failed = 0, checksum = NULL, seeds = ? WHERE number = ?",
             json.dumps(list(seeds)), number,
         )  # fmt: skip
-        self._write_state(number, state)
-        self._opened = number
+        self._checksums.write_state(number, state)
+        self._journal.opened = number
         self._settle_recall()
 
     @property
     def has_set_aside(self) -> bool:
-        """Whether there may be results of dropped generations that `take_back` could count again."""
+        """Whether there may be results of dropped generations that `count_again` could count again."""
         if self._has_set_aside is None:
-            row = self._read_row("SELECT 1 FROM recalled WHERE because = ? LIMIT 1", REWOUND)
+            row = self._journal.read_row("SELECT 1 FROM recalled WHERE because = ? LIMIT 1", REWOUND)
             self._has_set_aside = row is not None
         return self._has_set_aside
 
-    def take_back(self, digests: Sequence[bytes]) -> None:
+    def count_again(self, digests: Sequence[bytes]) -> None:
         """Count results of dropped generations again that these jobs want."""
         if not self.has_set_aside:
             return
-        for start in range(0, len(digests), MOST_VARIABLES):
-            some = digests[start : start + MOST_VARIABLES]
-            self._count_again(f"because = ? AND digest IN ({', '.join('?' * len(some))})", REWOUND, *some)
+        for these, some in digest_terms(digests):
+            self._count_again(f"because = ? AND {these}", REWOUND, *some)
 
     def set_surplus_aside(self, generation: int, digests: Sequence[bytes]) -> None:
         """Count these results and failures of a race no more, which is about to close and does not want them.
 
         So the results of a closed generation are those of its fitness and steps.
         """
-        for start in range(0, len(digests), MOST_VARIABLES):
-            some = digests[start : start + MOST_VARIABLES]
-            these = f"digest IN ({', '.join('?' * len(some))})"
+        for these, some in digest_terms(digests):
             self._set_aside(SURPLUS, f"kind = 'score' AND generation = ? AND {these}", generation, *some)
-            self._write(f"DELETE FROM failure WHERE {these}", *some)  # noqa: S608
-            self._write(f"UPDATE verification SET stands = 0 WHERE {these}", *some)  # noqa: S608
-            self._effort = self._counted = None
+            self._journal.write(f"DELETE FROM failure WHERE {these}", *some)  # noqa: S608
+            self._journal.write(f"UPDATE verification SET stands = 0 WHERE {these}", *some)  # noqa: S608
+        self._results.forget_totals()
 
-    def recalled_rollouts(self) -> list[tuple[int, int]]:
+    def rollouts(self) -> list[tuple[int, int]]:
         """Generation and episode of the rollouts that count no more, and that were not collected again."""
         query = (
             "SELECT DISTINCT generation, episode FROM recalled WHERE kind = 'collect' "
             "EXCEPT SELECT generation, episode FROM result WHERE kind = 'collect'"
         )
-        return [(int(generation), int(episode)) for generation, episode in self._read(query)]
-
-    def vectors_of(self, number: int) -> tuple[bytes, ...]:
-        """The population of a generation, the latest vectors of candidates that were drawn anew."""
-        rows = self._read("SELECT vector FROM candidate WHERE generation = ? ORDER BY number", number)
-        return tuple(vector for (vector,) in rows)
-
-    def redraws_of(self, number: int) -> list[list[int]]:
-        """The candidates of a generation that were drawn anew, by round."""
-        rounds: dict[int, list[int]] = {}
-        query = "SELECT round, candidate FROM redraw WHERE generation = ? ORDER BY round, candidate"
-        for each, candidate in self._read(query, number):
-            rounds.setdefault(each, []).append(candidate)
-        return list(rounds.values())
-
-    def seeds_of(self, number: int) -> list[int]:
-        """The seeds of a generation."""
-        (seeds,) = self._read_row("SELECT seeds FROM generation WHERE number = ?", number)
-        return list(json.loads(seeds))
-
-    def scores_of(self, number: int, axes: int) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-        """Fitness of a closed generation, as the strategy took it, and measures if it has `axes` of them."""
-        query = "SELECT fitness, measures FROM candidate WHERE generation = ? ORDER BY number"
-        rows = self._read(query, number)
-        fitness = np.array([nan if each is None else each for each, _ in rows], dtype=np.float64)
-        if not axes:
-            return fitness, None
-        return fitness, np.array([[nan] * axes if each is None else json.loads(each) for _, each in rows])
+        return [(int(generation), int(episode)) for generation, episode in self._journal.read(query)]
 
     def _failures_of(self, hosts: Collection[str]) -> list[tuple[bytes, str, int]]:
         """Digest, kind and generation of the lasting failures to which any of these hosts contributed."""
-        rows = self._read("SELECT digest, kind, generation, workers FROM failure")
+        rows = self._journal.read("SELECT digest, kind, generation, workers FROM failure")
         return [
             (digest, kind, generation)
             for digest, kind, generation, workers in rows
@@ -181,33 +145,34 @@ class RecallRecords(VerificationRecords):
     def _confirmed_by(self, hosts: Collection[str]) -> list[tuple[bytes, str, int]]:
         """Digest, kind and generation of the results that were checked, and by nobody else than these hosts."""
         query = "SELECT digest, kind, generation, checker FROM verification WHERE stands AND outcome != 'unchecked'"
-        rows = self._read(query)
+        rows = self._journal.read(query)
         return [tuple(checked) for *checked, checkers in rows if set(checkers.split(",")) <= set(hosts)]
 
     def _set_aside(self, because: str, where: str, *values: object) -> None:
         """Move results into the table of those that do not count."""
-        self._write(
+        self._journal.write(
             f"INSERT INTO recalled ({COLUMNS}, because, happened, was_closed) SELECT {COLUMNS}, '{because}', ?, "  # noqa: S608
             f"{WAS_CLOSED} FROM result WHERE {where}",
             time(), *values,
         )  # fmt: skip
-        self._write(f"DELETE FROM result WHERE {where}", *values)  # noqa: S608
+        self._journal.write(f"DELETE FROM result WHERE {where}", *values)  # noqa: S608
 
     def _count_again(self, where: str, *values: object) -> None:
         """Move results back from the table of those that do not count, and let their checks stand again.
 
         A check stands by the word of a host that is still believed.
         """
-        taken = self._read(f"SELECT DISTINCT digest FROM recalled WHERE {where}", *values)  # noqa: S608
+        write = self._journal.write
+        taken = self._journal.read(f"SELECT DISTINCT digest FROM recalled WHERE {where}", *values)  # noqa: S608
         changed = f"generation IN (SELECT generation FROM recalled WHERE {where})"  # noqa: S608
-        self._write(f"UPDATE evaluation SET checksum = NULL WHERE {changed}", *values)  # noqa: S608
-        self._is_unsealed = True
-        self._write(f"INSERT OR IGNORE INTO result ({COLUMNS}) SELECT {COLUMNS} FROM recalled WHERE {where}",  # noqa: S608
-                    *values)  # fmt: skip
-        self._write(f"DELETE FROM recalled WHERE {where}", *values)  # noqa: S608
+        write(f"UPDATE evaluation SET checksum = NULL WHERE {changed}", *values)  # noqa: S608
+        self._checksums.is_unsealed = True
+        back = f"INSERT OR IGNORE INTO result ({COLUMNS}) SELECT {COLUMNS} FROM recalled WHERE {where}"  # noqa: S608
+        write(back, *values)
+        write(f"DELETE FROM recalled WHERE {where}", *values)  # noqa: S608
         stands = "UPDATE verification SET stands = 1 WHERE digest = ? AND outcome = 'equal' AND checker != ''"
-        self._write_all(stands, taken)
-        self._effort = self._counted = None
+        self._journal.write_all(stands, taken)
+        self._results.forget_totals()
 
     def _void_checks(self, hosts: Collection[str]) -> None:
         """Take these hosts from those that confirm results; a check that none is left of stands no more.
@@ -217,13 +182,19 @@ class RecallRecords(VerificationRecords):
         lists = "instr(',' || checker || ',', ',' || ? || ',')"
         without = "trim(replace(',' || checker || ',', ',' || ? || ',', ','), ',')"
         for host in hosts:
-            self._write(f"UPDATE verification SET checker = {without} WHERE {lists}", host, host)  # noqa: S608
-        self._write("UPDATE verification SET stands = 0 WHERE checker = '' AND outcome != 'unchecked'")
+            self._journal.write(f"UPDATE verification SET checker = {without} WHERE {lists}", host, host)  # noqa: S608
+        self._journal.write("UPDATE verification SET stands = 0 WHERE checker = '' AND outcome != 'unchecked'")
 
     def _settle_recall(self) -> None:
         """Let checks of results that do not count any more stand no longer, and no end or confirmation follow."""
-        self._write("UPDATE verification SET stands = 0 WHERE digest NOT IN (SELECT digest FROM result)")
+        self._journal.write("UPDATE verification SET stands = 0 WHERE digest NOT IN (SELECT digest FROM result)")
         for fact in (ENDING, STOP_KIND, "ended", ENDED_AT, CONFIRMED):
-            self.drop_fact(fact)
-        self._is_unsealed = True
-        self._effort = self._counted = self._has_set_aside = None
+            self._journal.drop_fact(fact)
+        self._checksums.is_unsealed = True
+        self._results.forget_totals()
+        self._has_set_aside = None
+
+
+def _of(hosts: Collection[str]) -> str:
+    """The condition that a row is of these hosts' workers."""
+    return f"{HOST} IN ({', '.join('?' * len(hosts))})"

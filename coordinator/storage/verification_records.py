@@ -5,15 +5,16 @@ from __future__ import annotations
 import json
 import secrets
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from time import time
 from typing import Any, Literal
 
-from dreamfleet.common.protocol.messages import Job, Kind
+from dreamfleet.common.protocol.messages import Job
 from dreamfleet.common.protocol.result_bounds import to_finite
 from dreamfleet.coordinator.jobs.checks import Answer
-from dreamfleet.coordinator.storage.batch_records import MOST_VARIABLES, BatchRecords
+from dreamfleet.coordinator.storage.journal_connection import JournalConnection
+from dreamfleet.coordinator.storage.result_records import ResultRecords
 
 VERIFY_KEY = "verify_key"  # the fact's name
 Outcome = Literal["equal", "differs", "unchecked"]
@@ -41,50 +42,33 @@ class StoredBar:
     by_operator: bool = False
 
 
-class VerificationRecords(BatchRecords):
+class VerificationRecords:
     """Reads and writes what a journal holds of checked results."""
 
-    _digest_indices: dict[Kind, str]  # of each kind whose results are found by their digests, the index
+    def __init__(self, journal: JournalConnection, results: ResultRecords) -> None:
+        self._journal = journal
+        self._results = results
 
-    def verify_key(self) -> bytes:
+    def key(self) -> bytes:
         """The secret of the draw: it is the run's own, so that a restart draws the same results."""
-        if self.fact(VERIFY_KEY) is None:
-            self.set_fact(VERIFY_KEY, secrets.token_hex(32))
-        return bytes.fromhex(self.fact(VERIFY_KEY) or "")
+        if (found := self._journal.fact(VERIFY_KEY)) is None:
+            found = secrets.token_hex(32)
+            self._journal.set_fact(VERIFY_KEY, found)
+        return bytes.fromhex(found)
 
-    def add_verification(self, job: Job, worker: str, checker: str, outcome: Outcome) -> None:
-        """Write what came of checking the result of a job that `worker` brought; the `checker` is empty if none did."""
-        self._write(
+    def add(self, job: Job, worker: str, checker: str, outcome: Outcome) -> None:
+        """Write the outcome of re-scoring a result of `worker`; the `checker` is empty if nobody did."""
+        self._journal.write(
             "INSERT INTO verification (digest, kind, generation, worker, checker, outcome, happened) "
             "VALUES (?, ?, ?, ?, ?, ?, ?)",
             job.digest, job.kind, job.generation, worker, checker, outcome, time(),
         )  # fmt: skip
 
-    def verification_counts(self) -> Counter[str]:
+    def counts(self) -> Counter[str]:
         """How many drawn results had each outcome, and `recalled` ones of barred hosts."""
-        counts = Counter(dict(self._read("SELECT outcome, count(*) FROM verification GROUP BY 1")))
-        (counts["recalled"],) = self._read_row("SELECT count(*) FROM recalled WHERE because = 'barred'")
+        counts = Counter(dict(self._journal.read("SELECT outcome, count(*) FROM verification GROUP BY 1")))
+        (counts["recalled"],) = self._journal.read_row("SELECT count(*) FROM recalled WHERE because = 'barred'")
         return counts
-
-    def index_scores(self) -> None:
-        """Let candidates' episodes be found by their digests alone, too: batches of others repeat them."""
-        self._write("CREATE INDEX IF NOT EXISTS score_digest ON result (digest) WHERE kind = 'score'")
-        self._digest_indices["score"] = "score_digest"
-
-    def _with_digests(
-        self, kind: Kind, columns: str, digests: Sequence[bytes], also: str = ""
-    ) -> Iterator[tuple[Any, ...]]:
-        """Read these columns of the results of a kind with these digests, whichever generation asked for them.
-
-        The index is named, because SQLite would read all results of the kind.
-        """
-        for start in range(0, len(digests), MOST_VARIABLES):
-            some = digests[start : start + MOST_VARIABLES]
-            yield from self._read(
-                f"SELECT {columns} FROM result INDEXED BY {self._digest_indices[kind]} "  # noqa: S608
-                f"WHERE kind = '{kind}' AND digest IN ({', '.join('?' * len(some))}) {also}",
-                *some,
-            )
 
     def unverified(self, jobs: Sequence[Job]) -> dict[bytes, StoredAnswer]:
         """The accepted results of those of a generation's jobs that have one, and no outcome of a check; by digest."""
@@ -92,11 +76,11 @@ class VerificationRecords(BatchRecords):
             return {}
         columns, kind = "digest, worker, host_class, fitness, steps, measures, seconds", jobs[0].kind
         wanted = {job.digest for job in jobs}
-        if kind in self._digest_indices:
-            rows: Iterable[tuple[Any, ...]] = self._with_digests(kind, columns, [*wanted], UNCHECKED)
+        if kind in self._results.indices:
+            rows: Iterable[tuple[Any, ...]] = self._results.with_digests(kind, columns, [*wanted], UNCHECKED)
         else:
             query = f"SELECT {columns} FROM result WHERE kind = ? AND generation = ? {UNCHECKED}"  # noqa: S608
-            rows = self._read(query, kind, jobs[0].generation)
+            rows = self._journal.read(query, kind, jobs[0].generation)
         found: dict[bytes, StoredAnswer] = {}
         for digest, worker, host_class, fitness, steps, measures, seconds in rows:
             if digest in wanted:
@@ -107,12 +91,12 @@ class VerificationRecords(BatchRecords):
 
     def barred(self) -> dict[str, StoredBar]:
         """The hosts that may not add to the run."""
-        rows = self._read("SELECT host, why, by_anchor, by_operator FROM barred ORDER BY happened")
+        rows = self._journal.read("SELECT host, why, by_anchor, by_operator FROM barred ORDER BY happened")
         return {host: StoredBar(why, bool(anchor), bool(operator)) for host, why, anchor, operator in rows}
 
     def bar(self, host: str, bar: StoredBar, incarnation: int) -> None:
         """Write that a host may not add to the run any more."""
-        self._write(
+        self._journal.write(
             "INSERT OR REPLACE INTO barred (host, why, by_anchor, by_operator, incarnation, happened) "
             "VALUES (?, ?, ?, ?, ?, ?)",
             host, bar.why, int(bar.by_anchor), int(bar.by_operator), incarnation, time(),
@@ -120,4 +104,4 @@ class VerificationRecords(BatchRecords):
 
     def unbar(self, host: str) -> None:
         """Write that a host may add to the run again."""
-        self._write("DELETE FROM barred WHERE host = ?", host)
+        self._journal.write("DELETE FROM barred WHERE host = ?", host)

@@ -23,12 +23,11 @@ from dreamfleet.common.host.trusted_modules import trust
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.tasks import module_of
 from dreamfleet.common.transport.network import Network
-from dreamfleet.coordinator.settings.config import RunConfig
+from dreamfleet.coordinator.settings.config import NO_SUBSPACE, RunConfig
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.live_log import parse_sinks
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.settings.presets import find_preset
-from dreamfleet.coordinator.settings.run_checks import NO_SUBSPACE
 from dreamfleet.coordinator.settings.run_setup import DEFAULT_NAME, SUMMARY, check_limits, configure, load_run_config
 from dreamfleet.coordinator.settings.schedule import find_schedule, split_first_stage
 

@@ -70,7 +70,8 @@ def fitness_figure(run: RunFolder) -> Figure:
     dreamt = settings.task.task == DREAM
     limit_of_run = run.episode_limit
     steps = join_distinct(
-        describe_steps(each.stage.horizon, each.stage.driven, dreamt=dreamt, limit=limit_of_run) for each in stages
+        describe_steps(each.stage.settings.task.horizon, each.stage.settings.driven, dreamt=dreamt, limit=limit_of_run)
+        for each in stages
     )
     evaluated = "; evaluated: whole episodes" if run.evaluations() and not two else ""
     limit = textwrap.wrap(f"in {steps} at most{evaluated}", LABEL)
@@ -83,7 +84,8 @@ def fitness_figure(run: RunFolder) -> Figure:
         SUBMITTED
         if settings.is_external
         else join_distinct(
-            f"{each.stage.population} candidates x {plural(each.stage.episodes, 'episode')}" for each in stages
+            f"{each.stage.settings.population} candidates x {plural(each.stage.settings.episodes, 'episode')}"
+            for each in stages
         )
     )
     _set_titles(panels[0], f"{run.name}: {settings.task.task}, {size}, seed {settings.seed}", _note(run))

@@ -11,10 +11,13 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli.add_ons import add_on
 from dreamfleet.common.client.elites import EliteArchive, controller_of, tables
-from dreamfleet.common.errors import ControllerError, MissingExtraError, UsageError
+from dreamfleet.common.errors import ControllerError, JournalError, MissingExtraError, UsageError
 from dreamfleet.common.host.packages import install_command
+from dreamfleet.common.printable import plural
 from dreamfleet.common.runs import run_folder, run_paths
+from dreamfleet.common.runs.records import best_evaluation, format_mean, in_values
 from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.schema.display import Displayed
 from dreamfleet.coordinator.views.export import ELITES, TABLES, columns_of, rows_of
 
 if TYPE_CHECKING:
@@ -28,7 +31,7 @@ PLOTS: tuple[Plot, ...] = get_args(Plot)
 NO_ARCHIVE = "run {} has no archive: begin one with --archive"
 
 
-class StoredRun(RunFolder):
+class StoredRun(RunFolder, Displayed):
     """A run's journal, read-only, as `open_run` opens it. It may be live; close it, or use it in a `with`.
 
     >>> from dreamfleet import open_run
@@ -39,6 +42,24 @@ class StoredRun(RunFolder):
     gym:CartPole-v1 0 True
     gym:CartPole-v1 None
     """
+
+    def _display(self) -> tuple[str, dict[str, object]]:
+        facts: dict[str, object] = {"folder": str(self.path)}
+        try:
+            with self.read_transaction():
+                count, confirmed, best = len(self.history()), self.confirmation(), best_evaluation(self.evaluations())
+                spec, state = self.spec, self.state
+        except JournalError as error:  # closed, or damaged
+            return f"Run {self.name}: {error}", facts
+        facts |= {
+            "task": spec.task,
+            "state": state,
+            "generations": count,
+            "best evaluation": best and format_mean(in_values(best, spec)),
+            "confirmed": confirmed and format_mean(in_values(confirmed, spec)),
+            "begun": self.created,
+        }
+        return f"Run {self.name} of {spec.task}: {plural(count, 'generation')}, {state}", facts
 
     def controller(self) -> Controller:
         """The controller that the run reports; `ControllerError` before its first generation is closed."""

@@ -42,7 +42,7 @@ from dreamfleet.common.runs.standard_error import format_with_error, standard_er
 from dreamfleet.common.worlds.profile import DemoPlan
 from dreamfleet.common.worlds.score_words import profile_of
 from dreamfleet.common.worlds.shipped import WORLDS
-from dreamfleet.coordinator.settings.run_checks import NO_SUBSPACE
+from dreamfleet.coordinator.settings.config import NO_SUBSPACE
 from dreamfleet.coordinator.views.status_panel import RunPanel
 from dreamfleet.experiments import command_lines
 from dreamfleet.experiments.local_run import START_SECONDS, LocalRun, has_begun

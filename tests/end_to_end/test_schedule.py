@@ -5,7 +5,6 @@ import json
 import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.common.runs.scoring_params import scoring_params_of
 from dreamfleet.common.runs.stages import begun_stages, stages_of
 from dreamfleet.coordinator.views.plot import plot_fitness
 from dreamfleet.worker.addons.inspection.curve_sections import fitness_section
@@ -114,14 +113,17 @@ def test_a_live_run_shows_its_stage_and_a_fork_begins_with_it(processes, begin):
     coordinator.wait_for("generation 4: mean")
     coordinator.end()
     with open_run(processes.runs, "night") as run:
-        stage = scoring_params_of(run, len(run.history())).stage
+        stage = run.stage_at(len(run.history())).stage
     forked = processes.start(
         "coordinator", "--from", "night", "--runs-dir", processes.runs, "--run", "other", "--listen",
         processes.endpoint, "--beat", 0.2, "--generations", 1,
     )  # fmt: skip
-    forked.wait_for(f"generation 0 is in stage 1 of {4 - stage.number} ({stage.horizon} steps")
+    forked.wait_for(f"generation 0 is in stage 1 of {4 - stage.number} ({stage.settings.task.horizon} steps")
     status = processes.statuses()[0]
-    assert (status.generation.stage.number, status.generation.stage.horizon) == (1, stage.horizon)
+    assert (status.generation.stage.number, status.generation.stage.settings.task.horizon) == (
+        1,
+        stage.settings.task.horizon,
+    )
     worker.end()
     processes.worker("--task", tasks.TOY, "--run", "other")
     assert forked.finish()[0] == 0

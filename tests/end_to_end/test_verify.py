@@ -21,13 +21,13 @@ def settings(random_bundle):
 DYING = """
 import os, signal
 from dreamfleet.coordinator.run.run import Run
-from dreamfleet.coordinator.storage.journal import Journal
+from dreamfleet.coordinator.storage.recall_records import RecallRecords
 
-recall, commit = Journal.recall_results, Run.commit
+recall, commit = RecallRecords.recall, Run.commit
 
 def dies_before(self, hosts):
     recall(self, hosts)
-    self.flush()
+    self._journal.flush()
     os.kill(os.getpid(), signal.SIGKILL)
 
 def dies_after(self):
@@ -37,7 +37,7 @@ def dies_after(self):
     return done
 
 if os.environ["DIES"] == "before":
-    Journal.recall_results = dies_before
+    RecallRecords.recall = dies_before
 else:
     Run.commit = dies_after
 """  # Python imports it as `sitecustomize` before the verb begins

@@ -72,14 +72,13 @@ class _Packed:
         return packed
 
 
-class MemoryJournal:
-    """One life's view of a disk: what it writes it reads, and what it did not commit is gone with it."""
+class MemoryTables:
+    """One life's view of a disk's tables, which its journal's parts share."""
 
     def __init__(self, disk: Disk, witness: Witness) -> None:
-        self.path = FOLDER / JOURNAL
-        self._witness = witness
+        self.witness = witness
         self._disk = disk
-        self._tables = {name: dict(rows) for name, rows in disk.tables.items()}
+        self.rows = {name: dict(rows) for name, rows in disk.tables.items()}
         self._pending: list[tuple[str, Any, Any]] = []
 
     def commit(self) -> None:
@@ -87,28 +86,33 @@ class MemoryJournal:
             _apply(self._disk.tables[table], key, row)
         self._pending.clear()
 
-    def close(self) -> None:
-        """Nothing is held."""
+    def insert(self, table: str, key: Any, row: Any) -> None:
+        """As a table with a primary key does."""
+        if key in self.rows[table]:
+            raise Violation("counted twice", f"the journal's {table} holds {_key_text(key)} already")
+        self.put(table, key, row)
 
-    def fact(self, key: str) -> str | None:
-        found: str | None = self._tables["fact"].get(key)
-        return found
+    def put(self, table: str, key: Any, row: Any) -> None:
+        _apply(self.rows[table], key, row)
+        self._pending.append((table, key, row))
 
-    def set_fact(self, key: str, value: str) -> None:
-        self._put("fact", key, value)
 
-    def end(self, why: str) -> None:
-        """No rule hangs on when."""
-        self.set_fact("ended", why)
+@dataclass(frozen=True)
+class MemoryResults:
+    """The twin of `ResultRecords`."""
 
-    def drop_fact(self, key: str) -> None:
-        self._put("fact", key, None)
+    tables: MemoryTables
 
-    def fingerprint(self) -> str | None:
-        return self.fact("fingerprint")
+    def add(self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int, host_class: str) -> None:
+        self.tables.witness.counted(job, result)
+        self.tables.insert("result", result.digest, (job, result, worker, host_class))
 
-    def host_class(self) -> str | None:
-        return self.fact("host_class")
+    def workers(self, *, recalled: bool = False) -> list[str]:
+        rows = [
+            *self.tables.rows["result"].values(),
+            *(row for _, row in self.tables.rows["recalled"].values() if recalled),
+        ]
+        return sorted({worker for _, _, worker, _ in rows})
 
     @property
     def classes(self) -> HostClasses:
@@ -119,6 +123,203 @@ class MemoryJournal:
     def effort(self) -> Effort:
         """No rule hangs on it."""
         return Effort()
+
+    def of(self, kind: str, generation: int) -> dict[bytes, KnownResult]:
+        rows = self.tables.rows["result"].items()
+        found = {
+            digest: (result.fitness, result.steps, result.measures)
+            for digest, (job, result, *_) in rows
+            if job.kind == kind and job.generation == generation
+        }
+        failed = {digest: (nan, 0, ()) for digest, (job, _) in self.tables.rows["failure"].items()
+                  if job.kind == kind and job.generation == generation}  # fmt: skip
+        return found | failed
+
+    def fitness_of(self, kind: Kind, digests: Sequence[bytes]) -> dict[bytes, float]:
+        rows = self.tables.rows["result"]
+        failed = {digest: nan for digest in digests if digest in self.tables.rows["failure"]}
+        return {digest: rows[digest][1].fitness for digest in digests if digest in rows} | failed
+
+    def index_scores(self) -> None:
+        """Nothing is searched."""
+
+
+@dataclass(frozen=True)
+class MemoryVerification:
+    """The twin of `VerificationRecords`."""
+
+    tables: MemoryTables
+
+    def key(self) -> bytes:
+        return b"a secret"  # a play is the same every time
+
+    def add(self, job: Job, worker: str, checker: str, outcome: str) -> None:
+        if outcome != "unchecked" and checker in ("", host_of(worker)):
+            raise Violation("checked", f"{worker} checked its own result")
+        self.tables.put("verification", job.digest, (job, worker, checker, outcome))
+
+    def counts(self) -> Counter[str]:
+        return Counter(outcome for *_, outcome in self.tables.rows["verification"].values())
+
+    def unverified(self, jobs: Sequence[Job]) -> dict[bytes, StoredAnswer]:
+        rows, known = self.tables.rows["result"], self.tables.rows["verification"]
+        return {
+            digest: StoredAnswer(worker, host_class, Answer.of(host_of(worker), result))
+            for digest in (job.digest for job in jobs)
+            if digest in rows and digest not in known
+            for _, result, worker, host_class in (rows[digest],)
+        }
+
+    def barred(self) -> dict[str, StoredBar]:
+        return dict(self.tables.rows["barred"])
+
+    def bar(self, host: str, bar: StoredBar, incarnation: int) -> None:
+        self.tables.put("barred", host, bar)
+
+    def unbar(self, host: str) -> None:
+        self.tables.put("barred", host, None)
+
+
+@dataclass(frozen=True)
+class MemoryRecalls:
+    """The twin of `RecallRecords`."""
+
+    tables: MemoryTables
+
+    def first_brought(self, hosts: Collection[str]) -> dict[str, int]:
+        first: dict[str, int] = {}
+        for job, _, worker, _ in self.tables.rows["result"].values():
+            if host_of(worker) in hosts:
+                first[job.kind] = min(job.generation, first.get(job.kind, job.generation))
+        for job in (*(job for job, _ in self._failures_of(hosts).values()), *self._confirmed_by(hosts)):
+            first[job.kind] = min(job.generation, first.get(job.kind, job.generation))
+        return first
+
+    def _confirmed_by(self, hosts: Collection[str]) -> list[Job]:
+        rows = self.tables.rows["verification"].values()
+        return [job for job, _, checkers, outcome in rows
+                if outcome != "unchecked" and {*checkers.split(",")} <= {*hosts}]  # fmt: skip
+
+    def _failures_of(self, hosts: Collection[str]) -> dict[bytes, Any]:
+        return {
+            digest: row for digest, row in self.tables.rows["failure"].items() if set(hosts) & {*map(host_of, row[1])}
+        }
+
+    def recall(self, hosts: Collection[str]) -> int:
+        mine = {digest: row for digest, row in self.tables.rows["result"].items() if host_of(row[2]) in hosts}
+        jobs = [*(row[0] for row in mine.values()), *self._confirmed_by(hosts)]
+        reopened = {job.generation for job in jobs if job.kind == "evaluate"}
+        vectors = {each.vector for number, (each, _) in self.tables.rows["evaluation"].items() if number in reopened}
+        for number, (evaluation, _) in list(self.tables.rows["evaluation"].items()):
+            if evaluation.vector in vectors:
+                self.tables.put("evaluation", number, (evaluation, None))
+        for digest in self._failures_of(hosts):
+            self.tables.put("failure", digest, None)
+        for digest, row in mine.items():
+            self._set_aside("barred", digest, row)
+        for key, (_, row) in list(self.tables.rows["recalled"].items()):
+            if host_of(row[2]) in hosts:
+                self.tables.put("recalled", key, ("barred", row))
+        for digest, (job, worker, checker, outcome) in list(self.tables.rows["verification"].items()):
+            left = ",".join(each for each in checker.split(",") if each not in hosts)
+            is_void = outcome != "unchecked" and not left
+            kept = None if is_void or digest not in self.tables.rows["result"] else (job, worker, left, outcome)
+            self.tables.put("verification", digest, kept)
+        self._settle_recall()
+        return len(mine)
+
+    def _set_aside(self, because: str, digest: bytes, row: Any) -> None:
+        self.tables.put("recalled", (digest, row[2]), (because, row))
+        self.tables.put("result", digest, None)
+
+    def _settle_recall(self) -> None:
+        for fact in ("ending", "stop_kind", "ended", "ended_at", "confirmed"):
+            self.tables.put("fact", fact, None)
+
+    def set_surplus_aside(self, generation: int, digests: Sequence[bytes]) -> None:
+        for digest in digests:
+            self.tables.put("failure", digest, None)
+            if digest in self.tables.rows["result"]:
+                self._set_aside("surplus", digest, self.tables.rows["result"][digest])
+
+    def rewind(self, number: int, state: Any, seeds: Sequence[int]) -> None:
+        for (digest, worker), (because, row) in list(self.tables.rows["recalled"].items()):
+            if because == "surplus" and row[0].generation == number:
+                self.tables.put("recalled", (digest, worker), None)
+                self.tables.put("result", digest, row)
+            elif because == "surplus" and row[0].generation > number:
+                self.tables.put("recalled", (digest, worker), ("rewound", row))
+        for digest, row in list(self.tables.rows["result"].items()):
+            job = row[0]
+            if job.generation > number or (job.generation == number and job.kind != "score"):
+                self._set_aside("rewound", digest, row)
+        for digest, (job, _) in list(self.tables.rows["failure"].items()):
+            if job.generation > number or (job.generation == number and job.kind != "score"):
+                self.tables.put("failure", digest, None)
+        for table in ("evaluation", "collection"):
+            for each in [each for each in self.tables.rows[table] if each >= number]:
+                self.tables.put(table, each, None)
+        for each in [each for each in self.tables.rows["generation"] if each > number]:
+            self.tables.put("generation", each, None)
+        row = self.tables.rows["generation"][number]
+        first = {"vectors": row["first"], "first": row["first"], "redrawn": ()}
+        self.tables.put(
+            "generation", number, {"state": row["state"], **first, "seeds": tuple(seeds), "restored": _Packed(state)}
+        )
+        self._settle_recall()
+
+    @property
+    def has_set_aside(self) -> bool:
+        return any(because == "rewound" for because, _ in self.tables.rows["recalled"].values())
+
+    def count_again(self, digests: Sequence[bytes]) -> None:
+        found = {digest: (key, row) for key, (because, row) in self.tables.rows["recalled"].items()
+                 for digest in [key[0]] if because == "rewound" and digest in digests}  # fmt: skip
+        for digest, (key, row) in found.items():
+            self.tables.put("recalled", key, None)
+            if digest not in self.tables.rows["result"]:
+                self.tables.put("result", digest, row)
+
+    def rollouts(self) -> list[tuple[int, int]]:
+        """Nothing reads them, and the simulated folder is not there."""
+        return []
+
+
+class MemoryJournal:
+    """One life's view of a disk: what it writes it reads, and what it did not commit is gone with it."""
+
+    def __init__(self, disk: Disk, witness: Witness) -> None:
+        self.path = FOLDER / JOURNAL
+        self.tables = MemoryTables(disk, witness)
+        self.results = MemoryResults(self.tables)
+        self.verification = MemoryVerification(self.tables)
+        self.recalls = MemoryRecalls(self.tables)
+
+    def commit(self) -> None:
+        self.tables.commit()
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def fact(self, key: str) -> str | None:
+        found: str | None = self.tables.rows["fact"].get(key)
+        return found
+
+    def set_fact(self, key: str, value: str) -> None:
+        self.tables.put("fact", key, value)
+
+    def end(self, why: str) -> None:
+        """No rule hangs on when."""
+        self.set_fact("ended", why)
+
+    def drop_fact(self, key: str) -> None:
+        self.tables.put("fact", key, None)
+
+    def fingerprint(self) -> str | None:
+        return self.fact("fingerprint")
+
+    def host_class(self) -> str | None:
+        return self.fact("host_class")
 
     @property
     def has_writes(self) -> bool:
@@ -137,10 +338,6 @@ class MemoryJournal:
     def add_event(self, text: str, what: str = "", worker: str = "") -> None:
         """No rule hangs on it."""
 
-    def workers(self, *, recalled: bool = False) -> list[str]:
-        rows = [*self._tables["result"].values(), *(row for _, row in self._tables["recalled"].values() if recalled)]
-        return sorted({worker for _, _, worker, _ in rows})
-
     def begin_incarnation(self) -> int:
         number = int(self.fact("incarnation") or 0) + 1
         self.set_fact("incarnation", str(number))
@@ -151,258 +348,102 @@ class MemoryJournal:
         """No rule hangs on it."""
 
     def open_generation(self, number: int, state: Any, sigma: float, seeds: Sequence[int], vectors: Any) -> None:
-        self._witness.opened(number, tuple(vectors))
+        self.tables.witness.opened(number, tuple(vectors))
         first = {"vectors": tuple(vectors), "first": tuple(vectors), "redrawn": ()}
-        self._insert("generation", number, {"state": state, "seeds": tuple(seeds), **first})
+        self.tables.insert("generation", number, {"state": state, "seeds": tuple(seeds), **first})
 
     def close_generation(self, closed: StoredGeneration, fitness: Any, measures: Any = None) -> None:
-        row = self._tables["generation"][closed.number]
+        row = self.tables.rows["generation"][closed.number]
         if "closed" in row:
             raise Violation("counted twice", f"generation {closed.number} was closed before")
         found = [None if np.isnan(each) else each for each in fitness.tolist()]
-        self._witness.check_fitness(closed.number, found)
-        self._put("generation", closed.number, {**row, "closed": closed, "fitness": found})
-
-    def add_result(
-        self, job: Job, result: Result, worker: str, fingerprint: str, incarnation: int, host_class: str
-    ) -> None:
-        self._witness.counted(job, result)
-        self._insert("result", result.digest, (job, result, worker, host_class))
-
-    def verify_key(self) -> bytes:
-        return b"a secret"  # a play is the same every time
-
-    def add_verification(self, job: Job, worker: str, checker: str, outcome: str) -> None:
-        if outcome != "unchecked" and checker in ("", host_of(worker)):
-            raise Violation("checked", f"{worker} checked its own result")
-        self._put("verification", job.digest, (job, worker, checker, outcome))
-
-    def verification_counts(self) -> Counter[str]:
-        return Counter(outcome for *_, outcome in self._tables["verification"].values())
-
-    def unverified(self, jobs: Sequence[Job]) -> dict[bytes, StoredAnswer]:
-        rows, known = self._tables["result"], self._tables["verification"]
-        return {
-            digest: StoredAnswer(worker, host_class, Answer.of(host_of(worker), result))
-            for digest in (job.digest for job in jobs)
-            if digest in rows and digest not in known
-            for _, result, worker, host_class in (rows[digest],)
-        }
-
-    def barred(self) -> dict[str, StoredBar]:
-        return dict(self._tables["barred"])
-
-    def bar(self, host: str, bar: StoredBar, incarnation: int) -> None:
-        self._put("barred", host, bar)
-
-    def unbar(self, host: str) -> None:
-        self._put("barred", host, None)
-
-    def first_brought(self, hosts: Collection[str]) -> dict[str, int]:
-        first: dict[str, int] = {}
-        for job, _, worker, _ in self._tables["result"].values():
-            if host_of(worker) in hosts:
-                first[job.kind] = min(job.generation, first.get(job.kind, job.generation))
-        for job in (*(job for job, _ in self._failures_of(hosts).values()), *self._confirmed_by(hosts)):
-            first[job.kind] = min(job.generation, first.get(job.kind, job.generation))
-        return first
-
-    def _confirmed_by(self, hosts: Collection[str]) -> list[Job]:
-        rows = self._tables["verification"].values()
-        return [job for job, _, checkers, outcome in rows
-                if outcome != "unchecked" and {*checkers.split(",")} <= {*hosts}]  # fmt: skip
-
-    def _failures_of(self, hosts: Collection[str]) -> dict[bytes, Any]:
-        return {digest: row for digest, row in self._tables["failure"].items() if set(hosts) & {*map(host_of, row[1])}}
-
-    def recall_results(self, hosts: Collection[str]) -> int:
-        mine = {digest: row for digest, row in self._tables["result"].items() if host_of(row[2]) in hosts}
-        jobs = [*(row[0] for row in mine.values()), *self._confirmed_by(hosts)]
-        reopened = {job.generation for job in jobs if job.kind == "evaluate"}
-        vectors = {each.vector for number, (each, _) in self._tables["evaluation"].items() if number in reopened}
-        for number, (evaluation, _) in list(self._tables["evaluation"].items()):
-            if evaluation.vector in vectors:
-                self._put("evaluation", number, (evaluation, None))
-        for digest in self._failures_of(hosts):
-            self._put("failure", digest, None)
-        for digest, row in mine.items():
-            self._set_aside("barred", digest, row)
-        for key, (_, row) in list(self._tables["recalled"].items()):
-            if host_of(row[2]) in hosts:
-                self._put("recalled", key, ("barred", row))
-        for digest, (job, worker, checker, outcome) in list(self._tables["verification"].items()):
-            left = ",".join(each for each in checker.split(",") if each not in hosts)
-            is_void = outcome != "unchecked" and not left
-            kept = None if is_void or digest not in self._tables["result"] else (job, worker, left, outcome)
-            self._put("verification", digest, kept)
-        self._settle_recall()
-        return len(mine)
-
-    def _set_aside(self, because: str, digest: bytes, row: Any) -> None:
-        self._put("recalled", (digest, row[2]), (because, row))
-        self._put("result", digest, None)
-
-    def _settle_recall(self) -> None:
-        for fact in ("ending", "stop_kind", "ended", "ended_at", "confirmed"):
-            self.drop_fact(fact)
-
-    def set_surplus_aside(self, generation: int, digests: Sequence[bytes]) -> None:
-        for digest in digests:
-            self._put("failure", digest, None)
-            if digest in self._tables["result"]:
-                self._set_aside("surplus", digest, self._tables["result"][digest])
-
-    def rewind(self, number: int, state: Any, seeds: Sequence[int]) -> None:
-        for (digest, worker), (because, row) in list(self._tables["recalled"].items()):
-            if because == "surplus" and row[0].generation == number:
-                self._put("recalled", (digest, worker), None)
-                self._put("result", digest, row)
-            elif because == "surplus" and row[0].generation > number:
-                self._put("recalled", (digest, worker), ("rewound", row))
-        for digest, row in list(self._tables["result"].items()):
-            job = row[0]
-            if job.generation > number or (job.generation == number and job.kind != "score"):
-                self._set_aside("rewound", digest, row)
-        for digest, (job, _) in list(self._tables["failure"].items()):
-            if job.generation > number or (job.generation == number and job.kind != "score"):
-                self._put("failure", digest, None)
-        for table in ("evaluation", "collection"):
-            for each in [each for each in self._tables[table] if each >= number]:
-                self._put(table, each, None)
-        for each in [each for each in self._tables["generation"] if each > number]:
-            self._put("generation", each, None)
-        row = self._tables["generation"][number]
-        first = {"vectors": row["first"], "first": row["first"], "redrawn": ()}
-        self._put(
-            "generation", number, {"state": row["state"], **first, "seeds": tuple(seeds), "restored": _Packed(state)}
-        )
-        self._settle_recall()
-
-    @property
-    def has_set_aside(self) -> bool:
-        return any(because == "rewound" for because, _ in self._tables["recalled"].values())
-
-    def take_back(self, digests: Sequence[bytes]) -> None:
-        found = {digest: (key, row) for key, (because, row) in self._tables["recalled"].items()
-                 for digest in [key[0]] if because == "rewound" and digest in digests}  # fmt: skip
-        for digest, (key, row) in found.items():
-            self._put("recalled", key, None)
-            if digest not in self._tables["result"]:
-                self._put("result", digest, row)
-
-    def recalled_rollouts(self) -> list[tuple[int, int]]:
-        """Nothing reads them, and the simulated folder is not there."""
-        return []
+        self.tables.witness.check_fitness(closed.number, found)
+        self.tables.put("generation", closed.number, {**row, "closed": closed, "fitness": found})
 
     def vectors_of(self, number: int) -> tuple[bytes, ...]:
-        vectors: tuple[bytes, ...] = self._tables["generation"][number]["vectors"]
+        vectors: tuple[bytes, ...] = self.tables.rows["generation"][number]["vectors"]
         return vectors
 
     def redraws_of(self, number: int) -> list[list[int]]:
-        return [list(each) for each in self._tables["generation"][number]["redrawn"]]
+        return [list(each) for each in self.tables.rows["generation"][number]["redrawn"]]
 
     def seeds_of(self, number: int) -> list[int]:
-        return list(self._tables["generation"][number]["seeds"])
+        return list(self.tables.rows["generation"][number]["seeds"])
 
     def scores_of(self, number: int, axes: int) -> tuple[Any, Any]:
-        return np.array(self._tables["generation"][number]["fitness"], dtype=np.float64), None
+        return np.array(self.tables.rows["generation"][number]["fitness"], dtype=np.float64), None
 
     def schedule_evaluation(self, evaluation: Evaluation) -> None:
-        self._insert("evaluation", evaluation.generation, (evaluation, None))
+        self.tables.insert("evaluation", evaluation.generation, (evaluation, None))
 
     def finish_evaluation(self, generation: int, found: StoredEvaluation | None, failed: int) -> None:
         if found is None or failed:
             raise Violation("raised", "a simulated run pauses where an episode fails")
-        self._witness.evaluated(generation, found.mean, found.std)
-        evaluation, _ = self._tables["evaluation"][generation]
-        self._put("evaluation", generation, (evaluation, found))
+        self.tables.witness.evaluated(generation, found.mean, found.std)
+        evaluation, _ = self.tables.rows["evaluation"][generation]
+        self.tables.put("evaluation", generation, (evaluation, found))
 
     def add_failure(self, job: Job, error: Failure, workers: Sequence[str], attempts: int) -> None:
-        self._witness.failed(job)
-        self._insert("failure", job.digest, (job, tuple(workers)))
+        self.tables.witness.failed(job)
+        self.tables.insert("failure", job.digest, (job, tuple(workers)))
 
     def drop_failures(self, generation: int) -> None:
-        of_it = [digest for digest, (job, _) in self._tables["failure"].items()
+        of_it = [digest for digest, (job, _) in self.tables.rows["failure"].items()
                  if job.kind == "score" and job.generation == generation]  # fmt: skip
         self.drop_failures_of(of_it)
 
     def drop_failures_of(self, digests: Sequence[bytes]) -> None:
         for digest in digests:
-            self._put("failure", digest, None)
+            self.tables.put("failure", digest, None)
 
     def set_seeds(self, generation: int, seeds: Sequence[int]) -> None:
-        self._put("generation", generation, {**self._tables["generation"][generation], "seeds": tuple(seeds)})
+        self.tables.put("generation", generation, {**self.tables.rows["generation"][generation], "seeds": tuple(seeds)})
 
     def redraw(self, generation: int, indices: Sequence[int], vectors: Sequence[bytes]) -> None:
-        row, new = self._tables["generation"][generation], dict(zip(indices, vectors, strict=True))
+        row, new = self.tables.rows["generation"][generation], dict(zip(indices, vectors, strict=True))
         now = tuple(new.get(index, vector) for index, vector in enumerate(row["vectors"]))
         rounds = (*row["redrawn"], tuple(indices))
-        self._witness.redrawn(generation, len(rounds), now)
-        self._put("generation", generation, {**row, "vectors": now, "redrawn": rounds})
+        self.tables.witness.redrawn(generation, len(rounds), now)
+        self.tables.put("generation", generation, {**row, "vectors": now, "redrawn": rounds})
 
     def schedule_collection(self, collection: RolloutCollection) -> None:
-        self._insert("collection", collection.generation, collection)
+        self.tables.insert("collection", collection.generation, collection)
 
     def scheduled_collections(self) -> list[RolloutCollection]:
-        return [row for _, row in sorted(self._tables["collection"].items())]
+        return [row for _, row in sorted(self.tables.rows["collection"].items())]
 
     def last_generation(self) -> StoredOpenGeneration | None:
-        numbers = self._tables["generation"]
+        numbers = self.tables.rows["generation"]
         return self.generation(max(numbers)) if numbers else None
 
     def generation(self, number: int) -> StoredOpenGeneration | None:
-        row = self._tables["generation"].get(number)
-        if row is None or number < max(self._tables["generation"]) - 1:
+        row = self.tables.rows["generation"].get(number)
+        if row is None or number < max(self.tables.rows["generation"]) - 1:
             return None
         state = row["restored"].data if "restored" in row else row["state"].packed()
         return StoredOpenGeneration(number, state, row["seeds"], row["vectors"], row["redrawn"])
 
     def read_closed(self) -> tuple[list[StoredGeneration], list[StoredEvaluation]]:
-        generations = [row["closed"] for _, row in sorted(self._tables["generation"].items()) if "closed" in row]
-        return generations, [done for _, (_, done) in sorted(self._tables["evaluation"].items()) if done]
-
-    def results_of(self, kind: str, generation: int) -> dict[bytes, KnownResult]:
-        rows = self._tables["result"].items()
-        found = {
-            digest: (result.fitness, result.steps, result.measures)
-            for digest, (job, result, *_) in rows
-            if job.kind == kind and job.generation == generation
-        }
-        failed = {digest: (nan, 0, ()) for digest, (job, _) in self._tables["failure"].items()
-                  if job.kind == kind and job.generation == generation}  # fmt: skip
-        return found | failed
+        generations = [row["closed"] for _, row in sorted(self.tables.rows["generation"].items()) if "closed" in row]
+        return generations, [done for _, (_, done) in sorted(self.tables.rows["evaluation"].items()) if done]
 
     def fitness_of(self, kind: Kind, digests: Sequence[bytes]) -> dict[bytes, float]:
-        rows = self._tables["result"]
-        failed = {digest: nan for digest in digests if digest in self._tables["failure"]}
-        return {digest: rows[digest][1].fitness for digest in digests if digest in rows} | failed
-
-    def index_scores(self) -> None:
-        pass
+        self.recalls.count_again(digests)
+        return self.results.fitness_of(kind, digests)
 
     def pending_evaluations(self) -> list[Evaluation]:
-        return [evaluation for _, (evaluation, done) in sorted(self._tables["evaluation"].items()) if done is None]
+        return [evaluation for _, (evaluation, done) in sorted(self.tables.rows["evaluation"].items()) if done is None]
 
     def finalists(self, count: int) -> list[Finalist]:
         first: dict[bytes, Finalist] = {}
-        for generation, (each, done) in sorted(self._tables["evaluation"].items()):
+        for generation, (each, done) in sorted(self.tables.rows["evaluation"].items()):
             if done is not None:
                 first.setdefault(each.vector, Finalist(generation, each.vector, done.episodes, done.mean))
         return sorted(first.values(), key=lambda each: (-each.mean, each.generation))[:count]
 
     def evaluated_vector(self, generation: int) -> bytes:
-        vector: bytes = self._tables["evaluation"][generation][0].vector
+        vector: bytes = self.tables.rows["evaluation"][generation][0].vector
         return vector
-
-    def _insert(self, table: str, key: Any, row: Any) -> None:
-        """As a table with a primary key does."""
-        if key in self._tables[table]:
-            raise Violation("counted twice", f"the journal's {table} holds {_key_text(key)} already")
-        self._put(table, key, row)
-
-    def _put(self, table: str, key: Any, row: Any) -> None:
-        _apply(self._tables[table], key, row)
-        self._pending.append((table, key, row))
 
 
 def _apply(rows: dict[Any, Any], key: Any, row: Any) -> None:

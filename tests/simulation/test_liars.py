@@ -9,7 +9,7 @@ from dreamfleet.common.errors import JournalError
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.run import recall
 from dreamfleet.coordinator.run.generations import Generations
-from tests.simulation.disk import MemoryJournal
+from tests.simulation.disk import MemoryRecalls
 from tests.simulation.liars import by_chance, campaign, for_a_candidate, one_flip, play_with, shape_of
 from tests.simulation.mutants import MUTANTS
 from tests.simulation.schedule import Fault, Schedule
@@ -122,7 +122,7 @@ def test_most_liars_are_barred_and_nobody_else():
     ("target", "name", "forgetful"),
     [
         (recall, "_first_affected", lambda brought, settings: None),
-        (MemoryJournal, "recall_results", lambda self, hosts: 0),
+        (MemoryRecalls, "recall", lambda self, hosts: 0),
         (Generations, "replay", lambda self, number: self._strategy.state()),
     ],
 )

@@ -30,6 +30,7 @@ from dreamfleet.common.runs.evaluation_report import read_evaluation_report
 from dreamfleet.common.runs.lookup import find_subspace
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.coordinator.settings.config import RunConfig
+from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.presets import find_preset
 from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.scoring.rollout import write_episode
@@ -267,7 +268,7 @@ def settings(folder):
         config = RunConfig(**find_preset(name))
         if config.subspace is not None:
             config = replace(config, loaded_subspace=find_subspace(config.subspace))
-        settings = config.settings(find_bundle("tiny"))
+        settings = freeze(config, find_bundle("tiny"))
         found[name] = [settings.to_json(), settings.task.digest("score", bytes(32), (SEED,)).hex()]
     return {"everywhere": {"journalled": journalled, "presets": found}}
 

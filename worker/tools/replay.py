@@ -22,7 +22,7 @@ from dreamfleet.common.protocol.tasks import module_of
 from dreamfleet.common.runs.own_runs import trust_own_run
 from dreamfleet.common.runs.records import StoredFailure, StoredResult
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.common.runs.scoring_params import ScoringParams, scoring_params_of
+from dreamfleet.common.runs.stages import Stage
 from dreamfleet.worker.scoring.failure_cause import crash, failure_of
 
 if TYPE_CHECKING:
@@ -97,10 +97,10 @@ def replay(
         check_trusted(module, f"task {run.spec.task!r}")
     with run.read_transaction():
         parameters = run.candidate(generation, candidate)
-        scoring_params, own = scoring_params_of(run, generation), run.spec
-        stored = _stored_episodes(run, generation, candidate, scoring_params)
+        stage, own = run.stage_at(generation).stage, run.spec
+        stored = _stored_episodes(run, generation, candidate, stage)
     failures = {each.episode: each.failure for each in stored if isinstance(each, StoredFailure)}
-    specs = {each.episode: scoring_params.episode_spec(each.episode) for each in stored}
+    specs = {each.episode: stage.episode_spec(each.episode) for each in stored}
     items = [
         (each.episode, parameters, each.seed, specs[each.episode])
         for each in stored
@@ -133,14 +133,14 @@ def _ends_process(failure: Failure | None) -> bool:
 
 
 def _stored_episodes(
-    run: RunFolder, generation: int, candidate: int, params: ScoringParams
+    run: RunFolder, generation: int, candidate: int, stage: Stage
 ) -> list[StoredResult | StoredFailure]:
     """The results and failures of a candidate's final vector on the generation's final seeds, by episode."""
     seeds = dict(enumerate(run.training_seeds(generation)))
     vector = hashlib.sha256(run.candidate(generation, candidate).astype("<f4").tobytes()).digest()
 
     def is_final(each: StoredResult | StoredFailure) -> bool:
-        digest = params.episode_spec(each.episode).digest("score", vector, (each.seed,))
+        digest = stage.episode_spec(each.episode).digest("score", vector, (each.seed,))
         return each.seed == seeds.get(each.episode) and bytes.fromhex(each.digest) == digest
 
     place = "score", generation, candidate

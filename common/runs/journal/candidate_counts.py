@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite
-from dreamfleet.common.runs.journal_reader import JournalReader
+from dreamfleet.common.runs.journal.journal_reader import JournalReader, digest_terms
 from dreamfleet.common.runs.records import RunSettings, StoredCandidate, StoredEvaluation, StoredGeneration
-from dreamfleet.common.runs.scoring_params import ScheduleState
+from dreamfleet.common.runs.stages import StageTracker
 
-SOME = 500  # variables of a query
 RESULTS = "SELECT digest, steps, seconds FROM result WHERE kind = 'score' AND generation = ?"
 RECALLED = "SELECT digest, steps, seconds FROM recalled WHERE kind = 'score' AND generation = ? AND was_closed"
 
@@ -27,7 +26,7 @@ class CandidateCounts:
         evaluations: Iterable[StoredEvaluation],
     ) -> None:  # fmt: skip
         self._journal, self._history = journal, history
-        self._schedule = ScheduleState(settings)
+        self._stages = StageTracker(settings)
         self._finished = {each.generation: each for each in evaluations}
         self._shares_results = settings.is_external  # among generations: batches of others repeat jobs
 
@@ -35,8 +34,8 @@ class CandidateCounts:
         """The candidates of a generation with its present seeds."""
         query = "SELECT number, vector, fitness FROM candidate WHERE generation = ? ORDER BY number"
         found = self._journal.rows("ibF", query, number)
-        params = self._schedule.scoring_params(number, self._history, self._finished)
-        jobs = [*params.job_digests((vector for _, vector, _ in found), seeds)]
+        stage = self._stages.advance_to(number, self._history, self._finished).stage
+        jobs = [*stage.job_digests((vector for _, vector, _ in found), seeds)]
         left = self._results(number)
         scored = {*left, *self._scored_elsewhere({each for own in jobs for each in own} - left.keys(), is_open=is_open)}
         lost = self._failed_jobs(number) if is_open else set()
@@ -70,9 +69,6 @@ class CandidateCounts:
 
     def _brought(self, missing: Collection[bytes]) -> Iterator[bytes]:
         """Those of these jobs that have a result, in any generation."""
-        jobs = [*missing]
-        for start in range(0, len(jobs), SOME):
-            some = jobs[start : start + SOME]
-            marks = ", ".join("?" * len(some))
-            query = f"SELECT DISTINCT digest FROM result WHERE kind = 'score' AND digest IN ({marks})"  # noqa: S608
+        for these, some in digest_terms([*missing]):
+            query = f"SELECT DISTINCT digest FROM result WHERE kind = 'score' AND {these}"  # noqa: S608
             yield from (digest for (digest,) in self._journal.rows("b", query, *some))

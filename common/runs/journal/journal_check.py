@@ -10,7 +10,7 @@ from typing import Any
 from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite
 from dreamfleet.common.runs.journal import checksums
 from dreamfleet.common.runs.journal.candidate_counts import CandidateCounts
-from dreamfleet.common.runs.journal_reader import JournalReader
+from dreamfleet.common.runs.journal.journal_reader import JournalReader
 from dreamfleet.common.runs.records import StoredCandidate, StoredGeneration
 
 TOLERANCE = 1e-9  # of a mean, as a part of the largest fitness: the writer summed in another order

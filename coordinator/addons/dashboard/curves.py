@@ -64,7 +64,9 @@ def curves(
     often = "of each generation" if every == 1 else f"every {every} generations"
     stages = begun_stages(settings, data.history, data.evaluations)
     steps = join_distinct(
-        describe_steps(each.stage.horizon, each.stage.driven, dreamt=dreamt, limit=data.episode_limit)
+        describe_steps(
+            each.stage.settings.task.horizon, each.stage.settings.driven, dreamt=dreamt, limit=data.episode_limit
+        )
         for each in stages
     )
     band, looks = _band(rows, quartiles, task), downsample(data.evaluations)

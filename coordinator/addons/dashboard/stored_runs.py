@@ -126,7 +126,7 @@ def _cell_texts(archive: EliteArchive) -> list[list[str]]:
 def read_quartiles(run: RunFolder, settings: RunSettings, drawn: Sequence[StoredGeneration]) -> Quartiles | None:
     """The fitness quartiles of these generations; `None` if they need more than `MOST_READ` bytes."""
     numbers = [each.number for each in drawn]
-    largest = max(each.population for each in stages_of(settings))
+    largest = max(each.settings.population for each in stages_of(settings))
     if len(numbers) * largest * settings.controller.size * 4 > MOST_READ:
         return None
     return run.quartiles(numbers)

@@ -8,6 +8,7 @@ from typing import Any
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.errors import UsageError
 from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, RunConfig
+from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.experiments.local_run import load_parsed_flags
@@ -54,5 +55,5 @@ def _check_settings(config: RunConfig, *, has_start: bool) -> list[str]:
     """Check the settings together; return the tasks that they name."""
     bundle = None if config.needs_no_bundle else find_bundle(config.bundle or DEFAULT_BUNDLE)
     if not has_start:  # a start point may name another world model
-        config.settings(bundle)
+        freeze(config, bundle)
     return [each for each in (config.task, bundle and bundle.manifest.task) if each]

@@ -19,6 +19,7 @@ from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_
 from dreamfleet.common.printable import plural
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, DEFAULT_HORIZON, RunConfig, default_world
+from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.experiments.iteration.config import IterateConfig
 
@@ -134,12 +135,12 @@ def _check_run(config: IterateConfig, run: RunConfig, layout: IterationFolder) -
 
     run = replace(run, recorded=0.0)  # a bundle need not hold recorded states yet
     if not config.init:
-        settings = run.settings(_stand_in(config))
+        settings = freeze(run, _stand_in(config))
     else:
         if is_file(Path(config.init)) and Path(config.init).is_relative_to(layout.root.resolve()):
             raise UsageError(f"--init {config.init} lies in the iteration's own folder: copy it elsewhere first")
         start, (_, bundle) = find_start(config.init, layout.runs), find_init(config.init, layout.runs)
-        settings = (start.apply_to(run) if config.go_on else run).settings(bundle)
+        settings = freeze(start.apply_to(run) if config.go_on else run, bundle)
         if config.go_on:
             start.check(settings, bundle)
     if config.go_on and settings.task.option("feedback") == "last":

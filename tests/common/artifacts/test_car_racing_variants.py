@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.actions import STEERING_AND_HALVES, STEERING_GAS_BRAKE
-from dreamfleet.common.artifacts.car_racing_variants import DEFAULT_VARIANT, OPTION_HELP, Variant
+from dreamfleet.common.artifacts.car_racing_variants import DEFAULT_VARIANT, Variant
 from dreamfleet.common.artifacts.world_facts import WorldFacts
 from dreamfleet.common.errors import UsageError
 
@@ -36,7 +36,7 @@ def test_options_round_trip(options):
 def test_the_default_variant_has_empty_options():
     assert (
         Variant.from_json("")
-        == Variant.from_values({"pedals": "two", "decide_every": 1, "time_cost": 0})
+        == Variant.from_json('{"pedals": "two", "decide_every": 1, "time_cost": 0}')
         == DEFAULT_VARIANT
     )
     assert (
@@ -69,7 +69,7 @@ def test_linear_outputs_are_the_action():
 
 def test_equal_numbers_give_equal_options():
     assert (
-        Variant.from_values({"time_cost": 2}).options
+        Variant.from_json('{"time_cost": 2}').options
         == '{"time_cost": 2.0}'
         == Variant.from_json('{"time_cost": 2}').options
     )
@@ -96,7 +96,7 @@ def test_feedback_adds_two_features_an_output():
 def test_the_error_for_an_unknown_option_lists_the_known_ones():
     with pytest.raises(UsageError, match=r"car-racing.* gears, pedal.* actions, pedals, pedal_shift, ") as raised:
         Variant.from_json('{"pedal": "one", "gears": 5}')
-    assert all(name in str(raised.value) for name in OPTION_HELP)
+    assert all(name in str(raised.value) for name in Variant.HELP)
     assert "\n" not in str(raised.value)
 
 
@@ -116,7 +116,7 @@ def test_the_error_for_a_value_out_of_range_describes_the_range(name, values):
     for value in values:
         with pytest.raises(UsageError) as raised:
             Variant.from_json(json.dumps({name: value}))
-        assert all(each in str(raised.value) for each in (name, OPTION_HELP[name], repr(value)))
+        assert all(each in str(raised.value) for each in (name, Variant.HELP[name], repr(value)))
 
 
 @pytest.mark.parametrize("options", ["{", "[1]", "7", '"one"'])

@@ -1,13 +1,16 @@
-"""Delta bundles: shipped without the parts of their base, and rebuilt."""
+"""Delta bundles: shipped without the parts of their base, and rebuilt. Tests bundle_store.py."""
 
+import json
 import re
+from zipfile import ZipFile
 
 import pytest
 
 from dreamfleet.common.artifacts import bundle_store
-from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, Bundle, write_bundle
-from dreamfleet.common.artifacts.bundle_store import BundleStore, find_bundle, write_shipped_delta
+from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, MANIFEST, Bundle, write_bundle
+from dreamfleet.common.artifacts.bundle_store import DELTA_MANIFEST, BundleStore, find_bundle
 from dreamfleet.common.errors import BundleError
+from dreamfleet.common.files.archives import write_archive
 from tests.support.bundles import states, write_random_bundle
 
 
@@ -23,7 +26,10 @@ def shelf(tmp_path, monkeypatch):
     shared = {name: base.read(name) for name in base.manifest.parts}
     own = {name: other.read(name) for name in other.manifest.parts.keys() - shared.keys()}
     whole = write_bundle(tmp_path / "whole.zip", other.manifest, {**shared, **own})
-    write_shipped_delta(whole, "base", folder / "able.lean")
+    about = {"sha256": whole.sha256, "base": "base", "parts": [MANIFEST, *sorted(whole.manifest.parts)]}
+    with (folder / "able.lean").open("wb") as file, ZipFile(whole.path) as members:
+        own_parts = [(name, members.read(name)) for name in (MANIFEST, *sorted(own))]
+        write_archive(file, [(DELTA_MANIFEST, json.dumps(about).encode()), *own_parts])
     return folder, whole
 
 

@@ -1,3 +1,5 @@
+"""Tests driving.py and world_driving.py."""
+
 import json
 
 import pytest
@@ -38,7 +40,7 @@ def test_feedback_is_two_features_for_each_output():
 
 
 def test_options_are_also_texts():
-    assert WorldDriving(FACTS, 4, "last").option_texts == ("decide_every=4", "feedback=last")
+    assert WorldDriving(FACTS, decide_every=4, feedback="last").option_texts == ("decide_every=4", "feedback=last")
 
 
 @pytest.mark.parametrize(

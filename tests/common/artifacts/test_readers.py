@@ -1,5 +1,5 @@
 """Files from untrusted sources, damaged in thousands of ways: each is read, or is a one-line error.
-Tests task_options.py and coordinator/settings/task_options.py."""
+Tests task_options.py."""
 
 import hashlib
 import io
@@ -197,7 +197,7 @@ def test_damaged_settings(tmp_path, watched):
 @pytest.mark.slow
 def test_damaged_task_options(watched):
     from dreamfleet.coordinator.settings.config import RunConfig
-    from dreamfleet.coordinator.settings.task_options import check_normalisation
+    from dreamfleet.coordinator.settings.freezing import check_normalisation
 
     whole = b'{"environment": {"a": 1}, "normal": {"mean": [0.5, 1.5], "deviation": [1.0, 2.0]}}'
     source = random.Random(4)

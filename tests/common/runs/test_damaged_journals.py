@@ -1,5 +1,5 @@
 """Damaged journals: each value is read, or is a one-line error.
-Tests journal_reader.py, run_folder.py and schema.py."""
+Tests run_folder.py, common/runs/journal/journal_reader.py and common/runs/journal/schema.py."""
 
 import json
 import os
@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from dreamfleet.common.errors import JournalError
+from dreamfleet.common.runs.journal.schema import APPLICATION_ID, VERSION
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
-from dreamfleet.common.runs.schema import APPLICATION_ID, VERSION
 from tests.support.mutations import mutate
 
 RUNS = Path(__file__).parents[2] / "fixtures" / "runs"

@@ -11,6 +11,7 @@ from dreamfleet.common.errors import ConnectionFailedError, UsageError
 from dreamfleet.common.runs import lookup
 from dreamfleet.common.runs.lookup import find_subspace, naming_the_stored_run
 from dreamfleet.coordinator.settings.config import RunConfig
+from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.storage.journal import Journal
 
 
@@ -52,7 +53,7 @@ def test_where_no_coordinator_answers_the_stored_run_is_named(tmp_path, random_b
 
     assert refused("night") == refused(None) == "no one answers"
     (tmp_path / "night").mkdir()
-    journal = Journal.create(tmp_path / "night", RunConfig().settings(random_bundle), random_bundle.path)
+    journal = Journal.create(tmp_path / "night", freeze(RunConfig(), random_bundle), random_bundle.path)
     assert re.search("night.* coordinator --resume night", refused("night"))
     journal.set_fact("ended", "3 generations")
     journal.commit()

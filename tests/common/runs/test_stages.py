@@ -1,3 +1,4 @@
+import hashlib
 import itertools
 from dataclasses import replace
 
@@ -5,8 +6,7 @@ import pytest
 
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.runs.records import RunSettings, StageSettings, StoredEvaluation, StoredGeneration
-from dreamfleet.common.runs.scoring_params import ScheduleState, scoring_params_at
-from dreamfleet.common.runs.stages import begun_stages, describe_stages, stages_of
+from dreamfleet.common.runs.stages import StageTracker, begun_stages, describe_stages, stage_at, stages_of
 from tests.support.samples import SPEC
 
 EVERY = 2
@@ -27,14 +27,15 @@ def evaluated(means):
 
 def numbers(settings, closed, evaluations=()):
     """The stage of each generation."""
-    return [scoring_params_at(number, settings, closed, evaluations).stage.number for number in range(len(closed) + 1)]
+    return [stage_at(number, settings, closed, evaluations).stage.number for number in range(len(closed) + 1)]
 
 
 def test_unchanged_settings_are_those_of_the_stage_before():
     stages = stages_of(scheduled(
         StageSettings(3), StageSettings(2, horizon=400, racing=True), StageSettings(population=9, patience=0),
     ))  # fmt: skip
-    assert [(each.horizon, each.patience, each.racing, each.population, each.sigma0) for each in stages] == [
+    named = ("horizon", "patience", "racing", "population", "sigma0")
+    assert [tuple(each.values[name] for name in named) for each in stages] == [
         (1000, 100, False, 6, 0.1), (400, 100, True, 6, 0.1), (400, 0, True, 9, 0.1),
     ]  # fmt: skip
 
@@ -135,8 +136,8 @@ def test_a_restart_is_a_search_of_its_own():
 def test_later_evaluations_and_their_order_do_not_matter():
     settings = scheduled(StageSettings(score=50.0), StageSettings(horizon=50))
     for order in itertools.permutations(evaluated({1: 10.0, 3: 50.0, 5: 90.0, 7: 0.0})):
-        assert scoring_params_at(5, settings, history(*[10] * 9), order).stage.number == 1
-        assert scoring_params_at(6, settings, history(*[10] * 9), order).begun.since == 6
+        assert stage_at(5, settings, history(*[10] * 9), order).stage.number == 1
+        assert stage_at(6, settings, history(*[10] * 9), order).since == 6
 
 
 @pytest.mark.parametrize(
@@ -145,9 +146,9 @@ def test_later_evaluations_and_their_order_do_not_matter():
     ids=["generations", "score"],
 )
 def test_a_generation_requires_an_evaluation_only_if_a_score_may_end_its_stage(end, required_evaluation):
-    agenda, found = ScheduleState(scheduled(end, StageSettings())), []
+    agenda, found = StageTracker(scheduled(end, StageSettings())), []
     for number in range(8):
-        agenda.scoring_params(number, history(*[10] * number), {})
+        agenda.advance_to(number, history(*[10] * number), {})
         found.append(agenda.required_evaluation(number + 1))
     assert found == required_evaluation
 
@@ -164,13 +165,13 @@ def test_stages_and_their_reasons_are_described():
 def test_candidates_are_scored_with_their_stage_and_temperature():
     warm = replace(PLAIN, task=replace(SPEC, temperature=1.0))
     settings = replace(warm, stages=(StageSettings(4), StageSettings(horizon=50, patience=0)))
-    spec = scoring_params_at(6, settings, history(*[10] * 6), ()).spec
+    spec = stage_at(6, settings, history(*[10] * 6), ()).stage.settings.task
     assert spec == replace(SPEC, horizon=50, patience=0, temperature=1.0)
 
 
 def test_settings_and_digests_without_a_schedule_are_unchanged():
     assert '"stages"' not in PLAIN.to_json()
-    assert scoring_params_at(5, PLAIN, history(*[10] * 5), ()).spec == SPEC
+    assert stage_at(5, PLAIN, history(*[10] * 5), ()).stage.settings.task == SPEC
     written = "32b5b1f8a6bee0b22ed62a5034cdf1657709a3c7b15707ad38a792110c7c9de4"
     assert SPEC.with_overrides(horizon=SPEC.horizon).digest("score", b"x" * 32, (1,)).hex() == written
 
@@ -179,3 +180,16 @@ def test_a_schedule_is_stored_without_unchanged_settings():
     settings = scheduled(StageSettings(3, score=5.0), StageSettings(horizon=400, racing=False))
     assert RunSettings.from_json(settings.to_json()) == settings
     assert '"stages": [{"generations": 3, "score": 5.0}, {"horizon": 400, "racing": false}]' in settings.to_json()
+
+
+def test_jobs_are_named_by_vector_seed_and_the_specification_of_their_episode():
+    dreams = replace(PLAIN, task=replace(SPEC, task="dream", temperature=1.0), driven=0.5)
+    (stage,) = stages_of(dreams)
+    specs = [stage.episode_spec(episode) for episode in range(2)]
+    assert specs == [replace(dreams.task, driven=True), dreams.task]
+    vectors, seeds = (b"x" * 12, b"y" * 12), (7, 8)
+    identities = [hashlib.sha256(vector).digest() for vector in vectors]
+    assert [*stage.job_digests(vectors, seeds)] == [
+        [spec.digest("score", identity, (seed,)) for spec, seed in zip(specs, seeds, strict=True)]
+        for identity in identities
+    ]

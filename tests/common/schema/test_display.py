@@ -13,8 +13,8 @@ from dreamfleet.common.artifacts.trained_agent import AgentManifest, TrainedAgen
 from dreamfleet.common.client.status import WorkerStatus, read_document, read_status
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
-from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.schema.display import DisplayedFields
+from dreamfleet.coordinator.views.stored_run import StoredRun
 
 GOLDEN, RUNS = Path(__file__).parents[1] / "golden", Path(__file__).parents[2] / "fixtures" / "runs"
 SHAPE = ControllerShape(4, 2, hidden=3)
@@ -81,7 +81,7 @@ def test_a_worker_has_a_name_that_its_next_process_shares():
 
 
 def test_a_run_is_shown_live_ended_or_closed(tmp_path):
-    with RunFolder(RUNS / "reality") as run:
+    with StoredRun(RUNS / "reality") as run:
         caption, facts = table_of(run)
         assert repr(run) == f"<{caption}>" == "<Run reality of car-racing: 3 generations, ended: 3 generations>"
         assert facts["best evaluation"].startswith("-27.5 ± ")

@@ -163,5 +163,5 @@ def test_fresh_seeds_differ_from_batch_to_batch(door):
         door.submit(each, seeds=(), episodes=number) for each, number in (("a", 3), ("b", 3), ("c", 0))
     )
     assert (first.episodes, second.episodes, third.episodes) == (3, 3, SETTINGS.episodes)
-    seeds = [door.journal.batch(each).seeds for each in "abc"]
+    seeds = [door.journal.batches.find(each).seeds for each in "abc"]
     assert len({each for some in seeds for each in some}) == 8

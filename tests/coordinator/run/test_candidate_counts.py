@@ -134,7 +134,7 @@ def test_batches_of_others_share_results_and_keep_them_after_a_recall(tmp_path):
         before = run.candidates(), [each.steps for each in run.history()]
         assert [each.episodes for each in before[0]] == [2, 2, 3, 3, 3, 2, 0, 0]
         assert [sum(each.steps for each in before[0] if each.generation == number) for number in range(3)] == before[1]
-    door.journal.bar("a", StoredBar("a test"), 1)
+    door.journal.verification.bar("a", StoredBar("a test"), 1)
     recall(door.journal, batch_door.SETTINGS, {"a"})
     door.journal.commit()
     with RunFolder(door.path) as run:

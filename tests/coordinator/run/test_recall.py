@@ -11,8 +11,7 @@ from dreamfleet.common.errors import JournalError, NotWritableNowError, UsageErr
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_paths import CONTROLLER
-from dreamfleet.common.runs.scoring_params import ScheduleState
-from dreamfleet.common.runs.stages import stages_of
+from dreamfleet.common.runs.stages import StageTracker, stages_of
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
 from dreamfleet.coordinator.run.failure_limit import LIMIT_FROM
@@ -136,15 +135,15 @@ def test_what_a_candidate_has_that_failed_for_a_while_is_checked_once_it_is_scor
     bench.serve(stop=lambda run: len(run.history) > 0)
     scored = "SELECT digest FROM result WHERE kind = 'score' AND generation = 0"
     checked = "SELECT digest FROM verification WHERE stands AND outcome = 'equal'"
-    assert len(bench.journal._read(scored)) == 24
-    assert not bench.journal._read(f"{scored} EXCEPT {checked}")
+    assert len(bench.journal.read(scored)) == 24
+    assert not bench.journal.read(f"{scored} EXCEPT {checked}")
     bench.journal.close()
 
 
 def new_generations(bench):
     closed, evaluations = bench.journal.read_closed()
     finished = {each.generation: each for each in evaluations}
-    return Generations(bench.journal, bench.settings, ScheduleState(bench.settings), History(closed), finished)
+    return Generations(bench.journal, bench.settings, StageTracker(bench.settings), History(closed), finished)
 
 
 def next_population(settings, state):
@@ -191,17 +190,17 @@ def test_candidates_that_were_drawn_anew_are_drawn_anew_again(tmp_path, random_b
 
 def test_what_other_hosts_scored_in_dropped_generations_is_not_scored_again(tmp_path, random_bundle):
     bench = ended(tmp_path, random_bundle.path, settings_of("cma"))
-    mine = {digest for (digest,) in bench.journal._read("SELECT digest FROM result WHERE worker LIKE 'b/%'")}
+    mine = {digest for (digest,) in bench.journal.read("SELECT digest FROM result WHERE worker LIKE 'b/%'")}
     recall(bench.journal, bench.settings, {"a"})
     bench.journal.commit()
-    aside = {digest for (digest,) in bench.journal._read("SELECT digest FROM recalled WHERE because = 'rewound'")}
+    aside = {digest for (digest,) in bench.journal.read("SELECT digest FROM recalled WHERE because = 'rewound'")}
     assert aside
     assert aside <= mine
     bench.restart()
     bench.serve()
     assert bench.run.state.ended
     again = "SELECT digest FROM result WHERE worker LIKE 'b/%' AND incarnation = 1"
-    assert {digest for (digest,) in bench.journal._read(again)} == mine
+    assert {digest for (digest,) in bench.journal.read(again)} == mine
 
 
 def test_what_a_host_brought_to_dropped_generations_counts_no_more_once_it_is_barred(tmp_path, random_bundle):
@@ -210,17 +209,17 @@ def test_what_a_host_brought_to_dropped_generations_counts_no_more_once_it_is_ba
     for host in ("a", "b"):
         recall(bench.journal, bench.settings, {host})
     bench.journal.commit()
-    assert set(bench.journal._read("SELECT because FROM recalled")) == {("barred",)}
+    assert set(bench.journal.read("SELECT because FROM recalled")) == {("barred",)}
     bench.restart()
     bench.serve()
     assert bench.run.state.ended
-    assert not bench.journal._read("SELECT 1 FROM result WHERE incarnation = 1")
+    assert not bench.journal.read("SELECT 1 FROM result WHERE incarnation = 1")
     assert outcome(bench) == before
 
 
 def test_a_journal_of_another_host_is_not_rewound(tmp_path, random_bundle):
     bench = ended(tmp_path, random_bundle.path, settings_of("cma"))
-    bench.journal._write("UPDATE candidate SET vector = ? WHERE generation = 0 AND number = 0", bytes(24))
+    bench.journal.write("UPDATE candidate SET vector = ? WHERE generation = 0 AND number = 0", bytes(24))
     with pytest.raises(JournalError):
         new_generations(bench).replay(2)
 
@@ -269,7 +268,7 @@ def test_a_host_is_barred_from_a_run_that_has_ended_and_comes_again(tmp_path, ra
     bench.begin()
     bench.serve()
     assert outcome(bench) == before
-    assert {worker for (worker,) in bench.journal._read("SELECT DISTINCT worker FROM result")} == {B}
+    assert {worker for (worker,) in bench.journal.read("SELECT DISTINCT worker FROM result")} == {B}
     bench.journal.close()
     bar_stored(bench.path, "a", is_barred=False)
     with RunFolder(bench.path) as run:

@@ -1,4 +1,4 @@
-"""Tests config.py, bounds.py, limits.py, network.py, presets.py and run_checks.py."""
+"""Tests config.py, freezing.py, bounds.py, limits.py, network.py and presets.py."""
 
 import json
 
@@ -14,6 +14,7 @@ from dreamfleet.common.runs.lookup import find_subspace
 from dreamfleet.common.runs.records import RunSettings, StageSettings
 from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.coordinator.settings.config import RunConfig, config_values
+from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.presets import PRESETS, find_preset
 from dreamfleet.coordinator.settings.start import StartPoint
 from dreamfleet.worker.tasks.api import Task
@@ -31,12 +32,12 @@ from tests.support.bundles import states, write_random_bundle
 )
 def test_a_runs_controller_is_as_configured_and_journalled(random_bundle, flags, size):
     config = RunConfig(bundle=str(random_bundle.path), **flags)
-    settings = config.settings(random_bundle)
+    settings = freeze(config, random_bundle)
     assert settings.controller.size == size
     assert (settings.task.controller is None) == (not flags)
     assert RunSettings.from_json(settings.to_json()) == settings
     again = config_values(settings, random_bundle.path)
-    assert RunConfig(**again).settings(random_bundle) == settings
+    assert freeze(RunConfig(**again), random_bundle) == settings
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS.keys() - {"takecover", "takecover-real", "pixels"}))
@@ -44,15 +45,15 @@ def test_a_preset_of_a_run_is_one_that_can_begin_and_be_configured_again(name):
     bundle = find_bundle("tiny")
     preset = dict(PRESETS[name])
     loaded_subspace = find_subspace(preset["subspace"]) if "subspace" in preset else None
-    settings = RunConfig(**preset, loaded_subspace=loaded_subspace).settings(bundle)
+    settings = freeze(RunConfig(**preset, loaded_subspace=loaded_subspace), bundle)
     assert (
-        RunConfig(**config_values(settings, bundle.path), loaded_subspace=loaded_subspace).settings(bundle) == settings
+        freeze(RunConfig(**config_values(settings, bundle.path), loaded_subspace=loaded_subspace), bundle) == settings
     )
     assert RunSettings.from_json(settings.to_json()) == settings
 
 
 def test_a_default_controller_leaves_the_words_of_the_first_version(random_bundle):
-    text = json.loads(RunConfig().settings(random_bundle).to_json())
+    text = json.loads(freeze(RunConfig(), random_bundle).to_json())
     assert text["controller"] == {"features": 288, "actions": 3}
     assert not {"features", "racing"} & text.keys()
     assert "controller" not in text["task"]
@@ -67,13 +68,13 @@ def test_jobs_of_other_controllers_have_other_digests(random_bundle):
 
 def test_a_share_of_recorded_states_is_frozen_with_a_dream_and_can_be_configured_again(tmp_path):
     bundle = write_random_bundle(tmp_path / "b.zip", recorded=states(3))
-    settings = RunConfig(task="dream", recorded=0.5).settings(bundle)
+    settings = freeze(RunConfig(task="dream", recorded=0.5), bundle)
     assert (settings.task.recorded, settings.task.version, settings.task.options) == (0.5, 1, "")
     assert RunSettings.from_json(settings.to_json()) == settings
-    assert RunConfig(**config_values(settings, bundle.path)).settings(bundle) == settings
-    plain = RunConfig(task="dream").settings(bundle)
+    assert freeze(RunConfig(**config_values(settings, bundle.path)), bundle) == settings
+    plain = freeze(RunConfig(task="dream"), bundle)
     assert "recorded" not in plain.to_json()
-    assert RunConfig(task="dream", recorded=0.0).settings(bundle) == plain
+    assert freeze(RunConfig(task="dream", recorded=0.0), bundle) == plain
     assert settings.task.digest("score", b"x", (1,)) != plain.task.digest("score", b"x", (1,))
     assert settings.task.with_overrides(100, 50).recorded == 0.5
 
@@ -90,7 +91,7 @@ def test_a_share_of_recorded_states_is_frozen_with_a_dream_and_can_be_configured
 )
 def test_recorded_states_that_there_are_not_are_refused_in_one_line(random_bundle, changes):
     with pytest.raises(DreamfleetError, match="--recorded") as error:
-        RunConfig(**changes).settings(random_bundle)
+        freeze(RunConfig(**changes), random_bundle)
     assert "\n" not in str(error.value)
 
 
@@ -106,20 +107,20 @@ def test_recorded_states_that_there_are_not_are_refused_in_one_line(random_bundl
     ],
 )
 def test_a_variant_is_frozen_with_a_run_and_can_be_configured_again(random_bundle, texts, options, shape):
-    settings = RunConfig(variant=texts).settings(random_bundle)
+    settings = freeze(RunConfig(variant=texts), random_bundle)
     assert json.loads(settings.task.options) == options
     assert (settings.controller.features, settings.controller.actions) == shape
     assert (settings.task.controller is None) == (shape == (288, 3))
     assert RunSettings.from_json(settings.to_json()) == settings
-    assert RunConfig(**config_values(settings, random_bundle.path)).settings(random_bundle) == settings
-    plain = RunConfig().settings(random_bundle)
+    assert freeze(RunConfig(**config_values(settings, random_bundle.path)), random_bundle) == settings
+    plain = freeze(RunConfig(), random_bundle)
     assert settings.task.digest("score", b"x", (1,)) != plain.task.digest("score", b"x", (1,))
-    assert RunConfig(variant=texts, task="dream").settings(random_bundle) if "time_cost=1" not in texts else True
+    assert freeze(RunConfig(variant=texts, task="dream"), random_bundle) if "time_cost=1" not in texts else True
 
 
 def test_a_variant_that_says_nothing_leaves_the_words_of_the_first_version(random_bundle):
-    said = RunConfig(variant=("pedals=two", "decide_every=1", "feedback=none")).settings(random_bundle)
-    assert said.to_json() == RunConfig().settings(random_bundle).to_json()
+    said = freeze(RunConfig(variant=("pedals=two", "decide_every=1", "feedback=none")), random_bundle)
+    assert said.to_json() == freeze(RunConfig(), random_bundle).to_json()
 
 
 @pytest.mark.parametrize(
@@ -128,7 +129,7 @@ def test_a_variant_that_says_nothing_leaves_the_words_of_the_first_version(rando
     ids=["all", "later"],
 )
 def test_a_run_of_task_dream_that_drives_too_may_charge_its_drives(random_bundle, driven):
-    found = RunConfig(task="dream", variant=("offroad_cost=2",), **driven).settings(random_bundle)
+    found = freeze(RunConfig(task="dream", variant=("offroad_cost=2",), **driven), random_bundle)
     assert found.task.options == '{"offroad_cost": 2.0}'
 
 
@@ -147,21 +148,21 @@ def test_a_run_of_task_dream_that_drives_too_may_charge_its_drives(random_bundle
 )
 def test_a_variant_that_there_is_not_is_refused_in_one_line(random_bundle, changes, names):
     with pytest.raises(UsageError, match=names) as error:
-        RunConfig(**changes).settings(random_bundle)
+        freeze(RunConfig(**changes), random_bundle)
     assert "\n" not in str(error.value)
 
 
 def test_a_start_that_drives_otherwise_is_refused_and_one_that_pays_otherwise_is_not(random_bundle):
     one_pedal = StartPoint(np.zeros(578), random_bundle.sha256, "run night", '{"pedals": "one"}')
-    one_pedal.check(RunConfig(variant=("pedals=one", "time_cost=1")).settings(random_bundle), random_bundle)
+    one_pedal.check(freeze(RunConfig(variant=("pedals=one", "time_cost=1")), random_bundle), random_bundle)
     for variant in ((), ("pedals=one", "decide_every=4")):
         with pytest.raises(ControllerError, match=r'run night .*{"pedals": "one"}.*--variant'):
-            one_pedal.check(RunConfig(variant=variant).settings(random_bundle), random_bundle)
+            one_pedal.check(freeze(RunConfig(variant=variant), random_bundle), random_bundle)
     with pytest.raises(ControllerError, match=r'{"decide_every": 4}'):
         StartPoint(np.zeros(867), random_bundle.sha256, "run night").check(
-            RunConfig(variant=("decide_every=4",)).settings(random_bundle), random_bundle
+            freeze(RunConfig(variant=("decide_every=4",)), random_bundle), random_bundle
         )
-    assert one_pedal.apply_to(RunConfig()).settings(random_bundle).task.options == one_pedal.options
+    assert freeze(one_pedal.apply_to(RunConfig()), random_bundle).task.options == one_pedal.options
 
 
 HALF, HELD = '{"pedals": "half"}', '{"decide_every": 2, "pedals": "half"}'
@@ -178,18 +179,18 @@ HALF, HELD = '{"pedals": "half"}', '{"decide_every": 2, "pedals": "half"}'
 )
 def test_what_is_said_of_a_variant_is_stronger_than_the_presets_name_by_name(random_bundle, texts, options):
     found = load(RunConfig, "run", file={"run": {"preset": "article", "variant": list(texts)}}, preset=find_preset)
-    assert found.settings(random_bundle).task.options == options
+    assert freeze(found, random_bundle).task.options == options
 
 
 def test_a_presets_variant_is_no_matter_of_worlds_without_a_world_model():
     found = load(RunConfig, "run", file={"run": {"preset": "article", "task": "gym:CartPole-v1"}}, preset=find_preset)
-    assert found.settings(None).task == RunConfig(task="gym:CartPole-v1").settings(None).task
+    assert freeze(found, None).task == freeze(RunConfig(task="gym:CartPole-v1"), None).task
 
 
 def test_a_preset_with_a_world_model_is_of_that_world_alone():
     found = load(RunConfig, "run", file={"run": {"preset": "real", "task": "gym:CartPole-v1"}}, preset=find_preset)
     with pytest.raises(UsageError, match=r"real .*car-racing.*gym:CartPole-v1.*--preset"):
-        found.settings(None)
+        freeze(found, None)
 
 
 @pytest.mark.parametrize(
@@ -205,7 +206,7 @@ def test_a_preset_with_a_world_model_is_of_that_world_alone():
 def test_a_start_keeps_its_way_of_driving_whatever_a_preset_does(random_bundle, own, texts, options):
     config = RunConfig(preset="article", variant=texts, preset_variant=("pedals=half",))
     start = StartPoint(np.zeros(867), random_bundle.sha256, "run night", own)
-    settings = start.apply_to(config).settings(random_bundle)
+    settings = freeze(start.apply_to(config), random_bundle)
     start.check(settings, random_bundle)
     assert settings.task.options == options
 
@@ -225,21 +226,21 @@ def test_what_a_preset_lets_candidates_pay_is_stronger_than_what_a_starts_paid(
     given = {} if task is None else {"task": task}
     config = RunConfig(preset="real", variant=texts, preset_variant=("offroad_cost=0.5",), **given)
     start = StartPoint(np.zeros(867), random_bundle.sha256, "run night", own)
-    assert start.apply_to(config).settings(random_bundle).task.options == options
+    assert freeze(start.apply_to(config), random_bundle).task.options == options
 
 
 def test_the_dream_of_a_start_that_paid_has_no_price(random_bundle):
     start = StartPoint(np.zeros(867), random_bundle.sha256, "run night", '{"offroad_cost": 2.0}')
-    assert start.apply_to(RunConfig(task="dream")).settings(random_bundle).task.options == ""
+    assert freeze(start.apply_to(RunConfig(task="dream")), random_bundle).task.options == ""
     with pytest.raises(UsageError, match=r"offroad_cost.*--variant"):
-        RunConfig(task="dream", preset_variant=("offroad_cost=2",)).settings(random_bundle)
+        freeze(RunConfig(task="dream", preset_variant=("offroad_cost=2",)), random_bundle)
 
 
 def test_a_start_of_another_length_is_refused(random_bundle):
     start = StartPoint(np.zeros(867), random_bundle.sha256, "run night")
-    start.check(RunConfig().settings(random_bundle), random_bundle)
+    start.check(freeze(RunConfig(), random_bundle), random_bundle)
     with pytest.raises(ControllerError, match=r"867 .*99"):
-        start.check(RunConfig(features="z").settings(random_bundle), random_bundle)
+        start.check(freeze(RunConfig(features="z"), random_bundle), random_bundle)
 
 
 @pytest.mark.parametrize("temperature", [0.0, -1.0, 5000.0, float("nan"), float("inf")])
@@ -257,14 +258,14 @@ def test_an_optimiser_is_journalled_and_can_be_configured_again(random_bundle):
     config = RunConfig(
         optimiser="tests.support.optimisers:ParentsAndChildren", optimiser_options=("parents=2", ""), features="z"
     )
-    settings = config.settings(random_bundle)
+    settings = freeze(config, random_bundle)
     assert settings.optimiser_options == ("parents=2",)
     assert RunSettings.from_json(settings.to_json()) == settings
-    assert RunConfig(**config_values(settings, random_bundle.path)).settings(random_bundle) == settings
+    assert freeze(RunConfig(**config_values(settings, random_bundle.path)), random_bundle) == settings
 
 
 def test_a_run_that_says_nothing_of_optimisers_keeps_the_words_of_the_first_version(random_bundle):
-    text = json.loads(RunConfig().settings(random_bundle).to_json())
+    text = json.loads(freeze(RunConfig(), random_bundle).to_json())
     assert not {"optimiser", "optimiser_options"} & text.keys()
     assert RunSettings.from_json(json.dumps(text)).optimiser == "cma"
 
@@ -282,7 +283,7 @@ def test_a_run_that_says_nothing_of_optimisers_keeps_the_words_of_the_first_vers
 )
 def test_what_an_optimiser_cannot_do_is_refused_before_there_is_a_run(random_bundle, changes, names):
     with pytest.raises(UsageError, match=names):
-        RunConfig(**changes).settings(random_bundle)
+        freeze(RunConfig(**changes), random_bundle)
 
 
 @pytest.mark.parametrize(
@@ -317,7 +318,7 @@ class Field(Task):
 def test_a_task_that_describes_itself_needs_no_bundle(random_bundle):
     config = RunConfig(task=f"{__name__}:Field")
     assert config.needs_no_bundle
-    assert config.settings(None).task.bundle == ""
+    assert freeze(config, None).task.bundle == ""
     assert not RunConfig().needs_no_bundle
     assert not RunConfig(task="dream").needs_no_bundle
     assert not RunConfig(task="no.such.module:Task", bundle="tiny").needs_no_bundle
@@ -325,15 +326,15 @@ def test_a_task_that_describes_itself_needs_no_bundle(random_bundle):
         with pytest.raises(UsageError, match=f"{names}.*--bundle"):
             _ = RunConfig(task=unknown).needs_no_bundle
     with pytest.raises(UsageError, match="gym:CartPole-v1"):
-        RunConfig(task="gym:CartPole-v1", bundle="tiny").settings(random_bundle)
+        freeze(RunConfig(task="gym:CartPole-v1", bundle="tiny"), random_bundle)
 
 
 def test_the_chosen_keys_of_an_observation_are_frozen_and_described_again(tmp_path):
     task = "gym:tests.support.pixel_fakes:Telling-v0"
-    settings = RunConfig(task=task, observation=("hand",)).settings(None)
+    settings = freeze(RunConfig(task=task, observation=("hand",)), None)
     assert settings.task.option("observation") == ["hand"]
     again = RunConfig(task=task, task_options=settings.task.options)
-    assert again.settings(None).controller == settings.controller
+    assert freeze(again, None).controller == settings.controller
     assert settings.controller.features == 3
 
 
@@ -347,4 +348,4 @@ def test_the_chosen_keys_of_an_observation_are_frozen_and_described_again(tmp_pa
 )
 def test_options_that_describe_no_world_are_refused(changes, flag):
     with pytest.raises(UsageError, match=flag):
-        RunConfig(task="gym:CartPole-v1", **changes).settings(None)
+        freeze(RunConfig(task="gym:CartPole-v1", **changes), None)

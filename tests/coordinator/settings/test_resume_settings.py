@@ -9,6 +9,7 @@ from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.transport.network import DEFAULT_ENDPOINT
 from dreamfleet.coordinator.settings.config import RunConfig
+from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.settings.resume_settings import (
@@ -24,7 +25,7 @@ HERE, THERE, FAR = "tcp/0.0.0.0:7610", "tcp/there:1", "tcp/far:2"
 
 @pytest.fixture
 def folder(tmp_path, random_bundle):
-    Journal.create(tmp_path, RunConfig().settings(random_bundle), random_bundle.path).close()
+    Journal.create(tmp_path, freeze(RunConfig(), random_bundle), random_bundle.path).close()
     return tmp_path
 
 

@@ -16,6 +16,7 @@ from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
 from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.common.runs.run_provenance import read_run_provenance, read_run_settings
 from dreamfleet.coordinator.settings.config import RunConfig
+from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.settings.rerun import Rerun
@@ -73,12 +74,12 @@ def test_it_holds_generations_effort_fingerprint_versions_and_seeds(make):
 
 def test_effort_is_counted_on_as_it_would_be_summed_up(make):
     bench = make()
-    before = bench.journal.effort
+    before = bench.journal.results.effort
     bench.step()
     bench.run.commit()
-    assert bench.journal.effort == before + Effort(10, 0, 0, 100_000)
+    assert bench.journal.results.effort == before + Effort(10, 0, 0, 100_000)
     again = Journal(bench.path / "journal.sqlite")
-    assert again.effort == bench.journal.effort
+    assert again.results.effort == bench.journal.results.effort
     again.close()
 
 
@@ -108,14 +109,14 @@ def test_what_ships_can_be_begun_again_as_it_was(tmp_path):
     bundle = find_bundle_of(controller, None)
     again = Rerun.of(controller, bundle)
     config, kept = again.plan(tmp_path / "tiny-again")
-    assert config.settings(bundle) == read_run_settings(controller)
+    assert freeze(config, bundle) == read_run_settings(controller)
     assert (again.limits, again.start) == (LimitsConfig(generations=25), None)
     assert kept == {"failure_limit": 1.0}, "the first run went on, whatever failed"
     assert again.expected_difference  # it is from before receipts
 
 
 def test_another_run_is_not_gone_on_with_and_another_version_is_named(tmp_path, random_bundle):
-    controller, settings = begun(random_bundle, population=6), RunConfig(population=5).settings(random_bundle)
+    controller, settings = begun(random_bundle, population=6), freeze(RunConfig(population=5), random_bundle)
     folder = tmp_path / "other"
     folder.mkdir()
     Journal.create(folder, settings, random_bundle.path).close()
@@ -143,7 +144,7 @@ def test_a_run_is_neither_compared_with_itself_nor_with_one_that_began_elsewhere
 
 def begun(bundle, **changes):
     """A controller of a run that has just begun."""
-    settings = RunConfig(**changes).settings(bundle)
+    settings = freeze(RunConfig(**changes), bundle)
     provenance = {"settings": asdict(settings), "generation": 0, "steps": 10}
     still = np.zeros(settings.controller.size, np.float32)
     return Controller(settings.controller, still, settings.task.task, bundle.sha256, provenance)
@@ -200,7 +201,7 @@ def test_a_result_is_counted_once_when_it_is_repeated(make):
     for send in bench.run.fleet.dispatch(bench.now):
         bench.given += [work.job for work in send.content.work]
     job = bench.given.pop(0)
-    before = bench.journal.effort
+    before = bench.journal.results.effort
     for _ in range(2):
         bench.deliver("a/00000001", Result(job.digest, 1.0, 10, 0.1, None, None))
-    assert bench.journal.effort == before + Effort(10, 0, 0, 100_000)
+    assert bench.journal.results.effort == before + Effort(10, 0, 0, 100_000)

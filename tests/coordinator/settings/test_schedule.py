@@ -10,6 +10,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.records import RunSettings, StageSettings
 from dreamfleet.common.runs.stages import stages_of
 from dreamfleet.coordinator.settings.config import RunConfig, config_values
+from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.run_setup import _with_stages, load_run_config
 from dreamfleet.coordinator.settings.schedule import find_schedule, remaining_settings
 
@@ -44,30 +45,30 @@ def read(tmp_path):
 
 @pytest.fixture
 def settings(read, random_bundle):
-    return lambda text, **flags: RunConfig(stages=read(text), **flags).settings(random_bundle)
+    return lambda text, **flags: freeze(RunConfig(stages=read(text), **flags), random_bundle)
 
 
 def test_the_first_stage_is_what_the_run_begins_as(settings):
     found = settings(WHOLE, population=10, horizon=700, seed=5)
     assert (found.population, found.task.horizon, found.task.patience, found.sigma0) == (32, 400, 60, 0.05)
     assert found.stages == (StageSettings(60, 3_000_000, 880.0), StageSettings(horizon=1000, episodes=16, racing=True))
-    assert [each.horizon for each in stages_of(found)] == [400, 1000]
+    assert [each.settings.task.horizon for each in stages_of(found)] == [400, 1000]
 
 
 def test_what_the_first_stage_does_not_name_is_as_the_flags_say(settings):
     found = settings("[[stage]]\nsteps = 5\n[[stage]]\nhorizon = 9\n", horizon=70, population=10)
-    assert [(each.horizon, each.population) for each in stages_of(found)] == [(70, 10), (9, 10)]
+    assert [(each.settings.task.horizon, each.settings.population) for each in stages_of(found)] == [(70, 10), (9, 10)]
 
 
 def test_a_schedule_is_journalled_and_can_be_configured_again(settings, random_bundle):
     found = settings(WHOLE)
     assert RunSettings.from_json(found.to_json()) == found
-    assert RunConfig(**config_values(found, random_bundle.path)).settings(random_bundle) == found
+    assert freeze(RunConfig(**config_values(found, random_bundle.path)), random_bundle) == found
 
 
 def test_one_stage_without_an_end_is_a_run_without_a_schedule(settings, random_bundle):
-    assert settings("[[stage]]\nhorizon = 70\n") == RunConfig(horizon=70).settings(random_bundle)
-    assert settings("[[stage]]\n") == RunConfig().settings(random_bundle)
+    assert settings("[[stage]]\nhorizon = 70\n") == freeze(RunConfig(horizon=70), random_bundle)
+    assert settings("[[stage]]\n") == freeze(RunConfig(), random_bundle)
 
 
 NEXT = "\n[[stage]]\nhorizon = 50\n"
@@ -175,7 +176,7 @@ def test_what_remains_of_a_schedule_begins_with_the_stage_and_its_end(settings, 
         "horizon": 1000, "patience": 60, "episodes": 16, "population": 32, "sigma0": 0.05, "racing": True,
         "driven": 0.0, "stages": (),
     }  # fmt: skip
-    RunConfig(**{**config_values(found, random_bundle.path), **remaining_settings(found, last)}).settings(random_bundle)
+    freeze(RunConfig(**{**config_values(found, random_bundle.path), **remaining_settings(found, last)}), random_bundle)
 
 
 def test_a_share_that_is_driven_stays_a_share_whatever_the_episodes(settings):

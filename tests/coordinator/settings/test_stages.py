@@ -14,7 +14,6 @@ from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.common.runs.records import StageSettings
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.common.runs.scoring_params import scoring_params_of
 from dreamfleet.common.runs.stages import begun_stages
 from dreamfleet.coordinator.jobs.work import vector_bytes
 from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
@@ -230,7 +229,7 @@ def test_a_fork_begins_with_the_stage_that_its_run_is_in_and_goes_on_with_the_ot
     bench = staged("night", generations=4)
     bench.drive(lambda _: 0)
     with RunFolder(bench.path) as run:
-        assert scoring_params_of(run, 4).stage.number == 2
+        assert run.stage_at(4).stage.number == 2
     settings = forked(bench)
     assert settings["stages"] == (StageSettings(score=500.0), *STAGES[2:])
     assert [settings[name] for name in ("horizon", "patience", "episodes", "racing")] == [400, 0, 2, True]

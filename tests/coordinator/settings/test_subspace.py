@@ -16,6 +16,7 @@ from dreamfleet.common.runs.run_provenance import RunProvenance
 from dreamfleet.common.runs.stages import stages_of
 from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
 from dreamfleet.coordinator.settings.config import RunConfig
+from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.rerun import Rerun
 from dreamfleet.coordinator.settings.start import stored_subspace
 
@@ -74,7 +75,7 @@ def settings(random_bundle):
     subspace = few(random_bundle.controller_shape.features, random_bundle.sha256)
 
     def made(**flags):
-        return RunConfig(loaded_subspace=subspace, **flags).settings(random_bundle), subspace
+        return freeze(RunConfig(loaded_subspace=subspace, **flags), random_bundle), subspace
 
     return made
 
@@ -108,17 +109,17 @@ def test_a_schedule_leaves_it_once(settings, stages, number):
 def test_without_one_there_is_nothing_to_leave(random_bundle):
     stages = (StageSettings(generations=2), StageSettings(whole=True, sigma0=0.1))
     with pytest.raises(UsageError, match=r"2.*--subspace"):
-        RunConfig(stages=stages).settings(random_bundle)
+        freeze(RunConfig(stages=stages), random_bundle)
 
 
 def test_one_of_another_world_model_or_of_other_eyes_is_refused(random_bundle):
     features = random_bundle.controller_shape.features
     with pytest.raises(UsageError, match=r"--subspace .*abababababab"):
-        RunConfig(loaded_subspace=few(features)).settings(random_bundle)
+        freeze(RunConfig(loaded_subspace=few(features)), random_bundle)
     with pytest.raises(UsageError, match=f"--subspace .*{features - 1} .*{features}"):
-        RunConfig(loaded_subspace=few(features - 1, random_bundle.sha256)).settings(random_bundle)
+        freeze(RunConfig(loaded_subspace=few(features - 1, random_bundle.sha256)), random_bundle)
     with pytest.raises(UsageError, match="--subspace"):
-        RunConfig(task="gym:CartPole-v1", loaded_subspace=few(4)).settings(None)
+        freeze(RunConfig(task="gym:CartPole-v1", loaded_subspace=few(4)), None)
 
 
 def test_what_a_journal_kept_of_it_is_held_to_the_settings(settings, tmp_path):
@@ -136,7 +137,7 @@ def test_a_receipt_holds_it_whole():
 
 def test_a_receipt_of_another_subspace_than_its_settings_is_damaged(random_bundle):
     subspace = few(random_bundle.controller_shape.features, random_bundle.sha256)
-    settings = RunConfig(loaded_subspace=subspace).settings(random_bundle)
+    settings = freeze(RunConfig(loaded_subspace=subspace), random_bundle)
     controller = Controller(
         settings.controller, np.zeros(settings.controller.size, np.float32), "car-racing", random_bundle.sha256
     )

@@ -15,6 +15,7 @@ from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.common.worlds import shipped
 from dreamfleet.coordinator.service.main import RunRequest, _resolve_settings
 from dreamfleet.coordinator.settings.config import RunConfig, config_values
+from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.settings.presets import find_preset
@@ -33,7 +34,7 @@ def bundle(tmp_path):
 
 
 def settings_of(bundle, **flags):
-    return RunConfig(bundle=str(bundle.path), **flags).settings(bundle)
+    return freeze(RunConfig(bundle=str(bundle.path), **flags), bundle)
 
 
 def test_a_run_begins_without_the_worlds_package_and_can_be_configured_again(bundle, tmp_path):
@@ -46,7 +47,7 @@ def test_a_run_begins_without_the_worlds_package_and_can_be_configured_again(bun
     assert settings.task.options == '{"decide_every": 4, "feedback": "last"}'
     assert settings.controller == ControllerShape(3 + 4 + 2 * 3, 3)
     assert RunSettings.from_json(settings.to_json()) == settings
-    assert RunConfig(**config_values(settings, bundle.path)).settings(bundle) == settings
+    assert freeze(RunConfig(**config_values(settings, bundle.path)), bundle) == settings
 
 
 def test_without_a_task_it_is_the_bundles_own_world(bundle, random_bundle):
@@ -79,8 +80,8 @@ def test_a_world_model_of_another_world_is_refused(bundle, random_bundle, task):
 @pytest.mark.parametrize("preset", ["takecover", "real"])
 def test_a_preset_that_was_made_for_another_worlds_model_is_refused(bundle, preset):
     with pytest.raises(UsageError, match=f"{preset} .*b.zip .*{ABSENT}.*--preset"):
-        RunConfig(**{**find_preset(preset), "bundle": str(bundle.path), "subspace": None}, preset=preset).settings(
-            bundle
+        freeze(
+            RunConfig(**{**find_preset(preset), "bundle": str(bundle.path), "subspace": None}, preset=preset), bundle
         )
 
 
@@ -92,7 +93,7 @@ def test_a_preset_without_a_world_model_is_of_any_world(bundle, preset):
 def test_a_preset_fits_a_world_model_of_its_world_that_does_not_ship(tmp_path):
     own = write_bundle_of("choices", tmp_path / "b.zip", task="takecover")
     named = {**find_preset("takecover"), "bundle": str(own.path)}
-    assert RunConfig(**named, preset="takecover").settings(own).task.horizon == 525
+    assert freeze(RunConfig(**named, preset="takecover"), own).task.horizon == 525
 
 
 def test_a_gymnasium_environment_is_scored_with_a_world_model_of_its_own(tmp_path):
@@ -120,7 +121,7 @@ def test_an_end_rule_of_the_runs_own_is_another_version(bundle):
     plain, own = settings_of(bundle, task="dream"), settings_of(bundle, task="dream", end="0.250")
     assert (own.task.end, own.task.version, own.task.world_version) == ("0.25", 3 + OWN_END_VERSION, 3)
     assert RunSettings.from_json(own.to_json()) == own
-    assert RunConfig(**config_values(own, bundle.path)).settings(bundle) == own
+    assert freeze(RunConfig(**config_values(own, bundle.path)), bundle) == own
     assert own.task.digest("score", b"x", (1,)) != plain.task.digest("score", b"x", (1,))
     assert own.task.with_overrides(horizon=20).end == "0.25"
     assert settings_of(bundle, task="dream", end="drawn") == plain, "the bundle's own rule is no rule of the run's own"
@@ -148,8 +149,8 @@ def test_presets_of_other_worlds_begin_on_their_bundles(tmp_path, name):
     facts = WorldFacts.of(one_hot(3), reward=RewardFacts("survival", gain=4.0), end=EndRule("drawn"), **ABOUT)
     bundle = write_world_bundle(tmp_path / "b.zip", facts, "takecover", vae=VAE, rnn=MODELS["choices"])
     preset = find_preset(name) | {"bundle": str(bundle.path)}
-    settings = RunConfig(**preset).settings(bundle)
-    assert RunConfig(**config_values(settings, bundle.path)).settings(bundle) == settings
+    settings = freeze(RunConfig(**preset), bundle)
+    assert freeze(RunConfig(**config_values(settings, bundle.path)), bundle) == settings
 
 
 @pytest.mark.parametrize(("limit", "given", "horizon"), [(200, None, 200), (5000, None, 1000), (200, 400, 400)])
@@ -159,7 +160,7 @@ def test_episodes_are_no_longer_than_the_bundles_world_unless_a_run_says_so(tmp_
     preset = find_preset("pixels") | ({"horizon": given} if given else {})
     settings = settings_of(bundle, **preset)
     assert settings.task.horizon == horizon
-    assert RunConfig(**config_values(settings, bundle.path)).settings(bundle) == settings
+    assert freeze(RunConfig(**config_values(settings, bundle.path)), bundle) == settings
 
 
 def test_episodes_of_the_first_world_have_its_thousand_steps(random_bundle):

@@ -1,4 +1,5 @@
-"""Tests journal.py, journal_connection.py, journal_file.py, verification_records.py and common/runs/records.py."""
+"""Tests journal.py, journal_connection.py, journal_file.py, result_records.py, verification_records.py and
+common/runs/records.py."""
 
 import os
 import shutil
@@ -51,7 +52,7 @@ def fill(journal):
     generation = Generation(0, SPEC, VECTORS, [7])
     for value, work in enumerate(generation.work):
         result = Result(work.job.digest, float(value), 10, 0.5, None, None)
-        journal.add_result(work.job, result, "w/00000000", "f", 1, "class")
+        journal.results.add(work.job, result, "w/00000000", "f", 1, "class")
     journal.close_generation(StoredGeneration(0, 0.5, 0.5, 1.0, 0.0, 0.1, 20, 1.0), np.array([0.0, 1.0]))
     journal.open_generation(1, b"state 1", 0.09, [8], VECTORS)
     journal.commit()
@@ -80,16 +81,16 @@ def test_it_gives_back_what_was_written(journal, folder):
 
 
 def test_jobs_of_any_generation_are_found_by_an_index(journal, monkeypatch):
-    journal.index_scores()
-    plans, read = [], journal._read
+    journal.results.index_scores()
+    plans, read = [], journal.read
 
     def explain(query, *values):
         plans.append([each[-1] for each in read(f"EXPLAIN QUERY PLAN {query}", *values)])
         return []
 
-    monkeypatch.setattr(journal, "_read", explain)
+    monkeypatch.setattr(journal, "read", explain)
     for kind in ("evaluate", "score"):
-        list(journal._with_digests(kind, "fitness", [bytes([each]) for each in range(100)], UNCHECKED))
+        list(journal.results.with_digests(kind, "fitness", [bytes([each]) for each in range(100)], UNCHECKED))
     assert [plan[0] for plan in plans] == [
         "SEARCH result USING INDEX evaluation_digest (digest=? AND kind=?)",
         "SEARCH result USING INDEX score_digest (digest=? AND kind=?)",
@@ -98,12 +99,12 @@ def test_jobs_of_any_generation_are_found_by_an_index(journal, monkeypatch):
 
 
 def test_results_of_a_run_of_batches_wait_for_their_check_in_any_generation(journal):
-    journal.index_scores()
+    journal.results.index_scores()
     fill(journal)
     early, late = (Generation(number, SPEC, VECTORS, [7]).work for number in (0, 5))
-    assert journal.unverified([each.job for each in late]).keys() == {each.job.digest for each in early}
-    journal.add_verification(early[0].job, "w/00000000", "v", "equal")
-    assert journal.unverified([each.job for each in late]).keys() == {early[1].job.digest}
+    assert journal.verification.unverified([each.job for each in late]).keys() == {each.job.digest for each in early}
+    journal.verification.add(early[0].job, "w/00000000", "v", "equal")
+    assert journal.verification.unverified([each.job for each in late]).keys() == {early[1].job.digest}
     assert journal.fitness_of("score", [each.job.digest for each in late]) == {
         each.job.digest: float(value) for value, each in enumerate(early)
     }
@@ -111,12 +112,12 @@ def test_results_of_a_run_of_batches_wait_for_their_check_in_any_generation(jour
 
 def test_a_check_stands_again_with_its_result_though_another_generation_asked_for_it(journal):
     first, again = (Evaluation(number, VECTORS[0], 1).work(SPEC)[0].job for number in (3, 5))
-    journal.add_result(first, Result(first.digest, 5.0, 10, 0.5, None, None), "w/00000000", "f", 1, "class")
-    journal.add_verification(again, "w/00000000", "v", "equal")
-    journal._set_aside(REWOUND, "generation = 3")
-    journal._settle_recall()
+    journal.results.add(first, Result(first.digest, 5.0, 10, 0.5, None, None), "w/00000000", "f", 1, "class")
+    journal.verification.add(again, "w/00000000", "v", "equal")
+    journal.recalls._set_aside(REWOUND, "generation = 3")
+    journal.recalls._settle_recall()
     assert journal.fitness_of("evaluate", [again.digest]) == {again.digest: 5.0}
-    assert journal.unverified([again]) == {}
+    assert journal.verification.unverified([again]) == {}
 
 
 def test_what_was_not_committed_never_happened(folder):

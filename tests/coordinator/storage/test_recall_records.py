@@ -22,8 +22,8 @@ def journal(tmp_path, random_bundle):
     for number in (0, 1):
         made.open_generation(number, b"state", 0.1, SEEDS, VECTORS)
         for work in jobs_of(number):
-            made.add_result(work.job, Result(work.digest, 1.0, 10, 0.1, None, None), "a/1", "f", 1, "class")
-            made.add_verification(work.job, "a/1", "b", "equal")
+            made.results.add(work.job, Result(work.digest, 1.0, 10, 0.1, None, None), "a/1", "f", 1, "class")
+            made.verification.add(work.job, "a/1", "b", "equal")
     made.commit()
     yield made
     made.close()
@@ -34,7 +34,7 @@ def jobs_of(number):
 
 
 def unverified(journal, number):
-    return set(journal.unverified([work.job for work in jobs_of(number)]))
+    return set(journal.verification.unverified([work.job for work in jobs_of(number)]))
 
 
 def digests_of(number):
@@ -42,35 +42,35 @@ def digests_of(number):
 
 
 def test_a_check_does_not_stand_again_by_the_word_of_a_host_that_was_barred(journal):
-    journal.rewind(0, b"state", SEEDS)
-    journal.recall_results({"b"})
+    journal.recalls.rewind(0, b"state", SEEDS)
+    journal.recalls.recall({"b"})
     journal.open_generation(1, b"state", 0.1, SEEDS, VECTORS)
-    journal.take_back([*digests_of(1)])
-    assert set(journal.results_of("score", 1)) == digests_of(1), "what a brought counts again"
+    journal.recalls.count_again([*digests_of(1)])
+    assert set(journal.results.of("score", 1)) == digests_of(1), "what a brought counts again"
     assert unverified(journal, 0) == digests_of(0)
     assert unverified(journal, 1) == digests_of(1)
-    journal.unbar("b")
-    journal.rewind(0, b"state", SEEDS)
-    journal.take_back([*digests_of(1)])
+    journal.verification.unbar("b")
+    journal.recalls.rewind(0, b"state", SEEDS)
+    journal.recalls.count_again([*digests_of(1)])
     assert unverified(journal, 1) == digests_of(1), "nor once it may come again"
 
 
 def test_a_check_stands_again_by_the_word_of_a_host_that_was_not_barred(journal):
-    journal.rewind(0, b"state", SEEDS)
+    journal.recalls.rewind(0, b"state", SEEDS)
     journal.open_generation(1, b"state", 0.1, SEEDS, VECTORS)
-    journal.take_back([*digests_of(1)])
+    journal.recalls.count_again([*digests_of(1)])
     assert not unverified(journal, 0)
     assert not unverified(journal, 1)
 
 
 def test_a_recall_begins_where_a_host_alone_confirmed_what_others_brought(journal):
-    assert journal.first_brought({"a"}) == journal.first_brought({"b"}) == {"score": 0}
-    journal.recall_results({"b"})
-    assert journal.first_brought({"b"}) == {}, "its word is gone"
+    assert journal.recalls.first_brought({"a"}) == journal.recalls.first_brought({"b"}) == {"score": 0}
+    journal.recalls.recall({"b"})
+    assert journal.recalls.first_brought({"b"}) == {}, "its word is gone"
     for work in jobs_of(1):
-        journal.add_verification(work.job, "a/1", "c", "equal")
-    assert journal.first_brought({"c"}) == {"score": 1}
-    assert journal.first_brought({"d"}) == {}
+        journal.verification.add(work.job, "a/1", "c", "equal")
+    assert journal.recalls.first_brought({"c"}) == {"score": 1}
+    assert journal.recalls.first_brought({"d"}) == {}
 
 
 def test_an_evaluation_of_which_a_barred_host_alone_confirmed_a_part_is_finished_again(journal):
@@ -78,47 +78,47 @@ def test_an_evaluation_of_which_a_barred_host_alone_confirmed_a_part_is_finished
         evaluation = Evaluation(number, VECTORS[number], 1)
         journal.schedule_evaluation(evaluation)
         (work,) = evaluation.work(SPEC)
-        journal.add_result(work.job, Result(work.digest, 1.0, 10, 0.1, None, None), "a/1", "f", 1, "class")
-        journal.add_verification(work.job, "a/1", checker, "equal")
+        journal.results.add(work.job, Result(work.digest, 1.0, 10, 0.1, None, None), "a/1", "f", 1, "class")
+        journal.verification.add(work.job, "a/1", checker, "equal")
         journal.finish_evaluation(number, StoredEvaluation(number, 1, 1.0, 0.0), 0)
-    journal.recall_results({"b"})
+    journal.recalls.recall({"b"})
     assert [each.generation for each in journal.pending_evaluations()] == [0]
 
 
 @pytest.mark.parametrize(("barred", "stands"), [("b", True), ("c", True), ("bc", True), ("b c", False)])
 def test_a_check_of_several_hosts_stands_while_one_of_them_is_believed(journal, barred, stands):
     (work, *_) = jobs_of(0)
-    journal._write("UPDATE verification SET checker = 'b,c', outcome = 'differs' WHERE digest = ?", work.digest)
+    journal.write("UPDATE verification SET checker = 'b,c', outcome = 'differs' WHERE digest = ?", work.digest)
     for host in barred.split():
-        journal.recall_results({host})
+        journal.recalls.recall({host})
     assert (work.digest not in unverified(journal, 0)) == stands
 
 
 def test_what_a_closed_race_did_not_want_is_aside_and_counts_again_if_its_generation_opens_again(journal):
-    steps, (surplus, *others) = journal.effort.steps, [work.digest for work in jobs_of(1)]
-    journal.set_surplus_aside(1, [surplus])
-    assert set(journal.results_of("score", 1)) == set(others)
-    assert journal.effort.steps == steps - 10
-    journal.take_back([surplus])
-    assert surplus not in journal.results_of("score", 1), "its generation is closed"
-    journal.rewind(1, b"state", SEEDS)
-    assert set(journal.results_of("score", 1)) == {surplus, *others}
-    assert journal.effort.steps == steps
+    steps, (surplus, *others) = journal.results.effort.steps, [work.digest for work in jobs_of(1)]
+    journal.recalls.set_surplus_aside(1, [surplus])
+    assert set(journal.results.of("score", 1)) == set(others)
+    assert journal.results.effort.steps == steps - 10
+    journal.recalls.count_again([surplus])
+    assert surplus not in journal.results.of("score", 1), "its generation is closed"
+    journal.recalls.rewind(1, b"state", SEEDS)
+    assert set(journal.results.of("score", 1)) == {surplus, *others}
+    assert journal.results.effort.steps == steps
     assert not unverified(journal, 1)
 
 
 def test_what_a_race_of_a_dropped_generation_did_not_want_counts_again_when_its_job_is_wanted(journal):
     surplus, *others = [work.digest for work in jobs_of(1)]
-    journal.set_surplus_aside(1, [surplus])
-    journal.rewind(0, b"state", SEEDS)
-    journal.take_back([surplus, *others])
-    assert set(journal.results_of("score", 1)) == {surplus, *others}
+    journal.recalls.set_surplus_aside(1, [surplus])
+    journal.recalls.rewind(0, b"state", SEEDS)
+    journal.recalls.count_again([surplus, *others])
+    assert set(journal.results.of("score", 1)) == {surplus, *others}
 
 
 def test_what_a_race_did_not_want_of_a_barred_host_never_counts_again(journal):
     surplus, *_ = [work.digest for work in jobs_of(1)]
-    journal.set_surplus_aside(1, [surplus])
-    journal.recall_results({"a"})
-    journal.rewind(1, b"state", SEEDS)
-    assert not journal.results_of("score", 1)
-    assert journal.verification_counts()["recalled"] == 8
+    journal.recalls.set_surplus_aside(1, [surplus])
+    journal.recalls.recall({"a"})
+    journal.recalls.rewind(1, b"state", SEEDS)
+    assert not journal.results.of("score", 1)
+    assert journal.verification.counts()["recalled"] == 8

@@ -121,6 +121,8 @@ def fitness_section(run: RunFolder) -> Section | None:
     axes[0, 0].set_ylabel("fitness")
     if two:
         axes[1, 0].set_ylabel("score in reality")
-    horizon = join_distinct(str(each.stage.horizon) for each in begun_stages(run.settings, history, run.evaluations()))
+    horizon = join_distinct(
+        str(each.stage.settings.task.horizon) for each in begun_stages(run.settings, history, run.evaluations())
+    )
     text = f"Run {run.name}, task {run.spec.task}, {horizon} steps an episode: fitness over the generations."
     return Section("fitness", "How its controller evolved", text, render_png(figure))

@@ -116,7 +116,10 @@ def _page(subject: InspectionSubject, trained: Sequence[TrainingCurves], section
         ("controller", f"{plural(settings.controller.size, 'parameter')}, layers {settings.controller.layers}"),
         (
             "population",
-            join_distinct(f"{each.stage.population} x {plural(each.stage.episodes, 'episode')}" for each in stages),
+            join_distinct(
+                f"{each.stage.settings.population} x {plural(each.stage.settings.episodes, 'episode')}"
+                for each in stages
+            ),
         ),
         ("generations", str(len(history))),
     ]

@@ -15,7 +15,8 @@ from dreamfleet.common.files.file_system import lock_problem
 from dreamfleet.common.files.regular_files import check_regular
 from dreamfleet.common.files.sqlite import ThreadConnections, is_damage, is_locked
 from dreamfleet.common.printable import one_line
-from dreamfleet.common.runs import schema
+from dreamfleet.common.protocol.check_counts import MAX_BARRED, CheckCounts
+from dreamfleet.common.runs.journal import schema
 from dreamfleet.common.runs.seeds import CHOOSING_OFFSET
 from dreamfleet.common.runs.stages import BegunStage
 
@@ -47,32 +48,27 @@ class JournalReader:
         if not self._connections.is_closed and self._connections.own.database.in_transaction:
             yield
             return
-        self._fetch("BEGIN")  # deferred: the first query fixes the state
+        self.read("BEGIN")  # deferred: the first query fixes the state
         try:
             yield
         finally:
             with suppress(JournalError):
-                self._fetch("ROLLBACK")
+                self.read("ROLLBACK")
 
     def rows(self, kinds: str, query: str, *values: Any) -> list[Any]:
         """All rows of a query, checked for their column types.
 
-        `kinds` has a letter for each column: i integer, f number, F number or NULL, s text, b bytes, n bytes or
-        NULL. A damaged page, or
-        another program, may have left other types.
+        `kinds` has a letter for each column: i integer, f number, F number or NULL, s text, b bytes, n bytes or NULL.
+        A damaged page, or another program, may have left other types.
         """
-        found, types = self._fetch(query, *values), [_TYPES[each] for each in kinds]
+        found, types = self.read(query, *values), [_TYPES[each] for each in kinds]
         if not all(all(map(isinstance, row, types)) for row in found):
             raise self.damage_error("a row holds values of another type")
         return found
 
-    def read(self, query: str, *values: Any) -> list[Any]:
-        """All rows of a query, unchecked."""
-        return self._fetch(query, *values)
-
     def row(self, query: str, *values: Any) -> Any:
         """The first row of a query, unchecked; `None` if there is none."""
-        found = self._fetch(query, *values)
+        found = self.read(query, *values)
         return found[0] if found else None
 
     def fact(self, key: str) -> str | None:
@@ -80,11 +76,25 @@ class JournalReader:
         row = self.row("SELECT value FROM run WHERE key = ?", key)
         return None if row is None else str(row[0])
 
+    def check_counts(self, share: float) -> CheckCounts | None:
+        """Outcomes of checking the `share` of results; `None` if nothing was checked and nobody is barred."""
+        counts = dict(self.rows("si", "SELECT outcome, count(*) FROM verification GROUP BY 1"))
+        barred = self.rows("si", "SELECT host, by_operator FROM barred ORDER BY happened")[-MAX_BARRED:]
+        (recalled,) = self.row("SELECT count(*) FROM recalled WHERE because = 'barred'")
+        if not (counts or barred or recalled):
+            return None
+        differing = counts.get("differs", 0)
+        return CheckCounts(
+            share, counts.get("equal", 0) + differing, differing, counts.get("unchecked", 0), recalled,
+            tuple(host for host, _ in barred), tuple(host for host, named in barred if named),
+        )  # fmt: skip
+
     def damage_error(self, what: str) -> DamagedJournalError:
         """The error for a damaged journal."""
         return DamagedJournalError(f"the journal of run {self._run} is damaged: {what}; restore it from a copy")
 
-    def _fetch(self, query: str, *values: Any) -> list[Any]:
+    def read(self, query: str, *values: Any) -> list[Any]:
+        """All rows of a query, unchecked."""
         if self._connections.is_closed:
             raise self._closed_error()
         own = self._connections.own
@@ -111,6 +121,16 @@ RESULTS_QUERY = (
     "SELECT kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, fingerprint, host_class, "
     "hex(digest) FROM result WHERE kind = ? AND generation = ? AND candidate = ? ORDER BY episode"
 )
+
+
+MOST_VARIABLES = 500  # of one SQL statement
+
+
+def digest_terms(digests: Sequence[bytes]) -> Iterator[tuple[str, Sequence[bytes]]]:
+    """Conditions that together find the rows with these digests, each with its values."""
+    for start in range(0, len(digests), MOST_VARIABLES):
+        some = digests[start : start + MOST_VARIABLES]
+        yield f"digest IN ({', '.join('?' * len(some))})", some
 
 
 def efforts_query(begun: Sequence[BegunStage]) -> str:
