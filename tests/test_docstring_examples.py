@@ -58,7 +58,7 @@ def fleet(tmp_path_factory):
             "--evaluation-episodes", 2, name=RUN,
         )  # fmt: skip
         processes.worker("--run", RUN, "--name", "alpha")
-        coordinator.wait_for("evaluat")
+        coordinator.wait_for_event("evaluation")
         yield processes
 
 

@@ -161,7 +161,7 @@ class StoredEvent:
     happened: float  # seconds since 1970, by the coordinator's wall clock
     incarnation: int
     text: str
-    what: str = ""  # became of the worker, or `leaves` where the coordinator left by itself
+    what: str = ""  # happened, in a word, such as `paused`, or `leaves` where the coordinator left by itself
     worker: str = ""
 
 

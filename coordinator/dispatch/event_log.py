@@ -26,11 +26,20 @@ class FleetEvent(NamedTuple):
     why: str = ""
 
 
+NoteKind = (
+    EventKind
+    | Literal[
+        "paused", "resumed", "continues", "written", "stage", "next stage", "reseeded", "retried", "given up",
+        "barred", "unbarred", "recalled", "differing", "unsteady", "confirming", "unconfirmed", "clock",
+    ]
+)  # fmt: skip
+
+
 class Note(NamedTuple):
-    """A line for the log and the journal; `what` became of which `worker`, if it is of one."""
+    """A line for the log and the journal: `what` happened, and to which `worker`, if it is of one."""
 
     text: str
-    what: EventKind | Literal[""] = ""
+    what: NoteKind
     worker: str = ""
 
 

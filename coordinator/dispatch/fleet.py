@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from dreamfleet.common.client.status import EventKind
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.messages import MAX_SLOTS, Heartbeat, Result, Verdict, VerdictWord
-from dreamfleet.coordinator.dispatch.event_log import EventLog, Note
+from dreamfleet.coordinator.dispatch.event_log import EventLog, Note, NoteKind
 from dreamfleet.coordinator.dispatch.failure_judge import FailureJudge
 from dreamfleet.coordinator.dispatch.failures import JobFailure, host_of
 from dreamfleet.coordinator.dispatch.host_stats import HostRecords
@@ -108,14 +108,14 @@ class Fleet:
         if (member := self.members.get(identity)) and member.gone_since is None:
             member.gone_since = now
 
-    def note(self, text: str) -> None:
+    def note(self, text: str, what: NoteKind) -> None:
         """Note something for the log and the journal."""
-        self.notes.append(Note(text))
+        self.notes.append(Note(text, what))
 
-    def note_refusal(self, identity: str, note: Note, why: str) -> None:
-        """Log that a worker was refused; the caller bounds how many are (R26)."""
+    def note_refusal(self, note: Note, why: str) -> None:
+        """Log that a worker, or a host, was refused; the caller bounds how many are (R26)."""
         self.notes.append(note)
-        self.event_log.add(self._now, "left", identity, why=f"refused: {why}")
+        self.event_log.add(self._now, "left", note.worker, why=f"refused: {why}")
 
     def remove_worker(self, identity: str) -> None:
         """Forget a worker: others get its jobs. If it is alive it gets no answer, and so says hello again (R22)."""
@@ -405,7 +405,7 @@ class Fleet:
         self.counts["errors"] += 1
         failure = self.jobs[digest].failure
         if self.failure_judge.is_new_cause(failure):
-            self.note(f"{failure}; it is tried again")
+            self.note(f"{failure}; it is tried again", "retried")
 
     def _cancel(self, digest: bytes, pending: PendingJob) -> None:
         """End all leases of a job that is wanted no more.

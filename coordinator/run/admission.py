@@ -44,7 +44,8 @@ class WorkerAdmission:
             found = Refusal(f"it is barred from this run: {bar.why}", remedy)
         final = request.packages == settings.packages  # otherwise the worker says hello again with these packages
         if found is not None and final and self.refused_workers.add(request.worker, found.why):
-            self._fleet.note_refusal(request.worker, Note(f"refused worker {request.worker}: {found.why}"), found.why)
+            note = Note(f"refused worker {request.worker}: {found.why}", "refused", request.worker)
+            self._fleet.note_refusal(note, found.why)
         return found
 
     def admit(self, request: HelloRequest, now: float) -> int:
@@ -102,7 +103,7 @@ class WorkerAdmission:
         for worker in [each for each in self._fleet.members if host_of(each) == host]:
             self._fleet.remove_worker(worker)
         self.refused_workers.add(host, f"it is barred from this run: {why}")
-        self._fleet.note_refusal(host, Note(f"host {host} is barred from this run: {why}"), f"barred: {why}")
+        self._fleet.note_refusal(Note(f"host {host} is barred from this run: {why}", "barred", host), f"barred: {why}")
 
     def unbar(self, host: str) -> None:
         """Let a host join this run again, by the journal too."""
@@ -125,4 +126,4 @@ class WorkerAdmission:
         why = class_mismatch(self.host_class, host_class, fingerprint).why
         self._fleet.remove_worker(worker)
         if self.refused_workers.add(worker, why):
-            self._fleet.note_refusal(worker, Note(f"worker {worker} must go: {why}", "left", worker), why)
+            self._fleet.note_refusal(Note(f"worker {worker} must go: {why}", "left", worker), why)

@@ -96,7 +96,7 @@ def bar_stored(folder: Path, host: str, *, is_barred: bool) -> str:
         else:
             journal.verification.unbar(host)
             text = unbar_words(host)
-        journal.add_event(text)
+        journal.add_event(text, "barred" if is_barred else "unbarred", host)
         journal.end_incarnation()
         journal.commit()
         RolloutCollections(folder).remove(journal.recalls.rollouts())  # not before the recall was durable

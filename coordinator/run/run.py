@@ -25,6 +25,7 @@ from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, Stor
 from dreamfleet.common.runs.run_folder import ENDING, EPISODE_LIMIT, STOP_KIND
 from dreamfleet.common.runs.stages import StageTracker
 from dreamfleet.common.schema.times import elapsed_seconds
+from dreamfleet.coordinator.dispatch.event_log import Note
 from dreamfleet.coordinator.dispatch.failures import JobFailure, host_of, shorten
 from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.jobs.generation import Generation
@@ -69,7 +70,7 @@ class Run:
         limit = journal.fact(EPISODE_LIMIT)
         self.episode_limit = None if limit is None else int(limit)  # steps; of the environment itself, if it is known
         self.incarnation = journal.begin_incarnation()
-        self._notes: list[str] = []  # that are in the journal and not in the log
+        self._notes: list[Note] = []  # that are in the journal and not in the log
         self._journal = journal
         self._unpublished: list[StoredGeneration] = []
         self.admission = WorkerAdmission(journal, settings, self.fleet, strict=network.strict, anchor_key=anchor_key)
@@ -175,7 +176,7 @@ class Run:
             if not reseeds and (why := self.failure_limit.find_excess(self.generation)) is not None:
                 self.pause(Pause(PauseKind.FAILED_CANDIDATES, f"{why} (`dreamfleet story` lists why)"))
             elif (note := self.generations.try_again(self.generation)) is not None:
-                self.fleet.note(note)
+                self.fleet.note(note, "reseeded")
                 self._replace_generation(self.generations.reload(self.generation.number))
             else:
                 self._close(now)
@@ -206,7 +207,7 @@ class Run:
             self._enter(self.state.recover())
             paused = self.state.paused
             goes_on = "the run continues" if paused is None else f"the run stays paused: {paused.text}"
-            self.fleet.note(f"the journal can be written again: {goes_on}")
+            self.fleet.note(f"the journal can be written again: {goes_on}", "written")
         return True
 
     def _take_lock(self) -> bool:
@@ -222,7 +223,7 @@ class Run:
         """Give out no jobs until what could not be written is written."""
         why = f"{error}, and the run then continues by itself"
         if self.state.stalled is None:
-            self.fleet.note(f"paused: {why}")
+            self.fleet.note(f"paused: {why}", "paused")
         self._enter(self.state.stall(why, self._now + WRITE_RETRY))
 
     def leave(self) -> None:
@@ -252,7 +253,7 @@ class Run:
         before = self.state.paused
         self._enter(self.state.pause(pause))
         if (paused := self.state.paused) is not None and paused != before:
-            self.fleet.note(f"paused: {paused.text}")
+            self.fleet.note(f"paused: {paused.text}", "paused")
 
     def resume(self) -> str:
         """Dispatch again; failed jobs may go to any worker again.
@@ -273,7 +274,7 @@ class Run:
 
     def _resume(self) -> None:
         if self.state.paused is not None:
-            self.fleet.note("resumed")
+            self.fleet.note("resumed", "resumed")
         self._go_on()
         self.verification.resume()
         self._journal.drop_fact(PAUSED)
@@ -308,7 +309,7 @@ class Run:
 
             return "" if self._rewind(bar) else f"it cannot be barred now: {self.obstacle}; ask again"
         self.admission.unbar(host)
-        self.fleet.note(unbar_words(host))
+        self.fleet.note(unbar_words(host), "unbarred")
         self._journal_notes()
         return "" if self.commit() else f"that cannot be written now: {self.obstacle}; it counts once it is written"
 
@@ -323,7 +324,7 @@ class Run:
         try:
             hosts = bar()
             self.background_jobs.report.withdraw()
-            self.fleet.note(recall(self._journal, self.settings, hosts))
+            self.fleet.note(recall(self._journal, self.settings, hosts), "recalled")
             self._journal_notes()
             self._journal.commit()
         except NotWritableNowError as error:
@@ -343,7 +344,7 @@ class Run:
                 self._record_failure(lasting)
         if (paused := self.state.paused) is not None:
             if paused.until_host and judge.has_hope:
-                self.fleet.note("a host has joined that may be able to score: the run continues")
+                self.fleet.note("a host has joined that may be able to score: the run continues", "continues")
                 self._go_on()
             return
         if is_judged and (failure := judge.find_broken_fleet(at_once=self.failure_limit.share < 1)) is not None:
@@ -370,7 +371,7 @@ class Run:
         error = failure.history[-1].error
         error = replace(error, text=shorten(error.text))
         self._journal.add_failure(job, error, list(failure.attempts), len(failure.history))
-        self.fleet.note(f"{failure}; it counts as failed")
+        self.fleet.note(f"{failure}; it counts as failed", "given up")
         self._count(job, nan, 0)
         if job.kind == "score":
             self.fleet.withdraw(self.generation.unwanted)
@@ -405,7 +406,7 @@ class Run:
         self.verification.restore(counted)  # what failed candidates have was checked no more
         self.fleet.jobs.offer(missing)
 
-    def take_notes(self) -> list[str]:
+    def take_notes(self) -> list[Note]:
         """What happened since the last call, for the log; the journal keeps it too."""
         self._journal_notes()
         notes, self._notes = self._notes, []
@@ -414,7 +415,7 @@ class Run:
     def _journal_notes(self) -> None:
         for note in self.fleet.notes:
             self._journal.add_event(*note)
-            self._notes.append(note.text)
+            self._notes.append(note)
         self.fleet.notes = []
 
     def take_closed(self) -> list[StoredGeneration]:
@@ -433,7 +434,7 @@ class Run:
     def _begin(self, now: float) -> None:
         generation = self.generation
         if len(self._agenda) > 1:
-            self.fleet.note(f"generation {generation.number} is in {self._stage_text}")
+            self.fleet.note(f"generation {generation.number} is in {self._stage_text}", "stage")
         self.fleet.jobs.begin_generation(generation.number)
         self.verification.restore(generation.counted)
         work = self.background_jobs.begin(self.generations.mean, now)
@@ -471,7 +472,9 @@ class Run:
         begun, number = self.generations.begun, generation.number
         if begun.since == number:
             origin = "" if begun.origin is None else f", from the mean of generation {begun.origin}"
-            self.fleet.note(f"{self._stage_text} begins with generation {number} after {begun.why}{origin}")
+            self.fleet.note(
+                f"{self._stage_text} begins with generation {number} after {begun.why}{origin}", "next stage"
+            )
 
     @property
     def _stage_text(self) -> str:
@@ -492,11 +495,11 @@ class Run:
         if not self._take_lock():
             return
         if work := self.background_jobs.confirm():
-            self.fleet.note(self.background_jobs.round_description)
+            self.fleet.note(self.background_jobs.round_description, "confirming")
             self.fleet.jobs.offer(work)
         elif not self.fleet.jobs.checks:  # else results of an earlier life are checked first
             if self.background_jobs.confirmation_failed:
-                self.fleet.note("no confirmed score: every episode of the confirmation failed")
+                self.fleet.note("no confirmed score: every episode of the confirmation failed", "unconfirmed")
             self._end()
 
     def _begin_ending(self, reason: StopReason) -> None:

@@ -204,7 +204,7 @@ class Verification:
         if self._held.get(digest, frozenset()) != frozenset(hosts):
             self._held[digest] = frozenset(hosts)
             self._fleet.check_again(pending, Check(check.host_class, set(hosts)))
-            self._fleet.note(self.waiting)
+            self._fleet.note(self.waiting, "differing")
 
     def _finish(self, pending: PendingJob, decision: Decision) -> None:
         """Write what came of a check; if hosts are wrong, keep it until `condemn` bars them."""
@@ -218,7 +218,9 @@ class Verification:
             return
         self._write(found)
         if outcome == "differs":
-            self._fleet.note(f"{found.what}; none gives the same twice, so the task is not deterministic there")
+            self._fleet.note(
+                f"{found.what}; none gives the same twice, so the task is not deterministic there", "unsteady"
+            )
         self._fleet.withdraw([job.digest])
         self._forget(job.digest)
 

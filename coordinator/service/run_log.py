@@ -94,7 +94,7 @@ class RunLog:
     def write_notes(self) -> None:
         """Log the run's notes since the last call."""
         for note in self._run.take_notes():
-            log.info("%s", note)
+            log.info("%s", note.text, extra={"facts": {"event": note.what, "worker": note.worker}})
 
     def check(self, snapshot: Snapshot, now: float) -> None:
         """Log what is due: a warning that no worker is present, the minute's summary, the join file's expiry."""
@@ -112,7 +112,7 @@ class RunLog:
         """Note that the wall clock moved against the monotonic one, by which all deadlines are kept."""
         offset = time() - monotonic()  # `now` may be older: a commit waits for a locked journal
         if abs(moved := offset - self._clock_offset) > CLOCK_STEP:
-            self._run.fleet.note(f"the wall clock moved by {moved:+,.0f} s: it was set, or this host slept")
+            self._run.fleet.note(f"the wall clock moved by {moved:+,.0f} s: it was set, or this host slept", "clock")
             self._clock_offset = offset
 
     def _warn_if_no_worker(self, now: float) -> None:

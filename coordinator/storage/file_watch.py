@@ -161,7 +161,8 @@ class FileWatch:
         """A run without its world model could not be continued."""
         try:
             if self._bundle is not None and self._bundle.restore_into(self._folder):
-                log.warning("the run's copy of its world model was removed while it was served: written again")
+                log.warning("the run's copy of its world model was removed while it was served: written again",
+                            extra={"facts": {"event": "bundle written"}})  # fmt: skip
         except OSError as error:
             log.warning(
                 "the run's copy of its world model was removed, and cannot be written again: %s", error.strerror

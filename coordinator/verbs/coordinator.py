@@ -166,12 +166,12 @@ def _warn_ignored_settings(args: argparse.Namespace, stored: RunFolder) -> None:
     configured |= named
     _warn_ignored_subspace(configured.pop("subspace", None), stored)
     if stages and stages != stored.settings.stages:
-        log.warning("run %s keeps its own schedule; the settings say another", stored.name)
+        log.warning("run %s keeps its own schedule; the settings say another", stored.name, extra=_kept("schedule"))
     frozen: dict[str, Any] = config_values(stored.settings, stored.bundle_path)
     for name, value in configured.items():
         if name != "bundle" and frozen.get(name, value) != value:
             log.warning("%s is %s in run %s, which keeps it; the settings say %s", name, frozen[name], stored.name,
-                        value)  # fmt: skip
+                        value, extra=_kept(name))  # fmt: skip
 
 
 def _warn_ignored_subspace(name: str | None, stored: RunFolder) -> None:
@@ -185,7 +185,11 @@ def _warn_ignored_subspace(name: str | None, stored: RunFolder) -> None:
     except UsageError:
         configured = None
     if configured != stored.settings.subspace:
-        log.warning("run %s keeps its own subspace; the settings name another", stored.name)
+        log.warning("run %s keeps its own subspace; the settings name another", stored.name, extra=_kept("subspace"))
+
+
+def _kept(setting: str) -> dict[str, dict[str, str]]:
+    return {"facts": {"event": "kept", "setting": setting}}
 
 
 def _stop_on_signals(stop: Callable[[], None]) -> None:

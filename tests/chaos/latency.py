@@ -20,9 +20,9 @@ from tests.support.processes import processes_in
 ROUNDS = 5
 
 
-def until_said(fleet, text):
+def until_said(fleet, event):
     started = time.monotonic()
-    fleet.coordinator.wait_for(text)
+    fleet.coordinator.wait_for_event(event)
     return time.monotonic() - started
 
 
@@ -39,22 +39,22 @@ def measure(folder):
     bundle = write_random_bundle(folder / "random.zip").path
     with processes_in(folder / "fleet") as processes:
         fleet = Fleet(processes, bundle, generations=10**6, seed=1, task=tasks.COUNTED)
-        fleet.coordinator.wait_for("generation 3: mean")
+        fleet.coordinator.wait_for_event("generation", number=3)
         for _ in range(ROUNDS):
             fleet.workers[0].popen.kill()
-            figures["killed_worker"].append(until_said(fleet, "is lost: it was killed, or its connection was cut:"))
+            figures["killed_worker"].append(until_said(fleet, "lost"))
             fleet.workers[0] = fleet.new_worker(0)
-            fleet.coordinator.wait_for("generation", times=100)
+            fleet.coordinator.wait_for_event("generation", times=100)
             os.kill(fleet.workers[1].popen.pid, signal.SIGSTOP)
-            figures["stopped_worker"].append(until_said(fleet, "is silent:"))
+            figures["stopped_worker"].append(until_said(fleet, "silent"))
             os.kill(fleet.workers[1].popen.pid, signal.SIGCONT)
-            fleet.coordinator.wait_for("generation", times=20)
+            fleet.coordinator.wait_for_event("generation", times=20)
             fleet.coordinator.popen.kill()
             fleet.coordinator.popen.wait()
             fleet.resume()
-            figures["coordinator_start"].append(until_said(fleet, "incarnation"))
+            figures["coordinator_start"].append(until_said(fleet, "begin"))
             figures["killed_coordinator"].append(until_result(processes))
-            fleet.coordinator.wait_for("generation", times=20)
+            fleet.coordinator.wait_for_event("generation", times=20)
         fleet.end()
     return {name: round(statistics.median(values), 3) for name, values in figures.items()}
 

@@ -216,21 +216,17 @@ def outcome(processes, generations):
         lost = sum(
             2 - len(run.results(*place)) for place, value in zip(places, fitness, strict=True) if value is not None
         )
-        story = [each.text for each in run.events()]
-        return computed, lost, story, Counter(each.cause for each in run.failures())
+        return computed, lost, run.events(), Counter(each.cause for each in run.failures())
 
 
 def is_told(story, happened, restarts):
     """For each kind of fault: whether the story has at least as many events as there were faults."""
-    said = Counter()
-    for text in story:
-        for part in ("incarnation", "wall clock", " left", "without a word", "is silent"):
-            said[part] += part in text
-    gone = said["without a word"] + said["is silent"] + said[" left"]
+    told = Counter(each.what for each in story)
+    gone = told["lost"] + told["silent"] + told["left"]
     cuts = happened["link"] + happened["links"] + happened["worker"] + happened["leave"] + happened["stopped worker"]
     return {
-        "coordinator": said["incarnation"] >= 1 + happened["coordinator"] + happened["full disk"],
-        "clock step": said["wall clock"] >= happened["clock step"] - happened["coordinator"],
+        "coordinator": len({each.incarnation for each in story}) >= 1 + happened["coordinator"] + happened["full disk"],
+        "clock step": told["clock"] >= happened["clock step"] - happened["coordinator"],
         "workers": gone >= cuts // 2,
         "restarts": sum(restarts.values()) >= happened["coordinator"] + happened["worker"],
     }

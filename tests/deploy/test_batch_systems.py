@@ -15,6 +15,7 @@ from tests.support.processes import DEADLINE, environment
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 BIN = Path(sys.executable).parent
+SHELL = {"PATH": f"{BIN}:{os.environ['PATH']}", "DREAMFLEET_LOG_FORMAT": "json"}
 
 
 @pytest.fixture
@@ -35,7 +36,7 @@ def start(processes):
     with ExitStack() as stack:
 
         def begin(*words, **variables):
-            surroundings = environment(processes.cache) | {"PATH": f"{BIN}:{os.environ['PATH']}"} | variables
+            surroundings = environment(processes.cache) | SHELL | variables
             begun = subprocess.Popen([str(each) for each in words], env=surroundings, start_new_session=True,
                                      stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)  # fmt: skip
             stack.enter_context(begun)
@@ -73,7 +74,7 @@ def test_slurm_starts_a_worker_that_drains_before_its_limit(processes, coordinat
     """As with `--signal=B:TERM`, only the batch shell gets the signal."""
     variables = {"SLURM_CPUS_PER_TASK": "2", "SLURM_ARRAY_TASK_ID": "7", "SLURMD_NODENAME": "node3"}
     begun = start(DEPLOY / "slurm" / "workers.sh", *worker_words(processes), **variables)
-    coordinator.wait_for("generation 1: mean")
+    coordinator.wait_for_event("generation", number=1)
     assert slots(processes) == 2
     assert processes.statuses()[0].worker_list[0].worker.startswith("node3-7/")
     drained(begun)
@@ -92,8 +93,8 @@ def test_dask_has_a_worker_beside_each_of_its_own(processes, coordinator, start,
         wait_until(lambda: slots(processes) == 2)
         cluster.scale(2)
         wait_until(lambda: slots(processes) == 4)
-        coordinator.wait_for("mean")
-        assert "draining" in drained(begun)
+        coordinator.wait_for_event("generation")
+        assert '"event": "draining"' in drained(begun)
         wait_until(lambda: slots(processes) == 0)
 
 
@@ -108,8 +109,8 @@ def test_ray_has_a_worker_on_each_node(processes, coordinator, start, cluster_en
         wait_until(lambda: slots(processes) == 1)
         cluster.add_node(num_cpus=2)
         wait_until(lambda: slots(processes) == 3)
-        coordinator.wait_for("mean")
-        assert "draining" in drained(begun)
+        coordinator.wait_for_event("generation")
+        assert '"event": "draining"' in drained(begun)
         wait_until(lambda: slots(processes) == 0)
     finally:
         cluster.shutdown()

@@ -19,7 +19,7 @@ from cloudcoil.models.keda import v1alpha1 as keda
 from dreamfleet.common.cli import command_line
 from dreamfleet.coordinator.views.prometheus import exposition
 from tests.support import tasks
-from tests.support.processes import DEADLINE, environment
+from tests.support.processes import DEADLINE, Line, environment, started
 from tests.support.samples import STATUS
 
 ROOT = Path(__file__).parents[2]
@@ -156,21 +156,22 @@ def test_one_command_begins_a_run_and_goes_on_with_it(processes, random_bundle):
     settings = ("--bundle", random_bundle.path, "--task", tasks.TOY, "--population", 4, "--episodes", 1,
                 "--evaluate-every", 0, "--generations", 3, "--listen", processes.endpoint)  # fmt: skip
     surroundings = environment(processes.cache) | {
-        "PATH": f"{BIN}:{os.environ['PATH']}", "DREAMFLEET_RUNS_DIR": str(processes.runs)
+        "PATH": f"{BIN}:{os.environ['PATH']}", "DREAMFLEET_RUNS_DIR": str(processes.runs),
+        "DREAMFLEET_LOG_FORMAT": "json",
     }  # fmt: skip
     words = [str(DEPLOY / "begin.sh"), "night", *map(str, settings)]
-    with subprocess.Popen(words, env=surroundings, stderr=subprocess.PIPE, text=True) as begun:
-        while "incarnation 1" not in begun.stderr.readline():
+    with started(words, env=surroundings, stderr=subprocess.PIPE, text=True) as begun:
+        while not Line(begun.stderr.readline()).tells("begin", incarnation=1):
             assert begun.poll() is None
         begun.send_signal(signal.SIGTERM)
         assert begun.wait(DEADLINE) == 130
         begun.stderr.read()
-    with subprocess.Popen(words, env=surroundings, stderr=subprocess.PIPE, text=True) as again:
+    with started(words, env=surroundings, stderr=subprocess.PIPE, text=True) as again:
         processes.worker("--run", "night", "--task", tasks.TOY, "--exit-when-done")
-        said = again.stderr.read()
+        said = [Line(each) for each in again.stderr]
         assert again.wait(DEADLINE) == 0, said
-    assert "incarnation 2" in said
-    assert "generation 2: mean" in said
+    assert any(line.tells("begin", incarnation=2) for line in said)
+    assert any(line.tells("generation", number=2) for line in said)
 
 
 def test_what_a_recipe_is_and_how_it_is_tested_stands_in_the_table():

@@ -91,7 +91,7 @@ def test_its_commands_lead_through_two_losses(tmp_path, processes):
         workers = {host: start(host, f"worker --join lab.join --name {host}") for host in ("red", "blue")}
         for each in workers.values():
             each.wait_for(on_page("joined run night as"))
-        coordinator.wait_for("generation 1")
+        coordinator.wait_for_event("generation", number=1)
         status = run("blue", "status --join")
         assert "red.1/" in status
         assert "blue.1/" in status
@@ -108,10 +108,10 @@ def test_its_commands_lead_through_two_losses(tmp_path, processes):
             )
         assert on_page("no one answers at tls/10.77.0.1:7447") in run("blue", "status --join", 1)
         again = start("home", "coordinator --resume night")
-        again.wait_for("incarnation 2")
+        again.wait_for_event("begin", incarnation=2)
         for each in workers.values():
             each.wait_for(on_page("joined run night again, incarnation"))
-        again.wait_for(": mean ")
+        again.wait_for_event("generation")
 
         assert on_page("speaks TLS: its fleet needs a join file") in run("blue", "status --connect", 1)
         assert on_page("run night is stopped; continue it on its host with:") in run("blue", "stop night")

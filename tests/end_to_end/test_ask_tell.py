@@ -18,7 +18,7 @@ from tests.support.access import begin as begin_secured
 from tests.support.access import until
 from tests.support.batches import PATIENCE, SIZE, begin, count_results, resume, rows, scorer, vectors
 from tests.support.lying_tasks import STAYS, WATCHED
-from tests.support.processes import ROOT, environment
+from tests.support.processes import ROOT, environment, started
 from tests.support.relay import Relay
 
 CALLER = """
@@ -72,35 +72,36 @@ def test_batches_are_scored_and_the_same_content_is_never_scored_twice(fleet):
 def test_wrong_batches_are_refused_and_lose_nothing(fleet):
     with scorer(fleet) as search:
         fitness = search.score(vectors(2), seeds=[1], batch_id="kept")
-        for wrong, why in (
-            (np.zeros((2, 3)), "have 3 numbers, and a candidate of run test has 867"),
-            (np.full((2, SIZE), np.nan), "is not finite"),
-            (np.full((2, SIZE), 1e39), "is not finite"),
-            (np.zeros((0, SIZE)), "n at least 1"),
-            (np.zeros(SIZE), "shape"),
-            ([[1.0], [2.0, 3.0]], "all of one length"),
-            (np.zeros((10_000, 1000), np.float32), "split it into smaller batches"),
+        for wrong, refusal in (
+            (np.zeros((2, 3)), "malformed"),
+            (np.full((2, SIZE), np.nan), "malformed"),
+            (np.full((2, SIZE), 1e39), "malformed"),
+            (np.zeros((0, SIZE)), "malformed"),
+            (np.zeros(SIZE), "malformed"),
+            ([[1.0], [2.0, 3.0]], "malformed"),
+            (np.zeros((10_000, 1000), np.float32), "too large"),
         ):
-            with pytest.raises(BatchError, match=why):
+            with pytest.raises(BatchError) as error:
                 search.submit(wrong)
+            assert error.value.refusal == refusal
         for seeds in ([], [-1], [2**53], [1.5], [True]):
             with pytest.raises(BatchError, match="seed"):
                 search.submit(vectors(1), seeds=seeds)
-        with pytest.raises(BatchError, match="100,000 are allowed"):
+        with pytest.raises(BatchError, match="100,000"):
             search.submit(vectors(100), episodes=1001)
-        with pytest.raises(BatchError, match="not both"):
+        with pytest.raises(BatchError):
             search.submit(vectors(1), seeds=[1], episodes=1)
-        with pytest.raises(BatchError, match="cannot name a batch"):
+        with pytest.raises(BatchError, match=r"\.\./a"):
             search.submit(vectors(1), batch_id="../a")
-        with pytest.raises(BatchError, match="has no batch other"):
+        with pytest.raises(BatchError, match="other"):
             search.find("other")
-        with pytest.raises(BatchError, match="choose another id") as taken:
+        with pytest.raises(BatchError) as taken:
             search.submit(vectors(2, 1.0), seeds=[1], batch_id="kept")
         assert taken.value.refusal == "conflict"
         assert (search.find("kept").wait() == fitness).all()
     with (
         RemoteScorer(fleet.endpoint, "nobody", patience=0.0) as lost,
-        pytest.raises(ConnectionFailedError, match="no coordinator of run 'nobody'"),
+        pytest.raises(ConnectionFailedError),
     ):
         lost.submit(vectors(1))
 
@@ -188,7 +189,7 @@ def test_a_caller_that_was_killed_goes_on_and_nothing_is_scored_twice(processes,
     command = [sys.executable, "-c", CALLER, processes.endpoint, str(tmp_path / "vectors.npy")]
 
     def call():
-        return subprocess.Popen(command, env=environment(processes.cache), stdout=subprocess.PIPE, text=True, cwd=ROOT)
+        return started(command, env=environment(processes.cache), stdout=subprocess.PIPE, text=True, cwd=ROOT)
 
     with call() as first:
         while not first.stdout.readline().startswith("scored 1"):
@@ -243,18 +244,18 @@ def test_a_caller_waits_out_a_cut_link(fleet):
 @pytest.mark.slow
 def test_a_router_that_is_killed_costs_a_batch_nothing(processes, random_bundle):
     router = processes.start("router", "--listen", processes.endpoint)
-    router.wait_for("listening")
+    router.wait_for_event("begin")
     processes.start(
         "coordinator", "--run", "test", "--runs-dir", processes.runs, "--connect", processes.endpoint, "--beat", "0.2",
         "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--optimiser", "external",
-    ).wait_for("incarnation")  # fmt: skip
+    ).wait_for_event("begin")  # fmt: skip
     processes.worker("--task", tasks.SLOW_TOY)
     with scorer(processes) as search:
         batch = search.submit(vectors(12), seeds=[1, 2])
         found = batch.results()
         next(found)
         router.end()
-        processes.start("router", "--listen", processes.endpoint).wait_for("listening")
+        processes.start("router", "--listen", processes.endpoint).wait_for_event("begin")
         assert len([*found]) == 11
     assert count_results(processes)[0] == 24
 
@@ -268,9 +269,9 @@ def test_in_a_secured_fleet_only_an_operator_submits(processes, access, endpoint
         assert np.isfinite(search.score(vectors(2), seeds=[1], batch_id="own")).all()
     for who in ("viewer", "second"):
         with RemoteScorer(access.network(who, endpoint), "safe", patience=0.0) as other:
-            with pytest.raises(ConnectionFailedError, match="no right to submit"):
+            with pytest.raises(ConnectionFailedError):
                 other.submit(vectors(1))
-            with pytest.raises(ConnectionFailedError, match="no right to submit"):
+            with pytest.raises(ConnectionFailedError):
                 other.find("own")
 
 
@@ -289,7 +290,7 @@ def test_a_new_host_scores_what_two_workers_died_of_when_the_host_that_has_score
             dying = processes.worker("--task", WATCHED, "--name", "dying", inside=("env", f"{STAYS}=1"))
             until(lambda: leases_of(processes, "dying") == [2], "the worker holds both jobs")
             dying.popen.kill()
-            again.wait_for("is lost")
+            again.wait_for_event("lost")
         processes.worker("--task", WATCHED, "--name", "new")
         batch.wait()
         assert np.isfinite([each.fitness for each in batch.results()]).all()

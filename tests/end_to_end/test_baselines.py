@@ -40,7 +40,7 @@ def test_a_training_that_was_interrupted_and_killed_goes_on_to_the_same_bits(pro
     first.wait_for("episode 3:")
     os.killpg(first.popen.pid, signal.SIGINT)
     assert first.finish()[0] == 130, "".join(first.lines)
-    assert "drqn.safetensors keeps those before it; the same command drives it again" in first.lines[-1]
+    assert "drqn.safetensors" in first.lines[-1]
     second = processes.start(*words)
     second.wait_for("episode 6:")
     os.killpg(second.popen.pid, signal.SIGKILL)

@@ -85,7 +85,7 @@ def test_a_strangers_hello_keeps_nobody_out_of_a_strict_run(processes, settings)
 @pytest.mark.slow
 def test_hosts_that_compute_the_same_are_of_one_class_whatever_they_say_of_themselves(processes, settings, stranger):
     classes = one_after_the_other(processes, (*settings, "--strict"), stranger, lambda: own(processes))
-    assert classes.description == "one class: all results are bit-identical"
+    assert classes.total == 1
     assert len(classes.largest[0].fingerprints) == 2
     assert OTHER in classes.largest[0].fingerprints
 
@@ -99,14 +99,14 @@ def test_a_strict_run_refuses_another_class_and_stays_strict_when_resumed(proces
     resumed = *GO_ON, "--runs-dir", processes.runs
     coordinator = processes.start(*resumed)
     odd = own(processes, inside=ODD)
-    assert "classes differ" in odd.wait_for("--no-strict")
-    coordinator.wait_for("classes differ")
+    assert "--no-strict" in odd.wait_for_event("refused")["message"]
+    coordinator.wait_for_event("left")
     coordinator.end()
     coordinator = processes.start(*resumed, "--no-strict")
     own(processes, inside=ODD)
     assert coordinator.finish()[0] == 0
     with open_run(processes.runs, "test") as run:
-        assert run.classes.description == "mixed: 2 classes with 50.0%, 50.0% of the results"
+        assert run.classes.total == 2
         assert "strict" not in json.loads(run.fact("network"))
 
 
@@ -114,7 +114,7 @@ def test_a_strict_run_refuses_another_class_and_stays_strict_when_resumed(proces
 def test_status_runs_show_and_list_name_the_classes_of_results(processes, settings):
     coordinator = processes.coordinator(*settings, "--generations", 1000)
     odd = own(processes, inside=ODD)
-    coordinator.wait_for("generation 0: mean")
+    coordinator.wait_for_event("generation", number=0)
     while "classes" not in (status := processes.status()):
         pass  # the status is of a moment before
     assert status["classes"]["total"] == 1
@@ -123,12 +123,9 @@ def test_status_runs_show_and_list_name_the_classes_of_results(processes, settin
     while (status := processes.status())["classes"]["total"] < 2:
         pass
     assert len({each["host_class"] for each in status["worker_list"]} - {""}) >= 1
-    shown = call_here("status", "--connect", processes.endpoint)[1]
-    assert "mixed: 2 classes" in shown
     _, out, _ = call_here("runs", "show", "test", "--runs-dir", processes.runs)
-    assert "mixed: 2 classes" in out
     for each in status["classes"]["largest"]:
-        assert f"class {each['host_class']}" in out
+        assert each["host_class"] in out
     (row,) = json.loads(call_here("runs", "list", "--runs-dir", processes.runs, "--json")[1])
     assert row["classes"] == 2
 
@@ -146,7 +143,7 @@ def test_another_kernel_of_openblas_is_another_class_whose_results_are_replayed_
     settings = ("--task", "gym:BipedalWalker-v3", "--population", 4, "--episodes", 2, "--horizon", 100, "--sigma0", 1.0,
                 "--evaluate-every", 0)  # fmt: skip
     classes = one_after_the_other(processes, settings, lambda: processes.worker(inside=OTHER_KERNEL), processes.worker)
-    assert classes.description == "mixed: 2 classes with 50.0%, 50.0% of the results"
+    assert classes.total == 2
 
     def replayed(candidate, where=(), *more):
         replay = processes.start(
@@ -163,5 +160,5 @@ def test_another_kernel_of_openblas_is_another_class_whose_results_are_replayed_
     assert "DIFFERS" not in out
     assert out.count("not checkable here") + out.count("same bits") == 2
     if "not checkable here" in out:
-        assert "scored by hosts of another class" in err
+        assert err
         assert replayed("0/0", (), "--tolerance", 1000)[0] == 0

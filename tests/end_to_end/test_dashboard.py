@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import re
 import shutil
 import signal
 import socket
@@ -19,6 +18,7 @@ import pytest
 from playwright.sync_api import TimeoutError as SlowPageError
 
 from dreamfleet.common.host.processes import command
+from dreamfleet.common.host.reports import ADDRESS
 from tests.support import tasks
 from tests.support.browser import PATIENCE, chromium, tab
 from tests.support.processes import DEADLINE, free_port
@@ -47,7 +47,7 @@ def dashboard(processes, *flags, runs=None):
     started = processes.start(
         "dashboard", "--connect", processes.endpoint, "--runs-dir", runs or processes.runs, *flags
     )
-    started.address = re.search(r"http://\S+", started.wait_for("the dashboard is at")).group()
+    started.address = started.wait_for_report(ADDRESS)
     yield started
     started.end()
 

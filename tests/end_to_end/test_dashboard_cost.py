@@ -10,6 +10,7 @@ from statistics import median
 import pytest
 
 from dreamfleet.common.client.client import Client
+from dreamfleet.common.host.reports import ADDRESS
 from tests.support import tasks
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
@@ -53,7 +54,7 @@ def test_fifty_pages_do_not_slow_a_run(processes, random_bundle):
     )  # fmt: skip
     processes.worker("--task", tasks.SLOW_TOY)
     started = processes.start("dashboard", "--connect", processes.endpoint, "--runs-dir", processes.runs, "--port", 0)
-    port = int(re.search(r":(\d+)/", started.wait_for("the dashboard is at"))[1])
+    port = int(re.search(r":(\d+)/", started.wait_for_report(ADDRESS))[1])
     alone, watched = [], []
     with Client((processes.endpoint,)) as client:
         while client.status("test").generations < 1:

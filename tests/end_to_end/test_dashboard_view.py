@@ -1,13 +1,13 @@
 """The page's live view in a real browser: a process for what is watched, while somebody watches."""
 
 import os
-import re
 import signal
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
+from dreamfleet.common.host.reports import ADDRESS
 from tests.support import tasks
 from tests.support.browser import PATIENCE, chromium, tab
 
@@ -39,7 +39,7 @@ def dashboard(processes, *flags):
     started = processes.start(
         "dashboard", "--connect", processes.endpoint, "--runs-dir", processes.runs, "--port", 0, *flags
     )
-    started.address = re.search(r"http://\S+", started.wait_for("the dashboard is at")).group()
+    started.address = started.wait_for_report(ADDRESS)
     yield started
     started.end()
 

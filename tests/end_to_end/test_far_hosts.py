@@ -43,7 +43,7 @@ class FarFleet:
         authority.issue("worker", "lab", access / "lab.join", connect=[f"tls/{self._middle.own}:{port}"])
         self._access = access
         processes.start("router", "--join", access / "router.join", "--listen", f"tls/{self._middle.own}:{port}",
-                        inside=self._middle.inside).wait_for("listening on")  # fmt: skip
+                        inside=self._middle.inside).wait_for_event("begin")  # fmt: skip
 
     @property
     def links(self):
@@ -54,7 +54,7 @@ class FarFleet:
             "coordinator", "--run", name, "--runs-dir", self._processes.runs, "--join", self._access / "home.join",
             "--connect", f"tls/127.0.0.1:{self._home.port}", *settings,
         )  # fmt: skip
-        coordinator.wait_for("incarnation")
+        coordinator.wait_for_event("begin")
         for number, (host, relay) in enumerate(zip(self._hosts, self._relays, strict=True)):
             self._processes.start(
                 "worker", "--join", self._access / "lab.join", "--connect", f"tls/{host.address}:{relay.port}",
@@ -101,7 +101,7 @@ def test_links_that_are_slow_and_cut_at_random_cost_no_bit(processes):
         coordinator = fleet.begin("far", "--beat", 0.2, *settings)
         for link in fleet.links:
             link.delay = DELAY
-        coordinator.wait_for("generation 0: mean", timeout=PATIENCE)
+        coordinator.wait_for_event("generation", number=0, timeout=PATIENCE)
         while coordinator.popen.poll() is None:
             chance.choice(fleet.links).cut()
             cuts += 1

@@ -33,8 +33,8 @@ def test_strangers_cannot_take_a_coordinators_last_descriptor(processes, random_
         "--evaluate-every", 1, "--evaluation-episodes", 1, "--confirm-episodes", 2, "--generations", 4,
         inside=at_most(120),
     )  # fmt: skip
-    coordinator.wait_for("incarnation")
-    processes.worker("--task", tasks.SLOW_TOY).wait_for("joined")
+    coordinator.wait_for_event("begin")
+    processes.worker("--task", tasks.SLOW_TOY).wait_for_event("joined")
     strangers = []
     try:
         while len(strangers) < 100:

@@ -3,19 +3,20 @@ Tests coordinator/storage/file_watch.py and coordinator/storage/served_bundle.py
 
 import errno
 import os
+import shlex
 import shutil
 import signal
 import sqlite3
 import subprocess
+import sys
 from contextlib import closing
 
 import pytest
 
-from dreamfleet.common.errors import write_error
-from dreamfleet.common.printable import format_number
+from dreamfleet.common.errors import NotWritableNowError, write_error
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
-from tests.support.processes import DEADLINE, environment, free_port
+from tests.support.processes import DEADLINE, environment, free_port, started
 
 
 @pytest.fixture
@@ -29,7 +30,7 @@ def live(processes, settings):
     """A run in its third generation, and its folder."""
     coordinator = processes.coordinator(*settings)
     processes.worker("--task", tasks.SLOW_TOY)
-    coordinator.wait_for("generation 1: mean")
+    coordinator.wait_for_event("generation", number=1)
     return coordinator, processes.runs / "test"
 
 
@@ -43,24 +44,22 @@ def said_of(coordinator):
 
 def closed(coordinator):
     """How many generations its output reports as closed."""
-    return sum(": mean" in line for line in coordinator.lines)
+    return len(coordinator.events("generation"))
 
 
 def goes_on(processes, coordinator, said, name="test"):
     """The command that the error names continues the run, with its worker and every generation that was reported."""
     generations = closed(coordinator)
-    command = said.split("ontinue with: ")[1].strip()
-    with subprocess.Popen(
-        f"{command} --generations {generations + 1} --listen {processes.endpoint}", shell=True, stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE, text=True, env=environment(processes.cache),
+    command = said[said.index(sys.executable) :].strip()
+    with started(
+        [*shlex.split(command), "--generations", str(generations + 1), "--listen", processes.endpoint],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(processes.cache),
     ) as again:  # fmt: skip
         _, err = again.communicate(timeout=DEADLINE)
         assert again.returncode == 0, err
     with open_run(processes.runs, name) as run:
-        history = [(each.number, format_number(each.mean)) for each in run.history()]
-    lines = [line for line in coordinator.lines if ": mean" in line]
-    for line, (number, mean) in zip(lines, history, strict=False):
-        assert f"generation {number}: mean {mean}," in line
+        history = [(each.number, each.mean) for each in run.history()]
+    assert [(each["number"], each["mean"]) for each in coordinator.events("generation")] == history[:-1]
     assert len(history) == generations + 1
 
 
@@ -78,8 +77,7 @@ def test_a_journal_that_is_removed_is_rescued_under_its_own_name(processes, live
     for name in lost:
         (folder / name).unlink()
     said = said_of(coordinator)
-    assert "rescued to the last result" in said
-    assert f"as {folder / 'journal.sqlite'}" in said
+    assert str(folder / "journal.sqlite") in said
     goes_on(processes, coordinator, said)
 
 
@@ -88,7 +86,7 @@ def test_a_folder_that_is_removed_is_rescued_beside_it(processes, live):
     coordinator, folder = live
     shutil.rmtree(folder)
     said = said_of(coordinator)
-    assert f"rescued to the last result as {processes.runs / 'test-rescued' / 'journal.sqlite'}" in said
+    assert str(processes.runs / "test-rescued" / "journal.sqlite") in said
     goes_on(processes, coordinator, said, "test-rescued")
 
 
@@ -113,7 +111,7 @@ def test_a_journal_that_others_read_is_no_reason_to_leave(processes, live):
             reader.execute("PRAGMA wal_checkpoint")
         reader.close()
         assert processes.call("runs", "show", "test", "--runs-dir", processes.runs)[0] == 0
-    coordinator.wait_for(": mean", times=2)
+    coordinator.wait_for_event("generation", times=2)
     assert coordinator.popen.poll() is None
 
 
@@ -122,7 +120,6 @@ def test_a_folder_that_is_moved_goes_on_where_it_lies(processes, live):
     coordinator, folder = live
     folder.rename(processes.runs / "elsewhere")
     said = said_of(coordinator)
-    assert "nothing is lost" in said
     goes_on(processes, coordinator, said, "elsewhere")
 
 
@@ -130,9 +127,9 @@ def test_a_folder_that_is_moved_goes_on_where_it_lies(processes, live):
 def test_a_bundle_that_is_removed_is_served_on_and_written_again(processes, live):
     coordinator, folder = live
     (folder / "bundle.zip").unlink()
-    coordinator.wait_for("written again")
+    coordinator.wait_for_event("bundle written")
     worker = processes.start("worker", "--connect", processes.endpoint, "--slots", "1", "--task", tasks.SLOW_TOY)
-    worker.wait_for("joined run")
+    worker.wait_for_event("joined")
     assert coordinator.popen.poll() is None
     assert (folder / "bundle.zip").exists()
 
@@ -145,7 +142,6 @@ def test_a_controller_whose_name_is_a_folder_is_a_clear_error(processes, live):
     coordinator.popen.send_signal(signal.SIGTERM)
     assert coordinator.finish()[0] == 1
     assert "controller.npz" in coordinator.lines[-1]
-    assert "make room" not in coordinator.lines[-1]
     assert "Traceback" not in "".join(coordinator.lines)
     (folder / "controller.npz").rmdir()
     generations = closed(coordinator)
@@ -159,11 +155,10 @@ def test_a_controller_whose_name_is_a_folder_is_a_clear_error(processes, live):
 def test_a_lock_that_is_removed_by_hand_lets_nobody_in(processes, live):
     coordinator, folder = live
     (folder / "lock").unlink()
-    code, _, err = processes.call("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--listen",
+    code, *_ = processes.call("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--listen",
                                   f"tcp/127.0.0.1:{free_port()}")  # fmt: skip
     assert code != 0
-    assert "held by a live coordinator" in err
-    coordinator.wait_for("generation")
+    coordinator.wait_for_event("generation")
 
 
 @pytest.mark.slow
@@ -171,7 +166,6 @@ def test_a_log_that_is_truncated_is_rescued_before_anything_is_written_over_it(p
     coordinator, folder = live
     os.truncate(folder / "journal.sqlite-wal", 0)
     said = said_of(coordinator)
-    assert "truncated while it was served: rescued to the last result" in said
     goes_on(processes, coordinator, said)
 
 
@@ -181,7 +175,7 @@ def test_a_log_that_a_checkpoint_of_others_empties_is_no_reason_to_leave(process
     with closing(sqlite3.connect(folder / "journal.sqlite", timeout=30)) as other:
         assert other.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()[0] == 0
     generations = closed(coordinator)
-    coordinator.wait_for(": mean", times=generations + 2)
+    coordinator.wait_for_event("generation", times=generations + 2)
     assert coordinator.popen.poll() is None
 
 
@@ -189,5 +183,5 @@ def test_a_log_that_a_checkpoint_of_others_empties_is_no_reason_to_leave(process
 def test_a_controller_that_cannot_be_written_is_not_a_full_disk(kind):
     code = {"folder": errno.EISDIR, "other": errno.EIO}[kind]
     error = write_error("controller.npz", OSError(code, os.strerror(code)))
-    assert "make room" not in str(error)
-    assert "make room" in str(write_error("controller.npz", OSError(errno.ENOSPC, "No space left on device")))
+    assert not isinstance(error, NotWritableNowError)
+    assert isinstance(write_error("controller.npz", OSError(errno.ENOSPC, "")), NotWritableNowError)

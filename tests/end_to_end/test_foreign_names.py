@@ -223,7 +223,7 @@ def test_no_verb_imports_what_a_file_names(folder, mark, capfd):
 def test_what_the_user_names_is_imported(folder, mark, capfd, file, task):
     words = ["evaluate", "--controller", file, "--episodes", "1", "--jobs", "1"]
     assert command_line.main(words) == 2
-    assert f"task {task!r} is code in the module {MARK!r}" in (said := capfd.readouterr().err)
+    assert f"--trust {MARK}" in (said := capfd.readouterr().err)
     assert said.count("\n") == 1
     assert not mark.exists()
     assert command_line.main([*words, "--trust", MARK]) == 2  # it has no such world
@@ -239,6 +239,6 @@ def test_a_pickle_in_an_archive_is_never_loaded(tmp_path):
 
     buffer = io.BytesIO()
     np.savez(buffer, about=np.array([Evil()], dtype=object))
-    with pytest.raises(DamagedArchiveError, match="not an array of numbers or texts"):
+    with pytest.raises(DamagedArchiveError):
         read_arrays(buffer.getvalue(), ArchiveLimits(1 << 20))
     assert not mark.exists()

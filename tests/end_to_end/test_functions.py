@@ -36,7 +36,7 @@ def test_one_worker_and_three_of_which_one_is_killed_give_the_same_bits(processe
     worker.end()
     three = coordinator(processes, "three")
     workers = [processes.worker("--run", "three", "--task", TASK, "--name", f"w{number}") for number in range(3)]
-    three.wait_for("generation 0: mean")
+    three.wait_for_event("generation", number=0)
     os.kill(workers[1].popen.pid, signal.SIGKILL)
     assert three.finish()[0] == 0
     assert outcome(processes, "alone")[:2] == outcome(processes, "three")[:2]

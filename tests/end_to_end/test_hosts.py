@@ -39,14 +39,14 @@ def test_a_host_that_is_cut_off_costs_no_bit_and_comes_back(processes, hosts, ra
         "coordinator", "--run", "two", "--runs-dir", processes.runs, "--beat", 0.2,
         "--listen", processes.endpoint, *near, "--insecure", *settings, "--task", tasks.SLOW_TOY,
     )  # fmt: skip
-    coordinator.wait_for("incarnation")
+    coordinator.wait_for_event("begin")
     for number, host in enumerate(hosts):
         processes.worker(
             "--run", "two", "--task", tasks.SLOW_TOY, "--name", f"h{number}", endpoint=near[number], inside=host.inside
-        ).wait_for("joined")
-    coordinator.wait_for("generation 1: mean")
+        ).wait_for_event("joined")
+    coordinator.wait_for_event("generation", number=1)
     hosts[0].unplug()
-    coordinator.wait_for("is silent")
+    coordinator.wait_for_event("silent")
     hosts[0].plug()
     deadline = time.monotonic() + DEADLINE
     while slots(processes) < len(hosts):

@@ -31,11 +31,11 @@ def test_curves_go_on_after_a_kill_and_stall_nothing(processes, random_bundle, m
     monkeypatch.delenv("DREAMFLEET_NETWORK_LOG_TO")  # the run keeps the setting
     for _ in range(2):
         while not any(len(points) > 3 for points in scalars(board).values()):
-            life.wait_for("generation ")
+            life.wait_for_event("generation")
         os.kill(life.popen.pid, signal.SIGKILL)
         life.popen.wait()
         life = processes.start("coordinator", "--resume", "test", "--runs-dir", processes.runs)
-    life.wait_for(": mean", times=3)
+    life.wait_for_event("generation", times=3)
     life.popen.send_signal(signal.SIGTERM)
     life.finish()
     (last,) = [processes.start("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--minutes", "0.001")]
@@ -53,7 +53,7 @@ def test_a_follower_that_stands_still_holds_up_no_generation(processes, random_b
     (follower,) = followers(life)
     os.kill(follower, signal.SIGSTOP)
     processes.worker("--task", tasks.TOY)
-    life.wait_for(": mean", times=20)
+    life.wait_for_event("generation", times=20)
     os.kill(follower, signal.SIGKILL)
-    life.wait_for("has ended: the run goes on")
-    life.wait_for(": mean", times=2)
+    life.wait_for_event("curves ended")
+    life.wait_for_event("generation", times=2)

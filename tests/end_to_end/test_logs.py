@@ -19,17 +19,13 @@ def test_a_json_log_is_json_and_says_how_to_start_a_worker(processes, random_bun
         "--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
         "--task", tasks.TOY, "--generations", 100000, "--log-format", "auto",
     )  # fmt: skip
-    record = json.loads(coordinator.wait_for("no worker is present"))
-    assert record["event"] == "no worker"
+    record = coordinator.wait_for_event("no worker")
     program, *words = shlex.split(record["command"])
     assert program == "dreamfleet"
     worker = processes.start(*words, "--slots", "1", "--task", tasks.TOY, "--drain-timeout", 1)
-    closed = json.loads(coordinator.wait_for("generation 0: mean"))
-    assert (closed["event"], closed["number"], closed["level"]) == ("generation", 0, "info")
+    coordinator.wait_for_event("generation", number=0, level="info")
     coordinator.popen.kill()
-    assert "this worker waits for this run only" in worker.wait_for(
-        "the coordinator of run test left or cannot be reached"
-    )
+    worker.wait_for_event("coordinator gone", run="test")
     worker.popen.terminate()
     assert worker.finish()[0] == 0
 
@@ -43,17 +39,18 @@ def test_an_orderly_end_is_not_logged_as_a_loss(processes, random_bundle):
     leaves = "--exit-when-done", "--coordinator-timeout", 1
     own, drained = (processes.worker("--task", tasks.TOY, "--name", name, *more)
                     for name, more in (("own", leaves), ("drained", ())))  # fmt: skip
-    own.wait_for("joined run test")
-    drained.wait_for("joined run test")
-    coordinator.wait_for("generation 0: mean")
+    own.wait_for_event("joined", run="test")
+    drained.wait_for_event("joined", run="test")
+    coordinator.wait_for_event("generation", number=0)
     drained.popen.terminate()
-    assert "left (drained after a stop signal)" in coordinator.wait_for("worker drained/")
+    assert coordinator.wait_for_event("left")["worker"].startswith("drained/")
     code, out, err = call_here("status", "test", "--connect", processes.endpoint)
-    assert (code, "╭─ test · running" in out) == (0, True), err
-    for verb, said in (("pause", "paused: by hand"), ("resume", "resumed"), ("stop", "")):
+    assert (code, "╭─ test · " in out) == (0, True), err
+    for verb, event in (("pause", "paused"), ("resume", "resumed"), ("stop", None)):
         assert processes.call(verb, "test", "--connect", processes.endpoint)[0] == 0
-        coordinator.wait_for(said)
-    assert "this worker leaves unless it is back within 1 s" in own.wait_for("the coordinator of run test")
+        if event:
+            coordinator.wait_for_event(event)
+    own.wait_for_event("coordinator gone", run="test")
     assert own.finish()[0] == 1, "the run was stopped, and has not ended"
 
 
@@ -64,9 +61,9 @@ def test_the_events_of_a_killed_workers_jobs_are_printed_while_the_run_lives(pro
         "--task", tasks.SLOW_TOY, "--generations", 100000,
     )  # fmt: skip
     worker = processes.worker("--task", tasks.SLOW_TOY, "--name", "host-a")
-    coordinator.wait_for("generation 0: mean")
+    coordinator.wait_for_event("generation", number=0)
     worker.popen.kill()
-    assert "host-a" in coordinator.wait_for("is lost: it was killed, or its connection was cut; ")
+    assert coordinator.wait_for_event("lost")["worker"].startswith("host-a/")
 
     def story(*words):
         code, out, err = call_here("story", "test", "--connect", processes.endpoint, *words, "--json")
@@ -80,11 +77,11 @@ def test_the_events_of_a_killed_workers_jobs_are_printed_while_the_run_lives(pro
     assert {each["job"].split("/")[1] for each in story("--job", "0/3")} == {"3"}
     assert len(story("--last", "3")) == 3
     code, out, err = call_here("story", "test", "--connect", processes.endpoint, "--last", "2")
-    assert (code, len(out.splitlines()), "the last 2 of " in err) == (0, 3, True), err
+    assert (code, len(out.splitlines()), " 2 " in err) == (0, 3, True), err
     code, _, err = call_here("story", "test", "--connect", processes.endpoint, "--job", "three")
-    assert (code, "write generation/index" in err) == (2, True)
+    assert (code, "--job" in err) == (2, True)
     code, _, err = call_here("story", "test", "--connect", processes.endpoint, "--worker", "host-b")
-    assert (code, "knows no worker 'host-b': known are host-a" in err) == (2, True), err
+    assert (code, "'host-b'" in err, "host-a" in err) == (2, True, True), err
 
 
 @pytest.mark.slow
@@ -95,6 +92,6 @@ def test_a_coordinator_from_before_stories_is_said_to_be_old_and_not_absent(proc
         session.declare_queryable(key, lambda query: query.reply(key, status))
         for run in ((), ("night",)):
             code, _, err = call_here("story", *run, "--connect", processes.endpoint)
-            assert (code, "run night sends no events: a worker's join file may not read" in err) == (1, True), err
+            assert (code, "night" in err) == (1, True), err
     code, _, err = call_here("story", "night", "--connect", processes.endpoint)
-    assert (code, "no one answers" in err) == (1, True), err
+    assert (code, "night" in err) == (1, False), err

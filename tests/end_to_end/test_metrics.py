@@ -1,12 +1,12 @@
 """`/metrics` of a live coordinator."""
 
-import re
 import urllib.error
 import urllib.request
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from dreamfleet.common.host.reports import ADDRESS
 from tests.support import tasks
 from tests.support.processes import DEADLINE, free_port
 from tests.support.served import serving, snapshot
@@ -26,7 +26,7 @@ def test_a_coordinator_answers_prometheus_and_a_taken_port_is_one_line(processes
     coordinator = processes.coordinator(*settings)
     assert read(port)["dreamfleet_generation"].value == 0
     processes.worker("--task", tasks.TOY, "--name", "host-a")
-    coordinator.wait_for("generation 1: mean")
+    coordinator.wait_for_event("generation", number=1)
     while (found := read(port))["dreamfleet_generations_closed_total"].value < 1:
         pass  # a snapshot is a fifth of a second old
     assert found["dreamfleet_worker_slots"].labels["worker"].startswith("host-a/")
@@ -36,14 +36,14 @@ def test_a_coordinator_answers_prometheus_and_a_taken_port_is_one_line(processes
     code, _, err = processes.call("coordinator", "--run", "other", "--runs-dir", processes.runs, "--listen", other,
                                   *settings)  # fmt: skip
     assert code == 1
-    assert f"cannot serve metrics at {port}" in err
+    assert str(port) in err
     assert "Traceback" not in err
 
 
 @pytest.mark.parametrize("wrong", ["none", "0", "host:", "70000"])
 def test_a_port_that_is_none_is_said_at_once(processes, wrong):
     code, _, err = processes.call("coordinator", "--run", "test", "--runs-dir", processes.runs, "--metrics-port", wrong)
-    assert (code, "give a port such as 9108" in err) == (2, True), err
+    assert (code, "--metrics-port" in err) == (2, True), err
 
 
 def test_the_dashboard_answers_for_every_live_run_to_holders_of_the_token(processes):
@@ -51,7 +51,7 @@ def test_the_dashboard_answers_for_every_live_run_to_holders_of_the_token(proces
         page = processes.start(
             "dashboard", "--connect", processes.endpoint, "--port", 0, "--token", "correct horse battery"
         )
-        address = re.search(r"http://\S+", page.wait_for("the dashboard is at")).group()
+        address = page.wait_for_report(ADDRESS)
         with pytest.raises(urllib.error.HTTPError, match="401"):
             urllib.request.urlopen(f"{address}metrics", timeout=DEADLINE)
         asked = urllib.request.Request(f"{address}metrics", headers={"Authorization": "Bearer correct horse battery"})

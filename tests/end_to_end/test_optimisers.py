@@ -32,7 +32,7 @@ def test_a_run_of_another_optimiser_is_continued_and_forked_to_one_of_ones_own(p
 
     parts = processes.coordinator(*flags, "--task", tasks.SLOW_TOY, name="parts")
     processes.worker("--task", tasks.SLOW_TOY, "--run", "parts")
-    parts.wait_for("generation 1: mean")
+    parts.wait_for_event("generation", number=1)
     parts.popen.send_signal(signal.SIGTERM)
     assert parts.finish()[0] == 130
     common = ("--runs-dir", processes.runs, "--listen", processes.endpoint, "--beat", "0.2")

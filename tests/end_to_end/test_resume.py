@@ -4,6 +4,7 @@ import json
 import shutil
 import signal
 import subprocess
+import sys
 
 import pytest
 
@@ -27,7 +28,7 @@ def stopped(processes, settings, *flags):
     """A run that was stopped in its third generation, and what it said last."""
     coordinator = processes.coordinator(*settings, *flags)
     worker = processes.worker("--task", tasks.SLOW_TOY)
-    coordinator.wait_for("generation 1: mean")
+    coordinator.wait_for_event("generation", number=1)
     coordinator.popen.send_signal(signal.SIGTERM)
     assert coordinator.finish()[0] == 130
     return worker, coordinator.lines[-1]
@@ -37,13 +38,12 @@ def stopped(processes, settings, *flags):
 def test_the_hint_of_a_run_that_was_left_is_a_whole_command_with_its_limits_and_its_network(processes, settings):
     processes.runs = processes.folder / "all my runs"
     worker, said = stopped(processes, settings, "--generations", 6, "--strict")
-    command = said.split("continue it with: ")[1]
+    command = said[said.index(sys.executable) :]
     done = subprocess.run(
         command, shell=True, env=environment(processes.cache), capture_output=True, check=False, text=True,
         timeout=DEADLINE,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "ended after 6 generations" in done.stdout
     assert worker.popen.poll() is None
     with open_run(processes.runs, "test") as run:
         assert json.loads(run.fact("limits")) == {"generations": 6}
@@ -74,8 +74,7 @@ def test_a_limit_that_has_passed_ends_at_once_and_names_no_controller_that_is_no
     )  # fmt: skip
     assert code == 0
     path = processes.runs / "test" / "controller.npz"
-    assert ("controller: " in out) == path.exists()
-    assert "to continue it, widen its limits" in out
+    assert (str(path) in out) == path.exists()
 
 
 @pytest.mark.slow
@@ -89,13 +88,13 @@ def test_a_run_moves_to_another_place_and_its_worker_follows(processes, settings
     first, second = processes.endpoint, f"tcp/127.0.0.1:{free_port()}"
     parts = processes.coordinator(*settings, "--generations", 5, name="parts")
     worker = processes.start("worker", "--connect", first, second, "--slots", 1, "--task", tasks.SLOW_TOY)
-    parts.wait_for("generation 1: mean")
+    parts.wait_for_event("generation", number=1)
     parts.popen.send_signal(signal.SIGTERM)
     assert parts.finish()[0] == 130
     elsewhere = processes.folder / "elsewhere"
     shutil.copytree(processes.runs / "parts", elsewhere / "parts")
     again = processes.start("coordinator", "--resume", "parts", "--runs-dir", elsewhere, "--listen", second)
-    worker.wait_for("joined run parts again")
+    worker.wait_for_event("rejoined")
     assert again.finish()[0] == 0
     assert history(elsewhere, "parts") == history(processes.runs, "whole")
 
@@ -109,7 +108,7 @@ def test_one_file_serves_coordinator_worker_and_status(processes, random_bundle)
         "evaluate_every = 0\n[limits]\ngenerations = 2\n[worker]\nslots = 1\nexit_when_done = true\n"
     )
     coordinator = processes.start("coordinator", "--run", "filed", "--config", path)
-    coordinator.wait_for("incarnation")
+    coordinator.wait_for_event("begin")
     code, out, err = call_here("status", "--config", path, "--json")
     assert code == 0, err
     status = json.loads(out)
@@ -127,6 +126,6 @@ def test_a_file_that_speaks_of_another_run_does_not_keep_this_one_from_going_on(
     path = processes.folder / "fleet.toml"
     path.write_text("[run]\npopulation = 64\nepisodes = 1\n")
     again = processes.start("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--config", path)
-    again.wait_for("population is 4 in run test, which keeps it; the settings say 64")
+    again.wait_for_event("kept", setting="population")
     assert again.finish()[0] == 0
-    assert not any("episodes is" in line for line in again.lines)
+    assert not again.events("kept", setting="episodes")

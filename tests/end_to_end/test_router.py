@@ -60,21 +60,21 @@ def test_two_linked_routers_one_of_which_is_killed_cost_no_bit(processes, recipe
                                       "router_example:7447": f"127.0.0.1:{ports['router']}",
                                       "second_example:7447": f"127.0.0.1:{ports['second']}"})  # fmt: skip
     linked = processes.start("router", "--config", second)  # either may start first
-    linked.wait_for("listening on")
+    linked.wait_for_event("begin")
     router = processes.start("router", "--config", first)
-    router.wait_for("listening on")
+    router.wait_for_event("begin")
     coordinator = processes.start("coordinator", "--config", first, "--run", "far", "--runs-dir", processes.runs,
                                   "--bundle", random_bundle.path, *SETTINGS, tasks.SLOW_TOY)  # fmt: skip
     worker = processes.start("worker", "--config", second, "--run", "far", "--task", tasks.SLOW_TOY, "--slots", 1)
-    worker.wait_for("joined")
-    coordinator.wait_for("generation 1: mean")
+    worker.wait_for_event("joined")
+    coordinator.wait_for_event("generation", number=1)
     os.kill(router.popen.pid, signal.SIGKILL)
     router.popen.wait()
-    processes.start("router", "--config", first).wait_for("listening on")
+    processes.start("router", "--config", first).wait_for_event("begin")
     assert coordinator.finish()[0] == 0
     linked.popen.send_signal(signal.SIGTERM)
     assert linked.finish()[0] == 0
-    assert "1 router" in linked.lines[-1]
+    assert linked.events("sessions")[-1]["routers"] == 1
     assert fitness(processes, "far") == alone
 
 
@@ -89,13 +89,13 @@ def test_a_coordinator_that_nobody_reaches_meets_workers_of_another_network_at_a
                                       "router_example:7447": f"{host.address}:{processes.port}"}).rename(
                     processes.folder / f"{host.name}.toml") for host in (inside, elsewhere)]  # fmt: skip
         listen = [f"tcp/{host.address}:{processes.port}" for host in (inside, elsewhere)]
-        processes.start("router", "--insecure", "--listen", *listen).wait_for("listening on")
+        processes.start("router", "--insecure", "--listen", *listen).wait_for_event("begin")
         coordinator = processes.start("coordinator", "--config", near[0], "--run", "nat", "--runs-dir", processes.runs,
                                       "--bundle", random_bundle.path, *SETTINGS, tasks.SLOW_TOY,
                                       inside=inside.inside)  # fmt: skip
         worker = processes.start("worker", "--config", near[1], "--run", "nat", "--task", tasks.SLOW_TOY, "--slots", 2,
                                  inside=elsewhere.inside)  # fmt: skip
-        worker.wait_for("joined")
+        worker.wait_for_event("joined")
         assert coordinator.finish()[0] == 0
     assert fitness(processes, "nat") == alone
 
@@ -117,6 +117,6 @@ def test_what_is_printed_for_zenohd_is_the_routers_own_configuration(processes, 
 
 
 def test_a_port_in_use_is_one_line(processes):
-    processes.start("router", "--listen", processes.endpoint).wait_for("listening on")
+    processes.start("router", "--listen", processes.endpoint).wait_for_event("begin")
     code, _, err = processes.call("router", "--listen", processes.endpoint)
-    assert (code, "is in use" in err, "Traceback" in err) == (1, True, False), err
+    assert (code, str(processes.port) in err, "Traceback" in err) == (1, True, False), err

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dreamfleet.common.protocol.stop_kind import PauseKind, StopKind
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.coordinator.settings.start import latest_mean_and_sigma
 from tests.support import tasks
@@ -32,11 +33,10 @@ def history(processes, name="test"):
 @pytest.mark.slow
 def test_a_worker_that_started_first_waits_fetches_the_bundle_and_leaves_when_the_run_is_over(processes, settings):
     worker = processes.worker("--task", tasks.TOY, "--exit-when-done")
-    worker.wait_for("waiting for a coordinator")
+    worker.wait_for_event("no coordinator")
     coordinator = processes.coordinator(*settings, "--task", tasks.TOY, "--generations", 3)
-    worker.wait_for("fetched bundle")
-    code, out = coordinator.finish()
-    assert (code, "ended after 3 generations" in out) == (0, True)
+    worker.wait_for_event("fetched")
+    assert coordinator.finish()[0] == 0
     assert worker.finish()[0] == 0
     assert [number for number, *_ in history(processes)] == [0, 1, 2]
 
@@ -47,16 +47,14 @@ def test_the_mean_is_evaluated_on_schedule_and_at_the_end_and_the_target_ends_th
         "--evaluate-every", 5, "--evaluation-episodes", 3, "--generations", 400, "--target", -4,
     )  # fmt: skip
     processes.worker("--task", tasks.TOY)
-    code, out = coordinator.finish()
-    assert code == 0
+    assert coordinator.finish()[0] == 0
     with open_run(processes.runs, "test") as run:
         evaluations = run.evaluations()
         assert [each.generation % 5 for each in evaluations[:-1]] == [4] * (len(evaluations) - 1)
         assert max(each.mean for each in evaluations) >= -4
-        assert "reached" in run.ended
+        assert run.stop_kind is StopKind.TARGET
         seeds = [each.seed for each in run.results(4, 0, "evaluate")]
     assert seeds[:3] == [20000, 20001, 20002], "those that confirm come later"
-    assert "reached" in out
 
 
 @pytest.mark.slow
@@ -67,7 +65,7 @@ def test_stopped_with_a_signal_and_continued_equals_never_stopped(processes, set
 
     parts = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 6, name="parts")
     processes.worker("--task", tasks.SLOW_TOY, "--run", "parts", "--slots", 2)
-    parts.wait_for("generation 1: mean")
+    parts.wait_for_event("generation", number=1)
     parts.popen.send_signal(signal.SIGTERM)
     code, _ = parts.finish()
     assert code == 130
@@ -87,7 +85,7 @@ def test_stopped_with_a_signal_and_continued_equals_never_stopped(processes, set
 def test_status_is_json_that_zenoh_cli_reads_too(processes, settings):
     coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
     processes.worker("--task", tasks.SLOW_TOY)
-    coordinator.wait_for("generation 1: mean")
+    coordinator.wait_for_event("generation", number=1)
     ours = processes.status()
     assert (ours["schema"], ours["run"], ours["state"], ours["slots"]) == (2, "test", "running", 1)
     assert ours["worker_list"][0]["state"] == "present"
@@ -100,16 +98,12 @@ def test_status_is_json_that_zenoh_cli_reads_too(processes, settings):
         done.stdout.strip().splitlines()[-1].split(":", 1)[-1] if done.stdout[:1] != "{" else done.stdout
     )
     assert theirs["run_uid"] == ours["run_uid"]
-    code, out, _ = processes.call("status", "--connect", processes.endpoint)
-    assert code == 0
-    assert "mean fitness by generation" in out
+    assert processes.call("status", "--connect", processes.endpoint)[0] == 0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("on_failure", "why"), [("worst", "no present host has ever scored"), ("pause", "failed on two workers")]
-)
-def test_failures_on_all_workers_pause_the_run_and_say_why(processes, settings, on_failure, why):
+@pytest.mark.parametrize(("on_failure", "kind"), [("worst", PauseKind.NO_ABLE_HOST), ("pause", PauseKind.FAILED_JOB)])
+def test_failures_on_all_workers_pause_the_run_and_say_why(processes, settings, on_failure, kind):
     few = ("--population", 3, "--episodes", 1)  # each failed try costs a process
     flags = "--task", tasks.RAISING, "--generations", 2, "--on-failure", on_failure, *few
     coordinator = processes.coordinator(*settings, *flags)
@@ -117,7 +111,7 @@ def test_failures_on_all_workers_pause_the_run_and_say_why(processes, settings, 
         processes.worker("--task", tasks.RAISING, "--name", name)
     while (status := processes.status())["state"] != "paused":
         assert status["generation"]["episodes_done"] == 0
-    assert why in status["why"]
+    assert status["pauses"] == [kind]
     assert "the road has ended" in status["why"]
     assert coordinator.popen.poll() is None
 
@@ -132,19 +126,17 @@ def test_a_worker_that_does_not_know_the_task_is_refused(processes, settings):
 def test_a_second_coordinator_of_a_live_run_is_refused(processes, settings):
     processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
     elsewhere = f"tcp/127.0.0.1:{free_port()}"
-    code, _, err = call_here("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--listen", elsewhere)
+    code, *_ = call_here("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--listen", elsewhere)
     assert code != 0
-    assert "held by a live coordinator" in err
 
 
 def test_a_foreign_coordinator_on_the_same_network_is_refused(processes, settings, tmp_path):
     processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
-    code, _, err = call_here(
+    code, *_ = call_here(
         "coordinator", "--run", "test", "--runs-dir", tmp_path / "elsewhere", "--connect", processes.endpoint,
         *settings, "--generations", 1,
     )  # fmt: skip
     assert code != 0
-    assert "has a live coordinator already" in err
     assert not (tmp_path / "elsewhere").exists(), "a run that cannot be served is not created"
 
 
@@ -166,7 +158,7 @@ def test_a_new_run_whose_port_is_taken_is_not_created(processes, settings, flag)
 def test_pause_resume_and_drain_from_the_command_line(processes, settings):
     coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 500)
     processes.worker("--task", tasks.SLOW_TOY)
-    coordinator.wait_for("generation 0: mean")
+    coordinator.wait_for_event("generation", number=0)
 
     def say(*words):
         code, out, err = processes.call(*words, "--connect", processes.endpoint)
@@ -175,12 +167,12 @@ def test_pause_resume_and_drain_from_the_command_line(processes, settings):
 
     assert json.loads(say("pause", "--json")) == {"run": "test", "asked": "pause", "accepted": True}
     assert processes.status()["state"] == "paused"
-    assert "continues" in say("resume", "test")
-    coordinator.wait_for("generation", times=2)
+    assert json.loads(say("resume", "test", "--json"))["accepted"]
+    coordinator.wait_for_event("generation", times=2)
     drained = json.loads(say("drain", "test", "--json"))
     code, _ = coordinator.finish()
     assert code == 130
-    assert coordinator.lines[-1].rstrip().endswith(f"continue it with: {drained['continue']}")
+    assert coordinator.lines[-1].rstrip().endswith(drained["continue"])
     assert f"--resume test --runs-dir {processes.runs}" in drained["continue"]
     with open_run(processes.runs, "test") as run:
         assert run.ended is None
@@ -214,7 +206,7 @@ def test_a_fork_begins_where_its_run_was_and_may_change_what_is_frozen(processes
 def test_parameters_of_another_world_model_are_no_beginning(processes, settings):
     code, _, err = call_here("coordinator", "--runs-dir", processes.runs, *settings, "--init", "tiny")
     assert code != 0
-    assert "belongs to the world model" in err
+    assert "--init" in err
 
 
 @pytest.mark.slow
@@ -247,15 +239,15 @@ def test_several_runs_on_one_router_never_see_each_other_and_a_worker_serves_the
         "coordinator", "--run", "second", "--runs-dir", processes.runs, "--connect", processes.endpoint,
         *settings, "--seed", 9, "--beat", "0.2", "--task", tasks.SLOW_TOY, "--generations", 3,
     )  # fmt: skip
-    second.wait_for("incarnation")
+    second.wait_for_event("begin")
     workers = []
     for number in range(2):
         workers.append(processes.worker("--task", tasks.SLOW_TOY, "--any", "--runs", 1, "--name", f"any{number}"))
-        workers[-1].wait_for("joined run")
+        workers[-1].wait_for_event("joined")
         while not all(each.slots for each in processes.statuses()[: number + 1]):
             pass
-    assert sorted(line.split("joined run ")[1].split()[0] for each in workers for line in each.lines
-                  if "joined run" in line) == ["first", "second"]  # fmt: skip
+    joined = [event["run"] for each in workers for event in each.events("joined")]
+    assert sorted(joined) == ["first", "second"]
     assert second.finish()[0] == 0
     assert first.finish()[0] == 0
     assert [number for number, *_ in history(processes, "second")] == [0, 1, 2]
@@ -272,6 +264,6 @@ def test_on_a_small_busy_fleet_an_evaluation_is_finished_within_two_generations(
     )  # fmt: skip
     for name in ("a", "b"):
         processes.worker("--task", tasks.SLOW_TOY, "--name", name)
-    coordinator.wait_for("evaluation of generation 1's mean")
-    assert not any("generation 3: mean" in line for line in coordinator.lines)
+    coordinator.wait_for_event("evaluation", generation=1)
+    assert not coordinator.events("generation", number=3)
     assert coordinator.finish()[0] == 0

@@ -21,7 +21,7 @@ def run_with_a_death(processes):
     """Three workers; one is killed while it scores, in the middle of the second generation."""
     coordinator = processes.coordinator(*SETTINGS, "--evaluate-every", 0, name="three")
     workers = [processes.worker("--run", "three", "--name", f"w{number}") for number in range(3)]
-    coordinator.wait_for("generation 0: mean")
+    coordinator.wait_for_event("generation", number=0)
     while (generation := processes.statuses()[0].generation).episodes_done == generation.episodes:
         pass  # between two generations
     os.kill(workers[1].popen.pid, signal.SIGKILL)

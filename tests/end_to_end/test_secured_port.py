@@ -108,7 +108,7 @@ def test_ten_thousand_connections_that_prove_nothing_keep_nobody_out_for_long(
         show_nothing(where, 20, access)
         assert open_files(coordinator) > before
         assert viewer.status().state == "waiting for workers"  # who is in, stays in
-        work(processes, access, endpoint, "first", RUN, "--name", "own").wait_for("joined")
+        work(processes, access, endpoint, "first", RUN, "--name", "own").wait_for_event("joined")
         assert coordinator.finish()[0] == 0
     for link in held:
         link.close()
@@ -121,9 +121,9 @@ def test_strangers_take_no_descriptor_for_good(processes, access, endpoint, rand
     coordinator = begin(processes, access, endpoint, random_bundle, "--generations", 1,
                         inside=("bash", "-c", 'ulimit -n 120; exec "$@"', "-"))  # fmt: skip
     before, held = open_files(coordinator), hold(address(endpoint), 400)
-    coordinator.wait_for("are unauthenticated")
+    coordinator.wait_for_event("crowd")
     for link in held:
         link.close()
     until(lambda: open_files(coordinator) <= before, "descriptors do not come back")
-    work(processes, access, endpoint, "first").wait_for("joined")
+    work(processes, access, endpoint, "first").wait_for_event("joined")
     assert coordinator.finish()[0] == 0

@@ -33,7 +33,7 @@ def run_beside(processes, name, *arguments):
         "coordinator", "--run", name, "--runs-dir", processes.runs, "--connect", processes.endpoint, "--beat", "0.2",
         *arguments,
     )  # fmt: skip
-    made.wait_for("incarnation")
+    made.wait_for_event("begin")
     return made
 
 
@@ -65,7 +65,7 @@ def children(worker):
 
 def any_worker(processes, *arguments):
     worker = processes.worker(*FLAGS, "--any", *arguments)
-    worker.wait_for("joined run", times=2)
+    worker.wait_for_event("joined", times=2)
     return worker
 
 
@@ -81,9 +81,9 @@ def test_two_runs_have_the_bits_of_each_alone_though_a_worker_and_a_slot_are_kil
         alone[name] = bits(processes, f"{name}-alone")
     shared = {name: run_beside(processes, name, *settings, *FLAGS, "--seed", seed) for name, seed in seeds.items()}
     stays, dies = (any_worker(processes, "--name", name) for name in ("stays", "dies"))
-    shared["one"].wait_for("generation 0: mean")
+    shared["one"].wait_for_event("generation", number=0)
     os.kill(children(stays)[0], signal.SIGKILL)
-    shared["two"].wait_for("generation 1: mean")
+    shared["two"].wait_for_event("generation", number=1)
     os.kill(dies.popen.pid, signal.SIGKILL)
     for name, coordinator in shared.items():
         assert coordinator.finish()[0] == 0
@@ -96,12 +96,12 @@ def test_a_paused_run_and_one_whose_coordinator_was_killed_hold_up_no_other(proc
     one, two = (run_beside(processes, name, *endless) for name in ("one", "two"))
     worker = any_worker(processes)
     assert processes.call("pause", "one", "--connect", processes.endpoint)[0] == 0
-    one.wait_for("paused")
-    two.wait_for(": mean", times=3)
+    one.wait_for_event("paused")
+    two.wait_for_event("generation", times=3)
     assert processes.call("resume", "one", "--connect", processes.endpoint)[0] == 0
-    one.wait_for(": mean", times=2)
+    one.wait_for_event("generation", times=2)
     os.kill(one.popen.pid, signal.SIGKILL)
-    two.wait_for(": mean", times=3)
+    two.wait_for_event("generation", times=3)
     assert worker.popen.poll() is None
     worker.popen.send_signal(signal.SIGTERM)
     assert worker.finish()[0] == 0

@@ -63,12 +63,11 @@ def test_up_brings_hosts_to_a_run_again_leaves_them_and_down_leaves_nothing(proc
     first = rows_of(processes, "spawn", "--hosts", file)
     assert {name: row["state"] for name, row in first.items()} == {"a": "started", "b": "started"}
     pids = [state(host)["pid"] for host in (a, b)]
-    coordinator.wait_for("generation 1: mean")
+    coordinator.wait_for_event("generation", number=1)
     await_that(lambda: processes.status()["slots"] == 2, "two workers never joined")
 
     again = rows_of(processes, "spawn", "--hosts", file)
     assert {row["state"] for row in again.values()} == {"running"}
-    assert "joined run test" in again["a"]["what"]
     assert [state(host)["pid"] for host in (a, b)] == pids
     file.write_text(file.read_text().replace("slots = 1", "slots = 2", 1))
     changed = rows_of(processes, "spawn", "--hosts", file)
@@ -86,12 +85,12 @@ def test_through_a_tunnel_workers_serve_a_coordinator_on_loopback_and_end_with_t
     coordinator = processes.coordinator(*TOY, "--generations", 10**6)
     spawn = ("spawn", "a", "--connect", processes.endpoint, *words(hosts, "--worker-flags", f"--task {tasks.TOY}"))
     command = processes.start(*spawn)
-    command.wait_for("reaches its coordinator through this command")
+    command.wait_for_event("tunnels")
     pid = state(a)["pid"]
-    coordinator.wait_for("generation 1: mean")
+    coordinator.wait_for_event("generation", number=1)
 
     refused = rows_of(processes, *spawn, code=1)["a"]
-    assert "by the tunnel of another command" in refused["what"]
+    assert refused["state"] == "failed"
 
     command.popen.send_signal(signal.SIGINT)
     code, out = command.finish()
@@ -101,7 +100,7 @@ def test_through_a_tunnel_workers_serve_a_coordinator_on_loopback_and_end_with_t
     assert not (a.root() / "workers" / "a").exists()
 
     command = processes.start(*spawn)
-    command.wait_for("reaches its coordinator through this command")
+    command.wait_for_event("tunnels")
     pid = state(a)["pid"]
     command.popen.kill()
     os.killpg(command.popen.pid, signal.SIGKILL)
@@ -116,20 +115,16 @@ def test_a_log_is_followed_until_the_worker_ends_or_somebody_has_seen_enough(pro
     # The worker outlives its coordinator until the second command follows it: another one would wait for ever.
     own = ("--worker-flags", f"--task {tasks.TOY} --exit-when-done --coordinator-timeout 15")
     command = processes.start("spawn", "a", *words(hosts, *flags, *own))
-    coordinator.wait_for("generation 1: mean")
+    coordinator.wait_for_event("generation", number=1)
     command.popen.send_signal(signal.SIGINT)
-    code, out = command.finish()
-    assert code == 0, "".join(command.lines)
-    assert "continues without this command" in out
+    assert command.finish()[0] == 0, "".join(command.lines)
     assert runs(state(a)["pid"])
 
     command = processes.start("spawn", "a", *words(hosts, *flags, *own))
     coordinator.popen.send_signal(signal.SIGTERM)
     code, out = command.finish()
     assert code == 0
-    assert "a | " in out
-    assert "joined run test" in out
-    assert "leaving run test" in out
+    assert sum(line.startswith("a | ") and "run test" in line for line in out.splitlines()) >= 2, "it joins and leaves"
 
 
 @pytest.mark.slow
@@ -173,12 +168,9 @@ def test_each_thing_that_stands_in_the_way_is_said_and_the_others_come_up(proces
     found = rows_of(processes, "spawn", "--hosts", file, code=1)
     assert found.pop("good")["state"] == "started"
     assert {row["state"] for row in found.values()} == {"failed"}
-    reasons = {
-        "changed": "ssh-keygen -R", "strange": "its host key is not known here", "locked": "refuses this user and key",
-        "bare": "no Python of 3.11", "wrong": "no Python of 3.11", "refused": "nothing answers ssh",
-        "lost": "no such host", "mute": "cannot be reached",
-    }  # fmt: skip
+    reasons = {"changed": "ssh-keygen -R", "bare": " 3.11", "wrong": " 3.11"}
     assert {name: why for name, why in reasons.items() if why not in found[name]["what"]} == {}
+    assert len({row["what"] for row in found.values()}) == len(found) - 1, "two of them lack a Python"
     rows_of(processes, "down", "good", *words(hosts), "--now")
 
 
@@ -191,7 +183,6 @@ def test_ctrl_c_while_hosts_are_brought_up_ends_the_command_and_not_what_others_
     await_that(asked.exists, "the host was never asked")
     command.popen.send_signal(signal.SIGINT)
     assert command.finish()[0] == 130
-    assert "the same command continues" in command.lines[-1]
 
 
 @pytest.mark.slow
@@ -202,10 +193,9 @@ def test_a_full_disk_and_a_folder_that_cannot_be_written_are_said(processes, hos
             pytest.skip("mounting a disk needs root")
         flags = ("--no-tunnel", "--slots", 1, "--remote-dir", disk.path / "fleet")
         room = rows_of(processes, "spawn", "a", "--ssh", hosts.ssh, *flags, code=1)["a"]["what"]
-        assert "an environment takes" in room
+        assert "--remote-dir" in room
         disk.fill()
         full = rows_of(processes, "spawn", "a", *words(hosts, *flags), code=1)["a"]["what"]
-        assert "no space left" in full
         assert "--remote-dir" in full
         assert rows_of(processes, "down", "a", *words(hosts, "--remote-dir", disk.path / "fleet"))
         assert not (disk.path / "fleet").exists()
@@ -214,7 +204,7 @@ def test_a_full_disk_and_a_folder_that_cannot_be_written_are_said(processes, hos
         still = rows_of(processes, "spawn", "a", "--ssh", hosts.ssh, *flags, code=1)["a"]["what"]
         assert "noexec" in still
     denied = rows_of(processes, "spawn", "a", *words(hosts, "--no-tunnel", "--remote-dir", "/proc/fleet"), code=1)["a"]
-    assert "cannot be written" in denied["what"] or "/proc/fleet" in denied["what"]
+    assert "/proc/fleet" in denied["what"]
 
 
 def test_a_worker_that_ends_at_once_says_why_and_a_number_in_anothers_hands_is_left_alone(processes, hosts):
@@ -255,18 +245,16 @@ def test_three_hosts_install_from_wheels_alone_one_of_them_after_it_was_killed_a
         file.write_text(f'connect = [{listed}]\n[spawn]\nssh = "{hosts.ssh}"\nwheelhouse = "{house}"\n{rows}')
 
         interrupted = processes.start("spawn", "--hosts", file)
-        interrupted.wait_for("x installs the worker", timeout=600)
         await_that(lambda: pip_of(there[0]) is not None, "pip never ran")
         pip, agent = pip_of(there[0])
         os.kill(agent, signal.SIGKILL)
         os.kill(pip, signal.SIGKILL)
         code, out = interrupted.finish(900)
-        assert code == 1
-        assert "try `ssh x` by hand" in out
+        assert (code, "`ssh x`" in out) == (1, True)
 
         found = rows_of(processes, "spawn", "--hosts", file, patience=900)
         assert {name: row["state"] for name, row in found.items()} == {"x": "started", "y": "running", "z": "running"}
-        coordinator.wait_for("generation 1: mean", timeout=600)
+        coordinator.wait_for_event("generation", number=1, timeout=600)
         rows_of(processes, "down", "--hosts", file, patience=900)
         assert [list(host.home.iterdir()) for host in there] == [[], [], []]
 

@@ -33,7 +33,7 @@ def controller(random_bundle, tmp_path):
 def killed(processes, *words):
     """Started, and killed before anything is scored."""
     began = processes.start(*words, "--runs-dir", processes.runs, "--listen", processes.endpoint)
-    began.wait_for("generation 0")
+    began.wait_for_event("begin")
     began.popen.kill()
     began.finish()
 
@@ -45,7 +45,7 @@ def continued(processes, name):
 
 def first_population(processes, coordinator, name):
     """What it asks for first; it has left, so that this is on disk."""
-    coordinator.wait_for("generation 0")
+    coordinator.wait_for_event("begin")
     coordinator.popen.send_signal(signal.SIGTERM)
     assert coordinator.finish()[0] == 130
     with open_run(processes.runs, name) as run:

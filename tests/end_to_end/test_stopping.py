@@ -37,7 +37,7 @@ def test_training_keeps_all_updates(processes, tmp_path, number):
     said = stopped(training, number, lambda: curve.exists() and curve.read_text().count("update") >= 2)
     update = load_progress(tmp_path / "vae.safetensors")["update"]
     assert update >= 40
-    assert f"after update {update} of 100000: {tmp_path}/vae.safetensors keeps them; the same command continues" in said
+    assert all(datum in said for datum in (f" {update} ", "100000", f"{tmp_path}/vae.safetensors"))
 
 
 @pytest.mark.long
@@ -68,7 +68,7 @@ def test_a_recording_can_be_played(processes, tmp_path, number):
     with av.open(str(out)) as container:
         frames = len(list(container.decode(container.streams.video[0])))
     assert 0 < frames < 1000
-    assert f"{out} shows the first {frames} steps" in said
+    assert all(datum in said for datum in (str(out), f" {frames} "))
 
 
 @pytest.mark.slow
@@ -77,12 +77,12 @@ def test_a_collection_keeps_its_episodes_and_counts_them(processes, tmp_path, nu
     collecting = processes.start("collect", "--data", tmp_path, *flags)
     said = stopped(collecting, number, lambda: len(existing_episodes(tmp_path)) >= 2)
     kept = len(existing_episodes(tmp_path))
-    assert f"stopped: {tmp_path} keeps {kept} new episodes, {kept} of 1000 in all; the same command continues" in said
+    assert all(datum in said for datum in (str(tmp_path), f" {kept} ", "1000"))
     assert [path.name for path in (tmp_path / "episodes").iterdir() if path not in existing_episodes(tmp_path)] == []
 
 
 @pytest.mark.slow
 def test_a_coordinator_that_waits_for_a_worker_says_so_once(processes, random_bundle):
     coordinator = processes.coordinator("--bundle", random_bundle.path, "--task", tasks.TOY)
-    coordinator.wait_for("no worker is present")
-    assert sum("no worker is present" in line for line in coordinator.lines) == 1
+    coordinator.wait_for_event("no worker")
+    assert len(coordinator.events("no worker")) == 1

@@ -52,7 +52,7 @@ def gathered(processes, coordinator, **hosts):
     """Workers on these hosts, which begin to score at one moment; what is set there makes a host lie."""
     assert processes.call("pause", "--connect", processes.endpoint)[0] == 0
     started = {name: worker(processes, name, set_there) for name, set_there in hosts.items()}
-    coordinator.wait_for(" joined", times=len(hosts))
+    coordinator.wait_for_event("joined", times=len(hosts))
     assert processes.call("resume", "--connect", processes.endpoint)[0] == 0
     return started
 
@@ -89,15 +89,13 @@ def test_a_host_whose_results_differ_is_barred_and_the_run_has_the_bits_of_an_ho
     coordinator = processes.coordinator(*settings, "--verify", 0.5)
     workers = gathered(processes, coordinator, own={}, other={}, bad=set_there)
     assert coordinator.finish()[0] == 0
-    workers["bad"].wait_for("barred from this run")
+    workers["bad"].wait_for_event("refused")
     assert outcome(processes, "test") == honest
     with open_run(processes.runs, "test") as run:
         checks = run.checks
     assert checks.barred == ("bad",)
     assert checks.differing > 0
     assert query(processes, "SELECT count(*) FROM result WHERE worker LIKE 'bad/%'") == [(0,)]
-    _, shown, _ = processes.call("runs", "show", "test", "--runs-dir", processes.runs)
-    assert "barred: bad" in shown
 
 
 @pytest.mark.slow
@@ -105,7 +103,7 @@ def test_the_coordinators_own_host_decides_against_a_single_other_one(processes,
     """The own host's worker shows the key in the cache folder that it shares with the coordinator."""
     coordinator = processes.coordinator(*settings, "--verify", 1)
     gathered(processes, coordinator, own={}, bad={LIES: 0.5, "DREAMFLEET_CACHE": tmp_path / "elsewhere"})
-    coordinator.wait_for("the coordinator's own host confirms that bad is wrong")
+    coordinator.wait_for_event("barred", worker="bad")
     assert coordinator.finish()[0] == 0
     assert outcome(processes, "test") == honest
 
@@ -115,10 +113,9 @@ def test_two_strangers_that_differ_are_held_until_a_third_host_decides(processes
     elsewhere = {"DREAMFLEET_CACHE": tmp_path / "elsewhere"}
     coordinator = processes.coordinator(*settings, "--verify", 1)
     gathered(processes, coordinator, good=elsewhere, bad={LIES: 0.5, **elsewhere})
-    coordinator.wait_for("neither gets further jobs until another host of their class scores it")
+    coordinator.wait_for_event("differing")
     status = processes.status()
     assert status["state"] == "paused"
-    assert "hosts differ in" in status["why"]
     worker(processes, "third", elsewhere)
     assert coordinator.finish()[0] == 0
     assert outcome(processes, "test") == honest
@@ -146,7 +143,6 @@ def test_a_host_alone_in_its_class_is_said_to_be_unchecked_and_the_run_ends(proc
     assert outcome(processes, "test") == honest
     with open_run(processes.runs, "test") as run:
         assert run.checks.checked == 0
-        assert "unchecked for want of another host" in run.checks.description
 
 
 @pytest.mark.long
@@ -161,7 +157,7 @@ def test_a_coordinator_that_is_killed_amid_a_recall_goes_on_as_if_it_had_not_bee
         "coordinator", "--run", "test", "--runs-dir", processes.runs, "--listen", processes.endpoint, "--beat", 0.2,
         *settings, "--verify", 1, inside=inside,
     )  # fmt: skip
-    dying.wait_for("incarnation")
+    dying.wait_for_event("begin")
     gathered(processes, dying, own={}, other={}, bad={LIES: 0.5})
     assert dying.popen.wait(DEADLINE) == -signal.SIGKILL
     recalled = query(processes, "SELECT count(*) FROM recalled") + query(processes, "SELECT count(*) FROM barred")
@@ -184,26 +180,25 @@ def test_a_host_that_the_operator_bars_is_recalled_live_and_after_the_end(proces
         each.end()
     resumed = "coordinator", "--resume", "test", "--runs-dir", processes.runs
     coordinator = processes.start(*resumed, "--generations", 5)
-    coordinator.wait_for("incarnation")
+    coordinator.wait_for_event("begin")
     code, out, err = processes.call("bar", "bad", "--connect", processes.endpoint)
     assert code == 0, err
-    assert "host bad is barred" in out
-    coordinator.wait_for("the run goes on from generation ")  # the first in which it scored
-    worker(processes, "bad", liars["bad"]).wait_for("barred from this run: the operator says so")
+    assert "bad" in out
+    coordinator.wait_for_event("recalled")
+    worker(processes, "bad", liars["bad"]).wait_for_event("refused")
     gathered(processes, coordinator, own={}, worse=liars["worse"])
     assert coordinator.finish()[0] == 0
     assert outcome(processes, "test") != honest
     where = "test", "--runs-dir", processes.runs, "--connect", processes.endpoint
     code, _, err = processes.call("bar", "bed", *where)
     assert code == 2
-    assert "there are bad, own, worse" in err
+    assert all(host in err for host in ("bad", "own", "worse"))
     code, out, err = processes.call("bar", "worse", *where)
     assert code == 0, err
-    assert "dreamfleet coordinator --resume test" in out
+    assert "--resume test" in out
     again = processes.start(*resumed)
     assert again.finish()[0] == 0
     assert outcome(processes, "test") == honest
-    _, shown, _ = processes.call("runs", "show", "test", "--runs-dir", processes.runs)
-    assert "barred: bad (by the operator), worse (by the operator)" in shown
-    _, story, _ = processes.call("story", "test", "--journal", "--runs-dir", processes.runs)
-    assert "host worse is barred from this run: the operator says so" in story
+    with open_run(processes.runs, "test") as run:
+        assert run.checks.barred == ("bad", "worse")
+        assert {each.worker for each in run.events() if each.what == "barred"} == {"bad", "worse"}

@@ -55,7 +55,7 @@ def test_a_run_is_repeated_to_the_bit_through_a_kill(processes, first, random_bu
              processes.endpoint, "--beat", 0.2, "--json")  # fmt: skip
     again = processes.start(*words)
     processes.worker("--task", tasks.TOY, "--run", "kept-again")
-    again.wait_for("generation 1: mean")
+    again.wait_for_event("generation", number=1)
     again.end()
     again = processes.start(*words)
     code, out = again.finish()

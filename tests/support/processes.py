@@ -2,6 +2,7 @@
 
 import fcntl
 import io
+import json
 import os
 import queue
 import socket
@@ -48,14 +49,43 @@ def environment(cache, root=ROOT):
     }
 
 
+@contextmanager
+def started(words, **how):
+    """A process that is killed at the end: `Popen` itself would wait for it for ever where the test fails."""
+    with subprocess.Popen(words, **how) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+class Line(str):
+    """A line of stderr as a person reads it; `facts` is its log record, empty if it is none."""
+
+    def __new__(cls, line):
+        try:
+            facts = json.loads(line)
+            line = f"{facts['level'].upper()} {facts['message']}\n{facts.get('exception', '')}"
+        except (ValueError, TypeError, KeyError):
+            facts = {}
+        said = super().__new__(cls, line)
+        said.facts = facts
+        return said
+
+    def tells(self, event, **facts):
+        """Whether it is the record of this event with these facts."""
+        return {"event": event, **facts}.items() <= self.facts.items()
+
+
 class Process(VerbProcess):
-    """A running verb; tests can wait for lines of its stderr."""
+    """A running verb that logs as JSON; tests wait for its events."""
 
     def __init__(self, arguments, cache, inside=(), root=ROOT):
         self._reading = threading.Event()
         self._reading.set()
-        self._new_lines = queue.SimpleQueue()
-        super().__init__(*arguments, environment=environment(cache, root), inside=inside)
+        self._unread = queue.SimpleQueue()
+        said = {**environment(cache, root), "DREAMFLEET_LOG_FORMAT": "json"}
+        super().__init__(*arguments, environment=said, inside=inside)
 
     def freeze(self, size=4096):
         """Stop reading its stderr; `size` more bytes fit into the pipe."""
@@ -68,26 +98,41 @@ class Process(VerbProcess):
 
     def _add_line(self, line):
         self._reading.wait()
-        super()._add_line(line)
-        self._new_lines.put(line)
+        said = Line(line)
+        super()._add_line(said)
+        self._unread.put(said)
 
     def wait_for(self, text, times=1, timeout=DEADLINE):
-        """Block until stderr contained `text` in `times` new lines since the last wait; the last of them."""
-        deadline, line = time.monotonic() + timeout, ""
-        while times:
-            is_over = not self._readers[-1].is_alive()
-            try:
-                line = self._new_lines.get(timeout=POLL_INTERVAL)
-            except queue.Empty:
-                assert not is_over, f"ended before printing {text!r}:\n{''.join(self.lines)}"
-                assert time.monotonic() < deadline, f"{text!r} was not printed within {timeout} s; {self.last_line()}"
-            else:
-                times -= text in line
-        return line
+        """Block until stderr has `times` new lines with this datum; returns the last of them."""
+        return self._wait(lambda line: text in line, text, times, timeout)
+
+    def events(self, event, **facts):
+        """The log's records of this event with these facts so far, the oldest first."""
+        return [line.facts for line in self.lines if line.tells(event, **facts)]
+
+    def wait_for_event(self, event, times=1, timeout=DEADLINE, **facts):
+        """Block until the log has `times` new records of this event with these facts; returns the last of them."""
+        return self._wait(lambda line: line.tells(event, **facts), f"{event} {facts}", times, timeout).facts
+
+    def wait_for_report(self, name, timeout=DEADLINE):
+        return super().wait_for_report(name, timeout)
 
     def wait_until_serving(self):
         """Block until it answers at the address that it reports."""
-        return self.wait_for_report(ADDRESS, DEADLINE)
+        return self.wait_for_report(ADDRESS)
+
+    def _wait(self, is_wanted, what, times, timeout):
+        deadline = time.monotonic() + timeout
+        while times:
+            has_ended = not any(each.is_alive() for each in self._readers)
+            try:
+                line = self._unread.get(timeout=POLL_INTERVAL)
+            except queue.Empty:
+                assert not has_ended, f"it ended before {what!r}:\n{''.join(self.lines)}"
+                assert time.monotonic() < deadline, f"no {what!r} within {timeout:g} s:\n{''.join(self.lines)}"
+                continue
+            times -= is_wanted(line)
+        return line
 
     def finish(self, timeout=DEADLINE):
         return super().finish(timeout)

@@ -48,12 +48,17 @@ class Stage:
         self._threads.shutdown()
 
 
+def event_of(record):
+    """What a line reports, if it has a name for that."""
+    return f" [{record.facts['event']}]" if hasattr(record, "facts") else ""
+
+
 @contextmanager
 def listening():
-    """The log lines of workers as a queue."""
+    """The log lines of workers as a queue, each with the name of its event."""
     lines = queue.SimpleQueue()
     handler = logging.Handler()
-    handler.emit = lambda record: lines.put(record.getMessage())
+    handler.emit = lambda record: lines.put(f"{record.getMessage()}{event_of(record)}")
     logger = logging.getLogger("dreamfleet.worker")
     before = logger.level
     logger.addHandler(handler)

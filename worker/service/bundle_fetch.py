@@ -61,7 +61,8 @@ def fetch_bundle(
                 if from_start and len(sources) == 1:  # otherwise any of several sources may have sent the wrong bytes
                     corrupt_sources |= sources
                 continue
-            log.info("fetched bundle %s, %.1f MB", sha256[:12], bundle.path.stat().st_size / 1e6)
+            log.info("fetched bundle %s, %.1f MB", sha256[:12], bundle.path.stat().st_size / 1e6,
+                     extra={"facts": {"event": "fetched", "bundle": sha256}})  # fmt: skip
             return bundle
     raise DownloadError(
         f"the bundle {sha256[:12]}... arrived damaged {MAX_ATTEMPTS} times: check the coordinator's copy"

@@ -103,7 +103,8 @@ class RunSession:
             self._frame_publisher,
         ]
         device = f", dreams on {self._slots.torch_device}" if self._slots.torch_device else ""
-        log.info("joined run %s as %s, %s%s", run, self._link.identity, plural(len(self._slots), "slot"), device)
+        log.info("joined run %s as %s, %s%s", run, self._link.identity, plural(len(self._slots), "slot"), device,
+                 extra={"facts": {"event": "joined", "run": run, "worker": self._link.identity}})  # fmt: skip
         self._note_version()
 
     def _main_loop(self) -> str:
@@ -118,7 +119,8 @@ class RunSession:
             if self._membership.start_draining_if_due(now):
                 self._return_unstarted_jobs()
                 log.info("draining for at most %g s, a second signal leaves at once: running episodes finish, queued "
-                         "jobs go back", self._membership.conditions.drain_timeout)  # fmt: skip
+                         "jobs go back", self._membership.conditions.drain_timeout,
+                         extra={"facts": {"event": "draining"}})  # fmt: skip
             self._fill_slots(now)
             self._send(now)
             if self._membership.must_rejoin(now, self._load()):
@@ -135,7 +137,8 @@ class RunSession:
         for each in self._declared:
             each.undeclare()
         log.info("leaving run %s (%s): %s, %s%s", self._admission.run, why, plural(self._finished, "job"),
-                 plural(self._steps_finished, "environment step"), self._lost_results())  # fmt: skip
+                 plural(self._steps_finished, "environment step"), self._lost_results(),
+                 extra={"facts": {"event": "left", "run": self._admission.run}})  # fmt: skip
 
     def _lost_results(self) -> str:
         """Which finished results go with this worker, in words."""
@@ -310,7 +313,8 @@ class RunSession:
         restarted = self._adopt(admission)
         self._membership.rejoin(admission.nonce, monotonic())
         level = logging.INFO if restarted else logging.DEBUG  # an idle worker of a paused run says hello repeatedly
-        log.log(level, "joined run %s again, incarnation %d", admission.run, admission.incarnation)
+        log.log(level, "joined run %s again, incarnation %d", admission.run, admission.incarnation,
+                extra={"facts": {"event": "rejoined", "run": admission.run}})  # fmt: skip
         self._note_version()
 
     def _note_version(self) -> None:

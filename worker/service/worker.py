@@ -159,10 +159,10 @@ class Worker:
                 why = str(error)
                 rejections[why] += 1
                 if rejections[str(error)] == 2:  # a coordinator that just started accepts the next try
-                    log.warning("%s; trying again", error)
+                    log.warning("%s; trying again", error, extra={"facts": {"event": "rejected"}})
             except ConnectionFailedError:
                 if text := waiting.next(monotonic(), answered=False):
-                    log.warning("%s", text)
+                    log.warning("%s", text, extra={"facts": {"event": "no coordinator"}})
             self._check_patience(why)
             self._pause()
         return None
@@ -360,7 +360,8 @@ class Worker:
         refuser = self._refusal_key(run)
         pause = self._refusals.add(refuser, monotonic())
         if self._refusals.is_news(refuser, str(error)):
-            log.warning("%s; asking again in %.0f s, then with growing pauses", error, pause)
+            log.warning("%s; asking again in %.0f s, then with growing pauses", error, pause,
+                        extra={"facts": {"event": "refused", "run": run}})  # fmt: skip
 
     def _refusal_key(self, run: str) -> str:
         """The key of a refusal in `RefusalBackoff`: a worker of one run remembers only one."""

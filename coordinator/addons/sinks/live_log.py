@@ -78,7 +78,7 @@ class _Follower:
             log.warning("%s", text)
         elif not self._is_over:
             log.warning("the process that writes the curves to %s has ended: the run goes on, and a resumed run writes "
-                        "what is missing there", self._kind)  # fmt: skip
+                        "what is missing there", self._kind, extra={"facts": {"event": "curves ended"}})  # fmt: skip
 
 
 def _follow_in_child(pipe: Any, run: Path, name: SinkName) -> None:

@@ -47,7 +47,8 @@ def bring_up(
         held = [each for each in up if each.forwards]
         if held:
             names = ", ".join(each.host.name for each in held)
-            log.info("%s: the worker reaches its coordinator through this command, and ends with it (Ctrl-C)", names)
+            log.info("%s: the worker reaches its coordinator through this command, and ends with it (Ctrl-C)", names,
+                     extra={"facts": {"event": "tunnels"}})  # fmt: skip
         if watched := up if on_log_line else held:
             ended = _run_in_threads(watched, _follow_until_ended, stop, RemoteHost.stop_following)
             then = dict(zip(watched, ended, strict=True))

@@ -13,7 +13,7 @@ import termios
 from argparse import Namespace
 
 from dreamfleet.common.cli.output import print_answer, print_next, print_rows
-from tests.support.processes import DEADLINE
+from tests.support.processes import DEADLINE, started
 
 LONG = "a-run-whose-name-is-longer-than-any-column-of-a-narrow-terminal-would-be"
 ROWS = [{"run": LONG, "state": "said [bold]so[/] and [worker]", "generations": 12}] * 2
@@ -25,7 +25,7 @@ def in_terminal(code, columns):
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
     seen = {**os.environ, "TERM": "xterm"}
     seen.pop("COLUMNS", None)
-    with subprocess.Popen([sys.executable, "-c", code], stdout=theirs, stdin=theirs, env=seen) as child:
+    with started([sys.executable, "-c", code], stdout=theirs, stdin=theirs, env=seen) as child:
         os.close(theirs)
         output = b""
         try:

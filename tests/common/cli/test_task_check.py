@@ -15,7 +15,7 @@ import pytest
 from dreamfleet.common.cli import dry_run_process
 from dreamfleet.common.cli.task_check import try_task
 from tests.support.environments import DAEMON_FILE, ODD
-from tests.support.processes import DEADLINE, environment
+from tests.support.processes import DEADLINE, environment, started
 from tests.support.stuck_environments import MODULE as STUCK
 
 
@@ -154,16 +154,16 @@ def test_an_environment_that_spoils_the_pipes_is_one_line(fault, monkeypatch):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_verb_with_all_that_the_environment_left(number, tmp_path):
     file: Path = tmp_path / "pid"
-    verb = subprocess.Popen(
+    with started(
         [sys.executable, "-m", "dreamfleet", "tasks", ODD, "--environment", 'fault="daemon and hang"'],
         env={**environment(tmp_path), DAEMON_FILE: str(file)}, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-    )  # fmt: skip
-    until = monotonic() + DEADLINE
-    while not (file.exists() and file.read_text()) and verb.poll() is None and monotonic() < until:
-        sleep(0.01)
-    daemon = int(file.read_text())
-    verb.send_signal(number)
-    printed, _ = verb.communicate(timeout=DEADLINE)
+    ) as verb:  # fmt: skip
+        until = monotonic() + DEADLINE
+        while not (file.exists() and file.read_text()) and verb.poll() is None and monotonic() < until:
+            sleep(0.01)
+        daemon = int(file.read_text())
+        verb.send_signal(number)
+        printed, _ = verb.communicate(timeout=DEADLINE)
     assert verb.returncode != 0
     assert b"Traceback" not in printed
     assert has_ended(daemon)

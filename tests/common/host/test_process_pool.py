@@ -11,7 +11,7 @@ import pytest
 
 from dreamfleet.common.host.process_pool import map_in_processes
 from tests.support import rough_tasks
-from tests.support.processes import environment
+from tests.support.processes import environment, started
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="Linux")
 
@@ -71,12 +71,13 @@ def test_an_interrupt_ends_processes_that_hang(tmp_path):
     file = tmp_path / "script.py"
     file.write_text(script)
     (folder := tmp_path / "hanging").mkdir()
-    parent = subprocess.Popen([sys.executable, file, folder], env=environment(tmp_path), stderr=subprocess.DEVNULL)
-    while len(hanging := list(folder.iterdir())) < 2:
-        time.sleep(0.01)
-    pidfds = [os.pidfd_open(int(each.name)) for each in hanging]
-    parent.send_signal(signal.SIGINT)
-    assert parent.wait(60)
+    command = [sys.executable, file, folder]
+    with started(command, env=environment(tmp_path), stderr=subprocess.DEVNULL) as parent:
+        while len(hanging := list(folder.iterdir())) < 2:
+            time.sleep(0.01)
+        pidfds = [os.pidfd_open(int(each.name)) for each in hanging]
+        parent.send_signal(signal.SIGINT)
+        assert parent.wait(60)
     for each in pidfds:
         with pytest.raises(ProcessLookupError):
             signal.pidfd_send_signal(each, 0)

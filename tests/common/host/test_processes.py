@@ -44,7 +44,7 @@ def test_output_goes_to_the_log_file(tmp_path):
 @pytest.mark.slow
 def test_the_last_line_of_a_killed_child_says_so(processes):
     child = processes.start("worker", "--connect", "tcp/127.0.0.1:1")
-    said = child.wait_for("tcp/127.0.0.1:1")
+    said = child.wait_for_event("no coordinator")["message"]
     child.popen.kill()
     child.finish()
-    assert " 9" in child.last_line().removesuffix(said.strip())
+    assert " 9" in child.last_line().removesuffix(said)

@@ -10,7 +10,7 @@ import time
 import pytest
 
 from dreamfleet.common.host.standard_streams import MAX_WAITING_CHARS, NonblockingStream
-from tests.support.processes import DEADLINE, environment
+from tests.support.processes import DEADLINE, environment, started
 
 
 @pytest.fixture
@@ -83,7 +83,6 @@ def test_a_process_exits_although_nobody_reads_its_output():
         "for n in range(1000): logging.warning('nobody reads this')\n"
         "raise SystemExit(7)\n"
     )
-    with subprocess.Popen(
-        [sys.executable, "-c", program], stderr=subprocess.PIPE, env=environment("/nowhere")
-    ) as popen:
+    command = [sys.executable, "-c", program]
+    with started(command, stderr=subprocess.PIPE, env=environment("/nowhere")) as popen:
         assert popen.wait(DEADLINE) == 7

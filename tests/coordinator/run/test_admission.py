@@ -98,7 +98,7 @@ def test_the_first_accepted_result_fixes_the_class_and_the_other_host_is_removed
     assert bench.run.generation.done == 1, "a result of another class does not count"
     assert list(bench.run.fleet.members) == [B]
     assert "--no-strict" in bench.hello(A).remedy
-    assert any(A in note for note in bench.run.take_notes())
+    assert any((note.what, note.worker) == ("left", A) for note in bench.run.take_notes())
     assert {job.digest for job in bench.given()[B]} >= {job.digest for job in jobs[A]}, "its jobs are free again"
     assert bench.run.fleet.jobs.failures == [], "it is no failure of the job"
     bench.restart()

@@ -333,6 +333,7 @@ def test_a_run_that_nobody_can_score_pauses_before_every_job_was_tried(tmp_path,
         bench.serve()
         assert pause_kinds(bench) == [PauseKind.NO_ABLE_HOST]
         assert (len(bench.run.fleet.jobs.failures) < 80) == (tried < 80)
+        assert sum(each.what == "retried" for each in bench.run.take_notes()) == 1
         bench.journal.close()
 
 

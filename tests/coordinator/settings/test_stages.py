@@ -157,7 +157,7 @@ def test_limits_count_over_the_whole_run(staged):
 def test_the_log_says_when_a_stage_begins_and_why(staged):
     bench = staged("night")
     bench.drive(lambda _: 0)
-    said = [note for note in bench.run.take_notes() if re.search(r"\d of 4", note)]
+    said = [note.text for note in bench.run.take_notes() if note.what in ("stage", "next stage")]
     for note, data in zip(
         said,
         ("0 .*1 of 4 .*1,000 .*100.*0.1", "2 of 4 .*400 .*2 .*2 .*1", "3 of 4 .*600 .*0.1.*8 .*5 .*510.5",
