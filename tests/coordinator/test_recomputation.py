@@ -236,10 +236,7 @@ def check_scores(processes, name, found, answer):
 
 def check_status(processes, name, found):
     """A coordinator that goes on and waits for workers tells the same of what was."""
-    coordinator = processes.start(
-        "coordinator", "--resume", name, "--runs-dir", processes.runs, "--listen", processes.endpoint,
-        "--generations", 99,
-    )  # fmt: skip
+    coordinator = processes.resume(name, "--generations", 99)
     coordinator.wait_until_serving()
     code, out, err = processes.call("status", "--connect", processes.endpoint, "--json")
     coordinator.end()

@@ -15,7 +15,6 @@ from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import ConnectionFailedError, HandshakeRejectedError
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import encode, encode_json
-from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.security.credentials import read_join_file
 from dreamfleet.common.transport.session import MAX_FORWARDED, Network, open_session
 from dreamfleet.coordinator.addons.dashboard.live_runs import Watcher
@@ -26,15 +25,11 @@ from tests.support import tasks
 from tests.support.access import Access, begin, until, work
 from tests.support.processes import DEADLINE, free_port
 from tests.support.relay import Relay
+from tests.support.same_bits import outcome
 from tests.support.samples import MSGPACK
 from tests.support.stage import drained, listening, wait_for
 
 LIFE = "0badc0de"
-
-
-def fitness(processes, name, generations=3):
-    with open_run(processes.runs, name) as run:
-        return [[run.fitness(generation, index) for index in range(4)] for generation in range(generations)]
 
 
 def note(answered, name, reply):
@@ -98,7 +93,7 @@ def test_each_may_do_what_its_role_says_and_the_run_is_none_the_worse(processes,
         until(lambda: not operator.runs(), "the run does not end")
     assert coordinator.finish()[0] == 0
     assert plain.finish()[0] == 0
-    assert fitness(processes, "safe") == fitness(processes, "plain")
+    assert outcome(processes, "safe") == outcome(processes, "plain")
     body = read_join_file(access.path("coordinator")).key.splitlines()[1]
     assert not [path for path in (processes.runs / "safe").iterdir() if body.encode() in path.read_bytes()]
     assert not [line for line in (*coordinator.lines, *worker.lines) if body in line]
@@ -135,9 +130,8 @@ def test_a_stranger_to_the_fleet_is_refused_with_the_reason(access, endpoint, tm
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("days", [-91, pytest.param(3, marks=pytest.mark.long)])
-def test_a_listener_whose_certificate_is_out_of_its_time_is_a_matter_of_clocks(access, endpoint, tmp_path, days):
-    now = datetime.now(UTC) + timedelta(days=days)
+def test_a_listener_whose_certificate_is_out_of_its_time_is_refused(access, endpoint, tmp_path):
+    now = datetime.now(UTC) - timedelta(days=91)
     out_of_time = access.authority.issue("coordinator", "other", tmp_path / "other", now=now)
     listener = Network(listen=(endpoint,), credentials=out_of_time)
     with open_session(listener), pytest.raises(HandshakeRejectedError):
@@ -209,21 +203,6 @@ def test_a_worker_that_is_revoked_counts_no_more_while_the_run_goes_on(processes
         call = ("coordinator", *words, "--runs-dir", runs, "--join", access.path("coordinator"))
         code, _, err = processes.call(*call)
         assert (code, "--access-dir" in err) == (1, True)
-    # The next start: the router itself lets it do nothing.
-    revoked_seats, said = frozenset({f"worker.{seats['fired']}"}), []
-    network = Network(
-        listen=(endpoint,), credentials=read_join_file(access.path("coordinator")), revoked_seats=revoked_seats
-    )
-    own = {name: keys.result("safe", f"x.{seat}/{LIFE}") for name, seat in seats.items()}
-    with open_session(network) as router:
-        listening = router.declare_subscriber(keys.all_workers("result", "safe"), said.append)
-        for name in ("fired", "newcomer"):
-            with open_session(access.network(name, endpoint)) as session:
-                session.put(own[name], b"")
-        until(lambda: own["newcomer"] in [str(each.key_expr) for each in said], "nothing arrives")
-        listening.undeclare()
-    # The newcomer's worker, which comes back by itself, may be among them.
-    assert {str(each.key_expr).split("/")[-2].rpartition(".")[2] for each in said} == {str(seats["newcomer"])}
 
 
 @pytest.mark.slow
@@ -238,9 +217,7 @@ def test_a_coordinator_whose_own_file_is_revoked_leaves_and_does_not_come_back(p
     other = access.path("other")
     access.authority.issue("coordinator", "home", other)
     again = ("--join", other, "--access-dir", access.folder)
-    processes.start("coordinator", "--resume", "safe", "--runs-dir", processes.runs, *again).wait_for_event(
-        "begin", incarnation=2
-    )
+    processes.resume("safe", *again).wait_for_event("begin", incarnation=2)
 
 
 def test_a_router_that_starts_after_it_bars_every_role(access, endpoint):

@@ -3,8 +3,6 @@ Tests common/client/batch_client.py, common/client/remote_scorer.py and coordina
 
 import subprocess
 import sys
-import threading
-from queue import SimpleQueue
 
 import numpy as np
 import pytest
@@ -17,8 +15,7 @@ from tests.support import tasks
 from tests.support.access import begin as begin_secured
 from tests.support.access import until
 from tests.support.batches import PATIENCE, SIZE, begin, count_results, resume, rows, scorer, vectors
-from tests.support.lying_tasks import STAYS, WATCHED
-from tests.support.processes import ROOT, environment, started
+from tests.support.processes import ROOT, call_here, environment, started
 from tests.support.relay import Relay
 
 CALLER = """
@@ -115,7 +112,7 @@ def test_a_run_with_its_own_search_takes_no_batch(processes, random_bundle):
 @pytest.mark.parametrize("flags", [("--racing",), ("--generations", 3), ("--on-failure", "redraw"),
                                    ("--evaluate-every", 5)])  # fmt: skip
 def test_what_needs_a_search_is_refused_for_an_external_run(processes, random_bundle, flags):
-    code, _, err = processes.call(
+    code, _, err = call_here(
         "coordinator", "--bundle", random_bundle.path, "--task", tasks.TOY, "--optimiser", "external",
         "--runs-dir", processes.runs, "--listen", processes.endpoint, *flags,
     )  # fmt: skip
@@ -161,27 +158,6 @@ def test_a_batch_is_cancelled_before_and_while_it_is_scored(processes, random_bu
 
 
 @pytest.mark.slow
-def test_two_callers_work_side_by_side(fleet):
-    def search_with(first, ids, outbox):
-        with scorer(fleet) as search:
-            outbox.put([search.score(vectors(4, first), seeds=[1], batch_id=each).tolist() for each in ids])
-
-    outbox = SimpleQueue()
-    threads = [
-        threading.Thread(target=search_with, args=(float(each), [f"{each}-{turn}" for turn in range(5)], outbox))
-        for each in range(3)
-    ]
-    for each in threads:
-        each.start()
-    for each in threads:
-        each.join()
-    for scored in (outbox.get() for _ in threads):
-        assert len(scored) == 5
-        assert all(each == scored[0] for each in scored)
-    assert count_results(fleet)[0] == 12
-
-
-@pytest.mark.slow
 def test_a_caller_that_was_killed_goes_on_and_nothing_is_scored_twice(processes, random_bundle, tmp_path):
     begin(processes, random_bundle, task=tasks.SLOW_TOY)
     processes.worker("--task", tasks.SLOW_TOY)
@@ -204,20 +180,16 @@ def test_a_caller_that_was_killed_goes_on_and_nothing_is_scored_twice(processes,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("victim", ["coordinator", pytest.param("worker", marks=pytest.mark.long)])
-def test_a_batch_outlives_the_kill_of_a_process(processes, random_bundle, victim):
+def test_a_batch_outlives_the_kill_of_its_coordinator(processes, random_bundle):
     coordinator = begin(processes, random_bundle, task=tasks.SLOW_TOY)
-    worker = processes.worker("--task", tasks.SLOW_TOY)
+    processes.worker("--task", tasks.SLOW_TOY)
     with scorer(processes) as search:
         batch = search.submit(vectors(12), seeds=[1, 2], batch_id="mine")
         later = search.submit(vectors(2, 5.0), seeds=[1], batch_id="later")
         found = batch.results()
         next(found)
-        (worker if victim == "worker" else coordinator).end()
-        if victim == "worker":
-            processes.worker("--task", tasks.SLOW_TOY)
-        else:
-            resume(processes)
+        coordinator.end()
+        resume(processes)
         assert len([*found]) == 11
         assert np.isfinite(later.wait()).all()
         assert (search.score(vectors(12), seeds=[1, 2], batch_id="mine") == batch.wait()).all()
@@ -242,25 +214,6 @@ def test_a_caller_waits_out_a_cut_link(fleet):
 
 
 @pytest.mark.slow
-def test_a_router_that_is_killed_costs_a_batch_nothing(processes, random_bundle):
-    router = processes.start("router", "--listen", processes.endpoint)
-    router.wait_for_event("begin")
-    processes.start(
-        "coordinator", "--run", "test", "--runs-dir", processes.runs, "--connect", processes.endpoint, "--beat", "0.2",
-        "--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--optimiser", "external",
-    ).wait_for_event("begin")  # fmt: skip
-    processes.worker("--task", tasks.SLOW_TOY)
-    with scorer(processes) as search:
-        batch = search.submit(vectors(12), seeds=[1, 2])
-        found = batch.results()
-        next(found)
-        router.end()
-        processes.start("router", "--listen", processes.endpoint).wait_for_event("begin")
-        assert len([*found]) == 11
-    assert count_results(processes)[0] == 24
-
-
-@pytest.mark.slow
 def test_in_a_secured_fleet_only_an_operator_submits(processes, access, endpoint, random_bundle):
     begin_secured(processes, access, endpoint, random_bundle, "--optimiser", "external")
     processes.start("worker", "--join", access.path("first"), "--connect", endpoint, "--run", "safe", "--slots", 1,
@@ -273,30 +226,3 @@ def test_in_a_secured_fleet_only_an_operator_submits(processes, access, endpoint
                 other.submit(vectors(1))
             with pytest.raises(ConnectionFailedError):
                 other.find("own")
-
-
-@pytest.mark.slow
-def test_a_new_host_scores_what_two_workers_died_of_when_the_host_that_has_scored_is_gone(processes, random_bundle):
-    """A coordinator that was started again knows no scored job by which the new host could show that it can score."""
-    coordinator = begin(processes, random_bundle, task=WATCHED)
-    known = processes.worker("--task", WATCHED, "--name", "known")
-    with scorer(processes) as search:
-        assert np.isfinite(search.score(vectors(1), seeds=[1])).all()
-        coordinator.end()
-        known.end()
-        again = resume(processes)
-        batch = search.submit(vectors(2, 3.0), seeds=[1])
-        for _ in range(2):
-            dying = processes.worker("--task", WATCHED, "--name", "dying", inside=("env", f"{STAYS}=1"))
-            until(lambda: leases_of(processes, "dying") == [2], "the worker holds both jobs")
-            dying.popen.kill()
-            again.wait_for_event("lost")
-        processes.worker("--task", WATCHED, "--name", "new")
-        batch.wait()
-        assert np.isfinite([each.fitness for each in batch.results()]).all()
-
-
-def leases_of(processes, host):
-    """How many jobs each present worker of a host holds."""
-    with Client(processes.endpoint) as client:
-        return [each.leases for each in client.workers("test") if (each.name, each.state) == (host, "present")]

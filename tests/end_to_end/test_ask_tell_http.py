@@ -120,27 +120,29 @@ def test_a_batch_is_submitted_followed_read_and_kept(processes, bridge):
 
 
 @pytest.mark.slow
-def test_bad_requests_are_refused_with_a_reason_and_lose_nothing(bridge):
-    def refused(wanted, body, datum="", **headers):
-        status, answer = bridge.submit(body, **headers)
-        assert (status, datum in answer["text"]) == (wanted, True), answer
-
+def test_bad_requests_are_refused_and_lose_nothing(bridge):
     good = {"id": "b", "vectors": rows(1), "seeds": [1]}
-    for body in (b"{", b"[" * 100_000, b"\xff\xfe", b'{"vectors": [[NaN]]}', []):
-        refused(400, body)
-    refused(400, {**good, "vectors": [[1.0] * 12]}, "867")
-    for wrong in ([], [["a"] * 867], [[1e39] * 867], "a", {"float32": "AAAAAA=="}):
-        refused(400, {**good, "vectors": wrong}, "vectors")
-    for wrong in ({"float32": "?", "size": 1}, {"float32": "AAAA", "size": 867}, {"float32": "AAAAAA==", "size": "a"},
-                  {"float32": 7, "size": 1}, {"float32": "AAAAAA==", "size": 0}):  # fmt: skip
-        refused(400, {**good, "vectors": wrong}, "float32")
-    for wrong in ({"seeds": [-1]}, {"seeds": "1"}, {"episodes": 2}, {"id": 7}):
-        refused(400, {**good, **wrong})
-    refused(400, {**good, "id": "a/b"}, "'a/b'")
-    refused(400, {**good, "more": 1}, "'more'")
-    refused(413, {**good, "vectors": [[0] * 1000] * 10_000})
-    refused(413, b" " * (65 << 20))
-    refused(415, good, "Content-Type: application/json", **{"Content-Type": "text/plain"})
+    text, first = json.dumps(good), good["vectors"][0][1:]
+    packed = {"float32": base64.b64encode(vectors(1).tobytes()).decode(), "size": 867}
+    wrong = [b"{", b"[" * 100_000, b"\xff\xfe", b'{"vectors": [[NaN]]}', [], text.encode("utf-16")]
+    wrong += [f'{text[:-1]}, "id": "b"}}'.encode(), text.replace("{", '{"seeds": [2], ', 1).encode()]  # said twice
+    for name, values in {
+        "vectors": (
+            [], "a", [[]], [[1.0] * 12], [["a"] * 867], [[1e39] * 867], [["1.5", *first]], [[True, *first]],
+            [[None, *first]], {"float32": "AAAAAA=="}, {"float32": "?", "size": 1}, {"float32": "AAAA", "size": 867},
+            {"float32": 7, "size": 1}, {"float32": "AAAAAA==", "size": 0}, {"float32": "AAAAAA==", "size": "a"},
+            {**packed, "size": True}, {**packed, "size": "867"},
+        ),
+        "seeds": ([-1], "1", ["1"], [True], None, [], [1.5]), "episodes": (0, True, 2),
+        "id": ("", None, 7, "a/b"), "more": (1,),
+    }.items():  # fmt: skip
+        wrong += [{**good, name: value} for value in values]
+    for body in wrong:
+        status, answer = bridge.submit(body)
+        assert (status, answer["error"]) == (400, "malformed"), (str(body)[:80], answer)
+    for body in ({**good, "vectors": [[0] * 1000] * 10_000}, b" " * (65 << 20)):
+        assert bridge.submit(body)[0] == 413
+    assert bridge.submit(good, **{"Content-Type": "text/plain"})[0] == 415
     assert bridge.submit(good, run="nobody")[0] == 404
     assert bridge.submit(good, run="a%20b")[0] == 400
     assert bridge.batch("other")[0] == 404
@@ -260,29 +262,13 @@ def test_schemathesis_finds_no_broken_promise_in_the_description(processes, tmp_
     assert done.returncode == 0, done.stdout
 
 
-def test_numbers_are_numbers_and_nothing_is_said_twice(processes, random_bundle):
+def test_seeds_outside_the_usual_range_are_remarked_and_too_many_refused(processes, random_bundle):
     begin(processes, random_bundle)
     bridge = Bridge(processes)
-    good = {"id": "a", "vectors": rows(1), "seeds": [1]}
-    first = rows(1)[0][1:]
-    packed = {"float32": base64.b64encode(vectors(1).tobytes()).decode(), "size": 867}
-    for wrong in (
-        {"vectors": [["1.5", *first]]}, {"vectors": [[True, *first]]}, {"vectors": [[None, *first]]}, {"vectors": [[]]},
-        {"vectors": {**packed, "size": True}}, {"vectors": {**packed, "size": "867"}}, {"seeds": ["1"]},
-        {"seeds": [True]}, {"seeds": None}, {"seeds": []}, {"seeds": [1.5]}, {"episodes": 0}, {"episodes": True},
-        {"id": ""}, {"id": None},
-    ):  # fmt: skip
-        status, answer = bridge.submit(good | wrong)
-        assert (status, answer["error"]) == (400, "malformed"), wrong
-    text = json.dumps(good)
-    for body in (text[:-1] + ', "id": "b"}', text.replace("{", '{"seeds": [2], ', 1)):
-        assert bridge.submit(body.encode())[0] == 400
-    assert bridge.submit(text.encode("utf-16"))[0] == 400
+    packed = {"float32": base64.b64encode(vectors(1).tobytes()).decode(), "size": 867.0}
     status, first = bridge.submit({"id": "b", "vectors": rows(1), "seeds": [2**20, 10_000, 19_999]})
-    assert (status, " 2 " in first["remark"], " 3 " in first["remark"]) == (201, True, True)
-    assert (
-        bridge.submit({"id": "c", "vectors": {**packed, "size": 867.0}, "seeds": [9_999.0, 20_000]})[1]["remark"] == ""
-    )
+    assert (status, re.findall(r"\b[23]\b", first["remark"])) == (201, ["2", "3"])
+    assert bridge.submit({"id": "c", "vectors": packed, "seeds": [9_999.0, 20_000]})[1]["remark"] == ""
     assert bridge.submit({"id": "d", "vectors": rows(1), "seeds": [*range(2**20, 2**20 + 10_000)]})[0] == 201
     assert bridge.submit({"id": "e", "vectors": rows(1), "episodes": 10_001})[0] == 400
 

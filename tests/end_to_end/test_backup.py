@@ -46,7 +46,7 @@ def test_a_run_goes_on_from_a_copy_that_was_made_while_it_was_served(processes, 
 
     code, _, err = processes.call("runs", "backup", "test", "--runs-dir", safe, "--to", processes.runs)
     assert code == 0, err
-    resumed = processes.start("coordinator", "--resume", "test", "--runs-dir", processes.runs)
+    resumed = processes.resume()
     processes.worker("--run", "test")
     assert resumed.finish()[0] == 0
     assert outcome(processes, "test") == outcome(processes, "whole")

@@ -7,15 +7,10 @@ import sys
 
 import pytest
 
-from dreamfleet.common.protocol import keys
-from dreamfleet.common.protocol.codec import encode_json
-from dreamfleet.common.protocol.messages import HelloRequest
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.common.transport.session import Network, open_session
 from tests.support import tasks
-from tests.support.processes import DEADLINE, call_here, environment
+from tests.support.processes import DEADLINE, call_here
 
-OTHER = "riscv64 other"
 ODD = ("env", f"{tasks.ROUNDING}=1")  # a host on which a sum comes out otherwise, in its last bit
 GO_ON = "coordinator", "--resume", "test", "--generations", 2
 OTHER_KERNEL = ("env", "OPENBLAS_CORETYPE=Nehalem")
@@ -29,29 +24,6 @@ PRODUCT = (
 def settings(random_bundle):
     return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
             "--task", tasks.ROUNDED)  # fmt: skip
-
-
-@pytest.fixture
-def stranger(processes, tmp_path):
-    """Starts a worker on a host that says something else of itself, and computes the same."""
-    script, started = tmp_path / "stranger.py", []
-    script.write_text(
-        "import sys\nfrom dreamfleet.worker.service import admission, sender as post\n"
-        f"admission.fingerprint = post.fingerprint = lambda *_, **_more: {OTHER!r}\n"
-        "from dreamfleet.common.cli.command_line import main\n"
-        "if __name__ == '__main__':\n    sys.exit(main(sys.argv[1:]))\n"  # its children import it too
-    )
-
-    def start():
-        command = [sys.executable, script, "worker", "--connect", processes.endpoint, "--task", tasks.ROUNDED,
-                   "--slots", "1", "--name", "stranger"]  # fmt: skip
-        started.append(subprocess.Popen(command, env=environment(tmp_path / "c"), stderr=subprocess.DEVNULL))
-        return started[-1]
-
-    yield start
-    for each in started:
-        each.kill()
-        each.communicate()
 
 
 def own(processes, *more, **where):
@@ -69,25 +41,6 @@ def one_after_the_other(processes, settings, first, second):
     assert coordinator.finish()[0] == 0
     with open_run(processes.runs, "test") as run:
         return run.classes
-
-
-@pytest.mark.slow
-def test_a_strangers_hello_keeps_nobody_out_of_a_strict_run(processes, settings):
-    coordinator = processes.coordinator(*settings, "--generations", 1, "--strict")
-    hello = HelloRequest(keys.PROTOCOL_VERSION, keys.PROTOCOL_VERSION, "0", "gone/00000001", (tasks.ROUNDED,), OTHER, 1)
-    with open_session(Network(connect=(processes.endpoint,))) as session:
-        (reply,) = session.get(keys.hello("test"), payload=encode_json(hello), timeout=DEADLINE)
-        assert b'"accepted": true' in reply.ok.payload.to_bytes()
-    own(processes)
-    assert coordinator.finish()[0] == 0
-
-
-@pytest.mark.slow
-def test_hosts_that_compute_the_same_are_of_one_class_whatever_they_say_of_themselves(processes, settings, stranger):
-    classes = one_after_the_other(processes, (*settings, "--strict"), stranger, lambda: own(processes))
-    assert classes.total == 1
-    assert len(classes.largest[0].fingerprints) == 2
-    assert OTHER in classes.largest[0].fingerprints
 
 
 @pytest.mark.slow

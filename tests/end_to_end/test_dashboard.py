@@ -21,7 +21,7 @@ from dreamfleet.common.host.processes import command
 from dreamfleet.common.host.reports import ADDRESS
 from tests.support import tasks
 from tests.support.browser import PATIENCE, chromium, tab
-from tests.support.processes import DEADLINE, free_port
+from tests.support.processes import DEADLINE, call_here, free_port
 from tests.support.served import WORKER, serving, snapshot
 
 RUNS = Path(__file__).parents[1] / "fixtures" / "runs"
@@ -117,17 +117,7 @@ def test_it_follows_a_run_from_nobody_through_losses_to_its_end(page, processes,
     coordinator.popen.kill()
     wait(page, "coordinator lost since")
     assert "--resume test" in part(page, "sentence")
-    resumed = processes.start(
-        "coordinator",
-        "--resume",
-        "test",
-        "--runs-dir",
-        processes.runs,
-        "--listen",
-        processes.endpoint,
-        "--generations",
-        4,
-    )
+    resumed = processes.resume("test", "--generations", 4)
     processes.worker("--task", tasks.SLOW_TOY, "--name", "beta")
     wait(page, "ended")
     assert resumed.finish()[0] == 0
@@ -404,11 +394,11 @@ def test_what_cannot_be_served_is_one_line(processes):
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         code, _, err = processes.call("dashboard", "--port", taken.getsockname()[1])
-    assert (code, "is in use" in err, "--port" in err) == (1, True, True), err
-    code, _, err = processes.call("dashboard", "--host", "0.0.0.0")
-    assert (code, "give a --token" in err) == (2, True), err
-    code, _, err = processes.call("dashboard", "--run", "No Run")
-    assert (code, "cannot name a run" in err) == (2, True), err
+    assert (code, "--port" in err) == (1, True), err
+    code, _, err = call_here("dashboard", "--host", "0.0.0.0")
+    assert (code, "--token" in err) == (2, True), err
+    code, _, err = call_here("dashboard", "--run", "No Run")
+    assert (code, "'No Run'" in err) == (2, True), err
 
 
 def test_without_its_packages_it_names_the_extra():

@@ -114,7 +114,7 @@ def test_killed_it_leaves_nobody_behind(processes, random_bundle):
         "--workers", 1, "--no-page",
     )  # fmt: skip
     while not ((status := processes.status()) and status["workers"]["present"]):
-        assert demo.popen.poll() is None
+        assert demo.popen.poll() is None, "".join(demo.lines)
     begun = Path(f"/proc/{demo.popen.pid}/task/{demo.popen.pid}/children").read_text().split()
     demo.popen.kill()
     assert len(begun) == 2

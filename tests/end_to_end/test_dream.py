@@ -4,12 +4,12 @@ import json
 import os
 import signal
 
-import numpy as np
 import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support.bundles import states, write_random_bundle
 from tests.support.processes import call_here
+from tests.support.same_bits import outcome
 
 GENERATIONS, POPULATION, EPISODES = 4, 4, 3
 
@@ -20,14 +20,6 @@ def begin(processes, bundle, name, *flags):
         "--horizon", 100, "--generations", GENERATIONS, "--evaluate-every", 2, "--evaluation-episodes", 2,
         "--confirm-episodes", 2, *flags, name=name,
     )  # fmt: skip
-
-
-def outcome(processes, name):
-    with open_run(processes.runs, name) as run:
-        fitness = [[run.fitness(g, i) for i in range(POPULATION)] for g in range(GENERATIONS)]
-        vectors = [run.candidate(g, i).tobytes() for g in range(GENERATIONS) for i in range(POPULATION)]
-        parameters = np.load(run.controller_path)["parameters"].tobytes()
-        return fitness, vectors, [(each.generation, each.mean) for each in run.evaluations()], parameters
 
 
 @pytest.mark.slow
@@ -43,7 +35,7 @@ def test_who_dreams_and_who_dies_meanwhile_changes_no_bit(processes, random_bund
     assert coordinator.finish()[0] == 0
     alone = outcome(processes, "alone")
     assert alone == outcome(processes, "three")
-    assert [generation for generation, _ in alone[2]] == [1, 3]
+    assert [each.generation for each in alone.evaluations] == [1, 3]
     code, out, err = call_here("verify", "candidate", "alone", "--runs-dir", processes.runs, "--candidate", "2/3")
     assert code == 0, err
     assert out.count("same bits") == EPISODES
@@ -81,17 +73,11 @@ def test_who_dreams_on_a_torch_device_changes_no_bit_either(processes, random_bu
 
 
 @pytest.mark.slow
-def test_dreams_from_recorded_states_are_the_same_on_every_worker(processes, tmp_path):
+def test_dreams_from_recorded_states_are_replayed_and_judged(processes, tmp_path):
     bundle = write_random_bundle(tmp_path / "b.zip", recorded=states(20))
-    for name, workers, flags in (("alone", 1, ("--recorded", 0.5)), ("two", 2, ("--recorded", 0.5)), ("plain", 1, ())):
-        coordinator = begin(processes, bundle, name, *flags)
-        crew = [processes.worker("--run", name, "--name", f"w{number}") for number in range(workers)]
-        assert coordinator.finish()[0] == 0, "".join(coordinator.lines)
-        for each in crew:
-            each.end()
-    alone = outcome(processes, "alone")
-    assert alone == outcome(processes, "two")
-    assert alone[0] != outcome(processes, "plain")[0]
+    coordinator = begin(processes, bundle, "alone", "--recorded", 0.5)
+    processes.worker("--run", "alone")
+    assert coordinator.finish()[0] == 0, "".join(coordinator.lines)
     runs = ("--runs-dir", processes.runs)
     code, out, err = call_here("verify", "candidate", "alone", *runs, "--candidate", "2/3")
     assert (code, out.count("same bits")) == (0, EPISODES), err
@@ -99,20 +85,9 @@ def test_dreams_from_recorded_states_are_the_same_on_every_worker(processes, tmp
     assert json.loads(out)["settings"]["task"]["recorded"] == 0.5, err
     code, out, err = call_here("evaluate", "--controller", "alone", *runs, "--episodes", 1)
     assert code == 0, err
-    code, out, err = processes.call("coordinator", "--from", "alone", *runs, "--task", "car-racing")
+    code, out, err = call_here("coordinator", "--from", "alone", *runs, "--task", "car-racing")
     assert (code, err.count("\n")) == (2, 1)
     assert "--recorded" in err
-
-
-def test_recorded_states_that_a_bundle_lacks_are_refused_as_the_run_begins(processes, random_bundle):
-    code, _, err = processes.call(
-        "coordinator", "--preset", "dream", "--bundle", random_bundle.path, "--recorded", 0.5,
-        "--runs-dir", processes.runs,
-    )  # fmt: skip
-    assert code in (1, 2)
-    assert "random.zip" in err
-    assert "Traceback" not in err
-    assert not (processes.runs / "run").exists()
 
 
 STAGES = """
@@ -153,9 +128,7 @@ def test_a_run_that_dreams_then_mixes_then_drives_gives_the_same_bits_through_ki
     for generation in (1, 2, 3):
         coordinator.wait_for_event("generation", number=generation)
         coordinator.end()
-        coordinator = processes.start(
-            "coordinator", "--resume", "night", "--runs-dir", processes.runs, "--listen", processes.endpoint,
-        )  # fmt: skip
+        coordinator = processes.resume("night")
     assert coordinator.finish()[0] == 0
     scores = []
     for name in ("calm", "night"):

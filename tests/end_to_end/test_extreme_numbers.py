@@ -20,7 +20,7 @@ def test_extreme_numbers_pause_the_run_with_their_reason_and_it_can_be_continued
     assert (status["state"], status["pauses"]) == ("paused", [PauseKind.FAILED_JOB])
     assert processes.call("stop", "test", "--connect", processes.endpoint)[0] == 0
     assert coordinator.finish()[0] == 130
-    again = processes.start("coordinator", "--resume", "test", "--runs-dir", processes.runs)
+    again = processes.resume()
     again.wait_for_event("paused")
     with open_run(processes.runs, "test") as run:
         assert run.result_count() == 0

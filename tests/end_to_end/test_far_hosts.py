@@ -12,12 +12,12 @@ from contextlib import ExitStack, closing, contextmanager
 
 import pytest
 
-from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.security.authority import Authority
 from tests.support import tasks
 from tests.support.hosts import new_host, require_hosts
 from tests.support.processes import free_port, processes_in
 from tests.support.relay import Relay
+from tests.support.same_bits import outcome
 
 log = logging.getLogger(__name__)
 pytestmark = [pytest.mark.long, pytest.mark.timeout(1800)]
@@ -85,13 +85,6 @@ def begin_near(processes, name, *settings):
     return coordinator
 
 
-def outcome(processes, name, generations, population):
-    """Every candidate and its fitness, and the strategy's state after the run."""
-    with open_run(processes.runs, name) as run:
-        each = [(g, i) for g in range(generations) for i in range(population)]
-        return [(run.candidate(*one).tobytes(), run.fitness(*one)) for one in each], run.strategy_state()
-
-
 def test_links_that_are_slow_and_cut_at_random_cost_no_bit(processes):
     generations, population = 12, 24
     settings = ("--task", tasks.SLOW_TOY, "--population", population, "--episodes", 2, "--evaluate-every", 0,
@@ -108,7 +101,7 @@ def test_links_that_are_slow_and_cut_at_random_cost_no_bit(processes):
             wait_for_end(coordinator, chance.uniform(0.5, 3.0))
         assert coordinator.finish(PATIENCE)[0] == 0, "".join(coordinator.lines[-5:])
     assert begin_near(processes, "alone", *settings).finish(PATIENCE)[0] == 0
-    assert outcome(processes, "far", generations, population) == outcome(processes, "alone", generations, population)
+    assert outcome(processes, "far") == outcome(processes, "alone")
     log.info("%d cuts while %d jobs were scored", cuts, generations * population * 2)
     assert cuts >= 10
 

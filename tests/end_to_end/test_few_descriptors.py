@@ -71,7 +71,8 @@ def test_a_limit_that_fits_no_session_is_one_line(processes, random_bundle, file
 @pytest.mark.slow
 @pytest.mark.skipif(os.geteuid() != 0 or not shutil.which("setpriv"), reason="needs another user, without processes")
 @pytest.mark.parametrize(
-    ("verb", "processes_allowed"), [("worker", 2), ("worker", 8), ("worker", 24), ("coordinator", 16)]
+    ("verb", "processes_allowed"),
+    [("coordinator", 16), ("worker", 8), *(pytest.param("worker", each, marks=pytest.mark.long) for each in (2, 24))],
 )
 def test_a_user_with_few_processes_gets_one_line_and_no_traceback(processes, random_bundle, processes_allowed, verb):
     able = "+dac_override,+dac_read_search"  # to read this interpreter and write its own run
@@ -83,15 +84,9 @@ def test_a_user_with_few_processes_gets_one_line_and_no_traceback(processes, ran
     words = {
         "worker": ("--connect", processes.endpoint, "--slots", 8, *flags),
         "coordinator": (
-            "--listen",
-            processes.endpoint,
-            *flags,
-            "--runs-dir",
-            processes.runs,
-            "--bundle",
-            random_bundle.path,
+            "--listen", processes.endpoint, *flags, "--runs-dir", processes.runs, "--bundle", random_bundle.path,
         ),
-    }[verb]
+    }[verb]  # fmt: skip
     if verb == "worker":  # where it can join, it lacks room for its slots
         processes.coordinator("--bundle", random_bundle.path, "--task", tasks.TOY)
     process = processes.start(verb, *words, inside=other)

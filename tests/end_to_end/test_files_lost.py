@@ -63,64 +63,48 @@ def goes_on(processes, coordinator, said, name="test"):
     assert len(history) == generations + 1
 
 
+def remove(*names):
+    return lambda folder: [(folder / name).unlink() for name in names]
+
+
+def replace_by_copy(folder):
+    shutil.copyfile(folder / "journal.sqlite", folder / "copy")
+    (folder / "copy").replace(folder / "journal.sqlite")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "lost",
+    ("harm", "name"),
     [
-        ("journal.sqlite",), pytest.param(("journal.sqlite-wal",), marks=pytest.mark.long),
-        ("journal.sqlite", "journal.sqlite-wal", "journal.sqlite-shm"),
+        (remove("journal.sqlite"), "test"), (shutil.rmtree, "test-rescued"), (replace_by_copy, "test"),
+        (lambda folder: folder.rename(folder.with_name("elsewhere")), "elsewhere"),
+        pytest.param(remove("journal.sqlite-wal"), "test", marks=pytest.mark.long),
+        pytest.param(remove(*(f"journal.sqlite{end}" for end in ("", "-wal", "-shm"))), "test", marks=pytest.mark.long),
+        pytest.param(lambda folder: os.truncate(folder / "journal.sqlite-wal", 0), "test", marks=pytest.mark.long),
     ],
-    ids=["journal", "log", "all"],
+    ids=["journal", "folder", "another journal", "moved", "log", "journal and log", "truncated log"],
 )  # fmt: skip
-def test_a_journal_that_is_removed_is_rescued_under_its_own_name(processes, live, lost):
+def test_what_is_lost_is_rescued_and_goes_on_where_the_error_says(processes, live, harm, name):
     coordinator, folder = live
-    for name in lost:
-        (folder / name).unlink()
+    harm(folder)
+    strange = folder / "journal.sqlite"
+    kept = strange.read_bytes() if strange.exists() else None
     said = said_of(coordinator)
-    assert str(folder / "journal.sqlite") in said
-    goes_on(processes, coordinator, said)
+    if harm is replace_by_copy:
+        assert strange.read_bytes() == kept, "what somebody put there stays"
+    goes_on(processes, coordinator, said, name)
 
 
 @pytest.mark.slow
-def test_a_folder_that_is_removed_is_rescued_beside_it(processes, live):
+def test_who_reads_the_journal_or_empties_its_log_is_no_reason_to_leave(processes, live):
     coordinator, folder = live
-    shutil.rmtree(folder)
-    said = said_of(coordinator)
-    assert str(processes.runs / "test-rescued" / "journal.sqlite") in said
-    goes_on(processes, coordinator, said, "test-rescued")
-
-
-@pytest.mark.slow
-def test_a_journal_that_is_replaced_by_a_copy_is_rescued_and_the_copy_stays(processes, live):
-    coordinator, folder = live
-    copy = folder / "copy"
-    shutil.copyfile(folder / "journal.sqlite", copy)
-    data = copy.read_bytes()
-    copy.replace(folder / "journal.sqlite")
-    said = said_of(coordinator)
-    assert (folder / "journal.sqlite").read_bytes() == data
-    goes_on(processes, coordinator, said)
-
-
-@pytest.mark.slow
-def test_a_journal_that_others_read_is_no_reason_to_leave(processes, live):
-    coordinator, folder = live
-    for _ in range(5):
-        with closing(sqlite3.connect(folder / "journal.sqlite")) as reader, reader:
+    for checkpoint in ("wal_checkpoint", "wal_checkpoint(TRUNCATE)") * 2:
+        with closing(sqlite3.connect(folder / "journal.sqlite", timeout=30)) as reader, reader:
             reader.execute("SELECT count(*) FROM result").fetchone()
-            reader.execute("PRAGMA wal_checkpoint")
-        reader.close()
-        assert processes.call("runs", "show", "test", "--runs-dir", processes.runs)[0] == 0
-    coordinator.wait_for_event("generation", times=2)
+            reader.execute(f"PRAGMA {checkpoint}")
+    assert processes.call("runs", "show", "test", "--runs-dir", processes.runs)[0] == 0
+    coordinator.wait_for_event("generation", times=closed(coordinator) + 2)
     assert coordinator.popen.poll() is None
-
-
-@pytest.mark.slow
-def test_a_folder_that_is_moved_goes_on_where_it_lies(processes, live):
-    coordinator, folder = live
-    folder.rename(processes.runs / "elsewhere")
-    said = said_of(coordinator)
-    goes_on(processes, coordinator, said, "elsewhere")
 
 
 @pytest.mark.slow
@@ -145,9 +129,7 @@ def test_a_controller_whose_name_is_a_folder_is_a_clear_error(processes, live):
     assert "Traceback" not in "".join(coordinator.lines)
     (folder / "controller.npz").rmdir()
     generations = closed(coordinator)
-    again = processes.start(
-        "coordinator", "--resume", "test", "--runs-dir", processes.runs, "--generations", generations
-    )
+    again = processes.resume("test", "--generations", generations)
     assert again.finish()[0] == 0
 
 
@@ -159,24 +141,6 @@ def test_a_lock_that_is_removed_by_hand_lets_nobody_in(processes, live):
                                   f"tcp/127.0.0.1:{free_port()}")  # fmt: skip
     assert code != 0
     coordinator.wait_for_event("generation")
-
-
-@pytest.mark.slow
-def test_a_log_that_is_truncated_is_rescued_before_anything_is_written_over_it(processes, live):
-    coordinator, folder = live
-    os.truncate(folder / "journal.sqlite-wal", 0)
-    said = said_of(coordinator)
-    goes_on(processes, coordinator, said)
-
-
-@pytest.mark.slow
-def test_a_log_that_a_checkpoint_of_others_empties_is_no_reason_to_leave(processes, live):
-    coordinator, folder = live
-    with closing(sqlite3.connect(folder / "journal.sqlite", timeout=30)) as other:
-        assert other.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()[0] == 0
-    generations = closed(coordinator)
-    coordinator.wait_for_event("generation", times=generations + 2)
-    assert coordinator.popen.poll() is None
 
 
 @pytest.mark.parametrize("kind", ["folder", "other"])

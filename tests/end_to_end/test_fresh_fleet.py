@@ -19,10 +19,8 @@ from dreamfleet.common.security.authority import Authority
 from dreamfleet.common.security.credentials import read_join_file
 from dreamfleet.common.transport.session import Network
 from dreamfleet.coordinator.addons.spawn.parcel import pack_wheel
-from tests.support.disks import small_disk
 from tests.support.hosts import new_host, require_hosts
 from tests.support.processes import free_port
-from tests.support.sshd import new_key
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(1800)]
 log = logging.getLogger(__name__)
@@ -141,30 +139,3 @@ def await_that(happens, why):
     while not happens():
         assert time.monotonic() < deadline, why
         time.sleep(0.1)
-
-
-def test_a_wrong_key_a_full_disk_and_no_python_are_rows_of_their_own_while_another_host_comes_up(
-    newcomer, hosts, tmp_path
-):
-    good = hosts.add("good", path=BARE, modules="")
-    for name, path in (("locked", BARE), ("full", BARE), ("bare", "/nowhere")):
-        hosts.add(name, path=path, modules="")
-    stranger = hosts.config_with(new_key(tmp_path / "foreign"))
-    with small_disk(tmp_path / "disk", 1) as disk:
-        if disk is None:
-            pytest.skip("mounting a disk needs root")
-        disk.fill()
-        file = newcomer.folder / "hosts.toml"
-        file.write_text(
-            f'[spawn]\ntunnel = false\nssh = "{hosts.ssh}"\nwheelhouse = "{newcomer.house}"\nslots = 1\n'
-            f'[[host]]\naddress = "good"\n[[host]]\naddress = "locked"\nssh = "ssh -F {stranger}"\n'
-            f'[[host]]\naddress = "full"\nremote_dir = "{disk.path}/fleet"\n[[host]]\naddress = "bare"\n'
-        )
-        rows = newcomer.rows("spawn", "--hosts", file, code=1)
-        file.unlink()
-        assert {name: row["state"] for name, row in rows.items()} == {
-            "good": "started", "locked": "failed", "full": "failed", "bare": "failed",
-        }  # fmt: skip
-        assert "--remote-dir" in rows["full"]["what"]
-        newcomer.rows("down", "good", "--ssh", hosts.ssh, "--now")
-    assert list(good.home.iterdir()) == []

@@ -1,8 +1,5 @@
 """A Python function on a fleet: who called it, and who died meanwhile, changes no bit; NaN is no end of a run."""
 
-import os
-import signal
-
 import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
@@ -18,28 +15,6 @@ SETTINGS = (
 def coordinator(processes, name, task=TASK, *more):
     options = ("--environment", "x0=[1,2,3]", "minimise=true")
     return processes.coordinator(*SETTINGS, "--task", task, *options, *more, name=name)
-
-
-def outcome(processes, name):
-    """Every call's fitness, every candidate, and the reported mean."""
-    with open_run(processes.runs, name) as run:
-        places = [(g, i) for g in range(GENERATIONS) for i in range(POPULATION)]
-        calls = [[(each.seed, each.fitness, each.steps) for each in run.results(*place)] for place in places]
-        return calls, [run.candidate(*place).tobytes() for place in places], run.controller_path.read_bytes()[-64:]
-
-
-@pytest.mark.long
-def test_one_worker_and_three_of_which_one_is_killed_give_the_same_bits(processes):
-    alone = coordinator(processes, "alone")
-    worker = processes.worker("--run", "alone", "--task", TASK)
-    assert alone.finish()[0] == 0
-    worker.end()
-    three = coordinator(processes, "three")
-    workers = [processes.worker("--run", "three", "--task", TASK, "--name", f"w{number}") for number in range(3)]
-    three.wait_for_event("generation", number=0)
-    os.kill(workers[1].popen.pid, signal.SIGKILL)
-    assert three.finish()[0] == 0
-    assert outcome(processes, "alone")[:2] == outcome(processes, "three")[:2]
 
 
 @pytest.mark.slow

@@ -4,10 +4,10 @@ import time
 
 import pytest
 
-from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
 from tests.support.hosts import new_host, require_hosts
 from tests.support.processes import DEADLINE
+from tests.support.same_bits import outcome
 
 GENERATIONS, POPULATION = 16, 8
 
@@ -17,11 +17,6 @@ def hosts():
     with new_host() as first, new_host() as second:
         require_hosts(first, second)
         yield first, second
-
-
-def fitness(processes, name):
-    with open_run(processes.runs, name) as run:
-        return [[run.fitness(g, i) for i in range(POPULATION)] for g in range(GENERATIONS)]
 
 
 def slots(processes):
@@ -58,4 +53,4 @@ def test_a_host_that_is_cut_off_costs_no_bit_and_comes_back(processes, hosts, ra
     processes.worker("--run", "alone", "--task", tasks.TOY)
     code, _ = alone.finish()
     assert code == 0
-    assert fitness(processes, "two") == fitness(processes, "alone")
+    assert outcome(processes, "two") == outcome(processes, "alone")

@@ -34,11 +34,11 @@ def test_curves_go_on_after_a_kill_and_stall_nothing(processes, random_bundle, m
             life.wait_for_event("generation")
         os.kill(life.popen.pid, signal.SIGKILL)
         life.popen.wait()
-        life = processes.start("coordinator", "--resume", "test", "--runs-dir", processes.runs)
+        life = processes.resume()
     life.wait_for_event("generation", times=3)
     life.popen.send_signal(signal.SIGTERM)
     life.finish()
-    (last,) = [processes.start("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--minutes", "0.001")]
+    last = processes.resume("test", "--minutes", "0.001")
     assert last.finish()[0] == 0
     with RunFolder(processes.runs / "test") as run:
         wanted = Counter((name.replace("__", "/"), step) for step, each in scalars_of(run) for name in each)

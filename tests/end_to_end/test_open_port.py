@@ -40,7 +40,7 @@ def test_all_at_once_change_no_bit(processes, random_bundle, unharmed):
         "result of a stranger", "result of a job that was not given", "result of another fingerprint than its worker's",
         "lease with more steps than a job has",
     }  # fmt: skip
-    assert not any("paused" in line for line in coordinator.lines)
+    assert not coordinator.events("paused")
 
 
 @pytest.mark.long

@@ -43,30 +43,6 @@ def test_a_cut_link_costs_neither_the_worker_nor_its_results(processes, random_b
 
 
 @pytest.mark.slow
-def test_a_coordinator_that_comes_back_finds_its_worker(processes, random_bundle):
-    coordinator = processes.coordinator("--bundle", random_bundle.path, *SETTINGS)
-    worker = processes.worker("--task", tasks.SLOW_TOY, "--exit-when-done")
-    coordinator.wait_for_event("generation", number=0)
-    coordinator.end()
-    worker.wait_for_event("coordinator gone")
-    resumed = processes.start(
-        "coordinator", "--resume", "test", "--runs-dir", processes.runs, "--listen", processes.endpoint
-    )
-    assert resumed.finish()[0] == 0
-    assert worker.finish()[0] == 0
-
-
-@pytest.mark.slow
-def test_a_coordinator_that_is_gone_for_good_fails_its_worker(processes, random_bundle):
-    coordinator = processes.coordinator("--bundle", random_bundle.path, *SETTINGS)
-    worker = processes.worker("--task", tasks.SLOW_TOY, "--exit-when-done", "--coordinator-timeout", 1)
-    coordinator.wait_for_event("generation", number=0)
-    coordinator.end()
-    assert worker.finish()[0] == 1
-    assert worker.events("coordinator gone")
-
-
-@pytest.mark.slow
 def test_a_run_says_why_its_worker_left_and_the_worker_in_one_line(processes):
     there = processes.folder / "there"
     there.mkdir()

@@ -54,8 +54,7 @@ def test_the_hint_of_a_run_that_was_left_is_a_whole_command_with_its_limits_and_
 def test_what_is_given_as_a_run_goes_on_is_stronger_and_is_kept(processes, settings):
     stopped(processes, settings, "--generations", 60, "--minutes", 30)
     elsewhere = f"tcp/127.0.0.1:{free_port()}"
-    again = processes.start("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--listen", elsewhere,
-                            "--generations", 3)  # fmt: skip
+    again = processes.resume("test", "--listen", elsewhere, "--generations", 3)
     processes.worker("--task", tasks.SLOW_TOY, endpoint=elsewhere)
     assert again.finish()[0] == 0
     with open_run(processes.runs, "test") as run:
@@ -64,17 +63,6 @@ def test_what_is_given_as_a_run_goes_on_is_stronger_and_is_kept(processes, setti
     code, out, _ = call_here("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--json")
     assert code == 0
     assert json.loads(out)["ended"] == "3 generations"
-
-
-@pytest.mark.slow
-def test_a_limit_that_has_passed_ends_at_once_and_names_no_controller_that_is_not_there(processes, settings):
-    stopped(processes, settings)
-    code, out, _ = call_here(
-        "coordinator", "--resume", "test", "--runs-dir", processes.runs, "--generations", 1
-    )  # fmt: skip
-    assert code == 0
-    path = processes.runs / "test" / "controller.npz"
-    assert (str(path) in out) == path.exists()
 
 
 @pytest.mark.slow
@@ -125,7 +113,7 @@ def test_a_file_that_speaks_of_another_run_does_not_keep_this_one_from_going_on(
     stopped(processes, settings, "--generations", 3)
     path = processes.folder / "fleet.toml"
     path.write_text("[run]\npopulation = 64\nepisodes = 1\n")
-    again = processes.start("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--config", path)
+    again = processes.resume("test", "--config", path)
     again.wait_for_event("kept", setting="population")
     assert again.finish()[0] == 0
     assert not again.events("kept", setting="episodes")

@@ -56,23 +56,13 @@ def test_a_crash_behind_a_forked_process_pauses_the_run_with_its_reason(processe
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
-def test_two_signals_end_it_and_what_its_environment_left(processes, random_bundle, left, number):
+def test_two_signals_end_it_and_what_its_environment_left(processes, random_bundle, left):
     _, worker = serve(processes, random_bundle, rough_tasks.ForkingAndHanging)
     pidfd = wait_for_one(left)
-    worker.popen.send_signal(number)
+    worker.popen.send_signal(signal.SIGINT)
     worker.wait_for_event("draining")
-    worker.popen.send_signal(number)
+    worker.popen.send_signal(signal.SIGINT)
     assert worker.finish(60)[0] == 0
-    wait_gone(pidfd)
-
-
-@pytest.mark.slow
-def test_what_its_environment_left_ends_with_a_worker_that_is_killed(processes, random_bundle, left):
-    _, worker = serve(processes, random_bundle, rough_tasks.ForkingAndHanging)
-    pidfd = wait_for_one(left)
-    worker.popen.kill()
-    worker.finish()
     wait_gone(pidfd)
 
 

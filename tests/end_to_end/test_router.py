@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
 from tests.support.hosts import new_host, require_hosts
 from tests.support.processes import free_port, processes_in
+from tests.support.same_bits import outcome
 
 RECIPES = Path(__file__).parents[2] / "deploy" / "zenoh"
 GENERATIONS, POPULATION = 5, 4
@@ -36,11 +36,6 @@ def recipe(tmp_path):
     return write
 
 
-def fitness(processes, name):
-    with open_run(processes.runs, name) as run:
-        return [[run.fitness(g, i) for i in range(POPULATION)] for g in range(GENERATIONS)]
-
-
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory, random_bundle):
     """What the run comes to where nothing stands between."""
@@ -48,7 +43,7 @@ def alone(tmp_path_factory, random_bundle):
         coordinator = processes.coordinator("--bundle", random_bundle.path, *SETTINGS, tasks.TOY, name="alone")
         processes.worker("--run", "alone", "--task", tasks.TOY)
         assert coordinator.finish()[0] == 0
-        return fitness(processes, "alone")
+        return outcome(processes, "alone")
 
 
 @pytest.mark.slow
@@ -75,7 +70,7 @@ def test_two_linked_routers_one_of_which_is_killed_cost_no_bit(processes, recipe
     linked.popen.send_signal(signal.SIGTERM)
     assert linked.finish()[0] == 0
     assert linked.events("sessions")[-1]["routers"] == 1
-    assert fitness(processes, "far") == alone
+    assert outcome(processes, "far") == alone
 
 
 @pytest.mark.slow
@@ -97,7 +92,7 @@ def test_a_coordinator_that_nobody_reaches_meets_workers_of_another_network_at_a
                                  inside=elsewhere.inside)  # fmt: skip
         worker.wait_for_event("joined")
         assert coordinator.finish()[0] == 0
-    assert fitness(processes, "nat") == alone
+    assert outcome(processes, "nat") == alone
 
 
 @pytest.mark.parametrize("name", ["one.toml", "linked.toml"])

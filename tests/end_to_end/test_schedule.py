@@ -5,10 +5,10 @@ import json
 import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.common.runs.stages import begun_stages, stages_of
 from dreamfleet.coordinator.views.plot import plot_fitness
 from dreamfleet.worker.addons.inspection.curve_sections import fitness_section
 from tests.support import tasks
+from tests.support.same_bits import outcome
 from tests.support.tables import cells
 
 GENERATIONS, BEGUN, SIZES = 8, [0, 4, 6], [5] * 4 + [7] * 4
@@ -47,22 +47,6 @@ def begin(processes, random_bundle):
     return coordinator
 
 
-def outcome(processes, name):
-    with open_run(processes.runs, name) as run:
-        places = [(g, i) for g in range(GENERATIONS) for i in range(SIZES[g])]
-        scores = [(run.candidate(*each).tobytes(), run.fitness(*each)) for each in places]
-        steps = [[each.steps for each in run.results(*place)] for place in places]
-        begun = begun_stages(run.settings, run.history(), run.evaluations())
-        return scores, steps, run.evaluations(), [each.since for each in begun]
-
-
-def resume(processes, name, *flags):
-    return processes.start(
-        "coordinator", "--resume", name, "--runs-dir", processes.runs, "--listen", processes.endpoint, "--beat", 0.2,
-        *flags,
-    )  # fmt: skip
-
-
 @pytest.mark.slow
 def test_a_run_of_three_stages_gives_the_same_bits_however_often_it_is_killed(processes, begin):
     coordinator = begin("calm")
@@ -78,11 +62,11 @@ def test_a_run_of_three_stages_gives_the_same_bits_however_often_it_is_killed(pr
                          (generation, {"number": 6})):  # fmt: skip
         coordinator.wait_for_event(event, **facts)
         coordinator.end()
-        coordinator = resume(processes, "night")
+        coordinator = processes.resume("night")
     assert coordinator.finish()[0] == 0
-    scores, steps, evaluations, begun = outcome(processes, "calm")
-    assert (scores, steps, evaluations, begun) == outcome(processes, "night")
-    assert begun == BEGUN
+    calm = outcome(processes, "calm")
+    assert calm == outcome(processes, "night")
+    steps = [[steps for _, _, steps in episodes] for episodes in calm.episodes]
     assert steps[0] == [3, 3], "patience cuts what never is rewarded"
     assert {each for candidate in steps[4 * 5 : 4 * 5 + 2 * 7] for each in candidate} == {7}
     assert sorted(map(len, steps[-7:])) == [2] * 3 + [4] * 4
@@ -106,31 +90,6 @@ def test_a_run_of_three_stages_gives_the_same_bits_however_often_it_is_killed(pr
     assert picture.stat().st_size > 1000
 
 
-@pytest.mark.slow
-def test_a_live_run_shows_its_stage_and_a_fork_begins_with_it(processes, begin):
-    coordinator = begin("night")
-    worker = processes.worker("--task", tasks.TOY, "--run", "night")
-    coordinator.wait_for_event("generation", number=4)
-    coordinator.end()
-    with open_run(processes.runs, "night") as run:
-        stage = run.stage_at(len(run.history())).stage
-    forked = processes.start(
-        "coordinator", "--from", "night", "--runs-dir", processes.runs, "--run", "other", "--listen",
-        processes.endpoint, "--beat", 0.2, "--generations", 1,
-    )  # fmt: skip
-    forked.wait_for_event("stage")
-    with open_run(processes.runs, "other") as run:
-        assert len(stages_of(run.settings)) == 4 - stage.number
-    status = processes.statuses()[0]
-    assert (status.generation.stage.number, status.generation.stage.settings.task.horizon) == (
-        1,
-        stage.settings.task.horizon,
-    )
-    worker.end()
-    processes.worker("--task", tasks.TOY, "--run", "other")
-    assert forked.finish()[0] == 0
-
-
 def test_a_schedule_is_frozen_with_its_run_and_another_file_is_refused(processes, begin):
     begin("night").end()
     schedule = processes.folder / "stages.toml"
@@ -145,22 +104,3 @@ def test_a_schedule_is_frozen_with_its_run_and_another_file_is_refused(processes
         coordinator.wait_for_event("begin")
         coordinator.end()
         assert bool(coordinator.events("kept", setting="schedule")) == warned
-
-
-def test_a_preset_may_hold_stages_and_a_schedule_goes_before_them(processes):
-    config, schedule = processes.folder / "fleet.toml", processes.folder / "stages.toml"
-    config.write_text('[run]\npreset = "mixed"\n')
-    schedule.write_text(STAGES)
-    coordinator = processes.coordinator("--config", config, name="night")
-    coordinator.wait_for_event("stage")
-    coordinator.end()
-    with open_run(processes.runs, "night") as run:
-        assert [each.driven for each in stages_of(run.settings)] == [0, 0.5]
-    coordinator = resume(processes, "night", "--config", config)
-    coordinator.wait_for_event("begin", incarnation=2)
-    coordinator.end()
-    assert not coordinator.events("kept")
-    coordinator = processes.coordinator("--config", config, "--schedule", schedule, name="other")
-    coordinator.end()
-    with open_run(processes.runs, "other") as run:
-        assert [each.horizon for each in stages_of(run.settings)] == [4, 7, 10]

@@ -5,11 +5,10 @@ import signal
 from contextlib import suppress
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
+from tests.support.same_bits import outcome
 
 POPULATION, GENERATIONS = 4, 4
 FLAGS = ("--task", tasks.SLOW_TOY)
@@ -35,17 +34,6 @@ def run_beside(processes, name, *arguments):
     )  # fmt: skip
     made.wait_for_event("begin")
     return made
-
-
-def bits(processes, name):
-    """All that a run's journal says of its search, but not who scored it."""
-    with open_run(processes.runs, name) as run:
-        episodes = [
-            [(each.seed, each.fitness, each.steps) for each in run.results(generation, candidate)]
-            for generation in range(GENERATIONS) for candidate in range(POPULATION)
-        ]  # fmt: skip
-        history = [(each.number, each.mean, each.best, each.sigma) for each in run.history()]
-        return episodes, history, np.load(run.controller_path)["parameters"].tobytes()
 
 
 def children(worker):
@@ -78,7 +66,7 @@ def test_two_runs_have_the_bits_of_each_alone_though_a_worker_and_a_slot_are_kil
         worker = processes.worker("--task", tasks.TOY, "--run", f"{name}-alone")
         assert coordinator.finish()[0] == 0
         worker.end()
-        alone[name] = bits(processes, f"{name}-alone")
+        alone[name] = outcome(processes, f"{name}-alone")
     shared = {name: run_beside(processes, name, *settings, *FLAGS, "--seed", seed) for name, seed in seeds.items()}
     stays, dies = (any_worker(processes, "--name", name) for name in ("stays", "dies"))
     shared["one"].wait_for_event("generation", number=0)
@@ -87,7 +75,7 @@ def test_two_runs_have_the_bits_of_each_alone_though_a_worker_and_a_slot_are_kil
     os.kill(dies.popen.pid, signal.SIGKILL)
     for name, coordinator in shared.items():
         assert coordinator.finish()[0] == 0
-        assert bits(processes, name) == alone[name]
+        assert outcome(processes, name) == alone[name]
 
 
 @pytest.mark.long

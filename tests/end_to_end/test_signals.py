@@ -64,8 +64,10 @@ def wait_for_nobody(cache):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("verb", ["demo", "iterate", "pipeline", "contrast"])
+@pytest.mark.parametrize(
+    ("verb", "number"),
+    [("demo", signal.SIGINT), ("iterate", signal.SIGTERM), ("pipeline", signal.SIGINT), ("contrast", signal.SIGTERM)],
+)
 def test_it_ends_however_it_was_started(processes, words, verb, number):
     process = processes.start(*words[verb], inside=IGNORING)
     wait_for_others(process, processes.cache)

@@ -39,36 +39,25 @@ def killed(processes, *words):
 
 
 def continued(processes, name):
-    again = processes.start("coordinator", "--resume", name, "--runs-dir", processes.runs)
-    return first_population(processes, again, name)
-
-
-def first_population(processes, coordinator, name):
-    """What it asks for first; it has left, so that this is on disk."""
-    coordinator.wait_for_event("begin")
-    coordinator.popen.send_signal(signal.SIGTERM)
-    assert coordinator.finish()[0] == 130
+    """What it asks for first when it is continued; it has left, so that this is on disk."""
+    again = processes.resume(name)
+    again.wait_for_event("begin")
+    again.popen.send_signal(signal.SIGTERM)
+    assert again.finish()[0] == 130
     with open_run(processes.runs, name) as run:
         return np.stack([run.candidate(0, number) for number in range(4)])
 
 
 def test_a_start_outlives_a_coordinator_that_was_killed_at_once_and_its_own_file(processes, settings, controller):
     mean = Controller.load(controller).parameters
-    killed(processes, "coordinator", "--run", "night", "--init", controller, *settings)
+    killed(processes, "coordinator", "--run", "night", "--init", controller, *settings, "--strict")
     controller.unlink()
     population = continued(processes, "night")
     assert np.abs(population - mean).max() < 10 * SIGMA
     with open_run(processes.runs, "night") as run:
         assert "start.npz" in run.fact("start")
-
-
-@pytest.mark.slow
-def test_a_run_that_was_killed_at_once_asks_for_what_one_that_was_not_asks_for(processes, settings, controller):
-    again = processes.start("coordinator", "--run", "whole", "--runs-dir", processes.runs, "--listen",
-                            processes.endpoint, "--init", controller, *settings)  # fmt: skip
-    whole = first_population(processes, again, "whole")
-    killed(processes, "coordinator", "--run", "parts", "--init", controller, *settings)
-    assert np.array_equal(continued(processes, "parts"), whole)
+        assert run.fact("limits") == '{"generations": 1}'
+        assert '"strict": true' in run.fact("network")
 
 
 @pytest.mark.slow
@@ -80,10 +69,3 @@ def test_a_fork_that_was_killed_at_once_goes_on_from_its_source_though_that_is_g
     killed(processes, "coordinator", "--from", "first")
     processes.call("runs", "delete", "first", "--yes", "--runs-dir", processes.runs)
     assert np.abs(continued(processes, "first-fork") - mean).max() < 10 * SIGMA
-
-
-def test_how_a_run_is_served_is_kept_with_its_start(processes, settings, controller):
-    killed(processes, "coordinator", "--run", "night", "--init", controller, *settings, "--strict")
-    with open_run(processes.runs, "night") as run:
-        assert run.fact("limits") == '{"generations": 1}'
-        assert '"strict": true' in run.fact("network")

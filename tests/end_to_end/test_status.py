@@ -14,6 +14,7 @@ from dreamfleet.common.errors import ConnectionFailedError, ControllerError
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.coordinator.verbs import status
 from tests.support import tasks
+from tests.support.processes import call_here
 
 
 @pytest.fixture
@@ -26,30 +27,24 @@ def lines(out):
 
 
 @pytest.mark.slow
-def test_a_watcher_prints_a_line_each_time_and_at_last_how_the_run_ended(processes, settings):
-    watcher = processes.start("status", "--connect", processes.endpoint, "--watch", "--json")
+def test_watchers_print_each_change_and_at_last_how_the_run_ended(processes, settings):
+    watch = ("status", "--connect", processes.endpoint, "--watch")
+    watcher = processes.start(*watch, "--json")
     watcher.wait_for(processes.endpoint)
     coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 2)
+    panel = processes.start(*watch)
     processes.worker("--task", tasks.SLOW_TOY)
     assert coordinator.finish()[0] == 0
-    code, out = watcher.finish()
+    (code, out), shown = watcher.finish(), panel.finish()
     seen = lines(out)
     assert code == 0
     assert (seen[-1]["state"], seen[-1]["why"], seen[-1]["generations"]) == ("ended", "2 generations", 2)
     assert len(seen) > 1
     with open_run(processes.runs, "test") as run:
         assert seen[-1]["last"]["mean"] == run.history()[-1].mean
-
-
-@pytest.mark.slow
-def test_the_last_panel_shows_the_final_state(processes, settings):
-    coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 2)
-    watcher = processes.start("status", "--connect", processes.endpoint, "--watch")
-    processes.worker("--task", tasks.SLOW_TOY)
-    assert coordinator.finish()[0] == 0
-    code, out = watcher.finish()
-    assert code == 0
-    assert "2 generations" in out
+    assert shown[0] == 0
+    assert shown[1].startswith("test: "), "in a pipe, a line at each change"
+    assert "2 generations" in shown[1]
 
 
 def test_watching_a_stopped_run_reports_that_it_is_not_ended(processes, settings):
@@ -120,25 +115,9 @@ def test_a_live_runs_controller_is_fetched_and_judged_on_another_host(processes,
     assert code == 0, err
 
 
-@pytest.mark.slow
-def test_resuming_past_a_limit_names_a_controller_that_is_there(processes, settings):
-    coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
-    processes.worker("--task", tasks.SLOW_TOY, "--exit-when-done")
-    coordinator.wait_for_event("generation", number=1)
-    coordinator.popen.kill()
-    with open_run(processes.runs, "test") as run:
-        run.controller_path.unlink()
-        code, out, err = processes.call(
-            "coordinator", "--resume", "test", "--runs-dir", processes.runs, "--listen", processes.endpoint,
-            "--generations", 1,
-        )  # fmt: skip
-        assert (code, str(run.controller_path) in out) == (0, True), err
-        assert Controller.load(run.controller_path).provenance["generation"] >= 1
-
-
-def test_a_controller_from_here_and_one_from_a_live_run_exclude_each_other(processes):
+def test_a_controller_from_here_and_one_from_a_live_run_exclude_each_other():
     for flags in ((), ("--controller", "tiny", "--run", "test"), ("--controller", "tiny", "--connect", "tcp/h:1")):
-        code, _, err = processes.call("evaluate", *flags)
+        code, _, err = call_here("evaluate", *flags)
         assert (code, "--controller" in err, "--run" in err) == (2, True, True), err
 
 

@@ -65,17 +65,7 @@ def test_the_same_bits_through_kills_and_again_by_the_receipt(processes, begin, 
     for generation in (1, 3):
         coordinator.wait_for_event("generation", number=generation)
         coordinator.end()
-        coordinator = processes.start(
-            "coordinator",
-            "--resume",
-            "night",
-            "--runs-dir",
-            processes.runs,
-            "--listen",
-            processes.endpoint,
-            "--beat",
-            0.2,
-        )
+        coordinator = processes.resume("night")
     assert coordinator.finish()[0] == 0
     asked = candidates(processes, "night")
     assert (asked == candidates(processes, "calm")).all()
@@ -101,17 +91,7 @@ def test_a_fork_goes_on_in_it_or_leaves_it_with_a_step_of_its_own(processes, beg
     processes.worker("--task", tasks.TOY, "--run", "night")
     coordinator.wait_for_event("generation", number=1)
     coordinator.end()
-    fork = (
-        "coordinator",
-        "--from",
-        "night",
-        "--runs-dir",
-        processes.runs,
-        "--listen",
-        processes.endpoint,
-        "--beat",
-        0.2,
-    )
+    fork = ("coordinator", "--from", "night", "--runs-dir", processes.runs, "--listen", processes.endpoint)
     code, _, err = processes.call(*fork, "--subspace", "none")
     assert (code, "--sigma0" in err) == (2, True), err
     (processes.folder / "fleet.toml").write_text('[run]\nsubspace = "none"\n')
@@ -128,7 +108,6 @@ def test_a_fork_goes_on_in_it_or_leaves_it_with_a_step_of_its_own(processes, beg
         assert [each.whole for each in same.settings.stages] == [False, True]
         assert not any(each.whole for each in free.settings.stages)
     (processes.folder / "fleet.toml").write_text('[run]\nsubspace = "gone.npz"\n')
-    again = processes.start("coordinator", "--resume", "night", "--runs-dir", processes.runs,
-                            "--listen", processes.endpoint, "--config", processes.folder / "fleet.toml")  # fmt: skip
+    again = processes.resume("night", "--config", processes.folder / "fleet.toml")
     again.wait_for_event("kept", setting="subspace")
     again.end()

@@ -20,6 +20,7 @@ RUNS = {
     "time": (("--variant", "time_cost=0.5"), (288, 3)),
     "dreamt": (("--task", "dream", "--variant", "pedals=one", "decide_every=3", "feedback=last"), (292, 2)),
 }
+OFTEN = ("pedals", "feedback", "dreamt")
 
 
 @pytest.fixture
@@ -37,7 +38,9 @@ def evolve(processes, random_bundle):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", RUNS)
+@pytest.mark.parametrize(
+    "kind", [*OFTEN, *(pytest.param(each, marks=pytest.mark.long) for each in RUNS if each not in OFTEN)]
+)
 def test_a_run_evolves_and_is_replayed_to_the_same_bits(processes, evolve, kind):
     flags, shape = RUNS[kind]
     evolve("one", *flags)

@@ -8,8 +8,9 @@ from contextlib import closing
 import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
-from tests.support.lying_tasks import FLIPS, LIES, WATCHED
+from tests.support.lying_tasks import LIES, WATCHED
 from tests.support.processes import DEADLINE, ROOT, processes_in
+from tests.support.same_bits import outcome
 
 
 @pytest.fixture(scope="module")
@@ -57,13 +58,6 @@ def gathered(processes, coordinator, **hosts):
     return started
 
 
-def outcome(processes, name):
-    """All that a run came to, whoever scored it."""
-    with open_run(processes.runs, name) as run:
-        history = [(each.number, each.mean, each.best, each.sigma, each.steps) for each in run.history()]
-        return history, run.evaluations(), run.confirmation()
-
-
 @pytest.fixture(scope="module")
 def honest(tmp_path_factory, settings):
     """What the run comes to on one honest host."""
@@ -80,14 +74,9 @@ def query(processes, text):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "set_there", [{LIES: 0.5}, pytest.param({FLIPS: 16}, marks=pytest.mark.long)], ids=["a liar", "bad memory"]
-)
-def test_a_host_whose_results_differ_is_barred_and_the_run_has_the_bits_of_an_honest_one(
-    processes, settings, honest, set_there
-):
+def test_a_host_whose_results_differ_is_barred_and_the_run_has_the_bits_of_an_honest_one(processes, settings, honest):
     coordinator = processes.coordinator(*settings, "--verify", 0.5)
-    workers = gathered(processes, coordinator, own={}, other={}, bad=set_there)
+    workers = gathered(processes, coordinator, own={}, other={}, bad={LIES: 0.5})
     assert coordinator.finish()[0] == 0
     workers["bad"].wait_for_event("refused")
     assert outcome(processes, "test") == honest
@@ -109,43 +98,6 @@ def test_the_coordinators_own_host_decides_against_a_single_other_one(processes,
 
 
 @pytest.mark.long
-def test_two_strangers_that_differ_are_held_until_a_third_host_decides(processes, settings, honest, tmp_path):
-    elsewhere = {"DREAMFLEET_CACHE": tmp_path / "elsewhere"}
-    coordinator = processes.coordinator(*settings, "--verify", 1)
-    gathered(processes, coordinator, good=elsewhere, bad={LIES: 0.5, **elsewhere})
-    coordinator.wait_for_event("differing")
-    status = processes.status()
-    assert status["state"] == "paused"
-    worker(processes, "third", elsewhere)
-    assert coordinator.finish()[0] == 0
-    assert outcome(processes, "test") == honest
-    with open_run(processes.runs, "test") as run:
-        assert run.checks.barred == ("bad",)
-
-
-@pytest.mark.long
-def test_an_honest_fleet_is_checked_and_nobody_is_accused(processes, settings, honest):
-    coordinator = processes.coordinator(*settings, "--verify", 1)
-    gathered(processes, coordinator, own={}, other={})
-    assert coordinator.finish()[0] == 0
-    assert outcome(processes, "test") == honest
-    with open_run(processes.runs, "test") as run:
-        checks = run.checks
-    assert checks.checked > 0
-    assert (checks.differing, checks.recalled, checks.barred) == (0, 0, ())
-
-
-@pytest.mark.long
-def test_a_host_alone_in_its_class_is_said_to_be_unchecked_and_the_run_ends(processes, settings, honest):
-    coordinator = processes.coordinator(*settings, "--verify", 1)
-    worker(processes, "own")
-    assert coordinator.finish()[0] == 0
-    assert outcome(processes, "test") == honest
-    with open_run(processes.runs, "test") as run:
-        assert run.checks.checked == 0
-
-
-@pytest.mark.long
 @pytest.mark.parametrize("moment", ["before", "after"])
 def test_a_coordinator_that_is_killed_amid_a_recall_goes_on_as_if_it_had_not_been(
     processes, settings, honest, moment, tmp_path
@@ -162,7 +114,7 @@ def test_a_coordinator_that_is_killed_amid_a_recall_goes_on_as_if_it_had_not_bee
     assert dying.popen.wait(DEADLINE) == -signal.SIGKILL
     recalled = query(processes, "SELECT count(*) FROM recalled") + query(processes, "SELECT count(*) FROM barred")
     assert (recalled == [(0,), (0,)]) == (moment == "before")
-    again = processes.start("coordinator", "--resume", "test", "--runs-dir", processes.runs)
+    again = processes.resume()
     assert again.finish()[0] == 0
     assert outcome(processes, "test") == honest
     with open_run(processes.runs, "test") as run:

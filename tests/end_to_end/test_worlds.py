@@ -2,19 +2,19 @@
 
 import json
 
-import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support.dreams import write_bundle_of
 from tests.support.pixel_world import DODGE, DODGE_TASK, MODULE
+from tests.support.same_bits import outcome
 
 GENERATIONS, POPULATION, EPISODES = 3, 6, 2
 
 
 def evolve(processes, bundle, name, workers, *flags):
-    """A run in the bundle's dream, whose means are judged in its world; its fitness, vectors and evaluations."""
+    """What a run in the bundle's dream comes to, whose means are judged in its world."""
     coordinator = processes.coordinator(
         "--preset", "pixels", "--bundle", bundle.path, "--population", POPULATION, "--episodes", EPISODES,
         "--horizon", 60, "--generations", GENERATIONS, "--evaluate-every", 1, "--evaluation-episodes", 2,
@@ -27,37 +27,32 @@ def evolve(processes, bundle, name, workers, *flags):
     assert code == 0, "".join(coordinator.lines + crew[0].lines)
     for each in crew:
         each.end()
+    return outcome(processes, name)
+
+
+def settings_of(processes, name):
     with open_run(processes.runs, name) as run:
-        fitness = [[run.fitness(g, i) for i in range(POPULATION)] for g in range(GENERATIONS)]
-        vectors = [run.candidate(g, i).tobytes() for g in range(GENERATIONS) for i in range(POPULATION)]
-        found = [(each.generation, each.mean) for each in run.evaluations()]
-        return fitness, vectors, found, np.load(run.controller_path)["parameters"].tobytes(), run.settings
+        return run.settings
 
 
 @pytest.mark.slow
-def test_a_bundles_world_gives_the_same_bits_on_one_worker_and_on_two(processes, tmp_path):
-    bundle = write_bundle_of("choices", tmp_path / "b.zip")
-    alone = evolve(processes, bundle, "alone", 1, "--variant", "decide_every=2")
-    assert alone == evolve(processes, bundle, "two", 2, "--variant", "decide_every=2")
-    settings = alone[-1]
+def test_a_bundles_world_gives_the_same_bits_on_one_worker_and_on_two_and_a_runs_own_end_other_dreams(
+    processes, tmp_path
+):
+    bundle, variant = write_bundle_of("choices", tmp_path / "b.zip"), ("--variant", "decide_every=2")
+    alone = evolve(processes, bundle, "alone", 1, *variant)
+    assert alone == evolve(processes, bundle, "two", 2, *variant)
+    own = evolve(processes, bundle, "own", 1, *variant, "--end", "0.999")
+    assert own.fitness != alone.fitness
+    task = settings_of(processes, "own").task
+    assert (task.end, task.version) == ("0.999", 11)
+    settings = settings_of(processes, "alone")
     assert (settings.task.task, settings.controller.actions) == ("dream", 3)
-    assert any(fitness for each in alone[0] for fitness in each), "somebody lived"
+    assert any(alone.fitness), "somebody lived"
     runs = ("--runs-dir", processes.runs)
     code, out, err = processes.call("verify", "candidate", "alone", *runs, "--candidate", "1/2", "--trust", MODULE)
     assert (code, out.count("same bits")) == (0, EPISODES), err
-
-
-@pytest.mark.slow
-def test_an_end_of_the_runs_own_changes_its_dreams_and_its_controller_is_of_the_world(processes, tmp_path):
-    bundle = write_bundle_of("choices", tmp_path / "b.zip")
-    plain, own = (evolve(processes, bundle, name, 1, *flags) for name, flags in
-                  (("plain", ()), ("own", ("--end", "0.999"))))  # fmt: skip
-    assert own[0] != plain[0]
-    assert (own[-1].task.end, own[-1].task.version) == ("0.999", 11)
-    code, _, err = processes.call(
-        "evaluate", "--controller", "own", "--runs-dir", processes.runs, "--episodes", 1, "--trust",
-        MODULE,
-    )  # fmt: skip
+    code, _, err = processes.call("evaluate", "--controller", "own", *runs, "--episodes", 1, "--trust", MODULE)
     assert code == 0, err
 
 

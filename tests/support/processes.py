@@ -176,6 +176,10 @@ class Processes:
         process.wait_until_serving()
         return process
 
+    def resume(self, name="test", *flags):
+        """Continue a run here; it is served where it was before, unless the flags name another place."""
+        return self.start("coordinator", "--resume", name, "--runs-dir", self.runs, *flags)
+
     def worker(self, *arguments, endpoint=None, inside=(), root=ROOT):
         arguments = ("--connect", endpoint or self.endpoint, "--slots", "1", *arguments)
         return self.start("worker", *arguments, inside=inside, root=root)

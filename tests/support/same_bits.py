@@ -1,4 +1,6 @@
-"""A short run in the dream, and what it computed."""
+"""What a run came to, whoever scored it; and a short run in the dream."""
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,13 +14,28 @@ SETTINGS = (
 )  # fmt: skip
 
 
+class Outcome(NamedTuple):
+    """All that a run computed, but not who scored it nor when."""
+
+    fitness: list
+    vectors: list
+    episodes: list
+    history: list
+    evaluations: list
+    confirmation: object
+    parameters: bytes
+
+
 def outcome(processes, name):
-    """Every fitness of every candidate, and the reported mean, after the run."""
+    """What a run has come to, candidate by candidate."""
     with open_run(processes.runs, name) as run:
-        fitness = [[run.fitness(g, i) for i in range(POPULATION)] for g in range(GENERATIONS)]
-        episodes = [
-            [(each.seed, each.fitness, each.steps) for each in run.results(g, i)]
-            for g in range(GENERATIONS) for i in range(POPULATION)
-        ]  # fmt: skip
-        vectors = [run.candidate(g, i).tobytes() for g in range(GENERATIONS) for i in range(POPULATION)]
-        return fitness, episodes, vectors, np.load(run.controller_path)["parameters"].tobytes()
+        places = [(each.generation, each.number) for each in run.candidates()]
+        return Outcome(
+            [run.fitness(*place) for place in places],
+            [run.candidate(*place).tobytes() for place in places],
+            [[(each.seed, each.fitness, each.steps) for each in run.results(*place)] for place in places],
+            [(each.number, each.mean, each.best, each.sigma, each.steps) for each in run.history()],
+            run.evaluations(),
+            run.confirmation(),
+            np.load(run.controller_path)["parameters"].tobytes(),
+        )
