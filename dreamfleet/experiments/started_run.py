@@ -236,7 +236,13 @@ def start_run_in(
         expected = task_flags(settings["task"]) if settings.get("task") and not settings.get("resume") else None
         if expected is not None:  # they load while the coordinator checks the task
             start_workers(expected)
-        run = _open(processes, folder / name, fleet.local_endpoint, stack, resumed=bool(settings.get("resume")))
+        client, address = None, fleet.local_endpoint
+        try:
+            client = stack.enter_context(processes.connect(address))
+        except DreamfleetError:
+            if processes.coordinator.exit_code != 0:  # else a limit was reached before
+                raise
+        run = StartedRun(folder / name, processes, address, client, resumed=bool(settings.get("resume")))
         needed = None
         if run.client is not None:  # the flags by which a worker of this run announces its tasks
             needed = task_flags(run.spec.task, *((bundle.manifest.task,) if (bundle := run.bundle()) else ()))
@@ -351,14 +357,3 @@ def _discard_unless_begun(path: Path) -> None:
             each.unlink(missing_ok=True)
         with suppress(OSError):
             path.rmdir()
-
-
-def _open(processes: LocalRun, path: Path, address: str, stack: ExitStack, *, resumed: bool) -> StartedRun:
-    """The run once its coordinator listens, or has ended because a limit was reached before."""
-    client = None
-    try:
-        client = stack.enter_context(processes.connect(address))
-    except DreamfleetError:
-        if processes.coordinator.exit_code != 0:
-            raise
-    return StartedRun(path, processes, address, client, resumed=resumed)

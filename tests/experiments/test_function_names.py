@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import types
+from operator import attrgetter
 
 import pytest
 
@@ -19,14 +20,10 @@ MODULE = "tests.support.objectives"
 
 def test_a_function_of_a_module_travels_by_its_name():
     found = name_function(objectives.sphere)
-    assert found.task == f"function:{MODULE}:sphere"
     assert found.folder == ROOT.resolve()
     assert found.environment[PLACES].split(os.pathsep)[0] == str(found.folder)
-    assert name_function(objectives.Shifted.value).task == f"function:{MODULE}:Shifted.value"
-    assert name_function(objectives.Shifted.of_class).task == f"function:{MODULE}:Shifted.of_class"
-    assert name_function(objectives.steady).task == f"function:{MODULE}:steady"
-    assert name_function(objectives.weighted).task == f"function:{MODULE}:weighted"
-    assert name_function(objectives.weighted.noisy).task == f"function:{MODULE}:weighted.noisy"
+    for name in ("sphere", "Shifted.value", "Shifted.of_class", "steady", "weighted", "weighted.noisy"):
+        assert name_function(attrgetter(name)(objectives)).task == f"function:{MODULE}:{name}"
     assert name_function("mine:cost").task == name_function("function:mine:cost").task == "function:mine:cost"
 
 
@@ -75,11 +72,6 @@ def test_a_function_of_a_notebooks_cell_is_to_be_put_into_a_file(monkeypatch):
     exec("def cost(x): return 0.0", names)
     with pytest.raises(UsageError, match="cost"):
         name_function(names["cost"])
-
-
-def test_a_function_of_a_prompt_is_to_be_put_into_a_file():
-    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False)
-    assert "UsageError" in done.stderr
 
 
 def test_a_module_beside_the_script_is_found_though_nothing_imported_it(tmp_path, monkeypatch):

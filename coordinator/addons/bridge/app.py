@@ -28,7 +28,7 @@ from dreamfleet.common.client.client import Client
 from dreamfleet.common.client.remote_scorer import scored_candidates
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
 from dreamfleet.common.host.packages import package_version
-from dreamfleet.common.printable import truncate
+from dreamfleet.common.printable import printable, truncate
 from dreamfleet.common.protocol.batches import MAX_CANDIDATES, BatchError, BatchReply, pack_batch
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.runs.seeds import remark_on_seeds
@@ -361,4 +361,4 @@ async def _bug(_request: Request, _cause: Exception) -> Response:
 
 
 def _error(status: int, kind: str, text: str, headers: Mapping[str, str] | None = None) -> Response:
-    return json_response({"error": kind, "text": text}, status, headers)
+    return json_response({"error": kind, "text": printable(text)}, status, headers)

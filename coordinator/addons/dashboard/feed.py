@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import AsyncGenerator
 
 from dreamfleet.common.host.error_counter import ErrorCounter
 from dreamfleet.coordinator.addons.dashboard.live_runs import DashboardSnapshot, Watcher
@@ -22,9 +22,7 @@ class Feed:
     """
 
     def __init__(self, watcher: Watcher, refresh: float = REFRESH, linger: float = LINGER) -> None:
-        self._watcher = watcher
-        self._refresh = refresh
-        self._linger = linger
+        self._watcher, self._refresh, self._linger = watcher, refresh, linger
         self._error_counter = ErrorCounter(log)
         self._viewers = 0
         self._latest: DashboardSnapshot | None = None
@@ -70,21 +68,17 @@ class Feed:
         try:
             while not self._closed and clock() < left:
                 began = clock()
-                await self._poll_once(self._watcher.poll)
+                try:
+                    self._latest = await asyncio.to_thread(self._watcher.poll)
+                    self._notify()
+                except Exception as error:  # a failed poll must not end the feed
+                    self._error_counter.record("look", error, "at live runs")
                 if self._viewers:
                     left = clock() + self._linger
                 await asyncio.sleep(max(began + self._refresh - clock(), 0.0))
         finally:
             self._latest, self._polling = None, None
         await asyncio.to_thread(self._watcher.suspend)
-
-    async def _poll_once(self, poll: Callable[[], DashboardSnapshot]) -> None:
-        try:
-            self._latest = await asyncio.to_thread(poll)
-        except Exception as error:  # a failed poll must not end the feed
-            self._error_counter.record("look", error, "at live runs")
-            return
-        self._notify()
 
     def _notify(self) -> None:
         self._changed.set()

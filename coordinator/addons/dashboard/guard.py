@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 import hmac
 from html import escape
-from http.cookies import CookieError, SimpleCookie
 
-from starlette.datastructures import Headers, QueryParams
+from starlette.datastructures import Headers
+from starlette.requests import Request
 from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.types import Scope
 
+from dreamfleet.coordinator.addons.dashboard.assets import FOLDER
 from dreamfleet.coordinator.addons.web.guard import Guard, constant_time_equal
 
 COOKIE = "dreamfleet"
@@ -28,12 +29,7 @@ HEADERS = {
     "cross-origin-opener-policy": "same-origin",
     "cross-origin-resource-policy": "same-origin",
 }
-LOGIN_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
-<title>dreamfleet: token</title><style>body{{font:16px/1.5 system-ui,sans-serif;margin:15vh auto;max-width:26rem;
-padding:0 1rem;color-scheme:light dark}}input,button{{font:inherit;padding:.4rem .6rem}}</style>
-<h1>dreamfleet</h1><p>{text}</p><form method="get" action="/"><label>Token
-<input name="token" type="password" autocomplete="current-password" required autofocus></label>
-<button>Look</button></form></html>"""
+LOGIN_PAGE = (FOLDER / "login.html").read_text(encoding="utf-8")
 
 
 class PageGuard(Guard):
@@ -56,24 +52,16 @@ class PageGuard(Guard):
         if not self.tokens:
             return None
         (token,) = self.tokens
-        given = QueryParams(scope["query_string"]).get("token")
+        given, cookie = Request(scope).query_params.get("token"), Request(scope).cookies.get(COOKIE, "")
         if given is not None and constant_time_equal(given, token):
             answer = RedirectResponse("/", 303)  # without the token, which an address bar would show
             answer.set_cookie(COOKIE, cookie_value(token), httponly=True, samesite="lax", path="/")
             return answer
-        if self.bears_token(headers) or _has_cookie(headers, token):
+        if self.bears_token(headers) or constant_time_equal(cookie, cookie_value(token)):
             return None
         text = "This is not the token." if given is not None else "Who looks at these runs must know their token."
         challenge = {"www-authenticate": 'Bearer realm="dreamfleet"'}
-        return HTMLResponse(LOGIN_PAGE.format(text=escape(text)), 401, challenge)
-
-
-def _has_cookie(headers: Headers, token: str) -> bool:
-    try:
-        cookie = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
-    except CookieError:
-        return False
-    return cookie is not None and constant_time_equal(cookie.value, cookie_value(token))
+        return HTMLResponse(LOGIN_PAGE.replace("$text", escape(text)), 401, challenge)
 
 
 def cookie_value(token: str) -> str:

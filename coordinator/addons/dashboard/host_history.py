@@ -23,8 +23,6 @@ _CAME, _GONE = ("joined", "back"), ("silent", "lost", "left")  # what becomes of
 
 @dataclass
 class _Host:
-    """One host's share."""
-
     lives: set[str] = field(default_factory=set)
     results: int = 0
     steps: float = 0.0

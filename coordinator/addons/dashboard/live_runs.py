@@ -100,7 +100,6 @@ class Watcher:
         self._followed.clear()
 
     def _query_statuses(self) -> dict[str, dict[str, Any]]:
-        """The status documents of live runs by name."""
         try:
             if self._client is None:
                 self._client = Client(self._network)

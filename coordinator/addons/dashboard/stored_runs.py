@@ -184,7 +184,6 @@ def _world(run: RunFolder) -> str:
 
 
 def _tiles(run: RunFolder, data: RunData, total: Effort, word: str) -> list[dict[str, str]]:
-    """The headline figures."""
     best, confirmed = (in_values(each, run.spec) for each in (best_evaluation(data.evaluations), data.confirmed))
     reported = confirmed or best
     tiles = [
@@ -205,7 +204,6 @@ def _tiles(run: RunFolder, data: RunData, total: Effort, word: str) -> list[dict
 
 
 def _about(run: RunFolder, settings: RunSettings) -> Facts:
-    """What the run is."""
     task, world = settings.task.task, _world(run)
     limit, horizon = run.episode_limit, settings.task.horizon
     steps = f"{min(horizon, limit or horizon):,} steps{describe_limit(horizon, limit)}"

@@ -55,19 +55,11 @@ class SpawnConfig:
 
 
 @dataclass(frozen=True)
-class HostConfig:
-    """Address and name in a [[host]] table."""
-
-    address: str = field(metadata={"help": "as ssh takes it: user@host, a name of ~/.ssh/config, or ssh://host:port"})
-    name: str = option("", "of host and worker (default the address without user)")
-
-
-@dataclass(frozen=True)
 class Host:
     """A host, and how a worker is started there."""
 
-    name: str
-    address: str
+    name: str = field(metadata={"help": "of host and worker (default the address without user)"})
+    address: str = field(metadata={"help": "as ssh takes it: user@host, a name of ~/.ssh/config, or ssh://host:port"})
     spawn: SpawnConfig
 
     def __post_init__(self) -> None:
@@ -98,12 +90,12 @@ def read_hosts(rows: Sequence[Mapping[str, Any]], sources: Mapping[str, Any]) ->
         own = {key: row[key] for key in ("address", "name") if key in row}
         if "address" not in own:
             raise UsageError(f'{where} has no address: write address = "user@host"')
-        about = HostConfig(**read_table(HostConfig, where, own))
+        about = read_table(Host, where, own)
         rest = {key: value for key, value in row.items() if key not in own}
         read_table(SpawnConfig, where, rest)  # its errors name this table
         table = {**(sources.get("file") or {}).get("spawn", {}), **rest}
         spawn = load(SpawnConfig, "spawn", **{**sources, "file": {"spawn": table}})
-        hosts.append(Host(about.name or default_name(about.address), about.address, spawn))
+        hosts.append(Host(about.get("name") or default_name(about["address"]), about["address"], spawn))
     return check_unique(hosts)
 
 

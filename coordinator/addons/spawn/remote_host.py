@@ -112,10 +112,8 @@ class RemoteHost:
     """A host and the connection to it; every method raises `DreamfleetError` if it fails."""
 
     def __init__(self, host: Host, fleet_address: FleetAddress, on_progress: OnText, on_log_line: OnText) -> None:
-        self.host = host
-        self._fleet_address = fleet_address
-        self._on_progress = on_progress
-        self._on_log_line = on_log_line
+        self.host, self._fleet_address = host, fleet_address
+        self._on_progress, self._on_log_line = on_progress, on_log_line
         self._connection: Connection | None = None
         self._closed = threading.Event()
         self.forwards = host.forwards(fleet_address.connect, joins=bool(fleet_address.join))

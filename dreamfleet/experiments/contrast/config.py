@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 from dreamfleet.common.cli.key_values import split_flags
 from dreamfleet.common.cli.presets import default_run_preset
@@ -75,17 +74,16 @@ class Contrast:
         """The flags that all trials' `coordinator` have in common, in the dream of this task's world."""
         return ("--preset", default_run_preset(world), *split_flags("--run-flags", self.run_flags))
 
-    def merge_settings(self, kept: dict[str, Any]) -> dict[str, Any]:
-        """The settings that a folder begun with `kept` has from now on: kinds and seeds are added, none is changed.
+    def continue_from(self, begun: Contrast) -> Contrast:
+        """The contrast of a folder that was begun with another: its kinds and seeds are added, none is changed.
 
         `UsageError` if its finished trials could not be compared with new ones.
         """
-        mine, kinds = asdict(self), dict(self.kinds)
-        known: dict[str, str] = dict(kept.get("kinds", ()))
-        differing: list[str] = []
-        differing += [name for name in ("mdnrnn_flags", "run_flags") if name in kept and kept[name] != mine[name]]
+        known, kinds = dict(begun.kinds), dict(self.kinds)
+        names: tuple[str, ...] = ("mdnrnn_flags", "run_flags")
+        differing = [name for name in names if getattr(begun, name) != getattr(self, name)]
         differing += [f"kind {name}" for name, flags in known.items() if kinds.get(name, flags) != flags]
         if differing:
             raise UsageError(f"it was begun with other {', '.join(differing)}: omit that, or begin in another --out")
-        seeds = tuple(dict.fromkeys((*kept.get("seeds", ()), *self.seeds)))
-        return {**mine, "kinds": tuple((known | kinds).items()), "seeds": seeds}
+        seeds = tuple(dict.fromkeys((*begun.seeds, *self.seeds)))
+        return replace(self, kinds=tuple((known | kinds).items()), seeds=seeds)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.cli.presets import default_run_preset
@@ -14,6 +14,7 @@ from dreamfleet.common.files.regular_files import is_folder, path_exists
 from dreamfleet.common.host.stop_signals import Stop
 from dreamfleet.common.runs.records import best_evaluation
 from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.schema.validation import from_plain, to_plain
 from dreamfleet.experiments.command_lines import options
 from dreamfleet.experiments.contrast.config import Contrast, Trial
 from dreamfleet.experiments.contrast.summary import TrialResult
@@ -28,6 +29,14 @@ from dreamfleet.worker.training.stages.train import TrainRequest, summarise, tra
 SHARED = ("episodes", "encoded", "vae.safetensors")
 SETTINGS = "contrast.json"
 LOCK = "contrast.lock"
+
+
+@dataclass(frozen=True)
+class StoredContrast:
+    """The data set that a folder was begun on, and its trials."""
+
+    data: str
+    contrast: Contrast
 
 
 class Trials:
@@ -49,15 +58,16 @@ class Trials:
         if not any((self._data / "encoded").iterdir()):
             raise DatasetError(f"{self._data} has no encoded drives: dreamfleet encode --data {self._data}")
         path = self._folder / SETTINGS
-        begun, data = read_document(path, _check_settings) or {}, str(self._data.resolve())
-        if begun.get("data", data) != data:
-            raise UsageError(f"{self._folder} was begun on {begun['data']}: begin in another --out")
-        kept = self._contrast.merge_settings(begun)
+        own = StoredContrast(str(self._data.resolve()), self._contrast)
+        begun = read_document(path, partial(from_plain, StoredContrast)) or own
+        if begun.data != own.data:
+            raise UsageError(f"{self._folder} was begun on {begun.data}: begin in another --out")
+        kept = replace(own, contrast=self._contrast.continue_from(begun.contrast))
         for trial in self._contrast.trials:  # refuses wrong training flags
             self._link_data(trial)
             log = self._log_path(trial, "summary")
             self._parameters[trial] = run_isolated(summarise, self._training(trial), log, self._stop).parameters
-        write_document(path, {**kept, "data": data}, "--out")
+        write_document(path, to_plain(kept), "--out")
 
     def do(self, trial: Trial, on_step: Callable[[str], None]) -> TrialResult:
         """Do what is left of a trial; `on_step` is called as each part begins."""
@@ -112,9 +122,3 @@ class Trials:
         return replace(
             trained, score=judged.mean, error=judged.error, tracks=judged.episodes, confirmed=confirmed is not None
         )
-
-
-def _check_settings(found: Any) -> dict[str, Any]:
-    if not isinstance(found, dict):
-        raise TypeError("it holds no settings")
-    return found

@@ -66,10 +66,12 @@ class PhaseRunner:
         """Run a phase, or what is left of it."""
         number = phase.round
         self._link_data(number)
+        asked = self._requests
         done: dict[str, Callable[[int], PhaseResult]] = {
-            plan.INIT: self._init, plan.COLLECT: self._collect, plan.TAKE: self._import_kept, plan.DRIVE: self._drive,
-            VAE: self._vae, plan.ENCODE: self._encode, MDNRNN: self._mdnrnn, plan.BUNDLE: self._bundle,
-            plan.GATE: self._gate, plan.EVOLVE: self._evolve,
+            plan.COLLECT: lambda number: self._drives(number, plan.COLLECT, collect_drives, asked.collect(number)),
+            plan.TAKE: lambda number: self._drives(number, plan.TAKE, import_kept, asked.import_kept(number)),
+            plan.INIT: self._init, plan.DRIVE: self._drive, VAE: self._vae, plan.ENCODE: self._encode,
+            MDNRNN: self._mdnrnn, plan.BUNDLE: self._bundle, plan.GATE: self._gate, plan.EVOLVE: self._evolve,
         }  # fmt: skip
         return done[phase.name](number)
 
@@ -101,12 +103,6 @@ class PhaseRunner:
         pilots = self._save_pilots(controller, [controller.parameters], layout.means(number), layout.bundle(number))
         figures = {"sha256": bundle.sha256, "controller": self._config.init}
         return PhaseResult((request,), figures, (layout.bundle(number), *checkpoints, layout.optimum(number), *pilots))
-
-    def _collect(self, number: int) -> PhaseResult:
-        return self._drives(number, plan.COLLECT, collect_drives, self._requests.collect(number))
-
-    def _import_kept(self, number: int) -> PhaseResult:
-        return self._drives(number, plan.TAKE, import_kept, self._requests.import_kept(number))
 
     def _drive(self, number: int) -> PhaseResult:
         pilots = sorted(self._layout.means(number - 1).glob("[0-9]*.npz"))

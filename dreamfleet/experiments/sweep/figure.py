@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from matplotlib.figure import Figure
 
@@ -16,6 +16,7 @@ from dreamfleet.coordinator.views.plot import save_figure
 from dreamfleet.experiments.sweep.summary import RunResult, mean_curve, with_goal, word_of
 
 FEWEST = 3  # evaluations of a run that make a curve
+LEGEND_PLACE: Final = "outside lower center"
 MARKERS = "os^vDPX*"
 DASHES = ("-", (0, (4, 2)), (0, (1, 1.5)), (0, (6, 2, 1, 2)))
 
@@ -63,5 +64,5 @@ def sweep_figure(results: Sequence[RunResult]) -> Any:
         kind += ", log scale"
     axes.set_ylabel(with_goal(kind, results))
     axes.grid(alpha=0.3)
-    figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
+    figure.legend(loc=LEGEND_PLACE, ncols=2, fontsize=9, frameon=False)
     return figure

@@ -20,22 +20,12 @@ SETTINGS, LOCK, FIGURE = "sweep.json", "sweep.lock", "learning.png"
 
 
 @dataclass(frozen=True)
-class VariedSetting:
-    """A setting that varies, and its values as texts."""
-
-    setting: str
-    values: tuple[str, ...]
-
-
-@dataclass(frozen=True)
 class StoredSweep:
-    """The settings of a sweep as they are stored."""
+    """A sweep as it is stored, with the tasks that its workers announce, and how it was served the last time."""
 
-    name: str
-    vary: tuple[VariedSetting, ...]
-    flags: tuple[str, ...]
-    tasks: tuple[str, ...]  # that its workers announce
-    options: SweepOptions = field(default=SweepOptions(), metadata=OPTIONAL)  # of the last time that it was served
+    sweep: Sweep
+    tasks: tuple[str, ...]
+    options: SweepOptions = field(default=SweepOptions(), metadata=OPTIONAL)
 
 
 class SweepFolder:
@@ -60,22 +50,12 @@ class SweepFolder:
         if taken := next((each.name for each in sweep.runs if has_begun(self.runs_dir, each.name)), None):
             raise UsageError(f"run {taken} exists in {self.runs_dir}: give the sweep another --run")
 
-    def write(self, sweep: Sweep, tasks: tuple[str, ...], options: SweepOptions) -> None:
+    def write(self, stored: StoredSweep) -> None:
         """Keep a sweep, and how it is served."""
-        vary = tuple(VariedSetting(key, tuple(values)) for key, values in sweep.vary.items())
-        stored = StoredSweep(sweep.name, vary, sweep.flags, tasks, options)
         write_document(self.path / SETTINGS, to_plain(stored), "--runs-dir")
 
-    def read(self) -> tuple[Sweep, tuple[str, ...]]:
-        """The sweep and its workers' tasks; `UsageError` if there is none of this name."""
-        found = self._read()
-        return Sweep(found.name, {each.setting: each.values for each in found.vary}, found.flags), found.tasks
-
-    def read_options(self) -> SweepOptions:
-        """How the sweep was served the last time; errors as in `read`."""
-        return self._read().options
-
-    def _read(self) -> StoredSweep:
+    def read(self) -> StoredSweep:
+        """The sweep; `UsageError` if there is none of this name, `DatasetError` if it is damaged."""
         if (found := read_document(self.path / SETTINGS, partial(from_plain, StoredSweep))) is None:
             raise UsageError(f"no sweep {self._name} in {self.runs_dir}: begin it with --run {self._name}")
         return found
@@ -97,6 +77,6 @@ def sweeps_of_runs(runs_dir: Path) -> dict[str, str]:
     found: dict[str, str] = {}
     for path in sorted(runs_dir.glob(f"*{SUFFIX}")):
         with suppress(DreamfleetError):
-            sweep, _ = SweepFolder(runs_dir, path.name.removesuffix(SUFFIX)).read()
+            sweep = SweepFolder(runs_dir, path.name.removesuffix(SUFFIX)).read().sweep
             found |= dict.fromkeys((each.name for each in sweep.runs), sweep.name)
     return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -21,7 +21,7 @@ _RANGE = re.compile(r"(-?\d+)\.\.(-?\d+)")
 _DASHED = re.compile(r"(0|[1-9]\d*)-([1-9]\d*)")
 SEED = "seed"  # runs that differ in it alone are one setting's repetitions
 PARALLEL, MOST_PARALLEL, MOST_WORKERS = 4, 64, 1024
-Vary = Mapping[str, Sequence[str]]  # flag of `coordinator` without `--` -> its values
+Vary = dict[str, tuple[str, ...]]  # flag of `coordinator` without `--` -> its values
 
 
 @dataclass(frozen=True)
@@ -108,13 +108,13 @@ def staggered_share(number: int, parallel: int) -> float:
     return 2 * (1 + number % parallel) / (parallel + 1)
 
 
-def parse_vary(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
+def parse_vary(texts: Sequence[str]) -> Vary:
     """What varies, from SETTING=VALUES: values are separated by commas, or a range of whole numbers.
 
     >>> parse_vary(["seed=1..3", "sigma0=0.05,0.1"])
     {'seed': ('1', '2', '3'), 'sigma0': ('0.05', '0.1')}
     """
-    found: dict[str, tuple[str, ...]] = {}
+    found: Vary = {}
     for text in texts:
         key, equals, values = text.partition("=")
         key = key.strip().replace("_", "-")
@@ -124,7 +124,7 @@ def parse_vary(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
     return found
 
 
-def read_vary(table: Any) -> dict[str, tuple[str, ...]]:
+def read_vary(table: Any) -> Vary:
     """What varies, from the table [vary] of a file: each value a list, or a text as of `--vary`.
 
     >>> read_vary({"seed": "1..2", "sigma0": [0.05, 0.1], "racing": [True, False]})
@@ -132,7 +132,7 @@ def read_vary(table: Any) -> dict[str, tuple[str, ...]]:
     """
     if not isinstance(table, dict):
         raise UsageError("[vary] must be a table, such as seed = [1, 2, 3]")
-    found: dict[str, tuple[str, ...]] = {}
+    found: Vary = {}
     for key, values in table.items():
         if isinstance(values, str):
             found |= parse_vary([f"{key}={values}"])
@@ -144,7 +144,7 @@ def read_vary(table: Any) -> dict[str, tuple[str, ...]]:
     return found
 
 
-def _add(found: dict[str, tuple[str, ...]], key: str, values: tuple[str, ...]) -> None:
+def _add(found: Vary, key: str, values: tuple[str, ...]) -> None:
     if key in found:
         raise UsageError(f"{key} varies twice: give all its values at once")
     if len(values) > MOST_RUNS:

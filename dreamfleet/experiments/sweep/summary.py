@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import accumulate, combinations
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 from dreamfleet.common.protocol.function_values import fitness_word, is_minimised
 from dreamfleet.common.protocol.messages import TaskSpec
@@ -145,6 +146,14 @@ def find_equal(results: Sequence[RunResult], kind: str) -> list[str]:
         elif [each.scores[kind] for each in ones] == [each.scores[kind] for each in others]:
             found.append(f"{first} and {second}: identical scores, so this score does not separate them")
     return found
+
+
+def compare_settings(results: Sequence[RunResult]) -> dict[str, Any]:
+    """What settings are judged by, the mean of each, and which are equal, as a JSON document."""
+    if (kind := judged_by(results)) is None:
+        return {"judged_by": None, "settings": [], "equal": []}
+    settings = [asdict(each) for each in means(results, kind)]
+    return {"judged_by": kind, "settings": settings, "equal": find_equal(results, kind)}
 
 
 def mean_curve(curves: Sequence[Sequence[CurvePoint]]) -> list[tuple[float, float, float | None]]:

@@ -79,15 +79,12 @@ def _compare_sweeps(args: argparse.Namespace, names: Sequence[str]) -> int:
         if folder is None:
             results.append(summary.read_result(args.runs_dir, name, name))
             continue
-        found = summary.read_results(args.runs_dir, folder.read()[0].runs)
+        found = summary.read_results(args.runs_dir, folder.read().sweep.runs)
         results += found if len(names) == 1 else [replace(each, setting=f"{name}: {each.setting}") for each in found]
-    kind = summary.judged_by(results)
     if args.json:
-        settings = [] if kind is None else [asdict(each) for each in summary.means(results, kind)]
         runs = [{"run": each.name, "setting": each.setting, "ended": each.ended, "scores": each.scores}
                 for each in results]  # fmt: skip
-        equal = [] if kind is None else summary.find_equal(results, kind)
-        print(json.dumps({"judged_by": kind, "settings": settings, "equal": equal, "runs": runs}))
+        print(json.dumps({**summary.compare_settings(results), "runs": runs}))
         return 0
     if len(tasks := sorted({each.task.task for each in results if each.task is not None})) > 1:
         print(f"note: these are of different tasks ({', '.join(tasks)}): their scores do not compare", file=sys.stderr)

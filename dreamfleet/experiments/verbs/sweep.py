@@ -5,23 +5,23 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dreamfleet.common.cli.config import add_flags, read_table, read_toml
+from dreamfleet.common.cli.config import add_flags, load, read_table, read_toml
 from dreamfleet.common.cli.global_config import add_global_flags, load_credentials, security_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import StoppedError, UsageError
-from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_signals
+from dreamfleet.common.host.stop_signals import Stop, interrupted_by_signals, stop_on_signals
 from dreamfleet.common.printable import plural
-from dreamfleet.coordinator.settings.config import RunConfig
+from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, RunConfig
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.experiments.sweep.plan import Sweep, SweepOptions, parse_vary, read_vary
 
 if TYPE_CHECKING:
-    from dreamfleet.experiments.sweep.folder import SweepFolder
+    from dreamfleet.experiments.sweep.folder import StoredSweep, SweepFolder
     from dreamfleet.experiments.sweep.runner import RunProgress, SweepFleet
     from dreamfleet.experiments.sweep.summary import RunResult
 
@@ -30,6 +30,11 @@ EXTRAS: tuple[str, ...] = ()
 SETTINGS_OF_RUNS = ("beat", "evaluation_share", "failure_limit", "share", "strict")  # of `NetworkConfig`
 ENDPOINTS = ("listen", "connect")
 LEFT_OPEN = 130
+# Flags of `coordinator` that a sweep sets for each run, or has for all of them.
+OWN = (
+    "run", "resume", "from", "listen", "connect", "runs-dir", "json", "config", "join", "access-dir", "insecure",
+    "metrics-port",
+)  # fmt: skip
 MOST_EQUAL = 10  # pairs of settings with equal results that are named
 
 
@@ -64,28 +69,27 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve a new sweep or resume one, then compare its settings."""
     from dreamfleet.common.files.locks import folder_lock
-    from dreamfleet.experiments.sweep.check import check_runs
-    from dreamfleet.experiments.sweep.folder import SweepFolder
+    from dreamfleet.experiments.sweep.folder import StoredSweep, SweepFolder
 
     file = read_toml(args.file, ("vary", "flags"), ("run", "parallel", "workers", "listen", "connect"))
     if args.resume:
         _refuse_settings(args, file)
         folder = SweepFolder(args.runs_dir, args.resume)
-        sweep, tasks = folder.read()
-        options = _options(args, file, folder.read_options())
+        stored = folder.read()
+        stored = replace(stored, options=_options(args, file, stored.options))
     else:
         options = _options(args, file, SweepOptions())
         sweep = _new_sweep(args, file)
         folder = SweepFolder(args.runs_dir, sweep.name)
         folder.check_new(sweep)
-        tasks = check_runs(sweep, args.sources)
-    fleet = _fleet(args, options)
+        stored = StoredSweep(sweep, check_runs(sweep, args.sources), options)
+    fleet = _fleet(args, stored.options)
     with folder_lock(folder.lock, "sweep of this name", "--runs-dir"), stop_on_signals() as stop:
         if not args.resume:
-            folder.check_new(sweep)
-        folder.write(sweep, tasks, options)
-        progress = _serve(args, sweep, tasks, folder, fleet, stop)
-    return _report(args, sweep, folder, progress)
+            folder.check_new(stored.sweep)
+        folder.write(stored)
+        progress = _serve(args, stored, folder, fleet, stop)
+    return _report(args, stored.sweep, folder, progress)
 
 
 def _options(args: argparse.Namespace, file: Mapping[str, Any], kept: SweepOptions) -> SweepOptions:
@@ -112,6 +116,47 @@ def _new_sweep(args: argparse.Namespace, file: Mapping[str, Any]) -> Sweep:
         *(word for key, value in given.items() for word in flag_words(key, value)),
     )
     return Sweep(name, vary, flags)
+
+
+def check_runs(sweep: Sweep, sources: Mapping[str, Any]) -> tuple[str, ...]:
+    """The tasks that workers of the sweep score; `UsageError` if `coordinator` would refuse the settings of a run.
+
+    `sources` are those of the verb, as `complete_arguments` left them.
+    """
+    from dreamfleet.common.cli.command_line import build_parser
+    from dreamfleet.coordinator.settings import run_setup
+    from dreamfleet.experiments.local_run import load_parsed_flags
+
+    given = {*sweep.vary, *(flag.removeprefix("--").partition("=")[0] for flag in sweep.flags if flag[:2] == "--")}
+    if taken := sorted(given & set(OWN)):
+        raise UsageError(f"{taken[0]} is no setting that a sweep can give its runs: it sets it itself")
+    parser = build_parser("coordinator", run_setup)
+    tasks: dict[str, None] = {}
+    checked: set[str] = set()
+    for run in sweep.runs:
+        try:
+            parsed = parser.parse_all([*sweep.flags, *run.flags])
+            config, limits = load_parsed_flags(parsed, sources)
+            load(NetworkConfig, "network", **{**sources, "flags": parsed})
+            if limits == LimitsConfig():
+                raise UsageError("it would never end: give a limit, such as --generations 32")
+            if run.setting not in checked:
+                checked.add(run.setting)
+                tasks |= dict.fromkeys(_check_settings(config, has_start=getattr(parsed, "init", None) is not None))
+        except UsageError as error:
+            raise UsageError(f"run {run.name} of the sweep: {error}") from error
+    return tuple(tasks)
+
+
+def _check_settings(config: RunConfig, *, has_start: bool) -> list[str]:
+    """Check the settings together; return the tasks that they name."""
+    from dreamfleet.common.artifacts.bundle_store import find_bundle
+    from dreamfleet.coordinator.settings.freezing import freeze
+
+    bundle = None if config.needs_no_bundle else find_bundle(config.bundle or DEFAULT_BUNDLE)
+    if not has_start:  # a start point may name another world model
+        freeze(config, bundle)
+    return [each for each in (config.task, bundle and bundle.manifest.task) if each]
 
 
 def _run_settings(args: argparse.Namespace) -> list[str]:
@@ -146,18 +191,19 @@ def _fleet(args: argparse.Namespace, options: SweepOptions) -> SweepFleet:
 
 
 def _serve(
-    args: argparse.Namespace, sweep: Sweep, tasks: tuple[str, ...], folder: SweepFolder, fleet: SweepFleet, stop: Any
+    args: argparse.Namespace, stored: StoredSweep, folder: SweepFolder, fleet: SweepFleet, stop: Stop
 ) -> list[RunProgress]:
     from dreamfleet.common.host.processes import shell_command
     from dreamfleet.experiments.sweep.display import showing
     from dreamfleet.experiments.sweep.runner import SweepRunner
 
+    sweep = stored.sweep
     runs, workers = plural(len(sweep.runs), "run"), plural(fleet.workers, "worker")
     join = shell_command("worker", "--any", "--connect", fleet.endpoint)
     what = f"{runs}, {fleet.parallel} at a time, {workers} here"
     print(f"sweep {sweep.name}: {what}; more join with: {join}", file=sys.stderr)
     try:
-        with SweepRunner(sweep, tasks, folder, fleet, args.config) as runner, showing(runner.progress) as update:
+        with SweepRunner(sweep, stored.tasks, folder, fleet, args.config) as runner, showing(runner.progress) as update:
             runner.serve(stop, update)
             update()
     except StoppedError as error:
@@ -172,15 +218,11 @@ def _report(args: argparse.Namespace, sweep: Sweep, folder: SweepFolder, progres
     from dreamfleet.experiments.sweep import summary
 
     results = summary.read_results(args.runs_dir, sweep.runs)
-    kind = summary.judged_by(results)
-    found = [] if kind is None else summary.means(results, kind)
-    equal = [] if kind is None else summary.find_equal(results, kind)
     failed, left = ([each for each in progress if each.state == state] for state in ("failed", "left open"))
     figure = _draw(folder, results)
     if args.json:
         print_answer(
-            args, "", sweep=sweep.name, judged_by=kind, settings=[asdict(each) for each in found], figure=figure,
-            equal=equal,
+            args, "", sweep=sweep.name, figure=figure, **summary.compare_settings(results),
             runs=[{"run": each.run.name, "setting": each.run.setting, "state": each.state, "why": each.text,
                    "scores": next((result.scores for result in results if result.name == each.run.name), {})}
                   for each in progress],

@@ -1,13 +1,15 @@
 """What a contrast trains, what it refuses, and what its figures come to. Tests config.py and summary.py."""
 
+import json
 import re
-from dataclasses import asdict
 
 import pytest
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.schema.validation import from_plain, to_plain
 from dreamfleet.experiments.contrast.config import KINDS, Contrast, Trial
 from dreamfleet.experiments.contrast.summary import TrialResult, describe_difference, differences, means, rows
+from dreamfleet.experiments.contrast.trials import StoredContrast
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 
@@ -51,14 +53,15 @@ def test_what_is_no_contrast_is_refused(settings, named):
 
 def test_seeds_and_kinds_may_be_added_but_none_changed():
     wide = ("wide", "--hidden 512")
-    kept = Contrast(seeds=(4,), kinds=(KINDS[0], wide)).merge_settings(asdict(Contrast()))
-    assert kept["kinds"] == (*KINDS, wide), "one that is not asked for this time is not forgotten"
-    assert kept["seeds"] == (1, 2, 3, 4)
+    kept = Contrast(seeds=(4,), kinds=(KINDS[0], wide)).continue_from(Contrast())
+    assert kept.kinds == (*KINDS, wide), "one that is not asked for this time is not forgotten"
+    assert kept.seeds == (1, 2, 3, 4)
     with pytest.raises(UsageError, match="kind attentive"):
-        Contrast(kinds=(KINDS[0], ("attentive", "--window 4"))).merge_settings(kept)
+        Contrast(kinds=(KINDS[0], ("attentive", "--window 4"))).continue_from(kept)
     with pytest.raises(UsageError, match="run_flags"):
-        Contrast(run_flags="--generations 3").merge_settings(kept)
-    assert Contrast().merge_settings({}) == asdict(Contrast())
+        Contrast(run_flags="--generations 3").continue_from(kept)
+    stored = StoredContrast("data", kept)
+    assert from_plain(StoredContrast, json.loads(json.dumps(to_plain(stored)))) == stored
 
 
 def outcome(kind, seed, nats, score):

@@ -43,11 +43,6 @@ def test_a_round_says_whose_model_it_evolved_in():
     assert summary.format_score(rounds[1]["score"]) == "900.0 ± 15.2 on 32 tracks, provisional"
 
 
-def test_a_score_of_one_track_has_no_standard_error():
-    single = {**SCORE, "mean": -80.0, "error": None, "episodes": 1, "confirmed": False}
-    assert summary.format_score(single) == "-80.0 on 1 track, provisional"
-
-
 def test_a_round_in_its_midst_has_no_model_that_was_kept():
     for begun in (SECOND[:1], SECOND[:2]):
         assert summary.table_rows(describe_rounds(*FIRST, *begun))[-1]["model"] is None

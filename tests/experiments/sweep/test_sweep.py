@@ -1,5 +1,5 @@
 """A sweep's plan, what it keeps, and its results, without processes.
-Tests check.py, figure.py, folder.py, plan.py and summary.py."""
+Tests figure.py, folder.py, plan.py, summary.py and dreamfleet/experiments/verbs/sweep.py."""
 
 import argparse
 import json
@@ -12,21 +12,13 @@ from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.common.cli.global_config import complete_arguments
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.experiments.local_run import task_flags
-from dreamfleet.experiments.sweep.check import check_runs
+from dreamfleet.experiments.sweep import summary
 from dreamfleet.experiments.sweep.figure import sweep_figure
-from dreamfleet.experiments.sweep.folder import SETTINGS, SweepFolder
+from dreamfleet.experiments.sweep.folder import SETTINGS, StoredSweep, SweepFolder
 from dreamfleet.experiments.sweep.plan import MOST_RUNS, Sweep, SweepOptions, parse_vary, read_vary
-from dreamfleet.experiments.sweep.summary import (
-    CONFIRMED,
-    FITNESS,
-    CurvePoint,
-    RunResult,
-    find_equal,
-    judged_by,
-    mean_curve,
-    means,
-)
+from dreamfleet.experiments.sweep.summary import CONFIRMED, FITNESS, CurvePoint, RunResult, find_equal, judged_by
 from dreamfleet.experiments.verbs import sweep as sweep_verb
+from dreamfleet.experiments.verbs.sweep import check_runs
 from dreamfleet.worker.verbs import worker
 
 SOURCES = {"flags": argparse.Namespace(), "environment": {}, "file": {}}
@@ -45,17 +37,9 @@ def test_a_grid_has_every_combination_and_repeats_all_settings_before_the_next_s
     assert len(sweep.runs) == 6
     assert {each.setting for each in sweep.runs} == {"sigma0 0.05", "sigma0 0.1"}
     assert sweep.runs[0].flags == ("--sigma0=0.05", "--seed=1")
-
-
-def test_runs_that_differ_in_the_seed_alone_are_one_setting():
     assert {each.setting for each in sweep_of("seed=1..3").runs} == {"all equal"}
-
-
-def test_true_and_false_are_a_flag_and_its_opposite():
     assert [each.flags for each in sweep_of("racing=true,false").runs] == [("--racing",), ("--no-racing",)]
-
-
-def test_a_file_varies_by_lists_and_by_texts():
+    assert len(sweep_of(f"seed=1..{MOST_RUNS}").runs) == MOST_RUNS
     assert read_vary({"seed": "1..2", "hidden_units": [4, 8]}) == {"seed": ("1", "2"), "hidden-units": ("4", "8")}
 
 
@@ -70,10 +54,6 @@ def test_a_file_varies_by_lists_and_by_texts():
 def test_what_makes_no_sweep_is_refused(vary):
     with pytest.raises(UsageError):
         sweep_of(*vary)
-
-
-def test_as_many_runs_as_are_allowed_are_made():
-    assert len(sweep_of(f"seed=1..{MOST_RUNS}").runs) == MOST_RUNS
 
 
 @pytest.mark.parametrize(
@@ -100,18 +80,16 @@ def test_the_tasks_of_all_runs_are_announced():
 
 
 def test_a_worker_announces_all_tasks_that_its_flags_name():
-    parser = build_parser("worker", worker)
-    assert parser.parse_all(task_flags("dream", "gym:mine:Own-v0", "mine:Task")).task == [
-        "gym:mine:Own-v0",
-        "mine:Task",
-    ]
+    parsed = build_parser("worker", worker).parse_all(task_flags("dream", "gym:mine:Own-v0", "mine:Task"))
+    assert parsed.task == ["gym:mine:Own-v0", "mine:Task"]
 
 
 def test_a_sweep_is_kept_and_read_as_it_was(tmp_path):
     sweep, folder = sweep_of("seed=1..2", "sigma0=0.05,0.1"), SweepFolder(tmp_path, "carts")
     folder.path.mkdir()
-    folder.write(sweep, ("gym:CartPole-v1",), SweepOptions())
-    assert folder.read() == (sweep, ("gym:CartPole-v1",))
+    stored = StoredSweep(sweep, ("gym:CartPole-v1",))
+    folder.write(stored)
+    assert folder.read() == stored
     assert "options" not in json.loads((folder.path / SETTINGS).read_text())
     with pytest.raises(UsageError, match="--resume carts"):
         folder.check_new(sweep)
@@ -131,8 +109,8 @@ def test_a_sweep_is_resumed_as_it_was_served(tmp_path):
     folder.path.mkdir()
     kept = resumed()
     assert kept == SweepOptions(2, 6, ("tcp/0.0.0.0:7447",), (), insecure=True)
-    folder.write(sweep_of("seed=1..2"), (), kept)
-    assert folder.read_options() == kept
+    folder.write(StoredSweep(sweep_of("seed=1..2"), (), kept))
+    assert folder.read().options == kept
     assert resumed("--workers", "0", "--parallel", "1") == replace(kept, workers=0, parallel=1)
     assert resumed("--connect", "tcp/a:1") == SweepOptions(2, 6, (), ("tcp/a:1",))
     assert resumed("--listen", "tcp/127.0.0.1:1") == SweepOptions(2, 6, ("tcp/127.0.0.1:1",))
@@ -166,7 +144,7 @@ def test_a_setting_has_the_mean_of_its_finished_runs_and_the_error_among_them():
         result("a", "one", {FITNESS: 1.0}), result("b", "one", {FITNESS: 3.0}),
         result("c", "one", {FITNESS: 99.0}, ended=False), result("d", "two", {FITNESS: 7.0}),
     ]  # fmt: skip
-    one, two = means(runs, FITNESS)
+    one, two = summary.means(runs, FITNESS)
     assert (one.setting, one.runs, one.mean, one.error) == ("one", 2, 2.0, 1.0)
     assert (two.runs, two.mean, two.error) == (1, 7.0, None)
 
@@ -197,4 +175,4 @@ def test_runs_with_few_evaluations_are_drawn_by_their_generations_and_each_line_
 def test_a_settings_curve_is_over_the_generations_that_all_its_runs_have():
     one = [CurvePoint(0, 10, 1.0), CurvePoint(1, 20, 2.0), CurvePoint(2, 30, 9.0)]
     other = [CurvePoint(0, 12, 3.0), CurvePoint(1, 22, 6.0)]
-    assert mean_curve([one, other]) == [(11, 2.0, 1.0), (21, 4.0, 2.0)]
+    assert summary.mean_curve([one, other]) == [(11, 2.0, 1.0), (21, 4.0, 2.0)]

@@ -20,21 +20,16 @@ def test_any_other_address_needs_one(host):
     assert not DashboardConfig(host=host, token=TOKEN).is_loopback
 
 
-def test_a_short_token_is_refused():
-    with pytest.raises(UsageError, match=r"--token.*\b12\b"):
-        DashboardConfig(token="short")
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [({"token": "short"}, r"--token.*\b12\b"), ({"port": -1}, "--port"), ({"port": 65536}, "--port")],
+)
+def test_what_is_no_address_or_token_is_refused(changes, named):
+    with pytest.raises(UsageError, match=named):
+        DashboardConfig(**changes)
 
 
-def test_the_repr_hides_the_token():
+def test_an_address_can_be_opened_and_its_repr_hides_the_token():
     assert TOKEN not in repr(DashboardConfig(token=TOKEN))
-
-
-@pytest.mark.parametrize("port", [-1, 65536])
-def test_a_port_is_one(port):
-    with pytest.raises(UsageError, match="--port"):
-        DashboardConfig(port=port)
-
-
-def test_an_address_can_be_opened():
     assert DashboardConfig().url(8420) == "http://127.0.0.1:8420"
     assert DashboardConfig(host="::1").url(1) == "http://[::1]:1"

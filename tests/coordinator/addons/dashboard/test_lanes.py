@@ -38,10 +38,7 @@ def test_slices_without_an_update_are_unknown_and_old_ones_are_dropped():
 
 def test_a_clock_that_is_set_back_does_no_harm():
     lanes, present = Lanes(), worker("a/1", 10.0)
+    assert lanes.render([present]) == [" " * LENGTH], "it was never seen"
     lanes.update([present], 1000.0)
     lanes.update([present], 10.0)
     assert lanes.render([present])[0].endswith("9")
-
-
-def test_a_worker_that_was_never_seen_has_an_empty_lane():
-    assert Lanes().render([worker("a/1")]) == [" " * LENGTH]

@@ -8,7 +8,7 @@ import pytest
 
 from dreamfleet.common.cli.global_config import read_config_file
 from dreamfleet.common.errors import UsageError
-from dreamfleet.coordinator.addons.spawn.config import Host, SpawnConfig, check_unique, default_name, read_hosts
+from dreamfleet.coordinator.addons.spawn.config import Host, SpawnConfig, default_name, read_hosts
 from tests.support.processes import ROOT
 
 LOOPBACK, WIDE = "tcp/127.0.0.1:7447", "tcp/10.0.0.1:7447"
@@ -70,7 +70,7 @@ def test_host_names_are_unique():
     with pytest.raises(UsageError, match=r"\bh\b"):
         hosts({"address": "a@h"}, {"address": "b@h"})
     with pytest.raises(UsageError):
-        check_unique([])
+        hosts()
 
 
 @pytest.mark.parametrize(
