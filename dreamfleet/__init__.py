@@ -111,11 +111,9 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
-        from difflib import get_close_matches
+        from dreamfleet.common.printable import suggest
 
-        near = get_close_matches(name, _HOMES, 1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{suggest(name, _HOMES, listed=False)}")
     from importlib import import_module
 
     module, _, original = _HOMES[name].partition(":")

@@ -1,14 +1,14 @@
 """The command line: finds verbs in the entry-point group `dreamfleet.verbs` and runs one.
 
-A verb is a module with `SUMMARY`, `EXTRAS`, `configure(parser)` and `run(args)`. A dot in its name is a space on the
-command line: `train.vae` is `dreamfleet train vae`. Only the requested verb's module is loaded, and it imports heavy
-packages in `run`.
+A verb is a module with `SUMMARY`, `EXTRAS`, `configure(parser)` and `run(args)`. One with many flags names those that
+`--help` shows in a text `FIRST`, and what to give for flags that it lacks in a dictionary `ELSEWHERE`. A dot in its
+name is a space on the command line: `train.vae` is `dreamfleet train vae`. Only the requested verb's module is loaded,
+and it imports heavy packages in `run`.
 """
 
 from __future__ import annotations
 
 import argparse
-import difflib
 import errno
 import logging
 import sys
@@ -19,7 +19,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import NoReturn, Protocol
 
-from dreamfleet.common.cli.elsewhere import OTHER_NAMES
 from dreamfleet.common.cli.parser import Parser
 from dreamfleet.common.errors import DreamfleetError, MissingExtraError, UsageError
 from dreamfleet.common.host.logs import configure_logging, report_failure
@@ -27,10 +26,15 @@ from dreamfleet.common.host.packages import GYMNASIUM, extra_of, wrong_version
 from dreamfleet.common.host.reports import adopt_reports
 from dreamfleet.common.host.standard_streams import discard_stdout, prepare_streams
 from dreamfleet.common.host.stop_signals import interrupts
-from dreamfleet.common.printable import one_line
+from dreamfleet.common.printable import did_you_mean, one_line, suggest
 
 GROUP = "dreamfleet.verbs"
 EXIT_INTERRUPTED = 130
+# What other programs call a verb of ours.
+OTHER_NAMES = {
+    "evolve": "coordinator", "help": "--help", "kill": "stop", "run": "coordinator", "search": "coordinator",
+    "start": "coordinator",
+}  # fmt: skip
 DESCRIPTION = "Evolve World-Models controllers on whatever machines you have."
 EXIT_CODES = (
     "Exit codes: 0 done; 1 it failed, was refused, or the answer is no; 2 the command or a setting is wrong; 130 it "
@@ -64,6 +68,7 @@ class SimpleVerb:
     configure: Callable[[argparse.ArgumentParser], None]
     run: Callable[[argparse.Namespace], int]
     EXTRAS: tuple[str, ...] = ()
+    FIRST: str = ""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -151,7 +156,10 @@ def build_parser(name: str, verb: Configurable) -> Parser:
     from dreamfleet.common.cli.global_config import add_common_flags
 
     spoken = name.replace(".", " ")
-    parser = Parser(prog=f"dreamfleet {spoken}", description=verb.SUMMARY, epilog=EXIT_CODES, verb=name)
+    first, elsewhere = getattr(verb, "FIRST", ""), getattr(verb, "ELSEWHERE", None)
+    parser = Parser(
+        prog=f"dreamfleet {spoken}", description=verb.SUMMARY, epilog=EXIT_CODES, first=first, elsewhere=elsewhere
+    )
     verb.configure(parser)
     add_common_flags(parser)
     return parser
@@ -192,10 +200,6 @@ def _show_overview(points: Mapping[str, EntryPoint], words: Sequence[str]) -> No
     parser.error("name a verb; --help lists them")
 
 
-def _top_level_names(points: Iterable[str]) -> list[str]:
-    return sorted({name.partition(".")[0] for name in points})
-
-
 class _Overview(argparse.ArgumentParser):
     """The parser of no verb: its help lists all verbs by what people do."""
 
@@ -231,11 +235,8 @@ def _unknown_verb_text(words: Sequence[str], spoken: Sequence[str], points: Iter
     """The error of a command whose first words, `spoken`, name no verb: it suggests verbs that people may mean."""
     verbs = [name.replace(".", " ") for name in points]
     same = sorted(verb for verb in verbs if " " in verb and verb.split()[1] == spoken[-1])  # without its group
-    two = difflib.get_close_matches(" ".join(words[:2]), [verb for verb in verbs if " " in verb], n=1, cutoff=0.8)
-    known = sorted({*verbs, *_top_level_names(points)})
-    other = [OTHER_NAMES[words[0]]] if words[0] in OTHER_NAMES else []
-    near = two or other or same or difflib.get_close_matches(" ".join(spoken), known, n=1)
-    meant = " or ".join(f"{each!r}" for each in near)
-    return f"unknown verb {' '.join(spoken)!r}" + (
-        f": did you mean {meant}?" if near else "; `dreamfleet --help` lists them"
-    )
+    near = suggest(" ".join(words[:2]), [verb for verb in verbs if " " in verb], likeness=0.8, listed=False)
+    if not near and (meant := [OTHER_NAMES[words[0]]] if words[0] in OTHER_NAMES else same):
+        near = did_you_mean(meant)
+    near = near or suggest(" ".join(spoken), sorted({*verbs, *(verb.split()[0] for verb in verbs)}), listed=False)
+    return f"unknown verb {' '.join(spoken)!r}{near or '; `dreamfleet --help` lists them'}"

@@ -8,7 +8,6 @@ key is an error that suggests the nearest one. A section's field `preset`, if it
 from __future__ import annotations
 
 import argparse
-import difflib
 import tomllib
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -19,6 +18,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import read_text
+from dreamfleet.common.printable import suggest
 
 T = TypeVar("T")
 Table = Mapping[str, Any]
@@ -118,7 +118,7 @@ def read_settings(
         if not (equals and key):
             raise UsageError(f"--set {text!r}: write KEY=VALUE")
         if key not in known:
-            raise UsageError(f"--set {text!r}: unknown key {key!r}{suggestion(key, known)}")
+            raise UsageError(f"--set {text!r}: unknown key {key!r}{suggest(key, known)}")
         values[key] = _parse_text(known[key], value, f"--set {key}")
     return values
 
@@ -150,7 +150,7 @@ def read_toml(
             continue
         if name not in (*known, *repeated):
             what = f"table [{name}]" if isinstance(value, dict) else f"key {name!r}"
-            raise UsageError(f"{path}: unknown {what}{suggestion(name, [*known, *repeated, *keys])}")
+            raise UsageError(f"{path}: unknown {what}{suggest(name, [*known, *repeated, *keys])}")
         if name in repeated:
             if not (isinstance(value, list) and all(isinstance(each, dict) for each in value)):
                 raise UsageError(f"{path}: {name} must be tables, each written [[{name}]]")
@@ -163,7 +163,7 @@ def _from_table(known: Mapping[str, Any], where: str, table: Table) -> dict[str,
     values = {}
     for key, value in table.items():
         if key not in known:
-            raise UsageError(f"unknown key {key!r} in {where}{suggestion(key, known)}")
+            raise UsageError(f"unknown key {key!r} in {where}{suggest(key, known)}")
         values[key] = _convert_toml_value(known[key], value, f"{key} in {where}" if where else key)
     return values
 
@@ -179,7 +179,7 @@ def _from_environment(known: Mapping[str, Any], section: str, environment: Mappi
         key = variable.removeprefix(prefix).lower()
         if key not in known:
             names = [prefix + each.upper() for each in known]
-            raise UsageError(f"unknown environment variable {variable}{suggestion(variable, names)}")
+            raise UsageError(f"unknown environment variable {variable}{suggest(variable, names)}")
         if text or _takes_empty(known[key]):  # else as if unset
             values[key] = _parse_text(known[key], text, variable)
     return values
@@ -280,10 +280,3 @@ def _field_types(section: type[Any]) -> dict[str, Any]:
 def configurable_fields(section: type[Any]) -> list[Field[Any]]:
     """The fields with a help text; only the code sets the others."""
     return [each for each in fields(section) if "help" in each.metadata]
-
-
-def suggestion(name: str, known: Iterable[str]) -> str:
-    """The end of an error text about an unknown name: the nearest known name, or all of them."""
-    names = list(known)
-    near = difflib.get_close_matches(name, names, n=1)
-    return f": did you mean {near[0]!r}?" if near else f"; known are {', '.join(names)}"

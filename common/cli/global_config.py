@@ -6,7 +6,6 @@ In a TOML file these keys come first, before any table; in the environment they 
 from __future__ import annotations
 
 import argparse
-import difflib
 import logging
 import os
 from collections.abc import Collection, Mapping
@@ -18,6 +17,7 @@ from dreamfleet.common.cli.config import add_flags, load, option, read_toml
 from dreamfleet.common.errors import AccessError, UsageError
 from dreamfleet.common.host.logs import set_log_format
 from dreamfleet.common.host.trusted_modules import PLACES, trust
+from dreamfleet.common.printable import suggest
 from dreamfleet.common.protocol.tasks import module_of
 from dreamfleet.common.security.credentials import (
     EXPIRY_WARNING,
@@ -35,7 +35,7 @@ TABLES = ("run", "limits", "network", "worker", "dashboard", "serve", "demo", "i
           "mdnrnn", "baseline")  # fmt: skip
 OTHER_VARIABLES = ("DREAMFLEET_CACHE", "DREAMFLEET_CONFIG", "DREAMFLEET_PICTURES", PLACES)
 PREFIX = "DREAMFLEET_"
-SIMILARITY_CUTOFF = 0.75  # similarity to a known name from which an unknown variable counts as a typing error
+SIMILARITY_CUTOFF = 0.88  # similarity to a known name from which an unknown variable counts as a typing error
 
 
 @dataclass(frozen=True)
@@ -161,12 +161,11 @@ def resolve_network(args: argparse.Namespace, *roles: str) -> Network:
 
 def _check_variables(environment: Mapping[str, str]) -> dict[str, str]:
     """The variables that begin with `PREFIX`; `UsageError` for an unknown one that resembles a known one."""
-    known = [PREFIX + each.name.upper() for each in fields(GlobalConfig)]
+    known = [*(PREFIX + each.name.upper() for each in fields(GlobalConfig)), *OTHER_VARIABLES]
     found = {name: text for name, text in environment.items() if name.startswith(PREFIX)}
     for name in found:
-        short, shorts = name.removeprefix(PREFIX), [each.removeprefix(PREFIX) for each in (*known, *OTHER_VARIABLES)]
-        if short in shorts or short.split("_")[0].lower() in TABLES:
+        if name in known or name.removeprefix(PREFIX).split("_")[0].lower() in TABLES:
             continue
-        if near := difflib.get_close_matches(short, shorts, n=1, cutoff=SIMILARITY_CUTOFF):
-            raise UsageError(f"unknown environment variable {name}: did you mean {PREFIX}{near[0]}?")
+        if near := suggest(name, known, likeness=SIMILARITY_CUTOFF, listed=False):
+            raise UsageError(f"unknown environment variable {name}{near}")
     return found

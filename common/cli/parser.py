@@ -10,11 +10,11 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, NoReturn
 
-from dreamfleet.common.cli.elsewhere import FLAGS_ELSEWHERE
-from dreamfleet.common.cli.first_flags import FIRST_FLAGS, FLAGS_OF_ALL
 from dreamfleet.common.cli.key_values import as_setting
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.printable import did_you_mean
 
+FLAGS_OF_ALL = frozenset({"--config", "--log-level", "--log-format", "--trust", "--quiet"})  # of every verb
 MIN_LIKENESS = 0.65  # of an unknown flag and the one that is suggested
 
 
@@ -25,10 +25,10 @@ class Parser(argparse.ArgumentParser):
     of today may mean another flag tomorrow.
     """
 
-    def __init__(self, *, verb: str, **more: Any) -> None:
-        """`verb` is the name of its entry point; `more` is as of `ArgumentParser`."""
+    def __init__(self, *, first: str = "", elsewhere: Mapping[str, str] | None = None, **more: Any) -> None:
+        """`first` and `elsewhere` are a verb's `FIRST` and `ELSEWHERE`; `more` is as of `ArgumentParser`."""
         super().__init__(add_help=False, allow_abbrev=False, formatter_class=_Formatter, **more)
-        self._verb = verb
+        self._first, self._elsewhere = first.split(), elsewhere or {}
         self.keys: dict[str, Mapping[str, str]] = {}  # texts of settings that are no flags, by the group's title
         self.add_argument("-h", "--help", action="help", help="show the first flags")
         self.add_argument("--help-all", action=_HelpAll, help="show all flags")
@@ -66,7 +66,7 @@ class Parser(argparse.ArgumentParser):
         """An error that names the flag, if the first of `words` is a controller and stands without one."""
         takes_words = any(not each.option_strings for each in self._actions)
         if words and not words[0].startswith("-") and not takes_words and "--controller" in self._option_string_actions:
-            raise UsageError(f"{words[0]!r} is no flag; did you mean --controller {words[0]}?")
+            raise UsageError(f"{words[0]!r} is no flag{did_you_mean([f'--controller {words[0]}'])}")
 
     def format_help(self) -> str:
         """The help text with the first flags; where some are left out it says how to see them."""
@@ -84,8 +84,7 @@ class Parser(argparse.ArgumentParser):
         if "--help-all" in action.option_strings:  # named at the end
             return True
         flags = set(action.option_strings)
-        first = FIRST_FLAGS.get(self._verb)
-        return bool(flags & FLAGS_OF_ALL) if first is None else flags.isdisjoint((*first, "--help"))
+        return flags.isdisjoint((*self._first, "--help")) if self._first else bool(flags & FLAGS_OF_ALL)
 
     def _format(self, shown: Sequence[argparse.Action], hidden: int) -> str:
         formatter = self._get_formatter()
@@ -130,14 +129,14 @@ class Parser(argparse.ArgumentParser):
         flags = [word.split("=")[0] for word in unknown if word.startswith("--")]
         near = [each for flag in flags for each in _near_flags(flag, self._option_string_actions)]
         if near:
-            raise UsageError(f"{said}; did you mean {', '.join(dict.fromkeys(near))}?")
+            raise UsageError(f"{said}{did_you_mean(dict.fromkeys(near))}")
         self._refuse_bare(words)
         self.error(said)
 
     def _describe_elsewhere(self, word: str, following: Sequence[str]) -> str | None:
         """The answer to a flag of another verb, or to a setting of `--set` that is given as a flag."""
         flag, equals, value = word.partition("=")
-        if other := FLAGS_ELSEWHERE.get((self._verb, flag)):
+        if other := self._elsewhere.get(flag):
             return f"{self.prog} has no {flag}: {other}"
         keys = {key for texts in self.keys.values() for key in texts}
         setting = as_setting(flag, (value,) if equals else tuple(takewhile(_is_value, following)))

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator
 from contextlib import suppress
 from time import monotonic
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from dreamfleet.common.schema.validation import MalformedError, from_plain_lenie
 from dreamfleet.common.transport.query import query_all
 from dreamfleet.common.transport.session import Network, enqueue_into, open_session
 
+T = TypeVar("T")
 QUERY_TIMEOUT = 3.0
 NAMES_TIMEOUT, SHOWN_RUNS = 1.0, 4  # of the names of other runs in an error text
 PATIENCE = 1.0  # seconds without an answer after which a watched run counts as gone
@@ -149,12 +150,11 @@ class Client(Displayed):
 
     def workers(self, run: str) -> list[WorkerStatus]:
         """All workers that the coordinator of `run` knows, lost ones included."""
-        return [from_plain_lenient(WorkerStatus, row) for row in self.fetch_rows("workers", run)]
+        return list(self.fetch_rows("workers", WorkerStatus, run))
 
     def history(self, run: str, offset: int = 0) -> list[StoredGeneration]:
         """The closed generations of `run` after the first `offset`, oldest first."""
-        rows = self.fetch_rows("history", run, offset)
-        return [from_plain_lenient(StoredGeneration, row) for row in rows]
+        return list(self.fetch_rows("history", StoredGeneration, run, offset))
 
     def events(
         self, run: str | None = None, worker: str = "", job: str = "", kinds: Collection[str] = ()
@@ -179,8 +179,7 @@ class Client(Displayed):
 
     def evaluations(self, run: str) -> list[StoredEvaluation]:
         """All finished evaluations of `run`, oldest first."""
-        rows = self.fetch_rows("evaluations", run)
-        return [from_plain_lenient(StoredEvaluation, row) for row in rows]
+        return list(self.fetch_rows("evaluations", StoredEvaluation, run))
 
     def candidates(self, run: str, generation: int) -> list[Population]:
         """All candidates of a generation, in parts: the open one, or the one before it; for others, the open one's."""
@@ -210,11 +209,11 @@ class Client(Displayed):
                 about = self._fetch_controller_part(run, len(data) // 4)
         raise ControllerError(f"the controller of run {run} changes faster than it can be fetched; ask again")
 
-    def fetch_rows(self, part: str, run: str, offset: int = 0) -> Iterator[dict[str, Any]]:
-        """All raw rows from `offset` on of a paged part: `workers`, `history` or `evaluations`."""
+    def fetch_rows(self, part: str, kind: type[T], run: str, offset: int = 0) -> Iterator[T]:
+        """The rows, of this `kind`, from `offset` on of a paged part: `workers`, `history` or `evaluations`."""
         while True:
             rows, total = _read_page(self.document(run, part, f"offset={offset}"), part)
-            yield from rows
+            yield from (from_plain_lenient(kind, row) for row in rows)
             offset += len(rows)
             if offset >= total or not rows:
                 return

@@ -115,14 +115,9 @@ class EliteArchive:
 
     @property
     def description(self) -> str:
-        """Cells filled, QD score and the best elite, in words."""
-        filled = f"{len(self.elites)} of {self.cells} cells filled"
-        if (best := self.best) is None:
-            return filled
-        return (
-            f"{filled}, QD score {format_number(self.qd_score)}; the best elite scored {format_number(best.fitness)} "
-            f"with {self.describe_measures(best)} (--cell {','.join(map(str, best.cell))})"
-        )
+        """Cells filled, QD score and the best elite with its measures, in words."""
+        found, best = self.status.description, self.best
+        return found if best is None else f"{found}: {self.describe_measures(best)}"
 
     def describe_elite(self, elite: Elite) -> str:
         """An elite's cell, its measures and its fitness, in words."""

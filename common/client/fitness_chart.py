@@ -33,6 +33,7 @@ STAR: dict[str, Any] = {
     "markersize": 14, "markeredgecolor": "white", "markeredgewidth": 1, "capsize": 4, "zorder": 5, "clip_on": False
 }  # fmt: skip
 PLOT_COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:olive")
+PLAIN = "{x:,.10g}"  # of the numbers of an axis: whole ones, without an offset beside them
 FEW_EPISODES = 4  # of a candidate, up to which luck with a generation's seeds is visible in its mean
 WINDOW = 9  # generations of a running median; a run of twice as many has one
 ASIDE = 0.012  # of the x axis: how far a confirmed score stands beside the same mean's evaluation
@@ -66,7 +67,7 @@ def draw_fitness(panels: Sequence[Any], run: RunFolder) -> list[Any]:
     jumps = [each.since for each in stages if each.stage.restart or each.origin is not None]
     smoothed = mean if smooth is None else smooth
     number, mean, std, best, worst, smoothed = _break_lines(jumps, number, mean, std, best, worst, smoothed)
-    axes.plot(number, mean, color="tab:blue", marker=marker, label="mean of the candidates", **thin)
+    axes.plot(number, mean, color="tab:blue", marker=marker, label="average of the candidates", **thin)
     if smooth is not None:
         label = f"its running median over {WINDOW} generations"
         axes.plot(number, smoothed, color="tab:blue", linewidth=2.2, label=label)
@@ -81,6 +82,7 @@ def draw_fitness(panels: Sequence[Any], run: RunFolder) -> list[Any]:
             panel.axvline(each.since - 0.5, color="tab:gray", linestyle="--", linewidth=1, **named)
         panel.margins(x=0.03)
         panel.xaxis.set_major_locator(MaxNLocator(9, integer=True, steps=(1, 2, 5, 10)))
+        panel.yaxis.set_major_formatter(PLAIN)
         panel.grid(alpha=0.3)
     scores.set_xlabel("generation")
     if evaluations:

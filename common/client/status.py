@@ -18,15 +18,7 @@ from dreamfleet.common.protocol.check_counts import CheckCounts
 from dreamfleet.common.protocol.failures import describe_job
 from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, FleetShare, HostClass
-from dreamfleet.common.protocol.tasks import step_unit
-from dreamfleet.common.runs.records import (
-    RunSettings,
-    StoredConfirmation,
-    StoredEvaluation,
-    StoredGeneration,
-    format_mean,
-    in_values,
-)
+from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.common.schema.display import Displayed
 from dreamfleet.common.schema.validation import (
     OPTIONAL,
@@ -338,22 +330,10 @@ class Status(Displayed):
     score_word: Word = field(default="seed", metadata=OPTIONAL)  # what the world calls a scored seed: "track", "game"
 
     def _display(self) -> tuple[str, dict[str, object]]:
-        task, now = self.settings.task, self.generation
-        last, best = in_values(self.last, task), in_values(self.confirmed or self.best, task)
-        progress = f"generation {now.number}, {now.episodes_done} of {plural(now.episodes, 'episode')}"
-        workers = plural(self.workers.present, "worker")
-        facts: dict[str, object] = {
-            "task": task.task,
-            "state": f"{self.state}: {self.why}" if self.why else self.state,
-            "progress": progress,
-            "last generation's mean": None if last is None else f"{last.mean:z.6g}",
-            "archive": None if self.archive is None else self.archive.description,
-            "confirmed" if self.confirmed else "best evaluation": None if best is None else format_mean(best),
-            "workers": f"{workers}, {plural(self.slots, 'slot')}",
-            "speed": f"{self.throughput.steps_per_second:,.0f} {step_unit(task.task)}/s",
-            "failing jobs": self.failing or None,
-        }
-        return f"Status of {self.run}: {self.state}, {progress}, {workers}", facts
+        from dreamfleet.common.client.run_view import LiveRunView
+
+        view = LiveRunView.of_status(self)
+        return view.headline, view.facts
 
     def _repr_html_(self) -> str:
         """The card that notebooks show."""

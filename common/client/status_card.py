@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from dreamfleet.common.client.eta import estimate_eta
+from dreamfleet.common.client.run_view import LiveRunView
 from dreamfleet.common.client.status import Status, WorkerStatus
 from dreamfleet.common.printable import format_number, one_line, plural, truncate
 from dreamfleet.common.protocol.function_values import fitness_word
-from dreamfleet.common.protocol.tasks import step_unit
 from dreamfleet.common.runs.records import StoredGeneration, format_mean, in_values
 
 MOST_WORKERS = 12  # in the card
@@ -52,30 +51,25 @@ def show_live(statuses: Iterable[Status]) -> bool:
 
 def status_card(status: Status) -> str:
     """The card: state, progress, the fitness of the last generations, and workers."""
-    task = status.settings.task
-    now, best = status.generation, in_values(status.confirmed or status.best, task)
+    task, view = status.settings.task, LiveRunView.of_status(status)
     shown = [in_values(each, task) for each in status.recent]
-    share = 100.0 if status.is_over else 100 * now.episodes_done / max(now.episodes, 1)
+    share = 1.0 if status.is_over else view.eta.share or 0.0
     state = f"{status.state}: {status.why}" if status.why else status.state
-    reported = "" if best is None else f"{'confirmed' if status.confirmed else 'best evaluation'} {format_mean(best)}"
-    doing = [
-        f"generation {now.number:,}",
-        f"{now.episodes_done:,} of {plural(now.episodes, 'episode')}",
-        f"{status.throughput.steps_per_second:,.0f} {step_unit(task.task)}/s",
-        estimate_eta(status).description,
-    ]
-    facts = [*([plural(status.generations, "generation")] if status.is_over else doing), reported]
+    kind = "confirmed" if status.confirmed else "best evaluation"
+    doing = plural(status.generations, "generation") if status.is_over else view.progress
+    now = [] if status.is_over else [view.speed, view.eta.description]
+    facts = [doing, *now, f"{kind} {format_mean(view.reported)}" if view.reported else ""]
     return (
         f'<div style="{CARD}"><div><b>{_text(status.run)}</b> · {_text(task.task)}'
         f'<span style="float:right">{_text(state)}</span></div>'
         f"<div>{' · '.join(_text(each) for each in facts if each)}</div>"
-        f'<div style="{BAR}"><div style="height:100%;width:{share:.1f}%;background:#2a9d8f"></div></div>'
-        f"{fitness_chart(shown, fitness_word(task))}{_workers(status)}</div>"
+        f'<div style="{BAR}"><div style="height:100%;width:{share:.1%};background:#2a9d8f"></div></div>'
+        f"{fitness_chart(shown, fitness_word(task))}{_workers(view)}</div>"
     )
 
 
 def fitness_chart(generations: Sequence[StoredGeneration], word: str = "fitness") -> str:
-    """The mean fitness of these generations as a line, between the worst and the best of each, as inline SVG."""
+    """The average fitness of these generations as a line, between the worst and the best of each, as inline SVG."""
     if len(generations) < 2:
         return f'<div style="opacity:.7">the {word} is drawn from the second closed generation on</div>'
     ends = [end for each in generations for end in (each.worst, each.best)]
@@ -102,15 +96,16 @@ def fitness_chart(generations: Sequence[StoredGeneration], word: str = "fitness"
         f'<text x="{LEFT}" y="{HEIGHT - 4}" {label}>generation {first:,}</text>'
         f'<text x="{WIDTH - MARGIN}" y="{HEIGHT - 4}" text-anchor="end" {label}>{last:,}</text>'
         f'<text x="{(LEFT + WIDTH) / 2}" y="{HEIGHT - 4}" text-anchor="middle" {label}>'
-        f"{word}: mean, worst to best</text></svg>"
+        f"{word}: average, worst to best</text></svg>"
     )
 
 
-def _workers(status: Status) -> str:
+def _workers(view: LiveRunView) -> str:
+    status = view.status
     present = [each for each in status.worker_list if each.state in ("present", "silent")]
     rows = "".join(map(_worker, present[:MOST_WORKERS]))
     more = status.workers.present - min(len(present), MOST_WORKERS)
-    head = f"{plural(status.workers.present, 'worker')}, {plural(status.slots, 'slot')}"
+    head = f"{view.workers}, {view.slots}"
     return (
         f'<div style="margin-top:6px">{_text(head)}</div><table style="{TABLE}">{rows}</table>'
         f"{f'<div>and {more} more</div>' if more > 0 and present else ''}"

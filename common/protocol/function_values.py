@@ -5,7 +5,8 @@ Journal, wire, JSON and tables for programs hold fitness; text, pictures and pag
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 
 from dreamfleet.common.artifacts.objective import Objective
@@ -40,9 +41,14 @@ def value_of(fitness: float, task: TaskSpec) -> float:
 
 
 def spans_decades(values: Sequence[float]) -> bool:
-    """Whether an axis of these values is better logarithmic: all are positive, and they span over two decades.
+    """Whether an axis of these values is better logarithmic: none is negative, and others than 0 span over two decades.
 
-    >>> spans_decades([0.001, 1.0]), spans_decades([0.5, 1.0]), spans_decades([0.0, 1.0])
-    (True, False, False)
+    >>> spans_decades([0.001, 1.0]), spans_decades([0.5, 1.0]), spans_decades([0.0, 0.001, 1.0])
+    (True, False, True)
     """
-    return min(values) > 0 and max(values) > TWO_DECADES * min(values)
+    return min(values) >= 0 and max(values) > TWO_DECADES * least_positive(values)
+
+
+def least_positive(values: Iterable[float]) -> float:
+    """The foot of a logarithmic axis, on which 0 is drawn; infinity if no value is above 0."""
+    return min((each for each in values if each > 0), default=math.inf)

@@ -8,7 +8,6 @@ A name may come from a file or a message of somebody else, so only a trusted mod
 
 from __future__ import annotations
 
-import difflib
 import re
 import sys
 from collections.abc import Mapping
@@ -21,6 +20,7 @@ from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.host.packages import GYMNASIUM, install_command_for, wrong_version
 from dreamfleet.common.host.trusted_modules import check_trusted, import_trusted
 from dreamfleet.common.host.user_code import user_code
+from dreamfleet.common.printable import suggest
 from dreamfleet.common.schema.display import DisplayedFields
 
 GROUP = "dreamfleet.tasks"
@@ -182,9 +182,8 @@ def check_task(name: str) -> None:
         raise UsageError(f"unknown task {name!r}: it is written {same[0]} here")
     if not colon and _ENVIRONMENT.search(name):
         raise UsageError(f"unknown task {name!r}: gymnasium's environments are written {GYM}:{name}")
-    near = difflib.get_close_matches(head, points, n=1, cutoff=0.75)
-    if near:
-        raise UsageError(f"unknown task {name!r}: did you mean {near[0]}{':...' if colon else ''}?")
+    if near := suggest(head, points, likeness=0.75, listed=False):
+        raise UsageError(f"unknown task {name!r}{near}")
 
 
 def _plain(name: str) -> str:

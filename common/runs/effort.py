@@ -11,7 +11,6 @@ from dreamfleet.common.protocol.tasks import DREAM, is_function_task
 from dreamfleet.common.schema.validation import OPTIONAL, Count, MalformedError, from_plain_lenient
 
 START_EFFORT = "start_effort"  # name of a fact in the journal
-SHORT_HOURS = 0.1  # core-hours below which slot time is printed in core-seconds
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class Effort:
         """A text for display, of a run in this task: a function has calls, and no steps."""
         dreamt = f", {format_steps(self.dreamt)} dreamt" if self.dreamt else ""
         steps = "calls" if is_function_task(task) else "steps in reality"
-        return f"{format_steps(self.steps)} {steps}{dreamt}, {format_core_time(self.core_hours)}"
+        return f"{format_steps(self.steps)} {steps}{dreamt}, {self.core_hours:,.3g} core-hours"
 
 
 @dataclass(frozen=True)
@@ -74,16 +73,6 @@ def parse_start_effort(kept: str | None) -> Effort | None:
         return None if kept is None else from_plain_lenient(Effort, json.loads(kept))
     except (ValueError, MalformedError) as error:
         raise JournalError(f"the journal's effort of the run's start is damaged: {error}; restore it") from error
-
-
-def format_core_time(core_hours: float) -> str:
-    """Format slot time: 1.25 core-hours, or 72 core-seconds where it is short.
-
-    >>> format_core_time(1.25), format_core_time(0.02)
-    ('1.25 core-hours', '72 core-seconds')
-    """
-    short = core_hours < SHORT_HOURS
-    return f"{3600 * core_hours:.3g} core-seconds" if short else f"{core_hours:.3g} core-hours"
 
 
 def format_steps(steps: int) -> str:

@@ -48,13 +48,12 @@ def score_digits(mean: float, error: float | None) -> int:
 
 
 def format_with_error(mean: float, error: float | None, digits: int | None = None, sign: str = "") -> str:
-    """A mean ± its standard error; the mean alone if it has none. `sign` is the format's, such as `+` or `,`.
+    """A mean ± its standard error; the mean alone if it has none. `sign` is as of `format_number`.
 
     Without `digits` it has those of `score_digits`, and without an error too those of `format_number`.
     """
-    plus, comma = "+" if "+" in sign else "", "," if "," in sign else ""
     if digits is None and (not error or abs(error) < 10**-MAX_DIGITS):  # no error says which digits are noise
         return f"{format_number(mean, sign)}{'' if error is None else f' ± {error:.1g}'}"
     digits = score_digits(mean, error) if digits is None else digits
-    after = "" if error is None else f" ± {error:{comma}.{digits}f}"
-    return f"{mean:{plus}z{comma}.{digits}f}{after}"
+    after = "" if error is None else f" ± {error:,.{digits}f}"
+    return f"{mean:{sign}z,.{digits}f}{after}"

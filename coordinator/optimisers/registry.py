@@ -14,7 +14,7 @@ from dreamfleet.common.host.packages import install_command_for
 from dreamfleet.common.host.resource_limits import usable_memory
 from dreamfleet.common.host.trusted_modules import import_trusted
 from dreamfleet.common.host.user_code import user_code
-from dreamfleet.common.printable import plural
+from dreamfleet.common.printable import did_you_mean, plural
 from dreamfleet.coordinator.optimisers.api import Footprint, Optimiser, Search
 
 GROUP = "dreamfleet.optimisers"
@@ -78,7 +78,7 @@ def _find(name: str) -> Any:
     if not attribute:
         known, near = known_optimisers(), _suggest(name)
         raise UsageError(
-            f"unknown optimiser {name!r}: {f'did you mean {near}? ' if near else ''}known are "
+            f"unknown optimiser {name!r}{did_you_mean([near]) if near else ':'} known are "
             f"{', '.join(known) or 'none'}, and your own as module:attribute"
         )
     try:

@@ -121,6 +121,8 @@ def _serve_life(request: RunRequest, stop: Stop) -> Run:
     folder = request.folder
     if request.config is not None and request.name == ARCHIVE:
         raise UsageError(f"{ARCHIVE!r} is where archived runs lie: choose another name")
+    if request.config is not None:
+        Journal.check_absent(folder)  # before the task is tried, which may take minutes
     _check_file_system(folder)
     if log_to := request.network.log_to:
         add_on("check-sinks")(log_to)
@@ -131,11 +133,9 @@ def _serve_life(request: RunRequest, stop: Stop) -> Run:
             "taken back; leave it out"
         )
     with ExitStack() as stack:
+        journal: Journal | None = None
         if request.config is None:
-            journal: Journal | None = _open_journal(request, folder, settings, bundle, {}, stack)
-        else:
-            journal = None
-            Journal.check_absent(folder)
+            journal = _open_journal(request, folder, settings, bundle, {}, stack)
         revocations = _watch_revocations(request, journal)
 
         def open_run() -> OpenRun:

@@ -13,7 +13,7 @@ from time import monotonic, time
 from typing import Any
 
 from dreamfleet.common.client.equal_fitness import EqualFitness
-from dreamfleet.common.client.eta import estimate_eta, summarise_status
+from dreamfleet.common.client.run_view import LiveRunView
 from dreamfleet.common.client.status import Status
 from dreamfleet.common.host.reports import ADDRESS, report
 from dreamfleet.common.printable import format_number, plural
@@ -70,7 +70,7 @@ class RunLog:
             self._warn_of_equal_fitness(closed)
             failed = f", {closed.failed} failed" if closed.failed else ""
             shown = in_values(closed, task)
-            log.info("generation %d: mean %s, best %s%s", closed.number, format_number(shown.mean),
+            log.info("generation %d: average %s, best %s%s", closed.number, format_number(shown.mean),
                      format_number(shown.best), failed,
                      extra={"facts": {"event": "generation", **asdict(closed)}})  # fmt: skip
         evaluations = self._run.background_jobs.evaluations
@@ -136,14 +136,14 @@ def _warn_of_expiry(credentials: Credentials) -> None:
 
 def summary(status: Status) -> tuple[str, dict[str, Any]]:
     """The status in one line, and as facts."""
-    best = status.confirmed or status.best
+    best, view = status.confirmed or status.best, LiveRunView.of_status(status)
     facts = {
         "event": "summary", "state": status.state, "generation": status.generation.number,
         "steps_per_second": status.throughput.steps_per_second, "best": None if best is None else best.mean,
         "best_error": None if best is None else best.error, "workers": status.workers.present, "slots": status.slots,
-        "eta_seconds": estimate_eta(status).seconds, "failed": status.failed + status.generation.failed,
+        "eta_seconds": view.eta.seconds, "failed": view.failed,
     }  # fmt: skip
-    return summarise_status(status), facts
+    return view.summary, facts
 
 
 def worker_command(network: Network, run: str, task: str) -> str:

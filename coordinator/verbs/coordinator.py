@@ -20,7 +20,7 @@ from dreamfleet.common.host.logs import label_logs
 from dreamfleet.common.host.resource_limits import check_room_for_session, raise_open_file_limit
 from dreamfleet.common.host.standard_streams import make_stderr_nonblocking
 from dreamfleet.common.host.trusted_modules import trust
-from dreamfleet.common.printable import plural
+from dreamfleet.common.printable import format_duration, plural
 from dreamfleet.common.protocol.tasks import module_of
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE, RunConfig
@@ -39,6 +39,15 @@ if TYPE_CHECKING:
 
 __all__ = ["EXTRAS", "SUMMARY", "configure", "run"]
 EXTRAS: tuple[str, ...] = ()
+FIRST = (
+    "--run --resume --from --init --preset --task --bundle --population --episodes --horizon --seed --evaluate-every "
+    "--generations --minutes --steps --target --listen --join --json"
+)
+ELSEWHERE = {
+    "--workers": "workers are programs of their own: `dreamfleet worker --run NAME --slots N`",
+    "--slots": "slots are a worker's: `dreamfleet worker --run NAME --slots N`",
+    "--log-to": "give DREAMFLEET_NETWORK_LOG_TO=tensorboard, or `log_to` in a file's [network]",
+}
 LEFT_OPEN = 130
 # Python looks for cycles after every 700 new objects by default. A generation's jobs are many and have none.
 COLLECTION = (100_000, 10, 10)
@@ -216,7 +225,6 @@ def _describe_failures(request: RunRequest, failed: int) -> str:
 def _report(
     args: argparse.Namespace, run: Run, request: RunRequest, outcome: ExitReport, *, nothing_new: bool
 ) -> None:  # fmt: skip
-    from dreamfleet.common.client.eta import format_duration
     from dreamfleet.common.protocol.stop_kind import StopKind
     from dreamfleet.common.runs.records import describe_score, in_values, with_error
     from dreamfleet.common.runs.run_folder import open_run
@@ -228,13 +236,9 @@ def _report(
     path = request.folder / CONTROLLER
     controller = path if path.is_file() else None
     facts: dict[str, Any] = {
-        "run": request.name,
-        "ended": ended.text if ended else None,
-        "controller": controller,
-        "continue": again,
-    }
-    facts["best"] = None if run.best is None else with_error(run.best)
-    facts["confirmed"] = None if run.confirmed is None else with_error(run.confirmed)
+        "run": request.name, "ended": ended.text if ended else None, "controller": controller, "continue": again,
+        "best": run.best and with_error(run.best), "confirmed": run.confirmed and with_error(run.confirmed),
+    }  # fmt: skip
     judged = run.confirmed or run.best
     word = score_word_of_run(run.settings.task, request.folder / BUNDLE)
     score = f"; {describe_score(in_values(judged, run.settings.task), word)}" if judged else ""

@@ -6,54 +6,41 @@ import argparse
 import json
 import shutil
 import sys
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from dreamfleet.common.cli.add_ons import find_add_on
 from dreamfleet.common.cli.command_line import SimpleVerb
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
-from dreamfleet.common.client.elites import EliteArchive
-from dreamfleet.common.client.equal_fitness import EqualFitness
-from dreamfleet.common.client.eta import format_duration
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.files.regular_files import is_folder, path_exists
-from dreamfleet.common.printable import format_number, format_setting, plural
-from dreamfleet.common.protocol.function_values import value_of
-from dreamfleet.common.protocol.tasks import DREAM, is_function_task
-from dreamfleet.common.runs.records import (
-    RunSettings,
-    StoredGeneration,
-    best_evaluation,
-    count_failed,
-    describe_failed,
-    describe_score,
-    in_values,
-    with_error,
-)
-from dreamfleet.common.runs.run_folder import RunFolder, open_run
+from dreamfleet.common.printable import format_number, plural
+from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.common.runs.run_paths import ARCHIVE as ARCHIVE_FOLDER
 from dreamfleet.common.runs.run_paths import check_movable, reporting_folder_errors, resume_command, run_paths
-from dreamfleet.common.runs.stages import begun_stages, describe_limit, describe_stages
+from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.transport.network import SECURED_PREFIX
-from dreamfleet.common.worlds.score_words import score_word_of_run
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+from dreamfleet.coordinator.views.run_details import (
+    generation_rows,
+    run_document,
+    run_facts,
+    run_row,
+    setting_rows,
+    unused_settings,
+)
 
 DROP_ORDER = (
     "created",
     "classes",
     "sweep",
     "task",
-    "mean",
-    "evaluated",
+    "average",
+    "best",
 )  # columns that a narrow terminal leaves out first
-SCORES = ("mean", "evaluated", "confirmed")  # columns of `runs list`
 LAST_GENERATIONS = 20
 
 
@@ -76,171 +63,61 @@ def list_runs(args: argparse.Namespace) -> int:
     if not is_folder(args.runs_dir) and ("runs_dir" in args.given or path_exists(args.runs_dir)):
         raise UsageError(f"--runs-dir {args.runs_dir} is not a folder: name the one that holds runs")
     runs_dir = args.runs_dir / ARCHIVE_FOLDER if args.archived else args.runs_dir
-    rows = [_run_row(path, in_text=not args.json) for path in run_paths(runs_dir)]
+    rows = [run_row(path, as_values=not args.json) for path in run_paths(runs_dir)]
     find_sweeps = find_add_on("sweeps-of-runs")
     sweeps: Mapping[str, str] = find_sweeps(args.runs_dir) if find_sweeps else {}  # an archived run was begun there
-    if args.json or any(row["run"] in sweeps for row in rows):
-        rows = [{**row, "sweep": sweeps.get(row["run"])} for row in rows]
     if args.json:
-        print(json.dumps(rows, indent=2))
+        print(json.dumps([{**row, "sweep": sweeps.get(row["run"])} for row in rows], indent=2))
         return 0
     if not rows:
         print(f"no runs in {runs_dir}; start one with: dreamfleet coordinator --run NAME", file=sys.stderr)
         return 0
-    for row in rows:
-        row |= {name: format_number(row[name]) for name in SCORES}
-    print_rows(rows, right=("generations", *SCORES, "classes"), drop_order=DROP_ORDER)
+    shown = [_shown_row(row) for row in rows]
+    if any(row["run"] in sweeps for row in rows):
+        shown = [{**row, "sweep": sweeps.get(str(row["run"]))} for row in shown]
+    print_rows(shown, right=("generations", "average", "best", "confirmed", "classes"), drop_order=DROP_ORDER)
     return 0
 
 
-def _run_row(path: Path, *, in_text: bool) -> dict[str, Any]:
-    """A run's row; `in_text` has a function's values, else its fitness."""
-    try:
-        with RunFolder(path) as run:
-            history, evaluations, confirmed, spec = run.history(), run.evaluations(), run.confirmation(), run.spec
-            found = {
-                "mean": history[-1].mean if history and history[-1].number not in run.unscored_generations() else None,
-                "evaluated": evaluations[-1].mean if evaluations else None,
-                "confirmed": confirmed.mean if confirmed else None,
-            }
-            own = {name: value_of(score, spec) for name, score in found.items() if in_text and score is not None}
-            return {
-                "run": run.name,
-                "created": run.created,
-                "task": spec.task,
-                "generations": len(history),
-                **found,
-                **own,
-                "classes": run.classes.total,
-                "state": run.state,
-            }
-    except JournalError as error:
-        return {"run": path.name, "created": None, "task": None, "generations": None, "mean": None,
-                "evaluated": None, "confirmed": None, "classes": None, "state": str(error)}  # fmt: skip
+def _shown_row(row: Mapping[str, Any]) -> dict[str, object]:
+    """A run's row for people: the last generation's average, the best evaluation and the confirmed score."""
+    best, confirmed = (
+        "-" if row[name] is None else format_with_error(row[name], row[f"{name}_error"])
+        for name in ("best", "confirmed")
+    )
+    return {
+        "run": row["run"], "created": row["created"], "task": row["task"], "generations": row["generations"],
+        "average": format_number(row["mean"]), "best": best, "confirmed": confirmed, "classes": row["classes"],
+        "state": row["state"],
+    }  # fmt: skip
 
 
 def show_run(args: argparse.Namespace) -> int:
     """Print a run's settings and generations; with `--json` also the settings that do not apply to it."""
     with open_run(args.runs_dir, args.run_name) as stored, stored.verified_transaction():
-        settings, history, evaluations = stored.settings, stored.history(), stored.evaluations()
-        confirmed, duration_seconds = stored.confirmation(), stored.duration_seconds
-        facts = {
-            "run": stored.name,
-            "run_uid": stored.uid,
-            "created": stored.created,
-            "ended": stored.ended,
-            "ended_at": stored.ended_at,
-            "lasted_seconds": duration_seconds,
-            "fingerprint": stored.fingerprint,
-            "failed_candidates": count_failed(history),
-            "replaced_seeds": (reseeds := stored.count_reseeds(history)),
-            "equal_generations": (equal := EqualFitness(() if settings.is_external else history)).count,
-        }
-        unscored = stored.unscored_generations()
-        best = best_evaluation(evaluations)
-        stored_mean = None if best is None else stored.evaluated_mean(best.generation)
-        checks = stored.checks
-        classes, word = stored.classes, score_word_of_run(stored.spec, stored.bundle_path)
-        limit = stored.episode_limit
-        archive = EliteArchive.of(stored)
-    begun = begun_stages(settings, history, evaluations) if settings.stages else ()
-    if args.json:
-        rows: dict[str, Any] = {"history": [_generation_facts(each, unscored) for each in history]}
-        rows["evaluations"] = [with_error(each) for each in evaluations]
-        rows["stages"] = [{"number": each.stage.number, "since": each.since, "after": each.why} for each in begun]
-        reported = None if confirmed is None else with_error(confirmed)
-        rows["classes"] = asdict(classes)
-        rows |= {} if checks is None else {"checks": asdict(checks)}
-        rows |= {} if archive is None else {"archive": archive.facts}
-        print(json.dumps({**facts, "settings": asdict(settings), "confirmed": reported, **rows}, indent=2))
-        return 0
-    del facts["lasted_seconds"], facts["replaced_seeds"], facts["equal_generations"]
-    facts |= {"warning": warning} if (warning := equal.describe(settings.task)) else {}
-    if duration_seconds is not None:
-        facts["ended_at"] = f"{facts['ended_at']}, {format_duration(duration_seconds)} after it began"
-    facts["failed_candidates"] = describe_failed(settings, history, reseeds)
-    facts["hosts"] = classes.description
-    facts |= {f"class {name}": hosts for name, hosts in classes.rows}
-    facts |= {} if checks is None else {"checks": checks.description}
-    facts["reported"] = describe_score(in_values(confirmed or best_evaluation(evaluations), settings.task), word)
-    if is_function_task(settings.task.task):
-        facts |= _function_facts(stored_mean, settings.task.options)
-    facts |= {} if archive is None else {"archive found": archive.description}
-    facts |= {"stage": f"{begun[-1].stage.number} of {len(settings.stages)}"} if begun else {}
-    shown_settings = {**_flatten_settings(settings), **describe_stages(settings, begun)}
-    if source := describe_limit(settings.task.horizon, limit):
-        shown_settings["task.horizon"] = f"{settings.task.horizon}; an episode has {limit} steps at most{source}"
-    unused = _unused_settings(settings)
-    shown_settings = {name: value for name, value in shown_settings.items() if value is not None and name not in unused}
-    print_rows([{"": name, "value": value} for name, value in {**facts, **shown_settings}.items()])
-    print()
-    shown = history[-LAST_GENERATIONS:] if sys.stdout.isatty() else history
-    judged = {each.generation: value_of(each.mean, settings.task) for each in evaluations}
-    own = [in_values(each, settings.task) for each in shown]
-    lines = [_generation_row(each, judged.get(each.number), scored=each.number not in unscored) for each in own]
-    if len(shown) < len(history):
-        print(f"the last {LAST_GENERATIONS} of {len(history)} generations; --json has all")
-    least = ("seconds", "worst", "steps", "std", "sigma") + (
-        () if any(each.failed for each in history) else ("failed",)
-    )
-    print_rows(lines, right=tuple(lines[0]) if lines else (), drop_order=least)
-    return 0
-
-
-def _function_facts(mean: NDArray[np.float32] | None, options: str) -> dict[str, str]:
-    """The arguments of a function that the reported mean of its run stands for."""
-    from dreamfleet.common.artifacts.objective import Objective
-
-    objective = Objective.parse(options)
-    values = f"the function's own; {'smaller' if objective.minimise else 'larger'} ones are better"
-    found = "-" if mean is None else ", ".join(f"{each:z.8g}" for each in objective.decode(mean))
-    return {"reported x": found, "values": values}
-
-
-def _flatten_settings(settings: RunSettings) -> dict[str, object]:
-    """Settings by name, with those of task and controller, without stages."""
-    flat: dict[str, object] = {}
+        if args.json:
+            print(json.dumps(run_document(stored), indent=2))
+            return 0
+        facts, rows, settings, limit = run_facts(stored), generation_rows(stored), stored.settings, stored.episode_limit
     plain = asdict(settings)
-    del plain["stages"], plain["task"]["controller"]  # the same as the run's own
-    for name, value in plain.items():
-        flat |= {name: value} if not isinstance(value, dict) else _prefix_names(name, value)
-    return {name: None if value in (None, "", ()) else format_setting(value) for name, value in flat.items()}
-
-
-def _unused_settings(settings: RunSettings) -> set[str]:
-    """Names of settings that change nothing in this run, by its task and by what it leaves out."""
-    task = settings.task
-    unused = {"task.version"} if task.version == 1 else set()
-    if not task.bundle:
-        unused |= {"features", "collect_every", "collect_episodes", "task.bundle"}
-    if task.task != DREAM:
-        unused |= {"driven", *(f"task.{name}" for name in ("temperature", "recorded", "driven", "end"))}
-    if not settings.evaluate_every:
-        unused |= {"evaluation_episodes", "confirm_episodes"}
-    if not settings.collect_every:
-        unused.add("collect_episodes")
-    if settings.optimiser != "cma":
-        unused.add("covariance")
-    return unused
-
-
-def _prefix_names(name: str, parts: dict[str, object]) -> dict[str, object]:
-    return {part if part == name else f"{name}.{part}": value for part, value in parts.items() if value is not None}
-
-
-def _generation_facts(each: StoredGeneration, unscored: Collection[int]) -> dict[str, Any]:
-    missing = dict.fromkeys(("mean", "std", "best", "worst")) if each.number in unscored else {}
-    return {**asdict(each), **missing}
-
-
-def _generation_row(each: StoredGeneration, evaluated: float | None, *, scored: bool) -> dict[str, object]:
-    fitness = {"mean": each.mean, "std": each.std, "best": each.best, "worst": each.worst}
-    shown = {name: format_number(value if scored else None) for name, value in fitness.items()}
-    return {
-        "generation": each.number, **shown,
-        "sigma": format_number(each.sigma), "failed": each.failed or "", "steps": each.steps,
-        "seconds": f"{each.seconds:.1f}", "evaluated": "" if evaluated is None else format_number(evaluated),
-    }  # fmt: skip
+    del plain["stages"], plain["task"]["controller"]  # they are among the facts, and the run's own
+    unused = unused_settings(settings)
+    facts |= {name: value for name, value, _ in setting_rows(settings, plain, limit) if name not in unused}
+    print_rows([{"": name, "value": value} for name, value in facts.items()])
+    print()
+    shown = rows[-LAST_GENERATIONS:] if sys.stdout.isatty() else rows
+    if len(shown) < len(rows):
+        print(f"the last {LAST_GENERATIONS} of {len(rows)} generations; --json has all")
+    least = (
+        "seconds",
+        "worst",
+        "steps",
+        "std",
+        "sigma",
+        *(() if any(each["failed"] for each in rows) else ("failed",)),
+    )
+    print_rows(shown, right=tuple(rows[0]) if rows else (), drop_order=least)
+    return 0
 
 
 def archive_run(args: argparse.Namespace) -> int:

@@ -71,30 +71,28 @@ def _can_redraw() -> bool:
 
 def print_runs(documents: Sequence[dict[str, Any]]) -> None:
     """One line per run; an unreadable status is a note."""
-    from dreamfleet.common.client.eta import describe_departed, estimate_eta
+    from dreamfleet.common.client.run_view import LiveRunView
     from dreamfleet.common.client.status import read_status
     from dreamfleet.common.printable import plural
-    from dreamfleet.common.runs.records import format_mean, in_values
+    from dreamfleet.common.runs.records import format_mean
 
-    statuses = []
+    views = []
     for document in documents:
         try:
-            statuses.append(read_status(document))
+            views.append(LiveRunView.of_status(read_status(document)))
         except MalformedError as error:  # of one run, and no matter of the others
             print(f"note: {error}", file=sys.stderr)
-    statuses.sort(key=lambda each: each.run)
-    best = [in_values(each.confirmed or each.best, each.settings.task) for each in statuses]
     rows = [
         {
-            "run": each.run,
-            "state": each.state,
-            "generation": each.generation.number,
-            "best": None if judged is None else format_mean(judged),
-            "workers": ", ".join(filter(None, (str(each.workers.present), describe_departed(each.workers)))),
-            "steps/s": f"{each.throughput.steps_per_second:,.0f}",
-            "to go": estimate_eta(each).description,
+            "run": each.status.run,
+            "state": each.status.state,
+            "generation": each.status.generation.number,
+            "best": each.reported and format_mean(each.reported),
+            "workers": ", ".join(filter(None, (str(each.status.workers.present), each.departed))),
+            "steps/s": f"{each.status.throughput.steps_per_second:,.0f}",
+            "to go": each.eta.description,
         }
-        for each, judged in zip(statuses, best, strict=True)
+        for each in sorted(views, key=lambda each: each.status.run)
     ]
     print_rows(rows, right=("generation", "steps/s"), drop_order=("steps/s", "workers", "best"))
     print(f"{plural(len(rows), 'live run')}; `dreamfleet status RUN` shows more", file=sys.stderr)
@@ -163,7 +161,7 @@ def _print_changes(client: Client, name: str) -> int:
     """Print a line whenever generation, evaluations, state or workers change; at the end the panel."""
     from rich.console import Console
 
-    from dreamfleet.common.client.eta import summarise_status
+    from dreamfleet.common.client.run_view import LiveRunView
     from dreamfleet.common.client.status import read_status
     from dreamfleet.common.printable import one_line
 
@@ -171,7 +169,7 @@ def _print_changes(client: Client, name: str) -> int:
     for status in map(read_status, _follow_documents(client, name)):
         now = status.state, status.generation.number, status.evaluations, status.workers.present
         if now != shown:
-            print(one_line(f"{status.run}: {summarise_status(status)}"), flush=True)
+            print(one_line(f"{status.run}: {LiveRunView.of_status(status).summary}"), flush=True)
         shown = now
     Console().print(_PanelBuilder(client).build(status))
     return 0

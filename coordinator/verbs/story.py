@@ -26,6 +26,7 @@ SUMMARY = (
     "else what its journal on this disk keeps (workers that came and went, pauses, failures, restarts)"
 )
 EXTRAS = ()
+FIRST = "--journal --worker --job --what --last --connect --json"
 MOST_NAMED = 8  # workers by name
 LAST = 40  # events that people are shown unless they say otherwise
 

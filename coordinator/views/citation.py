@@ -11,30 +11,19 @@ from typing import Any
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.client.eta import format_duration
 from dreamfleet.common.errors import BundleError
-from dreamfleet.common.printable import plural
-from dreamfleet.common.protocol.tasks import module_of, step_unit
+from dreamfleet.common.printable import format_duration, plural
+from dreamfleet.common.protocol.tasks import module_of
 from dreamfleet.common.runs.lookup import load_controller_of
-from dreamfleet.common.runs.records import (
-    SUBMITTED,
-    RunSettings,
-    StoredConfirmation,
-    StoredEvaluation,
-    best_evaluation,
-    count_failed,
-    describe_failed,
-    describe_score,
-    in_values,
-)
+from dreamfleet.common.runs.records import SUBMITTED, RunSettings, count_failed, describe_failed
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_paths import trust_flag
 from dreamfleet.common.runs.run_provenance import RunProvenance, read_run_provenance, read_run_settings
 from dreamfleet.common.runs.seeds import TRAINING_FIRST
-from dreamfleet.common.runs.stages import begun_stages, describe_limit, describe_stages
+from dreamfleet.common.runs.stages import begun_stages, describe_stages
 from dreamfleet.common.schema.times import parse_time
 from dreamfleet.common.schema.validation import to_plain
-from dreamfleet.common.worlds.score_words import score_word_of_run
+from dreamfleet.coordinator.views.run_details import view_of
 
 AUTHORS = "The dreamfleet authors"
 
@@ -43,12 +32,12 @@ def citation_facts(run: RunFolder) -> dict[str, Any]:
     """The run and its provenance as JSON values; `ControllerError` before the run has a controller."""
     controller = load_controller_of(run)
     receipt, settings = read_run_provenance(controller), read_run_settings(controller)
-    score, spent, history = _reported(run), run.total_effort(), run.history()
+    view, spent, history = view_of(run), run.total_effort(), run.history()
     return {
         "run": run.name, "run_uid": run.uid, "created": run.created, "ended": run.ended,
         "ended_at": run.ended_at, "lasted_seconds": run.duration_seconds,
         "controller": controller.sha256, "bundle": settings.task.bundle or None,
-        "score": _describe_score(run), "failed_episodes": score.failed if score else 0,
+        "score": view.score, "failed_episodes": view.reported.failed if view.reported else 0,
         "failed_candidates": count_failed(history), "replaced_seeds": run.count_reseeds(history),
         "on_failure": settings.on_failure,
         "spent": {**asdict(spent), "core_hours": spent.core_hours},
@@ -84,7 +73,7 @@ def format_markdown(run: RunFolder) -> str:
 def _rows(
     run: RunFolder, controller: Controller, receipt: RunProvenance, settings: RunSettings
 ) -> Iterator[tuple[str, str]]:
-    spec = settings.task
+    spec, view = settings.task, view_of(run)
     at = (
         ""
         if run.duration_seconds is None
@@ -94,7 +83,7 @@ def _rows(
     yield "run", f"`{run.uid}`, begun {since}, {state}"
     yield "controller", f"SHA-256 `{controller.sha256}` of its parameters"
     yield "world model", f"SHA-256 `{spec.bundle}`" if spec.bundle else "none"
-    yield "score", _describe_score(run)
+    yield "score", view.score
     warm = "" if spec.temperature is None else f", temperature {spec.temperature:g}"
     warm += f", end {spec.end}" if spec.end else ""
     generations = plural(receipt.generations, "generation")
@@ -104,10 +93,7 @@ def _rows(
         yield "search", f"{settings.optimiser}, {settings.covariance}, {generations}"
         yield from describe_stages(settings, begun).items()
     else:
-        limit = run.episode_limit
-        unit = step_unit(spec.task).removesuffix("s")
-        steps = plural(min(spec.horizon, limit or spec.horizon), unit) + describe_limit(spec.horizon, limit)
-        yield "task", f"{spec.task}, {steps}{warm}, version {spec.version}"
+        yield "task", f"{spec.task}, {view.steps}{warm}, version {spec.version}"
         size = f"population {settings.population} x {plural(settings.episodes, 'episode')}, sigma0 {settings.sigma0:g}"
         own = f"{settings.optimiser}, {settings.covariance}, {size}, {generations}"
         yield "search", f"{SUBMITTED}, {generations}" if settings.is_external else own
@@ -132,14 +118,6 @@ def _rows(
         yield "checked on other hosts", receipt.checks.description
     if receipt.versions is not None:
         yield "coordinator", ", ".join(f"{name} {version}" for name, version in receipt.versions.items())
-
-
-def _reported(run: RunFolder) -> StoredConfirmation | StoredEvaluation | None:
-    return run.confirmation() or best_evaluation(run.evaluations())
-
-
-def _describe_score(run: RunFolder) -> str:
-    return describe_score(in_values(_reported(run), run.spec), score_word_of_run(run.spec, run.bundle_path))
 
 
 def _commands(run: RunFolder) -> dict[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,6 +15,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from dreamfleet.common.client.elites import EliteArchive, exploration_note
 from dreamfleet.common.client.fitness_chart import (
+    PLAIN,
     PLOT_COLOURS,
     STAR,
     draw_fitness,
@@ -26,7 +28,7 @@ from dreamfleet.common.files.atomic_write import open_output
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.function_values import is_minimised, spans_decades
 from dreamfleet.common.protocol.tasks import DREAM, is_function_task
-from dreamfleet.common.runs.effort import SHORT_HOURS, Effort, format_steps
+from dreamfleet.common.runs.effort import Effort, format_steps
 from dreamfleet.common.runs.learning import LearningCurve
 from dreamfleet.common.runs.records import SUBMITTED
 from dreamfleet.common.runs.run_folder import RunFolder
@@ -35,7 +37,6 @@ from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.profile import PublishedScores
 from dreamfleet.common.worlds.score_words import score_word
 from dreamfleet.common.worlds.shipped import WORLDS
-from dreamfleet.coordinator.views.shown_figure import ShownFigure
 
 TITLE = 90  # characters in a line of the title
 LABEL = 52  # characters in a line of the label of the y axis
@@ -46,6 +47,15 @@ DECADE = 10
 KINDS = (".png", ".svg")
 NEAR_SHARE = 0.1  # of the steps of the first published score: a shorter run's curve would be squeezed beside it
 REPEATABLE: dict[Any, str] = {"svg.hashsalt": "dreamfleet"}  # fixed identifiers in SVG files, instead of random ones
+
+
+class ShownFigure(Figure):
+    """A matplotlib figure that a notebook shows where nothing has imported pyplot, which would choose a backend."""
+
+    def _repr_png_(self) -> bytes:
+        stream = BytesIO()
+        self.savefig(stream, format="png")
+        return stream.getvalue()
 
 
 def plot_fitness(run: RunFolder, path: Path) -> None:
@@ -125,12 +135,10 @@ def learning_figure(curves: Sequence[LearningCurve], marks: PublishedScores | No
     figure = ShownFigure(figsize=(11, 5.6), layout=ConstrainedLayoutEngine(w_pad=PAD, h_pad=PAD))
     over_steps, over_hours = figure.subplots(1, 2, sharey=True)
     one_world = len({each.world for each in curves}) == 1
-    short = marks is None and max(each.total.core_hours for each in curves) < SHORT_HOURS
-    unit, hour = ("core-seconds", 3600) if short else ("core-hours", 1)
     for curve, colour in zip(curves, PLOT_COLOURS * len(curves), strict=False):
         name = curve.name if one_world else f"{curve.name} in {curve.world}"
         _draw_curve(over_steps, curve, name, colour, lambda effort: effort.steps)
-        _draw_curve(over_hours, curve, name, colour, lambda effort: hour * effort.core_hours)
+        _draw_curve(over_hours, curve, name, colour, lambda effort: effort.core_hours)
     if marks is not None:
         for axes, name in ((over_steps, "steps"), (over_hours, "core_hours")):
             spent = [(getattr(each, name), each.score) for each in marks.scores]
@@ -140,12 +148,13 @@ def learning_figure(curves: Sequence[LearningCurve], marks: PublishedScores | No
             over_hours.axhline(level, linestyle="--", color="black", linewidth=1)
     values = [each.score for curve in curves for each in (*curve.points, curve.confirmed) if each is not None]
     is_log = all(each.minimised for each in curves) and spans_decades(values)
+    over_steps.yaxis.set_major_formatter(PLAIN)
     if is_log:
         over_steps.set_yscale("log")  # of both panels: they share the axis
     over_steps.set_ylabel(_score_axis(curves, "log scale" if is_log else ""))
     for axes, spent_in in (
         (over_steps, _steps_axis(curves)),
-        (over_hours, f"{unit}: time that slots worked on accepted results"),
+        (over_hours, "core-hours: time that slots worked on accepted results"),
     ):
         axes.set_xlabel(f"{spent_in}{' (log scale)' if _scale(axes) else ''}")
         axes.margins(y=0.1)

@@ -14,29 +14,18 @@ from rich.console import Console, ConsoleOptions, Group, RenderResult
 from rich.panel import Panel
 from rich.text import Text
 
-from dreamfleet.common.artifacts.objective import describe_sign
-from dreamfleet.common.client.eta import describe_state, estimate_eta, format_duration
-from dreamfleet.common.client.status import (
-    EpisodeProgress,
-    FailureStatus,
-    GenerationStatus,
-    Population,
-    Status,
+from dreamfleet.common.client.run_view import LiveRunView, format_episodes
+from dreamfleet.common.client.status import FailureStatus, Population, Status
+from dreamfleet.common.printable import format_duration, format_number, plural, printable
+from dreamfleet.common.protocol.function_values import (
+    fitness_word,
+    is_minimised,
+    least_positive,
+    spans_decades,
+    value_of,
 )
-from dreamfleet.common.printable import format_number, plural, printable
-from dreamfleet.common.protocol.function_values import fitness_word, is_minimised, spans_decades, value_of
-from dreamfleet.common.protocol.tasks import DREAM, is_unregistered, step_unit
-from dreamfleet.common.runs.records import (
-    SUBMITTED,
-    RunSettings,
-    StoredConfirmation,
-    StoredEvaluation,
-    StoredGeneration,
-    count_episodes,
-    format_mean,
-    in_values,
-)
-from dreamfleet.common.runs.stages import describe_limit, describe_steps
+from dreamfleet.common.protocol.tasks import is_unregistered
+from dreamfleet.common.runs.records import in_values
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, describe_time_left
 from dreamfleet.coordinator.views.terminal_charts import bar_chart, candidate_grid, candidate_grid_height, share_bar
 from dreamfleet.coordinator.views.worker_table import WorkerTable
@@ -54,7 +43,7 @@ FRAME_WIDTH = 4  # columns of border and padding
 BORDER_LINES = 2
 LABEL_WIDTH = 17  # columns of a fact's name
 TWO_COLUMN_WIDTH = 110  # columns from which facts are in two columns
-MAX_BAR_WIDTH = 40  # columns
+BAR_WIDTH = 24  # columns of the run's bar, or a third of a narrow terminal
 MAX_CURVE_LINES = 8
 UNKNOWN_ADDRESS = "--connect tcp/HOST:PORT"  # worker flags if the run's address is not known
 
@@ -120,22 +109,14 @@ def allocate_lines(blocks: Sequence[Block], lines: int | None) -> list[int]:
 
 def _blocks(status: Status, width: int, worker_flags: str) -> Iterator[Block]:
     """The blocks from top to bottom."""
-    state = STATE_STYLES.get(status.state, "")
-    yield _text_block(0, Text(printable(describe_state(status)), style=state), width, min_lines=2)
-    if status.failures and not status.why:
-        yield _text_block(1, Text(printable(_describe_failure(status.failures[0])), style="red"), width, min_lines=1)
-    if status.checks is not None and status.checks.waiting and not status.why:
-        yield _text_block(1, Text(printable(status.checks.waiting), style="red"), width, min_lines=1)
-    if status.equal_fitness:
-        yield _text_block(1, Text(status.equal_fitness, style="yellow"), width, min_lines=1)
-    if status.worker_list:  # else they stand in its place
-        for each in status.refusals:
-            yield _text_block(1, Text(printable(each), style="yellow"), width, min_lines=1)
+    view = LiveRunView.of_status(status)
+    yield _text_block(0, view.state, width, STATE_STYLES.get(status.state, ""), min_lines=2)
+    for trouble, style in _troubles(status):
+        yield _text_block(1, trouble, width, style)
     if not status.is_over:
-        yield _text_block(2, Text(printable(estimate_eta(status).description)), width, min_lines=1)
-    if progress := list(_progress_lines(status, width)):
-        yield Block(3, 1, len(progress), len(progress), lambda _: progress)
-    facts = list(_facts(status))
+        progress = _progress_lines(view, width)
+        yield Block(2, 1, len(progress), len(progress), lambda given: progress[:given])
+    facts = list(_facts(view))
     max_lines = len(_fact_lines(facts, width))
     yield Block(4, min(3, max_lines), min(5, max_lines), max_lines, lambda given: _fit_facts(facts, width, given))
     if len(status.recent) > 1:
@@ -147,10 +128,30 @@ def _blocks(status: Status, width: int, worker_flags: str) -> Iterator[Block]:
     yield _workers_block(status, width, worker_flags)
 
 
-def _text_block(priority: int, text: Text, width: int, min_lines: int) -> Block:
-    lines = _wrap(text.plain, width)
-    drawn = [Text(each, style=text.style) for each in lines]
-    return Block(priority, min(min_lines, len(lines)), len(lines), len(lines), lambda given: drawn[:given])
+def _troubles(status: Status) -> Iterator[tuple[str, str]]:
+    """What needs somebody, with its style."""
+    if status.failures and not status.why:
+        yield _describe_failure(status.failures[0]), "red"
+    if status.checks is not None and status.checks.waiting and not status.why:
+        yield status.checks.waiting, "red"
+    if status.equal_fitness:
+        yield status.equal_fitness, "yellow"
+    for each in status.refusals if status.worker_list else ():  # else they stand in place of the workers
+        yield each, "yellow"
+
+
+def _progress_lines(view: LiveRunView, width: int) -> list[Text]:
+    """The run's one bar, in front of its one estimate."""
+    share = view.eta.share
+    bar = "" if share is None else f"{share_bar(share, min(BAR_WIDTH, width // 3))} {share:4.0%}  "
+    lines = _wrap(printable(view.eta.description), max(width - len(bar), 1))
+    return [Text.assemble((bar, "cyan"), line) if row == 0 else Text(" " * len(bar) + line)
+            for row, line in enumerate(lines)]  # fmt: skip
+
+
+def _text_block(priority: int, text: str, width: int, style: str, min_lines: int = 1) -> Block:
+    lines = [Text(each, style=style) for each in _wrap(printable(text), width)]
+    return Block(priority, min(min_lines, len(lines)), len(lines), len(lines), lambda given: lines[:given])
 
 
 def _wrap(text: str, width: int) -> list[str]:
@@ -158,44 +159,38 @@ def _wrap(text: str, width: int) -> list[str]:
     return textwrap.wrap(text, width) if cell_len(text) == len(text) else chop_cells(text, width)
 
 
-def _facts(status: Status) -> Iterator[tuple[int, str, str]]:
+def _facts(view: LiveRunView) -> Iterator[tuple[int, str, str]]:
     """Priority (0 is highest), name and value of each fact, in display order."""
-    settings, task, waste = status.settings, status.settings.task, status.waste
-    temperature, stage = status.generation.temperature, status.generation.stage
-    now, size = (task, settings) if stage is None else (stage, stage)
-    warm = "" if temperature is None or size.driven == 1 else f", temperature {temperature:g}"
-    limit, dreamt = status.episode_limit, task.task == DREAM and size.driven > 0
-    length = describe_steps(now.horizon, size.driven, dreamt=dreamt, limit=limit, word=step_unit(task.task))
-    length += describe_limit(now.horizon, limit)
-    yield 6, "task", ", ".join(filter(None, (task.task, length + warm, describe_sign(task.options))))
-    own = f"{plural(size.population, 'candidate')} x {plural(size.episodes, 'episode')}"
-    yield 7, "population", SUBMITTED if settings.is_external else own
+    status, stage = view.status, view.stage
+    temperature, waste = status.generation.temperature, status.waste
+    warm = "" if temperature is None or (stage or view.settings).driven == 1 else f", temperature {temperature:g}"
+    yield 6, "task", view.about + warm
+    yield 7, "population", view.population
     if stage is not None:
         yield 4, "stage", f"{stage.number} of {stage.total}, since generation {stage.since}"
-    yield 0, "last generation", _describe_generation(in_values(status.last, task)) if status.last else "-"
-    if settings.is_external:
+    last = "-" if view.last is None else f"average {format_number(view.last.mean)}, {view.spread}"
+    yield 0, "last generation", last
+    if view.settings.is_external:
         waiting = max(status.open_batches - bool(status.generation.episodes), 0)
         yield 3, "batches", f"{status.open_batches} open, {waiting} of them wait"
     else:
-        yield 5, "step size", f"{format_number(status.generation.sigma)} ({_describe_optimiser(settings)})"
+        yield 5, "step size", f"{format_number(status.generation.sigma)} ({view.optimiser})"
     if status.archive is not None:
         yield 1, "archive", status.archive.description
-    yield 1, "evaluated mean", _describe_evaluation(in_values(status.evaluation, task), status.score_word)
-    yield 2, "reported", _describe_reported(status)
-    rate, steps = status.throughput.steps_per_second, status.throughput.environment_steps
-    word = step_unit(task.task)
-    yield 3, "throughput", f"{rate:,.0f} {word}/s, {steps:,} {word} in all"
+    for name, part in (("evaluation", status.evaluating), ("kept rollouts", status.collecting)):
+        if part.episodes:
+            yield 3, name, format_episodes(part)
+    yield 1, "evaluated mean", view.describe(in_values(status.evaluation, view.task))
+    provisional = ", provisional" if view.best and not view.confirmed else ""
+    yield 2, "reported", view.describe(view.reported) + provisional
+    yield 3, "throughput", f"{view.speed}, {status.throughput.environment_steps:,} {view.unit} in all"
     resent = f", {plural(waste.resent_batches, 'batch', 'batches')} resent" if waste.resent_batches else ""
-    yield 4, "redundant work", f"{waste.share:.1%} of {word}, {plural(waste.reissued, 'job')} reissued{resent}"
-    if failed := status.failed + status.generation.failed:
-        yield (
-            2,
-            "failed",
-            f"{plural(failed, 'candidate')}, {status.generation.failed} of this generation; `story` lists why",
-        )
-    if status.elapsed is not None:
-        worked = status.throughput.seconds + status.generation.seconds
-        yield 6, "time", f"{format_duration(worked)} of work, {format_duration(status.elapsed)} since it began"
+    yield 4, "redundant work", f"{view.wasted}; {plural(waste.reissued, 'job')} reissued{resent}"
+    if view.failed:
+        here = status.generation.failed
+        yield 2, "failed", f"{plural(view.failed, 'candidate')}, {here} of this generation; `story` lists why"
+    if view.worked:
+        yield 6, "time", view.worked
     if status.classes.total:
         yield 4 if status.classes.mixed or status.classes.varying else 7, "hosts", status.classes.description
     if (checks := status.checks) is not None:
@@ -239,44 +234,10 @@ def _fact(each: tuple[int, str, str], width: int) -> list[Text]:
     ]
 
 
-def _describe_generation(last: StoredGeneration) -> str:
-    mean, std, worst, best = map(format_number, (last.mean, last.std, last.worst, last.best))
-    return f"mean {mean}, deviation {std} ({worst} to {best})"
-
-
-def _describe_optimiser(settings: RunSettings) -> str:
-    return settings.covariance if settings.optimiser == "cma" else settings.optimiser
-
-
-def _describe_evaluation(each: StoredEvaluation | StoredConfirmation | None, word: str) -> str:
-    if each is None:
-        return "-"
-    seeds = count_episodes(each, f"fresh {word}" if isinstance(each, StoredConfirmation) else word)
-    return f"{format_mean(each)} on {seeds} (generation {each.generation})"
-
-
-def _describe_reported(status: Status) -> str:
-    confirmed, best = (in_values(each, status.settings.task) for each in (status.confirmed, status.best))
-    if confirmed is not None or best is None:
-        return _describe_evaluation(confirmed, status.score_word)
-    return f"{_describe_evaluation(best, status.score_word)}, provisional"
-
-
 def _describe_failure(failure: FailureStatus) -> str:
     worker, error = next(iter(failure.errors.items()), ("a worker", "no reason was given"))
     when = "" if failure.retry_in is None else f" in {format_duration(failure.retry_in)}"
     return f"{failure.subject}, failed on {worker}: {error}; it is tried again{when}"
-
-
-def _progress_lines(status: Status, width: int) -> Iterator[Text]:
-    """Progress bars of evaluations, confirmation and rollouts in progress."""
-    parts = {"evaluation": status.evaluating, "confirmation": status.confirming, "kept rollouts": status.collecting}
-    for label, part in parts.items():
-        if part.episodes:
-            share = part.episodes_done / part.episodes
-            count = f" {part.episodes_done}/{plural(part.episodes, 'episode')}"
-            drawn = share_bar(share, max(min(MAX_BAR_WIDTH, width - LABEL_WIDTH - len(count)), 0))
-            yield Text.assemble((label.ljust(LABEL_WIDTH), "dim"), (drawn, "cyan"), count)
 
 
 def _open_population(status: Status) -> Population | None:
@@ -288,8 +249,7 @@ def _open_population(status: Status) -> Population | None:
 def _candidate_lines(status: Status, population: Population, width: int, lines: int) -> list[Text]:
     """A caption and the grid of candidates."""
     found = [each for each in population.candidates if each.fitness is not None]
-    episodes: GenerationStatus | EpisodeProgress = status.generation
-    done, wanted = episodes.episodes_done, episodes.episodes
+    done, wanted = status.generation.episodes_done, status.generation.episodes
     if population.generation != status.generation.number:
         done, wanted = sum(population.done), sum(population.wanted)
     failed = sum(each.has_failed for each in population.candidates)
@@ -307,14 +267,14 @@ def _candidate_lines(status: Status, population: Population, width: int, lines: 
 
 
 def _curve_lines(status: Status, width: int, lines: int) -> list[Text]:
-    """The mean fitness of the last generations: a line of bars, or, with more lines, a bar chart under a caption.
+    """The average fitness of the last generations: a line of bars, or, with more lines, a bar chart under a caption.
 
     If there are more generations than columns, a bar is the mean of several. Generations of earlier stages are dim:
     their fitness may not be comparable.
     """
     task, stage = status.settings.task, status.generation.stage
     history = [in_values(each, task) for each in status.recent]
-    caption = f"mean {fitness_word(task)} by generation"
+    caption = f"average {fitness_word(task)} by generation"
     margin = max(len(format_number(each.mean)) for each in history) + 1
     room = width - margin - (len(caption) + 1 + margin if lines == 1 else 0)
     means = _downsample([each.mean for each in history], max(room, 1))
@@ -328,7 +288,7 @@ def _curve_lines(status: Status, width: int, lines: int) -> list[Text]:
         return [drawn]
     wide = max(1, room // len(means))
     is_log = is_minimised(task) and spans_decades(means)
-    heights = [math.log10(mean) if is_log else mean for mean in means]
+    heights = [math.log10(max(mean, least_positive(means))) if is_log else mean for mean in means]
     rows = bar_chart([each for each in heights for _ in range(wide)], lines - 1)
     marks = [high] if len(rows) == 1 else [high, *[""] * (len(rows) - 2), low]
     plot = [Text.assemble((f"{mark:>{margin - 1}} ", "dim"), *_colour_bars(row, earlier * wide))

@@ -14,9 +14,8 @@ from statistics import median
 from rich.cells import cell_len, chop_cells
 from rich.text import Text
 
-from dreamfleet.common.client.eta import format_duration
 from dreamfleet.common.client.status import WorkerStatus
-from dreamfleet.common.printable import plural, printable
+from dreamfleet.common.printable import format_duration, plural, printable
 
 COLUMN_GAP = 2  # spaces between two columns
 SLOW_FACTOR = 1.5  # the slowest worker is marked if its seconds a job exceed the median by this factor

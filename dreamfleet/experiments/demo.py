@@ -26,7 +26,7 @@ from dreamfleet.common.cli.config import option
 from dreamfleet.common.cli.output import print_rows
 from dreamfleet.common.cli.progress import progress_bar
 from dreamfleet.common.client.client import Client
-from dreamfleet.common.client.eta import summarise_status
+from dreamfleet.common.client.run_view import LiveRunView
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
 from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.host.processes import VerbProcess, shell_command
@@ -261,7 +261,7 @@ class Demo:
             live.update(RunPanel(status, client.worker_flags, fitted=self._console.is_terminal))
             if not self._console.is_terminal and time.monotonic() >= self._next_line and not status.is_over:
                 self._next_line = time.monotonic() + LOG_INTERVAL
-                self._print(f"  {summarise_status(status)}")
+                self._print(f"  {LiveRunView.of_status(status).summary}")
 
     def _plot(self, demo_run: DemoRun) -> None:
         from dreamfleet.coordinator.views.plot import plot_fitness

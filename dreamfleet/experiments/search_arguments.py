@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
 
 from dreamfleet.common.artifacts.objective import Objective
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.printable import plural
+from dreamfleet.common.printable import plural, suggest
 from dreamfleet.coordinator.jobs.confirmation import FINALISTS, total_episodes
 
 STEP_SHARE = 0.3  # of a parameter's range: Hansen 2016, "The CMA Evolution Strategy: A Tutorial", section B
@@ -62,8 +61,8 @@ def check_names(settings: Mapping[str, Any]) -> None:
     for name in settings:
         if name in ADVICE:
             raise UsageError(f"unknown setting {name!r}: {ADVICE[name]}")
-        if near := get_close_matches(name, OWN_NAMES, n=1, cutoff=0.85):
-            raise UsageError(f"unknown setting {name!r}: did you mean {near[0]!r}?")
+        if near := suggest(name, OWN_NAMES, likeness=0.85, listed=False):
+            raise UsageError(f"unknown setting {name!r}{near}")
 
 
 def read_seed(value: Any) -> int:

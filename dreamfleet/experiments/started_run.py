@@ -14,7 +14,6 @@ from typing import Any, Self, Unpack
 from weakref import finalize
 
 from dreamfleet.common.cli.command_line import build_parser
-from dreamfleet.common.cli.config import suggestion
 from dreamfleet.common.cli.parser import Parser
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.client.status import Status
@@ -26,6 +25,7 @@ from dreamfleet.common.host.reports import WARNING
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.trusted_modules import check_trusted
 from dreamfleet.common.host.user_code import own_arguments
+from dreamfleet.common.printable import suggest
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.common.protocol.tasks import module_of
@@ -285,7 +285,7 @@ def check_settings(settings: Mapping[str, Any]) -> tuple[str, ...]:
     known = setting_names(parser)
     for name in settings:
         if name not in known:
-            raise UsageError(f"unknown setting {name!r}{suggestion(name, known)}")
+            raise UsageError(f"unknown setting {name!r}{suggest(name, known)}")
     words = {name: flag_words(name, value) for name, value in settings.items()}
     parser.parse_all([word for each in words.values() for word in each])
     return tuple(word for name, each in words.items() if name not in ("run", "resume", "listen") for word in each)

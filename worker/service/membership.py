@@ -149,18 +149,21 @@ class Membership:
     def find_end(self, now: float, busy: bool) -> str:
         """Why to leave the run now; empty: it stays. `busy` means that jobs run or results have no verdict.
 
-        R24: a draining worker leaves once all is delivered, or when its time is up. A run ends by its coordinator's
-        word; silence alone may be a cut link or a restart, so it needs long patience.
+        R24: a draining worker leaves once all is delivered, when its time is up, or, once it is stopped, if nobody is
+        in sight who takes what is left. A run ends by its coordinator's word; silence alone may be a cut link or a
+        restart, so it needs long patience.
         """
         if self._stops.count > 1:
             return "stopped by two signals, without draining"
         if self.run_is_over:
             return self.run_is_over
         if self._drain_until is not None:
-            if busy and now <= self._drain_until:
+            is_late = now > self._drain_until
+            if busy and not is_late and not (self._stops.count and self._is_alone(now, SEARCH_INTERVAL)):
                 return ""
             why = "drained after a stop signal" if self._stops.count else "drained at the end of its lifetime"
-            return f"{why}, but jobs or results were left when --drain-timeout was over" if busy else why
+            when = "--drain-timeout was over" if is_late else "no coordinator was in sight"
+            return f"{why}, but jobs or results were left when {when}" if busy else why
         if self.gives_up(now):
             return f"no coordinator was reachable for {self.conditions.coordinator_timeout:g} s"
         if self.conditions.serves_any and self._is_alone(now, NEXT_RUN_PATIENCE if busy else NEXT_RUN_AFTER):

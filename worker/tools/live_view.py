@@ -81,11 +81,13 @@ class LiveCanvas(Board):
         """`names` and `actions` are as in `Board`, `task` the world's; without a `dreamer` only observations show."""
         super().__init__(SIZE, names, actions)
         self._run, self._dreamer, self._profile = run, dreamer, profile_of(task)
+        self._captions: list[str] = []  # of the pictures in the frame that is drawn
 
     def draw(self, live: LiveFrame) -> CaptionedFrame:
         """Draw a frame."""
         dream = None if self._dreamer is None else self._dreamer.decode_and_dream(live)
         self._surface.fill(BACKGROUND)
+        self._captions = []
         if dream is not None:
             self._draw_model(live.picture, dream)
         elif live.picture is not None:
@@ -93,8 +95,8 @@ class LiveCanvas(Board):
         else:
             self._text("this task shows no picture", (EDGE, EDGE), self._small, FAINT)
         self._draw_words(live)
-        is_drawn = dream is not None or live.picture is not None
-        return CaptionedFrame(pixels(self._surface), {**frame_facts(self._run, live), "drawn": is_drawn})
+        shown = {"drawn": bool(self._captions), "captions": self._captions}
+        return CaptionedFrame(pixels(self._surface), {**frame_facts(self._run, live), **shown})
 
     def _draw_model(self, seen: Frame | None, dream: DecodedDream) -> None:
         """Draw observation and decoded latent side by side; without an observation, the decoded latent alone."""
@@ -133,6 +135,7 @@ class LiveCanvas(Board):
         """Draw a picture as large as `room` allows, below its label."""
         height, width = picture.shape[:2]
         scale = min(room[0] / width, room[1] / height)
+        self._captions.append(label)
         self._text(label, corner, self._small, FAINT)
         size = max(1, round(width * scale)), max(1, round(height * scale))
         self._picture(picture, (corner[0], corner[1] + LABEL), size, smooth=height != width)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.files.atomic_write import check_output_path
+from dreamfleet.common.host.packages import PACKAGES, check_modules
 from dreamfleet.common.host.stop_signals import stop_on_signals
 from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.seeds import TEST
@@ -66,6 +67,7 @@ def record_videos(args: argparse.Namespace, agent: Agent, film: partial[float]) 
     from dreamfleet.worker.tools.recording import record_in_process
 
     profile, known, world = profile_of(agent.reality), agent.known_score, agent.world
+    check_modules(PACKAGES[each][0] for each in world.packages if each in PACKAGES)  # before a bar is drawn
     word, most = world.score_word, min(args.steps, world.horizon)
     with stop_on_signals() as stop:
         for seed, video in video_paths(args, first_seed(known)).items():

@@ -24,6 +24,7 @@ from dreamfleet.worker.training.stages.collect import (
 
 SUMMARY = "collect training data for a world model: random drives, drives of controllers, or rollouts that a run kept"
 EXTRAS = ("worker",)
+FIRST = "--preset --task --environment --episodes --steps --seed --jobs --controller --driver --from-run --json"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

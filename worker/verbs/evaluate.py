@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 SUMMARY = "judge a controller on unseen seeds, in whole episodes of the world itself"
 EXTRAS = ("worker",)
+FIRST = "--controller --run --task --connect --episodes --first-seed --bundle --jobs --out --json"
+ELSEWHERE = {"--tracks": "give --episodes N, the number of tracks"}
 CONTROLLER = (
     "who drives: the file of a controller or agent, a training's folder, a run, one that ships, or random: uniform "
     "random actions in --task (random-discrete: the default world's five)"

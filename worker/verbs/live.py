@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 SUMMARY = "watch what a worker scores, the best mean, or a controller: its drive, what it decodes, what it dreams"
 EXTRAS = ("worker", "views")  # a window needs only the first
+FIRST = "--connect --run --worker --best --controller --generation --seed --seconds --fps --out --temperature"
 FASTEST = 50  # pictures a second
 LONGEST = 20  # default seconds of pictures in files
 

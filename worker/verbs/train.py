@@ -15,6 +15,7 @@ from dreamfleet.worker.training.stages.train import MDNRNN, MODELS, VAE, TrainRe
 
 SUMMARY = "train a world model's VAE or MDN-RNN on a data set, or continue its training"
 EXTRAS = ("train",)
+FIRST = "--preset --device --continue-from --new --summary --updates --batch --rate --seed --set --tensorboard --json"
 TRAINING_FLAGS = ("updates", "batch", "rate", "seed")  # other settings are keys of --set
 
 

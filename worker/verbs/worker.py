@@ -15,6 +15,8 @@ from dreamfleet.worker.service.config import WorkerConfig
 
 SUMMARY = "score candidates for a run; it needs no files and no display, and may start before its coordinator"
 EXTRAS = ("worker",)
+FIRST = "--connect --join --run --any --runs --slots --name --task --exit-when-done --lifetime"
+ELSEWHERE = {"--workers": "give --slots N, the number of processes"}
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

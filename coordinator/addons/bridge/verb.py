@@ -13,6 +13,7 @@ from dreamfleet.coordinator.addons.bridge.config import BridgeConfig
 
 SUMMARY = "let a search in any language score batches over HTTP"
 EXTRAS = ("dashboard",)
+FIRST = "--connect --join --port --host --token-file"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

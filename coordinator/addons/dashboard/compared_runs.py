@@ -64,7 +64,7 @@ def _difference(of: str, sides: Sides, found: PairedDifference | str, word: str)
         "better": found.mean > 0,
         "error": found.error,
         "half": found.critical_value * found.error,  # a significant difference is larger
-        "size": format_with_error(sign * found.mean, found.error, sign="+,"),
+        "size": format_with_error(sign * found.mean, found.error, sign="+"),
         "on": plural(found.seeds, f"common {word}"),
         "clear": found.is_significant,
         "verdict": _verdict(sides, found),

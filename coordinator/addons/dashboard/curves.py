@@ -9,7 +9,13 @@ from typing import Any, TypeVar
 
 from dreamfleet.common.client.elites import exploration_note
 from dreamfleet.common.printable import plural
-from dreamfleet.common.protocol.function_values import fitness_word, is_minimised, spans_decades, value_of
+from dreamfleet.common.protocol.function_values import (
+    fitness_word,
+    is_minimised,
+    least_positive,
+    spans_decades,
+    value_of,
+)
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import DREAM, is_function_task
 from dreamfleet.common.runs.effort import Effort, GenerationEffort
@@ -74,12 +80,13 @@ def curves(
     confirmed = _judged(reported, [len(data.history) - 1] * len(reported), task, spent)
     ends = [end for each in rows for end in (each.best, each.mean)]
     is_log = is_minimised(task) and bool(rows) and spans_decades(ends)
+    foot = least_positive(ends) if is_log else -math.inf  # where a logarithmic axis has its zeros
     drawn: dict[str, Any] = {
         "step": sampling_step(len(data.history)),
         "generation": [each.number for each in rows],
-        "mean": [_rounded(each.mean) for each in rows],
-        "best": [_rounded(each.best) for each in rows],
-        "low": [_rounded(low) for low, _ in band],
+        "mean": [_rounded(max(each.mean, foot)) for each in rows],
+        "best": [_rounded(max(each.best, foot)) for each in rows],
+        "low": [_rounded(max(low, foot)) for low, _ in band],
         "high": [_rounded(high) for _, high in band],
         "band": "± 1 standard deviation" if quartiles is None else "the middle half of the candidates",
         "sigma": [_rounded(each.sigma) for each in rows],

@@ -19,7 +19,7 @@ from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
-from dreamfleet.common.schema.validation import MalformedError, from_plain_lenient
+from dreamfleet.common.schema.validation import MalformedError
 from dreamfleet.common.transport.network import Network
 from dreamfleet.common.transport.session import enqueue_into
 from dreamfleet.common.worlds.score_words import score_word, score_word_of_run
@@ -303,5 +303,4 @@ class _FollowedRun:
 
 def _fetch_rows(client: Client, part: str, kind: type[T], run: str, offset: int = 0) -> Iterator[T]:
     """The rows of a paged part from `offset` on, at most `MOST_ROWS` in all."""
-    rows = islice(client.fetch_rows(part, run, offset), MOST_ROWS - offset)
-    return (from_plain_lenient(kind, row) for row in rows)
+    return islice(client.fetch_rows(part, kind, run, offset), MOST_ROWS - offset)

@@ -7,24 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from dreamfleet.common.artifacts.objective import describe_sign
-from dreamfleet.common.client.eta import Eta, describe_detail, estimate_eta, format_duration
+from dreamfleet.common.client.eta import Eta
+from dreamfleet.common.client.run_view import LiveRunView
 from dreamfleet.common.client.status import ArchiveStatus, Population, Status, WorkerStatus
-from dreamfleet.common.printable import format_number, plural, printable
+from dreamfleet.common.printable import format_duration, format_number, plural, printable
 from dreamfleet.common.protocol.function_values import fitness_word, is_minimised, value_of
-from dreamfleet.common.protocol.tasks import DREAM, is_function_task, step_unit
 from dreamfleet.common.runs.effort import format_steps
-from dreamfleet.common.runs.records import (
-    SUBMITTED,
-    RunSettings,
-    StoredConfirmation,
-    StoredEvaluation,
-    count_episodes,
-    in_values,
-)
+from dreamfleet.common.runs.records import format_mean
 from dreamfleet.common.runs.run_paths import resume_command
-from dreamfleet.common.runs.stages import describe_limit, describe_steps
-from dreamfleet.common.runs.standard_error import format_with_error
 
 LIVE, LOST, OVER = "live", "lost", "over"
 NONE = "-"
@@ -48,25 +38,25 @@ class RunSnapshot:
 def page_state(look: RunSnapshot) -> dict[str, Any]:
     """The document. Texts from other hosts are made printable; the page must insert them as text, not HTML."""
     status = look.status
+    view = LiveRunView.of_status(status, look.word)
     link = OVER if status.is_over else LIVE if look.lost is None else LOST
-    eta = estimate_eta(status)
     return {
         "run": status.run,
         "uid": status.run_uid,
         "link": link,
         "stored": look.folder is not None,
         "state": {LOST: "coordinator lost", LIVE: status.state}.get(link, _ended_state(status)),
-        "sentence": _lost_sentence(look) if link == LOST else _sentence(status),
+        "sentence": _lost_sentence(look) if link == LOST else _sentence(view),
         "lost": look.lost if link == LOST else None,
         "heard": look.heard,
-        "eta": _eta(eta) if link == LIVE else None,
-        "task": printable(_task(status)),
+        "eta": _eta(view.eta) if link == LIVE else None,
+        "task": printable(_task(view)),
         "word": look.word,
-        "tiles": _tiles(look, eta, link),
+        "tiles": _tiles(view, link),
         "candidates": _candidates(look.population, status),
         "evaluation": _progress(status, look.word),
-        "search": _search(status),
-        "redundant": _redundant_work(status),
+        "search": _search(view),
+        "redundant": _redundant_work(view),
         "troubles": _problems(status),
         "fleet": _fleet(status, link),
         "workers": _workers(look, link),
@@ -77,11 +67,16 @@ def _ended_state(status: Status) -> str:
     return "ended" if status.state == "ended" else "left open"
 
 
-def _sentence(status: Status) -> str:
+def _task(view: LiveRunView) -> str:
+    stage = [] if view.stage is None else [f"stage {view.stage.number} of {view.stage.total}"]
+    return ", ".join([view.about, view.population, *stage])
+
+
+def _sentence(view: LiveRunView) -> str:
     """What the run does or waits for, without its state; empty while the open generation's card says it."""
-    if status.state == "running":
+    if view.status.state == "running":
         return ""
-    text = printable(describe_detail(status) or status.state)
+    text = printable(view.detail or view.status.state)
     return text[:1].upper() + text[1:]
 
 
@@ -97,61 +92,36 @@ def _lost_sentence(look: RunSnapshot) -> str:
 
 
 def _eta(eta: Eta) -> dict[str, Any]:
-    bounds = [{"text": each.description, "share": round(each.share, 4)} for each in eta.bounds]
-    return {"text": replace(eta, pace=None).description, "bounds": bounds}  # a tile has the pace
+    """The one estimate, without the pace, which a tile has, and the one bar; none of a run whose end is not known."""
+    text = replace(eta, pace=None).description
+    return {"text": text, "bounds": [] if eta.share is None else [{"text": text, "share": round(eta.share, 4)}]}
 
 
-def _task(status: Status) -> str:
-    settings, stage = status.settings, status.generation.stage
-    size = settings if stage is None else stage
-    horizon = settings.task.horizon if stage is None else stage.horizon
-    limit = status.episode_limit
-    word = step_unit(settings.task.task)
-    steps = describe_steps(horizon, size.driven, dreamt=settings.task.task == DREAM, limit=limit, word=word)
-    steps += describe_limit(horizon, limit)
-    own = f"{plural(size.population, 'candidate')}, {plural(size.episodes, 'episode')} each"
-    candidates = SUBMITTED if settings.is_external else own
-    parts = [settings.task.task, candidates, steps, *filter(None, [describe_sign(settings.task.options)])]
-    if stage is not None:
-        parts.append(f"stage {stage.number} of {stage.total}")
-    return ", ".join(parts)
-
-
-def _tiles(look: RunSnapshot, eta: Eta, link: str) -> list[dict[str, str]]:
+def _tiles(view: LiveRunView, link: str) -> list[dict[str, str]]:
     """The headline figures: name, value and caption."""
-    status, task = look.status, look.status.settings.task
-    last, reported, spent = (
-        in_values(status.last, task),
-        in_values(status.confirmed or status.best, task),
-        status.throughput,
-    )
-    workers, slots = plural(status.workers.present, "worker"), plural(status.slots, "slot")
-    word = step_unit(task.task)
-
-    def figure(value: float) -> str:
-        return format_number(value, ",") if is_function_task(task.task) else f"{value:z,.1f}"
-
-    spread = "" if last is None else f"mean; std {figure(last.std)}; {figure(last.worst)} to {figure(last.best)}"
+    status, last, reported, eta = view.status, view.last, view.reported, view.eta
+    spent = format_steps(status.throughput.environment_steps)
     return [
-        tile("score", NONE if reported is None else format_score(reported),
-              _awaited_score(status) if reported is None else reported_caption(reported, look.word)),
-        tile("last generation", NONE if last is None else figure(last.mean), spread or "once a generation closes"),
+        tile("score", NONE if reported is None else format_mean(reported),
+              _awaited_score(status) if reported is None else view.caption(reported)),
+        tile("last generation", NONE if last is None else format_number(last.mean),
+              f"average of the candidates; {view.spread}" if last else "once a generation closes"),
         *([] if status.archive is None else [_archive_tile(status.archive)]),
-        tile("time per generation", NONE if eta.pace is None else format_duration(eta.pace), _worked(status)),
-        tile("throughput", f"{format_steps(round(spent.steps_per_second))} {word}/s" if link == LIVE else NONE,
-              f"{format_steps(spent.environment_steps)} {word} in all"),
-        tile("fleet", workers, slots) if link == LIVE else tile("fleet", NONE, f"{workers}, {slots} at the last"),
+        tile("time per generation", NONE if eta.pace is None else format_duration(eta.pace), view.worked),
+        tile("throughput", view.speed if link == LIVE else NONE, f"{spent} {view.unit} in all"),
+        tile("fleet", view.workers, view.slots) if link == LIVE
+        else tile("fleet", NONE, f"{view.workers}, {view.slots} at the last"),
     ]  # fmt: skip
 
 
 def _archive_tile(archive: ArchiveStatus) -> dict[str, str]:
     if archive.best is None:
         return tile("archive", f"0 of {archive.cells:,}", "cells filled; once a generation closes")
-    best = f"the best elite {format_number(archive.best, ',')} in cell {','.join(map(str, archive.best_cell))}"
+    best = f"the best elite {format_number(archive.best)} in cell {','.join(map(str, archive.best_cell))}"
     return tile(
         "archive",
         f"{archive.filled:,} of {archive.cells:,}",
-        f"cells filled; QD score {format_number(archive.qd_score, ',')}; {best}",
+        f"cells filled; QD score {format_number(archive.qd_score)}; {best}",
     )
 
 
@@ -160,31 +130,12 @@ def tile(name: str, value: str, caption: str) -> dict[str, str]:
     return {"name": name, "value": value, "beneath": caption}
 
 
-def format_score(found: StoredEvaluation | StoredConfirmation) -> str:
-    """Format a mean with its standard error, if it has one."""
-    return format_with_error(found.mean, found.error, sign=",")
-
-
 def _awaited_score(status: Status) -> str:
     """When the first score comes."""
     every = status.settings.evaluate_every
     if not every:
         return "means are not evaluated"
     return f"first evaluation after generation {every - 1}" if every > 1 else "after the first generation"
-
-
-def reported_caption(reported: StoredEvaluation | StoredConfirmation, word: str) -> str:
-    """What the caption of a reported score says."""
-    kind = "confirmed" if isinstance(reported, StoredConfirmation) else "provisional"
-    return f"{kind}, generation {reported.generation}, {count_episodes(reported, word)}"
-
-
-def _worked(status: Status) -> str:
-    """The time that was worked, and the time that passed; empty if unknown."""
-    if status.elapsed is None:
-        return ""
-    worked = format_duration(status.throughput.seconds + status.generation.seconds)
-    return f"{worked} of work in {format_duration(status.elapsed)}"
 
 
 def _candidates(parts: Sequence[Population], status: Status) -> dict[str, Any]:
@@ -207,50 +158,45 @@ def _candidates(parts: Sequence[Population], status: Status) -> dict[str, Any]:
     }
 
 
-def _progress(status: Status, word: str) -> list[dict[str, Any]]:
-    """Progress of evaluation, confirmation and kept rollouts."""
+def _progress(status: Status, word: str) -> list[str]:
+    """The evaluation, the confirmation and the kept rollouts in progress."""
     parts = {
         "evaluation of the mean": (status.evaluating, word), "confirmation": (status.confirming, word),
         "kept rollouts": (status.collecting, "episode"),
     }  # fmt: skip
     return [
-        {"name": name, "done": each.episodes_done, "wanted": each.episodes, "of": plural(each.episodes, noun)}
+        f"{name}: {each.episodes_done:,} of {plural(each.episodes, noun)}"
         for name, (each, noun) in parts.items()
         if each.episodes > each.episodes_done
     ]
 
 
-def _search(status: Status) -> Facts:
-    open_one, settings = status.generation, status.settings
-    facts = [("optimiser", describe_optimiser(settings))]
-    if not settings.is_external:
+def _search(view: LiveRunView) -> Facts:
+    open_one = view.status.generation
+    facts = [("optimiser", printable(view.optimiser))]
+    if not view.settings.is_external:
         facts.insert(0, ("step size", f"{open_one.sigma:.4g}"))
     if open_one.axis_ratio is not None:
-        facts.append(("axis ratio", f"{open_one.axis_ratio:,.4g}"))
+        facts.append(("axis ratio", f"{open_one.axis_ratio:,.4g} (longest axis of the search over the shortest)"))
     if open_one.temperature is not None:
         facts.append(("temperature", f"{open_one.temperature:g}"))
-    if failed := status.failed + open_one.failed:
-        facts.append(("failed candidates", f"{failed:,}, {open_one.failed} of this generation"))
+    if view.failed:
+        facts.append(("failed candidates", f"{view.failed:,}, {open_one.failed} of this generation"))
     return facts
 
 
-def describe_optimiser(settings: RunSettings) -> str:
-    """The optimiser's name, with the kind of covariance matrix for CMA-ES."""
-    return printable(f"CMA-ES, {settings.covariance}" if settings.optimiser == "cma" else settings.optimiser)
-
-
-def _redundant_work(status: Status) -> dict[str, Any]:
+def _redundant_work(view: LiveRunView) -> dict[str, Any]:
     """Work that was repeated or discarded: a line, and what is not zero."""
-    waste, word = status.waste, step_unit(status.settings.task.task)
+    status, waste = view.status, view.status.waste
     counts = [
-        (f"discarded {word}", waste.discarded_steps), ("jobs issued again", waste.reissued),
+        (f"discarded {view.unit}", waste.discarded_steps), ("jobs issued again", waste.reissued),
         ("jobs recalled", waste.recalled), ("jobs copied at a generation's end", waste.copied),
         ("duplicate results", waste.duplicate), ("obsolete results", waste.obsolete), ("errors", waste.errors),
         ("batches sent again", waste.resent_batches), ("silences of workers", waste.silences),
         *((f"messages dropped: {printable(why)}", count) for why, count in status.dropped.items()),
     ]  # fmt: skip
     rows = [(name, f"{count:,}") for name, count in counts if count]
-    return {"text": f"{waste.share:.1%} of {word}" if rows else "none", "rows": rows}
+    return {"text": view.wasted if rows else "none", "rows": rows}
 
 
 def _problems(status: Status) -> list[str]:

@@ -11,44 +11,30 @@ from pathlib import Path
 from typing import Any
 
 from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.artifacts.objective import describe_sign
 from dreamfleet.common.client.elites import Elite, EliteArchive
-from dreamfleet.common.client.eta import format_duration
+from dreamfleet.common.client.run_view import RunView
 from dreamfleet.common.errors import DreamfleetError, JournalError
-from dreamfleet.common.printable import format_setting, plural, printable
-from dreamfleet.common.protocol.function_values import value_of
+from dreamfleet.common.printable import format_duration, printable
 from dreamfleet.common.protocol.measures import Axis, describe_measure
 from dreamfleet.common.protocol.tasks import DREAM, is_function_task
 from dreamfleet.common.runs.effort import Effort, format_steps
 from dreamfleet.common.runs.records import (
-    SUBMITTED,
     RunSettings,
     StoredGeneration,
-    best_evaluation,
-    count_episodes,
+    count_failed,
     expand_task_options,
+    format_mean,
     in_values,
 )
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import resume_command, run_paths
-from dreamfleet.common.runs.stages import describe_limit, stages_of
+from dreamfleet.common.runs.stages import stages_of
 from dreamfleet.common.schema.times import format_time, parse_time
-from dreamfleet.common.worlds.score_words import score_word_of_run
 from dreamfleet.coordinator.addons.dashboard.curves import Quartiles, RunData, cumulative_effort, curves, downsample
 from dreamfleet.coordinator.addons.dashboard.host_history import host_history
-from dreamfleet.coordinator.addons.dashboard.page_state import (
-    NONE,
-    Facts,
-    describe_optimiser,
-    format_score,
-    reported_caption,
-    tile,
-)
+from dreamfleet.coordinator.addons.dashboard.page_state import NONE, Facts, tile
+from dreamfleet.coordinator.views.run_details import run_row, setting_rows, view_of
 
-COLUMNS = (
-    "run", "created", "begun", "task", "generations", "mean", "best", "confirmed", "best_error", "confirmed_error",
-    "again", "state", "ended", "damaged",
-)  # fmt: skip
 LAST = 20  # generations in the table
 MOST_READ = 256 << 20  # bytes of candidates that are read for quartiles
 
@@ -68,12 +54,21 @@ def describe_run(runs_dir: Path, name: str) -> dict[str, Any]:
         start, efforts = run.start_effort(), run.efforts()
         spent = cumulative_effort(start, efforts, len(history))
         total = sum((each.effort for each in efforts), start)
-        word = score_word_of_run(run.spec, run.bundle_path)
+        view, plain = view_of(run), expand_task_options(asdict(settings))
         return {
-            "run": run.name, "state": printable(run.state), "ended": run.ended is not None,
-            "tiles": _tiles(run, data, total, word), "again": _resume_command(run), "facts": _about(run, settings),
-            "outcome": _outcome(run, data, total, word), "settings": flatten_settings(settings), "world": _world(run),
-            "curves": curves(data, read_quartiles(run, settings, downsample(history)), spent, word),
+            "run": run.name,
+            "state": printable(run.state),
+            "ended": run.ended is not None,
+            "tiles": _tiles(run, view, total),
+            "again": printable(resume_command(run.path)) if run.state == "open" else "",
+            "facts": _about(run, view),
+            "outcome": _outcome(run, view, total),
+            "settings": [
+                (name, printable(value), differs)
+                for name, value, differs in setting_rows(settings, plain, run.episode_limit)
+            ],
+            "world": _world(run),
+            "curves": curves(data, read_quartiles(run, settings, downsample(history)), spent, view.word),
             "archive": describe_archive(EliteArchive.of(run)),
             "generations": [_generation_row(in_values(each, run.spec)) for each in history[-LAST:][::-1]],
         }  # fmt: skip
@@ -132,46 +127,12 @@ def read_quartiles(run: RunFolder, settings: RunSettings, drawn: Sequence[Stored
     return run.quartiles(numbers)
 
 
-def flatten_settings(settings: RunSettings) -> Facts:
-    """Every setting by its dotted name."""
-    rows: Facts = []
-
-    def walk(prefix: str, value: object) -> None:
-        if isinstance(value, dict):
-            for name, inner in value.items():
-                walk(f"{prefix}.{name}" if prefix else str(name), inner)
-        elif isinstance(value, (list, tuple)) and value and isinstance(value[0], dict):
-            for number, inner in enumerate(value, 1):
-                walk(f"{prefix}.{number}", inner)
-        elif value not in (None, "", ()):
-            rows.append((prefix, printable(format_setting(value))))
-
-    walk("", expand_task_options(asdict(settings)))
-    return rows
-
-
 def _run_row(path: Path) -> dict[str, Any]:
-    try:
-        with RunFolder(path) as run:
-            spec, history = run.spec, run.history()
-            judged = best_evaluation(run.evaluations()), run.confirmation()
-            best, confirmed = (in_values(each, spec) for each in judged)
-            return {
-                "run": printable(run.name), "created": run.created, "begun": format_time(run.created),
-                "task": printable(spec.task), "generations": len(history),
-                "mean": value_of(history[-1].mean, spec) if history else None,
-                "best": best and best.mean, "best_error": best and best.error,
-                "confirmed": confirmed and confirmed.mean, "confirmed_error": confirmed and confirmed.error,
-                "again": _resume_command(run), "state": printable(run.state), "ended": run.ended is not None,
-                "damaged": False,
-            }  # fmt: skip
-    except JournalError as error:
-        return {**dict.fromkeys(COLUMNS), "run": printable(path.name), "state": printable(str(error)), "damaged": True}
-
-
-def _resume_command(run: RunFolder) -> str:
-    """The command that resumes an open run; empty for live and ended runs."""
-    return printable(resume_command(run.path)) if run.state == "open" else ""
+    row = run_row(path, as_values=True)
+    texts = {name: printable(row[name] or "") for name in ("run", "task", "state")}
+    begun = None if row["created"] is None else format_time(row["created"])
+    again = printable(resume_command(path)) if row["state"] == "open" else ""
+    return {**row, **texts, "begun": begun, "again": again, "damaged": row["generations"] is None}
 
 
 def _world(run: RunFolder) -> str:
@@ -183,39 +144,31 @@ def _world(run: RunFolder) -> str:
     return printable(task)
 
 
-def _tiles(run: RunFolder, data: RunData, total: Effort, word: str) -> list[dict[str, str]]:
-    best, confirmed = (in_values(each, run.spec) for each in (best_evaluation(data.evaluations), data.confirmed))
-    reported = confirmed or best
-    tiles = [
-        tile("score", NONE, "no mean was evaluated") if reported is None
-        else tile("score", format_score(reported), reported_caption(reported, word)),
-    ]  # fmt: skip
-    if confirmed is not None and best is not None:
-        tiles.append(tile("best evaluation", format_score(best), reported_caption(best, word)))
-    lasted = run.duration_seconds
-    passed = "" if lasted is None else f"in {format_duration(lasted)}"
-    dreamt, task = f"{format_steps(total.dreamt)} dreamt" if total.dreamt else "", run.spec.task
+def _tiles(run: RunFolder, view: RunView, total: Effort) -> list[dict[str, str]]:
+    reported, best = view.reported, view.best
+    tiles = [tile("score", NONE, "no mean was evaluated") if reported is None
+             else tile("score", format_mean(reported), view.caption(reported))]  # fmt: skip
+    if view.confirmed is not None and best is not None:
+        tiles.append(tile("best evaluation", format_mean(best), view.caption(best)))
+    passed = "" if run.duration_seconds is None else f"in {format_duration(run.duration_seconds)}"
+    dreamt = f"{format_steps(total.dreamt)} dreamt" if total.dreamt else ""
     return [
         *tiles,
-        tile("generations", f"{len(data.history):,}", passed),
-        tile("calls" if is_function_task(task) else "steps in reality", format_steps(total.steps), dreamt),
+        tile("generations", f"{len(run.history()):,}", passed),
+        tile("calls" if is_function_task(view.task.task) else "steps in reality", format_steps(total.steps), dreamt),
         tile("core-hours", f"{total.core_hours:.3g}", printable(run.classes.description)),
     ]
 
 
-def _about(run: RunFolder, settings: RunSettings) -> Facts:
-    task, world = settings.task.task, _world(run)
-    limit, horizon = run.episode_limit, settings.task.horizon
-    steps = f"{min(horizon, limit or horizon):,} steps{describe_limit(horizon, limit)}"
-    population = f"{plural(settings.population, 'candidate')}, {plural(settings.episodes, 'episode')} each"
+def _about(run: RunFolder, view: RunView) -> Facts:
+    settings, world = view.settings, _world(run)
     facts = [
-        ("task", ", ".join(filter(None, (task, describe_sign(settings.task.options))))),
-        *([("world", world)] if world != task else []),
+        ("task", view.about),
+        *([("world", world)] if world != view.task.task else []),
         ("begun", format_time(run.created)),
         *([("ended", format_time(run.ended_at))] if run.ended_at else []),
-        ("population", SUBMITTED if settings.is_external else population),
-        *([] if is_function_task(task) else [("horizon", steps)]),
-        ("optimiser", describe_optimiser(settings)),
+        ("population", view.population),
+        ("optimiser", view.optimiser),
         *([] if settings.is_external else [("first step size", f"{settings.sigma0:g}")]),
         ("seed", str(settings.seed)),
         *([] if run.checks is None else [("checks", run.checks.description)]),
@@ -223,20 +176,17 @@ def _about(run: RunFolder, settings: RunSettings) -> Facts:
     return [(name, printable(value)) for name, value in facts]
 
 
-def _outcome(run: RunFolder, data: RunData, total: Effort, word: str) -> Facts:
+def _outcome(run: RunFolder, view: RunView, total: Effort) -> Facts:
     """What it came to, in words that stand beside another run's."""
-    best, confirmed = (in_values(each, run.spec) for each in (best_evaluation(data.evaluations), data.confirmed))
-    failed = sum(each.failed for each in data.history)
+    history = run.history()
     facts = [
-        ("generations", f"{len(data.history):,}"),
-        ("failed candidates", f"{failed:,}"),
-        ("spent", total.describe(run.spec.task)),
+        ("generations", f"{len(history):,}"),
+        ("failed candidates", f"{count_failed(history):,}"),
+        ("spent", total.describe(view.task.task)),
         ("hosts", run.classes.description),
-        ("best evaluation", NONE if best is None else
-         f"{format_score(best)} on {count_episodes(best, word)}, generation {best.generation}"),
-        ("confirmed", NONE if confirmed is None else
-         f"{format_score(confirmed)} on {count_episodes(confirmed, f'fresh {word}')}"),
-    ]  # fmt: skip
+        ("best evaluation", view.describe(view.best)),
+        ("confirmed", view.describe(view.confirmed)),
+    ]
     return [(name, printable(value)) for name, value in facts]
 
 

@@ -12,6 +12,7 @@ from dreamfleet.coordinator.addons.dashboard.config import DashboardConfig
 
 SUMMARY = "serve a read-only web page about live runs and those on this disk"
 EXTRAS = ("dashboard",)
+FIRST = "--connect --join --port --host --runs-dir --run"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -12,8 +12,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import format_number
 from dreamfleet.common.protocol.measures import Axis, describe_measure
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.coordinator.views.plot import TITLE
-from dreamfleet.coordinator.views.shown_figure import ShownFigure
+from dreamfleet.coordinator.views.plot import TITLE, ShownFigure
 
 EMPTY = "#f2f2f2"  # of cells without an elite
 MOST_LABELS = 13  # of an axis

@@ -13,10 +13,9 @@ from dreamfleet.common.cli.command_line import SimpleVerb
 from dreamfleet.common.cli.config import add_flags, load
 from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
 from dreamfleet.common.cli.output import add_json_flag, print_rows
-from dreamfleet.common.client.eta import format_duration
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import is_file, read_regular
-from dreamfleet.common.printable import printable
+from dreamfleet.common.printable import format_duration, printable
 from dreamfleet.common.security.credentials import MAX_BYTES
 from dreamfleet.coordinator.addons.spawn.config import HOSTS, Host, SpawnConfig, check_unique, default_name, read_hosts
 from dreamfleet.coordinator.addons.spawn.parallel import bring_up, check, end
@@ -122,6 +121,7 @@ SPAWN = SimpleVerb(
     "install and start a worker on other hosts over ssh, each with its join file; it goes on when ssh ends",
     configure_spawn,
     start_workers,
+    FIRST="--hosts --name --connect --join --check --follow --slots --ssh --remote-python --json",
 )
 DOWN = SimpleVerb(
     "end the workers that spawn started, once they finish what they score, and remove them from their hosts",

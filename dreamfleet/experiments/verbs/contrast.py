@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 SUMMARY = "train kinds of MDN-RNNs on equal data, several seeds each, evolve in each one's dream, and compare them"
 EXTRAS = ("train",)
+FIRST = "--kind --seeds --mdnrnn-flags --run-flags --local --json"
 PACKAGES = ("gymnasium", "onnx", "onnxruntime", "safetensors", "torch")
 
 

@@ -16,6 +16,7 @@ from dreamfleet.experiments.demo import Demo, DemoConfig
 
 SUMMARY = "evolve a controller on this machine in minutes, judge it, plot it and record its drive"
 EXTRAS = ("worker", "views")
+FIRST = "--world --run --dream-minutes --minutes --population --episodes --tracks --seed --workers --page"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -34,6 +34,10 @@ SUMMARY = (
     "make world models and evolve in their dreams in turn; each world model learns from drives of the last evolution"
 )
 EXTRAS = ("train", "views")
+FIRST = (
+    "--init --rounds --task --preset --drives --own-drives --run-flags --seed --local --jobs --device --redo "
+    "--listen --json"
+)
 PACKAGES = ("gymnasium", "matplotlib", "onnx", "onnxruntime", "safetensors", "torch")
 VARYING = ("preset", "schedule", "bundle", "loaded_subspace")  # to the rounds' runs, of all settings
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 SUMMARY = "make a preset's world model: collect, train vae, encode, train mdnrnn, bundle; run again, it resumes"
 EXTRAS = ("train",)
+FIRST = "--preset --task --environment --scale --seed --jobs --device --out --vae-flags --mdnrnn-flags --json"
 RESERVED_FLAGS = (  # of the stages, which pipeline sets for each
     "--data", "--preset", "--seed", "--json", "--new", "--summary", "--from-run", "--out", "--extract",
 )  # fmt: skip

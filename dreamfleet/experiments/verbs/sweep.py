@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 
 SUMMARY = "evolve with several seeds and settings on one fleet, and compare the settings"
 EXTRAS: tuple[str, ...] = ()
+FIRST = (
+    "--run --vary --resume --parallel --workers --listen --connect --json --runs-dir --task --bundle --preset "
+    "--population --episodes --generations --minutes"
+)
 SETTINGS_OF_RUNS = ("beat", "evaluation_share", "failure_limit", "share", "strict")  # of `NetworkConfig`
 ENDPOINTS = ("listen", "connect")
 LEFT_OPEN = 130

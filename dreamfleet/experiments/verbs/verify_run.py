@@ -17,6 +17,7 @@ SUMMARY = (
     "re-run the run that a controller came from, by its provenance, and compare its reported controller bit by bit"
 )
 EXTRAS = ()
+FIRST = "--run --bundle --optimiser --listen --connect --runs-dir --json"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -1,18 +1,14 @@
-"""Estimates of a run's end, and descriptions of its state."""
+"""Estimates of a run's end. Tests run_view.py too."""
 
 import dataclasses
 import re
 
 import pytest
 
-from dreamfleet.common.client.eta import describe_state, estimate_eta, format_duration
-from dreamfleet.common.client.status import (
-    EpisodeProgress,
-    FailureStatus,
-    GenerationStatus,
-    Throughput,
-    WorkerCount,
-)
+from dreamfleet.common.client.eta import estimate_eta
+from dreamfleet.common.client.run_view import LiveRunView
+from dreamfleet.common.client.status import EpisodeProgress, FailureStatus, GenerationStatus, Throughput, WorkerCount
+from dreamfleet.common.printable import format_duration
 from tests.support.samples import BEST, CLOSED, STATUS
 
 WORKER = STATUS.worker_list[0]
@@ -30,7 +26,7 @@ def status(limits=(), seconds=0.0, gone=0.0, **changes):
 def test_a_limit_of_minutes():
     eta = estimate_eta(status({"minutes": 30.0}, seconds=18 * 60))
     assert eta.description == "18 of 30 minutes, 4.6 s a generation, about 12 min to go"
-    assert eta.bounds[0].share == pytest.approx(0.6)
+    assert eta.share == eta.limits[0].share == pytest.approx(0.6)
     assert eta.seconds == pytest.approx(12 * 60)
 
 
@@ -79,8 +75,8 @@ def test_steps_are_estimated_from_the_rate_of_closed_generations():
 
 def test_the_nearest_of_several_limits_is_first_and_counts():
     eta = estimate_eta(status({"generations": 1000, "minutes": 30.0}, seconds=18 * 60))
-    assert [each.name for each in eta.bounds] == ["minutes", "generations"]
-    assert eta.seconds == eta.bounds[0].seconds
+    assert [each.name for each in eta.limits] == ["minutes", "generations"]
+    assert eta.seconds == eta.limits[0].seconds
 
 
 def with_speed(status, candidates=None, evaluations=None):
@@ -90,15 +86,36 @@ def with_speed(status, candidates=None, evaluations=None):
     return dataclasses.replace(status, throughput=throughput)
 
 
-@pytest.mark.parametrize(("rate", "then"), [(None, "then 90 episodes of evaluation"), (0.5, "about 3 min to go")])
-def test_evaluations_and_confirmation_after_the_limit_count(rate, then):
-    ending = status({"minutes": 1.0}, seconds=66.0, gone=40.0, state="evaluating", ending=True, closing=90)
-    eta = estimate_eta(with_speed(ending, evaluations=rate))
-    assert eta.description == f"1.1 of 1 minute, 4.6 s a generation, {then}"
-    before = status({"minutes": 2.0}, seconds=60.0, closing=90)
+def rest(status, rate):
+    return [
+        (each.name, each.seconds, each.episodes) for each in estimate_eta(with_speed(status, evaluations=rate)).rest
+    ]
+
+
+@pytest.mark.parametrize("rate", [None, 0.5])
+def test_the_end_is_that_of_search_evaluation_and_confirmation(rate):
+    each = STATUS.settings.evaluation_episodes
+    before = status({"minutes": 2.0}, seconds=60.0, closing=90, evaluating=EpisodeProgress(0, 0))
+    judging = [
+        (name, rate and count / rate, count) for name, count in (("evaluation", each), ("confirmation", 90 - each))
+    ]
+    assert rest(before, rate) == [("search", 60.0, 0), *judging]
     eta = estimate_eta(with_speed(before, evaluations=rate))
-    assert (eta.limit, eta.seconds) == (60.0, None if rate is None else 240.0)
-    assert ("about 1 min to its limit, then 90" in eta.description) == (rate is None)
+    assert eta.seconds == (None if rate is None else 240.0)
+    assert eta.share == pytest.approx(0.5 if rate is None else 60 / 300)
+
+
+@pytest.mark.parametrize("rate", [None, 0.5])
+def test_once_its_limit_is_reached_a_run_is_not_at_its_end(rate):
+    ending = status(
+        {"minutes": 1.0}, seconds=66.0, gone=40.0, state="evaluating", ending=True, closing=90,
+        evaluating=EpisodeProgress(10, 16),
+    )  # fmt: skip
+    assert rest(ending, rate) == [(name, rate and count / rate, count)
+                                  for name, count in (("evaluation", 6), ("confirmation", 84))]  # fmt: skip
+    eta = estimate_eta(with_speed(ending, evaluations=rate))
+    assert eta.share == pytest.approx(10 / 100 if rate is None else (66 + 20) / (66 + 20 + 180))
+    assert "of 1 minute" not in eta.description
 
 
 def test_a_limit_that_an_evaluation_reached_is_over_too():
@@ -129,7 +146,7 @@ def test_a_target_score_has_no_estimate():
 
 
 def test_without_limits_or_generations_there_is_no_estimate():
-    assert estimate_eta(status(paces=())).bounds == ()
+    assert estimate_eta(status(paces=())).limits == ()
     assert estimate_eta(status({"generations": 9}, paces=())).seconds is None
 
 
@@ -143,7 +160,7 @@ def test_unknown_limits_are_ignored(strange):
     eta = estimate_eta(
         status(dict.fromkeys(("generations", "steps", "minutes", "target", "parted"), strange), seconds=1.0)
     )
-    assert eta.bounds == ()
+    assert eta.limits == ()
 
 
 @pytest.mark.parametrize(
@@ -170,7 +187,7 @@ def test_unknown_limits_are_ignored(strange):
     ],
 )
 def test_states_are_described(changes, named):
-    assert re.search(named, describe_state(status(**changes)))
+    assert re.search(named, LiveRunView.of_status(status(**changes)).state)
 
 
 @pytest.mark.parametrize(

@@ -36,8 +36,7 @@ def test_one_episode_has_no_error_wherever_it_is_read(found):
 
 
 def test_a_mean_without_an_error_is_printed_without_one():
-    assert format_with_error(1234.56, 7.89) == "1234.6 ± 7.9"
-    assert format_with_error(1234.56, 7890.1, sign=",") == "1,234.6 ± 7,890.1"
+    assert format_with_error(1234.56, 7890.1) == "1,234.6 ± 7,890.1"
     assert format_with_error(0.5, 0.25, 2, sign="+") == "+0.50 ± 0.25"
 
 

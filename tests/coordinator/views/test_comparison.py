@@ -120,5 +120,5 @@ def test_what_a_fork_inherited_is_named(runs):
         journal.execute("INSERT INTO run VALUES (?, ?)", (START_EFFORT, '{"driven": 5000, "microseconds": 9000000}'))
         journal.commit()
     _, fork = sides(runs, "dream", "reality")
-    assert re.search(r"\b5k .* 9 ", fork.spent)
+    assert re.search(r"\b5k .* 0\.0025 ", fork.spent)
     assert fork.total.steps > fork.inherited.steps == 5000

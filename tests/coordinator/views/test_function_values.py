@@ -77,7 +77,7 @@ def test_the_verbs_print_values_and_json_has_fitness(minimised, capsys):
     rows = {row["run"]: row for row in json.loads(capsys.readouterr().out)}
     assert rows["reality"]["mean"] == -1.0
     assert command_line.main(["runs", "show", "reality", *words]) == 0
-    assert "-1000" not in capsys.readouterr().out
+    assert "-1,000" not in capsys.readouterr().out
     assert command_line.main(["compare", "reality", "hidden", *words]) == 0
 
 
@@ -104,5 +104,5 @@ def test_the_panel_says_values():
     closed = [replace(STATUS.last, number=n, mean=-(10.0 ** (3 - n)), best=-0.5, worst=-2000.0) for n in range(4)]
     status = replace(STATUS, settings=settings, last=closed[-1], recent=tuple(closed))
     text = " ".join(" ".join(line.plain for line in panel_lines(status, 78)).split())
-    assert re.search(r"\b1\.0.*2000.*0\.5.*0.*3", text)
-    assert "-2000" not in text
+    assert re.search(r"\b1\.0.*2,000.*0\.5.*0.*3", text)
+    assert "-2,000" not in text

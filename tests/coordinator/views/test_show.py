@@ -1,4 +1,4 @@
-"""What `runs show` prints of a run's settings. Tests coordinator/verbs/runs.py."""
+"""What `runs show` prints of a run's settings. Tests coordinator/verbs/runs.py and run_details.py."""
 
 import json
 import re
@@ -9,7 +9,7 @@ from dataclasses import replace
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.client.equal_fitness import ENOUGH, EqualFitness
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.coordinator.verbs import runs as verb
+from dreamfleet.coordinator.views import run_details
 from dreamfleet.coordinator.views.plot import fitness_figure
 from tests.support.tables import cells
 
@@ -40,6 +40,6 @@ def test_a_limit_of_the_environment_below_the_horizon_is_said(runs, capsys):
 def test_generations_of_one_fitness_are_warned_of(runs, capsys, monkeypatch):
     assert "warning" not in show(capsys, runs, "reality")
     monkeypatch.setattr(
-        verb, "EqualFitness", lambda rows: EqualFitness([replace(rows[0], worst=rows[0].best)] * ENOUGH)
+        run_details, "EqualFitness", lambda rows: EqualFitness([replace(rows[0], worst=rows[0].best)] * ENOUGH)
     )
     assert "--sigma0" in show(capsys, runs, "reality")["warning"]

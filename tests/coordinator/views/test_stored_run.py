@@ -1,5 +1,4 @@
-"""A run in a user's program: tables as data frames, the picture of `runs plot`, its controller and world model.
-Tests shown_figure.py."""
+"""A run in a user's program: tables as data frames, the picture of `runs plot`, its controller and world model."""
 
 import re
 import shutil
@@ -66,23 +65,7 @@ def test_without_the_package_the_error_names_what_to_install(tmp_path, call, pac
 
 
 def test_it_plots_what_the_verb_plots(reality, tmp_path):
-    for words, kind in (
-        ((), "fitness"),
-        (
-            (
-                "--kind",
-                "fitness",
-            ),
-            "fitness",
-        ),
-        (
-            (
-                "--kind",
-                "learning",
-            ),
-            "learning",
-        ),
-    ):
+    for words, kind in (((), "fitness"), (("--kind", "learning"), "learning")):
         out = tmp_path / "verb.png"
         assert command_line.main(["runs", "plot", "reality", *words, "--runs-dir", str(RUNS), "--out", str(out)]) == 0
         reality.plot(kind).savefig(tmp_path / "own.png", dpi=120)
@@ -118,15 +101,6 @@ def test_a_fresh_notebook_shows_a_plot(kind, tmp_path):
 
 def test_the_names_of_tables_are_known_to_type_checkers():
     assert get_args(TableName) == (*TABLES, ELITES)
-
-
-def test_drawing_leaves_the_backend_of_a_notebook(tmp_path):
-    program = (
-        "import dreamfleet, matplotlib\nmatplotlib.use('svg')\n"
-        f"dreamfleet.open_run('reality', {str(RUNS)!r}).plot()\n"
-        "import sys\nassert matplotlib.get_backend() == 'svg' and 'matplotlib.pyplot' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", program], env=environment(tmp_path), check=True, timeout=DEADLINE)
 
 
 def test_its_controller_and_world_model_are_those_of_its_folder(reality, tmp_path):

@@ -262,7 +262,8 @@ class AnyOrder(RuleBasedStateMachine):
             if self.stops > 1:
                 assert is_over
             elif self.drains:
-                assert is_over == (not busy or self.now > self.drain_until)
+                is_alone = self.stops and not self.seen and self.now - self.alone > SEARCH_INTERVAL
+                assert is_over == bool(not busy or self.now > self.drain_until or is_alone)
             else:
                 given_up = not self.seen and self.now - self.alone > TIMEOUT
                 assert is_over == (given_up and not self.member.is_leaving(self.now))

@@ -113,6 +113,7 @@ TRAIN = SimpleVerb(
     configure_train,
     train_baseline,
     EXTRAS=("train",),
+    FIRST="--preset --device --new --episodes --steps --seed --set --json",
 )
 EXPORT = SimpleVerb(
     "write a trained baseline as one file, which `evaluate --controller` and `record` take without torch",

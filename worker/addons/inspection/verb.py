@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 SUMMARY = "look into a world model: what it sees, keeps and dreams, and how it learnt, as one page, or as figures"
 EXTRAS = ("worker", "views")
+FIRST = "--out --data --picture --controller --seed --steps --probe --losses --likeness --survival --episodes --json"
 SECTIONS = 12  # at most, and one more a data folder
 
 

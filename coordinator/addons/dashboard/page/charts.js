@@ -178,10 +178,10 @@ export const fitness = (element, curves) => {
       line(generation, low, "", "blue", edge),
       line(generation, high, "", "blue", { ...edge, fill: "tonexty", fillcolor: rgba("blue", 0.18) }),
       line(generation, best, "best candidate", "orange", { line: { color: colour("orange"), width: 1.3 } }),
-      line(generation, mean, "mean of candidates", "blue"),
+      line(generation, mean, "average of the candidates", "blue"),
     ];
     const keys = [
-      { kind: "line", ink: "blue", name: "mean of candidates" }, { kind: "band", ink: "blue", name: curves.band },
+      { kind: "line", ink: "blue", name: "average of the candidates" }, { kind: "band", ink: "blue", name: curves.band },
       { kind: "thin", ink: "orange", name: "best candidate" },
     ];
     if (evaluations.generation.length) {

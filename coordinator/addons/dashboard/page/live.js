@@ -9,7 +9,7 @@ const TONES = {
   ended: "done", "left open": "wait", "no coordinator": "wait",
 };
 const COLUMNS = [
-  ["state", "state"], ["slots", "slots"], ["rate", "steps/s"], ["leases", "leases"], ["finished", "finished"],
+  ["state", "state"], ["slots", "slots"], ["rate", "steps/s"], ["leases", "assigned"], ["finished", "finished"],
   ["load", "load"], ["heard", "last seen"], ["picture", "picture"],
 ];
 const MANY = 100; // workers from which on those out of sight are filled anew only every fifth time, which saves half the work
@@ -178,22 +178,13 @@ const fillPopulation = ({ candidates, evaluation }) => {
   });
   page.cells.setAttribute("aria-label", open ? `${finished} of ${total} candidates of generation ${generation} are scored` : "no generation is open");
   say(page.scale, known.length ? `${word} so far: ${score(low)} to ${score(high)}` : "");
-  fill(page.evaluation, evaluation, beside, (each, row) => {
-    say(each.firstChild, `${row.name}: ${row.done} of ${row.of}`);
-    setBar(each.lastChild, row.done / row.wanted, row.name);
-  });
+  fill(page.evaluation, evaluation, () => make("p"), say);
 };
 
 const shade = (share) =>
   share < 0.5
     ? `hsl(${214 - 48 * share} ${45 + 20 * share}% ${72 - 48 * share}%)`
     : `hsl(${190 - 100 * (share - 0.5)} ${55 + 10 * (share - 0.5)}% ${48 - 24 * (share - 0.5)}%)`;
-
-const beside = () => {
-  const whole = make("div", "", { class: "beside" });
-  whole.append(make("span"), bar());
-  return whole;
-};
 
 const fillWorkers = (frame) => {
   const { workers } = frame;

@@ -4,7 +4,7 @@ import * as charts from "./charts.js";
 import { ask, facts, fill, guarded, liveLink, make, number, open, runLink, say, score, tiles } from "./dom.js";
 
 const COLUMNS = [
-  ["run", "run"], ["created", "begun"], ["task", "task"], ["generations", "generations"], ["mean", "last mean"],
+  ["run", "run"], ["created", "begun"], ["task", "task"], ["generations", "generations"], ["mean", "last average"],
   ["best", "best evaluation"], ["confirmed", "confirmed"], ["state", "state"],
 ];
 const NUMBERS = new Set(["generations", "mean", "best", "confirmed"]);
@@ -154,8 +154,8 @@ const fillCurves = (page, { run, curves }) => {
 };
 
 const fillSettings = (page, settings) => {
-  const rows = settings.map(([name, value]) => {
-    const row = make("tr", "", { role: "row" }); // the roles that a grid would take from a table
+  const rows = settings.map(([name, value, differs]) => {
+    const row = make("tr", "", { role: "row", class: differs ? "differs" : "" }); // the roles that a grid would take from a table
     row.append(make("th", name, { scope: "row", role: "rowheader" }), make("td", value, { role: "cell" }));
     row.words = `${name} ${value}`.toLowerCase();
     return row;

@@ -153,15 +153,16 @@ const draw = ({ facts: named, jpeg }) => {
     return showText(NONE);
   }
   picture.src = `data:image/jpeg;base64,${jpeg}`;
+  const alt = `${page["view-whom"].selectedOptions[0].textContent}: ${(named.captions ?? []).join(", ")}; the figures follow`;
+  if (picture.alt !== alt) picture.alt = alt;
   if (picture.hidden) {
     picture.hidden = false;
-    picture.alt = `${page["view-whom"].selectedOptions[0].textContent}: what it sees, beside what the world model decodes and the dream that goes on; the figures follow`;
     showText("");
   }
 };
 
-const rows = ({ worker, kind, generation, candidate, seed, step, score }) => {
-  const found = [["worker", worker], ["drive of", worker ? (KINDS[kind] ?? kind) : "a mean, here"],
+const rows = ({ worker, kind, generation, candidate, seed, step, score, captions = [] }) => {
+  const found = [["shown", captions.join(", ") || null], ["worker", worker], ["drive of", worker ? (KINDS[kind] ?? kind) : "a mean, here"],
     ["generation", generation], ["candidate", kind === "score" ? candidate : null], [kind === "score" ? "seed" : word, seed], ["step", step],
     ["score so far", score?.toFixed(1).replace(/^-0\.0$/, "0.0")], ["speed", speed(worker, step)]];
   return found.filter(([, value]) => value !== null && value !== undefined).map(([name, value]) => [name, String(value)]);

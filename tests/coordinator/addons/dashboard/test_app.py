@@ -112,7 +112,7 @@ def test_a_run_is_its_curves_facts_and_settings(runs):
     assert curves["core_hours"] == sorted(curves["core_hours"])
     assert len(curves["evaluations"]["steps"]) == len(curves["evaluations"]["generation"]) > 0
     assert curves["dreamt"]
-    assert ["task.task", "dream"] in document["settings"]
+    assert ["task", "dream", True] in document["settings"]
     assert "spent" in dict(document["outcome"])
     assert document["tiles"][0]["name"] == "score"
 
