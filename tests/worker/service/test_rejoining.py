@@ -143,7 +143,7 @@ def test_it_follows_its_run_to_another_name_with_its_results(stage, said, cached
     hand.leave()
     again = stage.also(hand, tasks.SLOW_TOY, run="test-rescued")
     again.nonce, again.incarnation = SECOND, 2
-    wait_for(said, "run test continues under the name test-rescued")
+    wait_for(said, "test-rescued")
     again.hello()
     assert again.results(done, running) == {done.digest, running.digest}
     again.next(Heartbeat)  # it listens under this name
@@ -157,19 +157,18 @@ def test_it_stays_with_its_name_where_the_run_is_refused_under_another(stage, sa
     stage.worker()
     hand.ready()
     hand.leave()
-    stage.also(hand, run="other").refusal = ("no", "none")
-    wait_for(said, "run of another name")
+    stage.also(hand, run="other").refusal = ("your moon is full", "wait")
+    wait_for(said, "moon")
     stage.also(hand).ready()
 
 
-def test_another_run_of_the_same_name_is_joined_anew(stage, said, cached):
+def test_another_run_of_the_same_name_is_joined_anew(stage, cached):
     hand = stage.hand()
     _, served = stage.worker()
     hand.ready()
     hand.vanish()
     hand.nonce, hand.run_uid = SECOND, "f" * 32
     hand.appear()
-    wait_for(said, "is another run now")
     assert hand.beat(lambda beat: beat.run_uid == "f" * 32).slots == 1
     assert not served.done()
 

@@ -27,7 +27,7 @@ from dreamfleet.worker.service.slot import (
 )
 from tests.support import tasks
 from tests.support.bundles import write_random_bundle
-from tests.support.processes import DEADLINE, environment
+from tests.support.processes import DEADLINE, environment, started
 from tests.support.samples import VECTOR, job
 from tests.support.slot_harness import Harness, hash_of
 
@@ -98,7 +98,7 @@ def test_a_child_that_lives_but_closed_its_pipe_is_replaced(harness):
     slot = harness(tasks.SILENT)
     slot.wait_ready()
     pid = slot.slot.pid
-    assert slot.score().error == crash("it closed its pipe and ran on")
+    assert slot.score().error.kind == "crash"
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
 
@@ -176,7 +176,7 @@ def test_a_hung_job_is_killed_and_its_child_replaced(harness):
     assert slot.slot.running
     slot.slot.check(now + 9.5, 0.0)
     result = slot.result()
-    assert (result.fitness, result.error) == (None, crash("no step for 5 s"))
+    assert (result.fitness, result.error.kind) == (None, "crash")
     slot.wait_ready()
 
 
@@ -233,7 +233,7 @@ def test_a_slot_retries_without_descriptors_and_then_names_the_cause(harness, ra
         slot.slot.handle(slot.gone())
         for _ in range(STARVED_STARTS - 2):
             slot.pass_time()
-        with pytest.raises(DreamfleetError, match=r"cannot start: .*Too many open files; .*--slots"):
+        with pytest.raises(DreamfleetError, match="--slots"):
             slot.pass_time()
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
@@ -353,7 +353,7 @@ def test_a_child_dies_with_its_worker(random_bundle, tmp_path):
         "    events.get()\n"
     )
     command = [sys.executable, script, random_bundle.path]
-    with subprocess.Popen(command, env=environment(tmp_path), stdout=subprocess.PIPE, text=True) as parent:
+    with started(command, env=environment(tmp_path), stdout=subprocess.PIPE, text=True) as parent:
         pid, ready = parent.stdout.readline().split()
         assert ready == "True"
         child = os.pidfd_open(int(pid))

@@ -126,7 +126,7 @@ def test_the_end_of_an_episode_is_shown_for_a_second(monkeypatch):
     shown = [each.facts for each in takewhile(lambda each: each.facts["seed"] == SEED, pictures)]
     last = shown[-1]
     assert [each for each in shown if each["step"] == last["step"]] == [last] * 10
-    assert (last["score"], ends) == (last["step"], [f"ended after {last['step']} steps"])
+    assert (last["score"], len(ends), str(last["step"]) in ends[0]) == (last["step"], 1, True)
 
 
 PICTURES = [CaptionedFrame(np.full((40, 60, 3), value, np.uint8), {"step": value}) for value in (10, 200, 90)]
@@ -174,5 +174,5 @@ def test_unwritable_outputs_are_refused(tmp_path):
     for name in ("live.webm", "file", "file/stills", "file/live.mp4"):
         with pytest.raises(DreamfleetError, match="--out"), open_sink(str(tmp_path / name), 10, io.BytesIO()):
             pass
-    with pytest.raises(UsageError, match=r"name an \.mp4"), open_sink(str(tmp_path / "live.webm"), 10, io.BytesIO()):
+    with pytest.raises(UsageError, match=r"live\.webm"), open_sink(str(tmp_path / "live.webm"), 10, io.BytesIO()):
         pass

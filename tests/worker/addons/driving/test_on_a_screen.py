@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from dreamfleet.worker.worlds.car_racing.native_check import make_car_racing
-from tests.support.processes import DEADLINE, environment
+from tests.support.processes import DEADLINE, environment, started
 
 SEED, STEPS = 20_003, 60
 pytestmark = pytest.mark.needs_programs("Xvfb", "xdotool")
@@ -20,12 +20,11 @@ def screen():
     """The number of a virtual X screen."""
     read, write = os.pipe()
     command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x1024x24", "-nolisten", "tcp"]
-    with subprocess.Popen(command, pass_fds=[write], stderr=subprocess.DEVNULL) as server:
+    with started(command, pass_fds=[write], stderr=subprocess.DEVNULL):
         os.close(write)
         with os.fdopen(read) as pipe:
             number = pipe.readline().strip()
         yield f":{number}"
-        server.terminate()
 
 
 def standing_still():
@@ -44,14 +43,11 @@ def test_a_person_drives_and_quits(screen, tmp_path):
         subprocess.run(["xdotool", *arguments], env=seen, check=True, timeout=DEADLINE, stdout=subprocess.DEVNULL)
 
     command = [sys.executable, "-m", "dreamfleet", "drive", "--seed", str(SEED), "--steps", str(STEPS)]
-    with subprocess.Popen([*command, "--scale", "0.3"], env=seen, stdout=subprocess.PIPE, text=True) as driving:
-        try:
-            hand("search", "--sync", "--onlyvisible", "--class", ".", "windowfocus", "--sync", "keydown", "Up")
-            said = driving.stdout.readline()  # printed at the episode's end
-            hand("keyup", "Up", "key", "q")
-            assert driving.wait(DEADLINE) == 0
-        finally:
-            driving.kill()
-    score, steps = re.search(r"score (\S+) in (\d+) steps, seed 20003", said).groups()
+    with started([*command, "--scale", "0.3"], env=seen, stdout=subprocess.PIPE, text=True) as driving:
+        hand("search", "--sync", "--onlyvisible", "--class", ".", "windowfocus", "--sync", "keydown", "Up")
+        said = driving.stdout.readline()  # printed at the episode's end
+        hand("keyup", "Up", "key", "q")
+        assert driving.wait(DEADLINE) == 0
+    score, steps = re.search(rf"(-?[\d.]+)\D* (\d+)\D* {SEED}", said).groups()
     assert int(steps) == STEPS
     assert float(score) > standing_still() + 5, "the car did not move"

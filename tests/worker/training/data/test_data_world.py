@@ -191,16 +191,16 @@ def test_a_mirrored_drive_has_its_worlds_mirrored_actions_and_no_action_is_widen
     assert batch[0, 0].tolist() == [0, 0, 1]
     assert batch[1, 0].tolist() == [0.5, 0.5, -0.5]
     narrow = encoded_drive(tmp_path, 2, write_drive(tmp_path, 2, actions=1))
-    with pytest.raises(UsageError, match=r"3 columns does not fit actions of shape \(12, 1\)"):
+    with pytest.raises(UsageError, match=r"\(12, 1\)"):
         load_rollouts([narrow], np.array([True]))
     for paths in ([car, narrow], [narrow, car]):
-        with pytest.raises(DatasetError, match=r"steps of shapes \(1,\) and \(3,\) are not of one world"):
+        with pytest.raises(DatasetError, match=r"\(1,\).*\(3,\)"):
             load_rollouts(paths)
-    with pytest.raises(DatasetError, match="not of one world"):
+    with pytest.raises(DatasetError):
         pad([left, left[:, :1]])
     still = encoded_drive(tmp_path, 3, write_drive(tmp_path, 3, world=GYM._replace(options='{"skip": 2}')))
     load_rollouts([still])
-    with pytest.raises(DatasetError, match=r"has no mirrored drive: gym:.* with {\"skip\": 2} has no mirror"):
+    with pytest.raises(DatasetError, match=r'gym:.*{"skip": 2}'):
         load_rollouts([still], np.array([True]))
 
 
@@ -208,15 +208,15 @@ def test_two_worlds_never_mix(tmp_path):
     data, run = tmp_path / "data", tmp_path / "run"
     car = write_drive(data, 0)
     dodge, skipped = write_drive(run, 0, world=TASK), write_drive(run, 1, world=GYM)
-    with pytest.raises(DatasetError, match=rf"000000\.npz is of car-racing, and the data are of {DODGE_TASK}"):
+    with pytest.raises(DatasetError, match=rf"000000\.npz.*car-racing.*{DODGE_TASK}"):
         list(collect(data, PLAIN, 1, world=TASK))
     for folder, drives in ((data, [dodge]), (tmp_path / "new", [dodge, skipped])):
-        with pytest.raises(DatasetError, match=r"has one world, and these are of .* \(.*\) and of .*npz\)"):
+        with pytest.raises(DatasetError):
             list(import_rollouts(folder, drives))
-    with pytest.raises(DatasetError, match=rf"is of {DODGE_TASK}, and the data are of car-racing"):
+    with pytest.raises(DatasetError, match=rf"{DODGE_TASK}.*car-racing"):
         check_pictures([car, dodge], 64)
     store_preset(tmp_path / "begun", "pixels", 0, GYM)
-    with pytest.raises(DatasetError, match=r"of gym:.*Dodge-v0 \(.*begun\) and of car-racing"):
+    with pytest.raises(DatasetError, match=r"gym:.*Dodge-v0.*car-racing"):
         list(import_rollouts(tmp_path / "begun", [car]))
     assert list(import_rollouts(tmp_path / "new", [dodge])) == [12]
     assert world_of_folder(tmp_path / "new") == TASK
@@ -234,19 +234,19 @@ def test_a_data_set_keeps_the_world_that_it_was_begun_in(tmp_path):
         assert load_pictures(path).shape[1:] == (96, 96, 3)
         assert load_steps(path)["reward"].tolist() == [2, 2, 2][: len(load_steps(path)["reward"])]
     for other in (("--task", "car-racing"), ("--task", "gym:CartPole-v1"), ("--skip", "3")):
-        with pytest.raises(UsageError, match=r"holds data of gym:CartPole-v1 with {.*}, and this is .*: a data"):
+        with pytest.raises(UsageError, match="gym:CartPole-v1"):
             call(*words, *other)
-    with pytest.raises(UsageError, match="omit --task and its flags"):
+    with pytest.raises(UsageError, match="--task"):
         call(*words, "--from-run", "night", "--task", "car-racing")
 
 
 @pytest.mark.parametrize(
     ("task", "arguments", "error"),
     [
-        (None, {"skip": 2}, "task car-racing has no options: omit --skip"),
-        (DODGE_TASK, {"size": 96, "crop": "0:9,0:9"}, "has no options: omit --size, --crop"),
-        ("takecover", {"size": 96}, "knows no option size"),
-        ("gym:CartPole-v1", {"crop": "half"}, "a crop is top:bottom,left:right"),
+        (None, {"skip": 2}, "--skip"),
+        (DODGE_TASK, {"size": 96, "crop": "0:9,0:9"}, "--size, --crop"),
+        ("takecover", {"size": 96}, "size"),
+        ("gym:CartPole-v1", {"crop": "half"}, "half"),
         ("ghost", {}, "ghost"),
     ],
 )
@@ -265,16 +265,16 @@ def test_a_preset_is_of_the_data_sets_world(tmp_path):
     store_preset(tmp_path, "pixels", 3, CART)
     assert (world_of_folder(tmp_path), load_preset(tmp_path)) == (CART, "pixels")
     assert resolve_preset(tmp_path, None) == resolve_preset(tmp_path, "pixels") == "pixels"
-    with pytest.raises(UsageError, match="begun with the preset pixels, and --preset tiny is another"):
+    with pytest.raises(UsageError, match=r"pixels.*--preset tiny"):
         resolve_preset(tmp_path, "tiny")
     new = tmp_path / "new"
     assert resolve_preset(new, None, TASK) == "pixels"
     assert resolve_preset(new, None, DataWorld("takecover")) == "takecover"
     for preset, world, own in (("tiny", TASK, "car-racing"), ("takecover", OF_FIRST_WORLD, "takecover")):
-        with pytest.raises(UsageError, match=f"preset {preset} is of {own}, and the data are of {world}: give"):
+        with pytest.raises(UsageError, match=rf"{preset}.*{own}.*{world}"):
             resolve_preset(new, preset, world)
     (tmp_path / "preset.json").write_text('{"preset": "pixels", "task": 5}')
-    with pytest.raises(DatasetError, match="names no preset"):
+    with pytest.raises(DatasetError):
         world_of_folder(tmp_path)
 
 
@@ -286,22 +286,22 @@ def test_a_refused_command_begins_no_data_set(tmp_path, flags):
 
 
 @pytest.mark.parametrize(
-    ("config", "error"),
+    ("config", "named"),
     [
-        (CollectConfig(driver="ghost", anywhere=0.0), "--driver must be one of random, held, uniform, not 'ghost'"),
-        (CollectConfig(anywhere=0.5), "begin at no random place: give --anywhere 0"),
-        (CollectConfig(picture=96, anywhere=0.0), "pictures are 64 pixels wide, not 96: give --picture 64"),
+        (CollectConfig(driver="ghost", anywhere=0.0), "random, held, uniform.*'ghost'"),
+        (CollectConfig(anywhere=0.5), "--anywhere 0"),
+        (CollectConfig(picture=96, anywhere=0.0), "--picture 64"),
     ],
 )
-def test_what_a_world_lacks_is_refused_before_any_drive(tmp_path, config, error):
-    with pytest.raises(UsageError, match=error):
+def test_what_a_world_lacks_is_refused_before_any_drive(tmp_path, config, named):
+    with pytest.raises(UsageError, match=named):
         list(collect(tmp_path, config, 1, world=TASK))
     assert not (tmp_path / "episodes").exists()
 
 
 def test_a_controller_of_another_world_drives_for_no_data_set(tmp_path):
     pilot = Pilot(find_controller("tiny", tmp_path)[0], find_bundle("tiny"))
-    with pytest.raises(ControllerError, match=rf"of car-racing, and the data set holds 'box-64' of {DODGE_TASK}"):
+    with pytest.raises(ControllerError, match=rf"car-racing.*'box-64'.*{DODGE_TASK}"):
         list(collect(tmp_path, PLAIN, 1, (pilot,), TASK))
 
 
