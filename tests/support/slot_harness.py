@@ -1,6 +1,8 @@
 """A slot with a real child, and the events that it sends."""
 
+import os
 import queue
+import signal
 from contextlib import suppress
 from functools import cache
 from time import monotonic
@@ -68,6 +70,16 @@ class Harness:
             event = self.events.get(timeout=DEADLINE)[1]
             if results := self.slot.handle(event):
                 return results[0], event.upload
+
+    def submit(self, *numbers, kind="score"):
+        """Groups of one job each."""
+        for number in numbers:
+            self.slot.submit([(job(number, kind, spec=self.spec), VECTOR)])
+
+    def lose(self):
+        """Kill the child, and handle that it is gone."""
+        os.kill(self.slot.pid, signal.SIGKILL)
+        self.slot.handle(self.gone())
 
     def gone(self):
         """The event that the child is gone, not handled yet."""

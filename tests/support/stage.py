@@ -38,6 +38,13 @@ class Stage:
         self.workers.append((made, self._threads.submit(made.serve)))
         return self.workers[-1]
 
+    def served(self, task=tasks.TOY, **config):
+        """A coordinator, its worker that can score, and the future of the worker's `serve`."""
+        hand = self.hand(task)
+        made, served = self.worker(**config)
+        hand.ready()
+        return hand, made, served
+
     def close(self):
         for made, served in self.workers:
             made.stop()

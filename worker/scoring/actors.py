@@ -12,7 +12,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.worker.tasks.api import Policy
-from dreamfleet.worker.tasks.policy import ALL_DRIVERS, DriverPolicy
+from dreamfleet.worker.tasks.policy import ALL_DRIVERS, NO_PARAMETERS, DriverPolicy
 from dreamfleet.worker.tasks.recordable import RecordableTask, TaskWithPolicies
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.worldmodel.inference import Controllers
@@ -53,7 +53,7 @@ class DriverActor:
 
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
-        policy.begin(np.zeros(0, dtype=np.float32))
+        policy.begin(NO_PARAMETERS)
 
     def choose(self, seen: Any) -> Floats:
         """The policy's next action `(1, actions)`."""

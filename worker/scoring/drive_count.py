@@ -15,13 +15,6 @@ class DriveCount:
 
     That depends on the processor and its caches, on the world and on the other slots. No score depends on it. The
     largest number that there is work for is tried, then the powers of two below it.
-
-    >>> count = DriveCount()
-    >>> count.most = 4
-    >>> for drives, seconds in [(4, 1.6), (2, 0.7), (1, 0.4)] * ENOUGH:
-    ...     count.add(drives, steps=1000 * drives, seconds=seconds)
-    >>> count.best
-    2
     """
 
     def __init__(self) -> None:

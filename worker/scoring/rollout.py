@@ -13,12 +13,7 @@ from dreamfleet.common.artifacts.driving import FIRST_WORLD
 
 
 class DataWorld(NamedTuple):
-    """The world of data: a task's name, and the options under which it was recorded.
-
-    >>> world = DataWorld("gym:CartPole-v1", '{"observation": "render"}')
-    >>> DataWorld.parse(world.text) == world, DataWorld.parse("")
-    (True, DataWorld(task='car-racing', options=''))
-    """
+    """The world of data: a task's name, and the options under which it was recorded."""
 
     task: str = FIRST_WORLD
     options: str = ""  # as the task's `parse_options` writes them

@@ -18,7 +18,6 @@ from dreamfleet.common.protocol.result_bounds import LONGEST_EPISODE, clamp_coun
 from dreamfleet.worker.service.failure_log import ScoringFailure
 
 if TYPE_CHECKING:  # the child imports this module before it imports what scores
-    from dreamfleet.worker.scoring.rollout import Rollout
     from dreamfleet.worker.scoring.scorer import Scorer
     from dreamfleet.worker.tasks.api import Score
 
@@ -125,7 +124,10 @@ def _score(
     if episodes[0][0] == "collect":
         _, vector, seed = episodes[0]
         score, drive = scorer.collect(vector, seed, on_step, spec)
-        return [score], _to_upload(drive)
+        if len(data := drive.to_bytes()) > MAX_UPLOAD:
+            steps = plural(len(drive), "step")
+            raise ValueError(f"a rollout of {steps} is larger than {MAX_UPLOAD >> 20} MiB: shorten the horizon")
+        return [score], data
     return scorer.score_all(episodes, on_step, spec), None
 
 
@@ -154,12 +156,3 @@ def _result(job: Job, score: Score, spent: float, sha256: bytes | None, horizon:
     if why is None:
         return Result(job.digest, fitness, steps, spent, None, sha256, tuple(map(float, score.measures)))
     return Result(job.digest, None, clamp_count(steps), spent, why, None)
-
-
-def _to_upload(drive: Rollout) -> bytes:
-    data = drive.to_bytes()
-    if len(data) > MAX_UPLOAD:
-        raise ValueError(
-            f"a rollout of {plural(len(drive), 'step')} is larger than {MAX_UPLOAD >> 20} MiB: shorten the horizon"
-        )
-    return data

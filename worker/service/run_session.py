@@ -117,11 +117,16 @@ class RunSession:
             # R21: after a suspension the gap is added to the slots' deadlines, so that no child counts as hanging.
             self._slots.check(now, gap=now - before if now - before > CLOCK_GAP else 0.0)
             if self._membership.start_draining_if_due(now):
-                self._return_unstarted_jobs()
+                # R24: the next heartbeat does not list unstarted jobs, so the coordinator gives them away at once.
+                self._backlog.clear()
+                self._slots.abandon_waiting()
                 log.info("draining for at most %g s, a second signal leaves at once: running episodes finish, queued "
                          "jobs go back", self._membership.conditions.drain_timeout,
                          extra={"facts": {"event": "draining"}})  # fmt: skip
-            self._fill_slots(now)
+            if self._membership.is_leaving(now):
+                self._slots.yield_idle_slots()
+            else:
+                self._slots.fill(self._backlog, undelivered=len(self._outbox))
             self._send(now)
             if self._membership.must_rejoin(now, self._load()):
                 self._rejoin(now)
@@ -162,9 +167,6 @@ class RunSession:
         R7: an error in a coordinator's message costs only that message, which is repeated, and never ends the worker.
         An error in a slot's event does end it, for example when no slot can start.
         """
-        if kind == "slot" and isinstance(event.message, SampledFrame):
-            self._publish_frame(event, event.message)
-            return
         if kind == "slot":
             self._handle_slot_event(event)
             return
@@ -244,8 +246,12 @@ class RunSession:
             self._backlog.clear()
 
     def _handle_slot_event(self, event: SlotEvent) -> None:
-        now = monotonic()
-        self._membership.note_activity(now)
+        if isinstance(event.message, SampledFrame):  # the coordinator owes it no answer: its silence is not restarted
+            work = self._slots.find_job(event.slot, event.child_number, event.message)
+            if work is not None:
+                self._frame_publisher.show(self._admission, event.slot, work, event.message)
+            return
+        self._membership.note_activity(monotonic())
         ready = self._slots.ready_count
         results = self._slots.handle(event)
         if self._slots.ready_count > ready:
@@ -256,26 +262,6 @@ class RunSession:
             self._outbox.add(result)
         if results and event.upload is not None:
             self._uploads.add(results[0].digest, event.upload)
-
-    def _publish_frame(self, event: SlotEvent, frame: SampledFrame) -> None:
-        """Publish a frame. The coordinator owes no answer to it, so its silence is not restarted."""
-        work = self._slots.find_job(event.slot, event.child_number, frame)
-        if work is not None:
-            self._frame_publisher.show(self._admission, event.slot, work, frame)
-
-    def _fill_slots(self, now: float) -> None:
-        if self._membership.is_leaving(now):
-            self._slots.yield_idle_slots()
-        else:
-            self._slots.fill(self._backlog, undelivered=len(self._outbox))
-
-    def _return_unstarted_jobs(self) -> None:
-        """Give up the jobs that no slot has started.
-
-        R24: the next heartbeat does not list them, so the coordinator gives them to another worker at once.
-        """
-        self._backlog.clear()
-        self._slots.abandon_waiting()
 
     def _send(self, now: float) -> None:
         """Send what is due.

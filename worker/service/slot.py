@@ -282,7 +282,11 @@ class Slot:
             return ()
         if running:
             self._groups.popleft()
-        self._start_after_pause()
+        self._useless_children += 1
+        if self._useless_children < 2:
+            self.start()
+        else:
+            self._clear_child(min(2.0 ** (self._useless_children - 3), MAX_START_DELAY))
         return tuple(Result(job.digest, None, steps // len(running), 0.0, failure, None) for job in running)
 
     def _count_failed_start(self, reason: str) -> None:
@@ -302,14 +306,6 @@ class Slot:
         if self._starved_starts >= FAILED_STARTS:
             self._groups.clear()
         self._clear_child(min(START_RETRY_DELAY * 2.0 ** (self._starved_starts - 1), MAX_STARVED_DELAY))
-
-    def _start_after_pause(self) -> None:
-        """Start a child: at once after the first useless one in a row, then after growing pauses."""
-        self._useless_children += 1
-        if self._useless_children < 2:
-            self.start()
-        else:
-            self._clear_child(min(2.0 ** (self._useless_children - 3), MAX_START_DELAY))
 
     def _clear_child(self, pause: float) -> None:
         self.ready = self._groups_are_short = False

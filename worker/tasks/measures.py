@@ -1,15 +1,7 @@
 """Measures of an episode beside its fitness: its length, what the controller did, and what the world reported.
 
-| name | meaning |
-|---|---|
-| `steps` | steps of the episode |
-| `ACTION` | mean of an action's component over the steps; of a numbered action the share of steps that took it |
-| `ACTION.abs` | mean of its magnitude |
-| `ACTION.share` | share of the steps in which it was above 0 |
-| `info.KEY` | a number in the `info` of the last step |
-| `truth.KEY` | mean over the steps of a number of the task's true state, such as a speed |
-
-The first four are there in a dream too. Components have the names of the world's actions, else action0, action1, ...
+docs/how-to/quality-diversity.md lists them. Components of actions have the names of the world's actions, else action0,
+action1, ...; of a numbered action the measure is the share of steps that took it.
 """
 
 from __future__ import annotations

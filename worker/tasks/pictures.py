@@ -36,11 +36,7 @@ KINDS = (
 
 
 def parse_crop(text: str) -> Crop | None:
-    """The crop of `top:bottom,left:right`; `None` if the text is none.
-
-    >>> parse_crop("0:400,0:640"), parse_crop("0:400")
-    ((0, 400, 0, 640), None)
-    """
+    """The crop of `top:bottom,left:right`; `None` if the text is none."""
     if (found := _CROP.fullmatch(text)) is None:
         return None
     top, bottom, left, right = map(int, found.groups())
@@ -48,11 +44,7 @@ def parse_crop(text: str) -> Crop | None:
 
 
 def is_crop(crop: Crop, height: int, width: int) -> bool:
-    """Whether a crop is a part of a picture of this size that is large enough to be seen: of 8 pixels a side.
-
-    >>> is_crop((0, 8, 0, 8), 8, 8), is_crop((0, 7, 0, 8), 8, 8), is_crop((4, 12, 0, 8), 8, 8)
-    (True, False, False)
-    """
+    """Whether a crop is a part of a picture of this size that is large enough to be seen: of 8 pixels a side."""
     top, bottom, left, right = crop
     return 0 <= top <= bottom - SHORTEST <= height - SHORTEST and 0 <= left <= right - SHORTEST <= width - SHORTEST
 
@@ -81,11 +73,6 @@ def is_picture(space: Any) -> bool:
     """Whether a space holds pictures that `cut_and_resize` takes: uint8 up to 255, or floats from 0 to 1.
 
     Whole numbers that stay below half of that are codes, such as those of a board.
-
-    >>> is_picture(spaces.Box(0, 255, (48, 40), np.uint8)), is_picture(spaces.Box(0, 255, (48,), np.uint8))
-    (True, False)
-    >>> is_picture(spaces.Box(0, 9, (24, 18), np.uint8))
-    False
     """
     if not isinstance(space, spaces.Box) or not find_axes(space.shape):
         return False
@@ -94,18 +81,10 @@ def is_picture(space: Any) -> bool:
     return np.issubdtype(space.dtype, np.floating) and bool((space.low >= 0).all() and (space.high <= 1).all())
 
 
-def is_stack(space: Any) -> bool:
-    """Whether a space holds pictures of several frames."""
-    return is_picture(space) and "N" in find_axes(space.shape)
-
-
 def to_pixels(picture: NDArray[Any]) -> Pixels:
     """The picture as uint8 `(H, W, 3)`; grey ones `(H, W)` or `(H, W, 1)` are repeated, floats are of 0 to 1.
 
     Opacity is left out. `ValueError` for floats beyond 0 to 1, or NaN.
-
-    >>> to_pixels(np.full((1, 2), 0.5)).tolist()
-    [[[128, 128, 128], [128, 128, 128]]]
     """
     if picture.dtype != np.uint8:
         levels = np.rint(picture * 255)
@@ -123,9 +102,6 @@ def drawn_pixels(drawn: Any) -> Pixels | None:
 
     Any numbers are taken: floats up to 1 are scaled to 255, others are cut at 0 and 255. Of several pictures the last
     counts.
-
-    >>> drawn_pixels(np.ones((1, 1, 4))).tolist(), drawn_pixels("a map")
-    ([[[255, 255, 255]]], None)
     """
     if isinstance(drawn, (list, tuple)) and drawn and isinstance(drawn[-1], np.ndarray):
         drawn = drawn[-1]
@@ -173,9 +149,6 @@ def box_resize(picture: Pixels, size: int) -> Pixels:
     """A picture `(H, W, C)` as `(size, size, C)`, larger or smaller; the same bits on every host.
 
     A new pixel is the mean of the area that it covers, rounded to the nearest integer, halves up.
-
-    >>> box_resize(np.array([[[0], [100], [200]]], np.uint8), 2)[0].ravel().tolist()
-    [33, 167]
     """
     height, width, channels = picture.shape
     area = height * width

@@ -23,11 +23,11 @@ def counting(most):
 
 @pytest.mark.parametrize(
     ("costs", "best"),
-    [({4: 3, 2: 4, 1: 5}, 4), ({4: 5, 2: 3, 1: 4}, 2), ({4: 5, 2: 5, 1: 4}, 1)],
+    [({4: 3, 2: 4, 1: 5}, 4), ({4: 5, 2: 3, 1: 4}, 2), ({4: 5, 2: 5, 1: 4}, 1), ({6: 1, 4: 2, 2: 3, 1: 4}, 6)],
 )
 def test_the_number_whose_steps_take_least_time_is_found_and_kept(costs, best):
-    count = counting(4)
-    assert drive(count, costs, 3 * ENOUGH) == [4] * ENOUGH + [2] * ENOUGH + [1] * ENOUGH
+    count = counting(max(costs))
+    assert drive(count, costs, len(costs) * ENOUGH) == [number for number in costs for _ in range(ENOUGH)]
     assert drive(count, costs, MEASURE_AGAIN // 2) == [best] * (MEASURE_AGAIN // 2)
 
 
@@ -61,9 +61,3 @@ def test_a_slot_that_drives_one_by_one_goes_on_so():
     count = DriveCount()
     assert drive(count, {1: 3}, 100) == [1] * 100
     assert count.best == count.most == 1
-
-
-def test_a_number_that_is_no_power_of_two_is_tried_too():
-    count = counting(6)
-    assert drive(count, {6: 1, 4: 2, 2: 3, 1: 4}, 4 * ENOUGH)[::ENOUGH] == [6, 4, 2, 1]
-    assert count.best == 6

@@ -91,12 +91,6 @@ def test_jobs_taken_together_have_one_stage():
     assert [[each.episode for each, _ in backlog.take(5)] for _ in range(5)] == [[0, 1], [2, 3], [4], [5], []]
 
 
-def test_a_damaged_vector_is_never_scored():
-    backlog = Backlog(SPEC)
-    backlog.add_batch(batch(1, (job(0),), (replace(WHOLE, data=VECTOR[::-1]),)))
-    assert not backlog.take(1)
-
-
 def test_the_oldest_vectors_that_no_job_needs_are_dropped():
     backlog = Backlog(SPEC)
     for number in range(1, 500):

@@ -13,9 +13,7 @@ from tests.support.stage import drained, wait_for
 
 
 def test_a_result_is_repeated_until_its_verdict(stage, cached):
-    hand = stage.hand()
-    stage.worker()
-    hand.ready()
+    hand, *_ = stage.served()
     first, second = hand.job(0), hand.job(1)
     hand.send(1, first)
     results = [hand.result(first) for _ in range(3)]
@@ -29,9 +27,7 @@ def test_a_result_is_repeated_until_its_verdict(stage, cached):
 
 
 def test_foreign_and_malformed_messages_are_dropped_and_counted(stage, cached):
-    hand = stage.hand()
-    made, _ = stage.worker()
-    hand.ready()
+    hand, made, _ = stage.served()
     foreign, mine = hand.job(0), hand.job(1)
     hand.send(1, foreign, nonce=SECOND)
     hand.send(1, foreign, run_uid="f" * 32)
@@ -43,18 +39,14 @@ def test_foreign_and_malformed_messages_are_dropped_and_counted(stage, cached):
 
 
 def test_a_job_whose_content_differs_from_its_digest_is_an_error(stage, cached):
-    hand = stage.hand()
-    stage.worker()
-    hand.ready()
+    hand, *_ = stage.served()
     job = MSGPACK["job"].jobs[0]  # of another run's task
     hand.send(1, job)
     assert "digest" in hand.result(job).error.text
 
 
 def test_a_rollout_is_uploaded_repeatedly_until_its_verdict(stage, cached):
-    hand = stage.hand(tasks.HEAVY)
-    stage.worker()
-    hand.ready()
+    hand, *_ = stage.served(tasks.HEAVY)
     kept, other = hand.job(0, "collect"), hand.job(1)
     hand.send(1, kept)
     data = hand.upload(kept)
@@ -68,9 +60,7 @@ def test_a_rollout_is_uploaded_repeatedly_until_its_verdict(stage, cached):
 
 
 def test_nothing_starts_while_too_many_results_have_no_verdict(stage, cached):
-    hand = stage.hand()
-    stage.worker()
-    hand.ready()
+    hand, *_ = stage.served()
     jobs = [hand.job(number) for number in range(8)]
     hand.send(1, *jobs)
     stuck = hand.beat(lambda beat: len(beat.unacked) == 5)
@@ -80,9 +70,7 @@ def test_nothing_starts_while_too_many_results_have_no_verdict(stage, cached):
 
 
 def test_a_failing_task_logs_its_traceback_once_with_its_job(stage, said, cached):
-    hand = stage.hand(tasks.RAISING)
-    stage.worker()
-    hand.ready()
+    hand, *_ = stage.served(tasks.RAISING)
     jobs = [hand.job(number) for number in range(3)]
     hand.send(1, *jobs)
     hand.results(*jobs)
@@ -94,16 +82,12 @@ def test_a_failing_task_logs_its_traceback_once_with_its_job(stage, said, cached
 
 
 def test_a_crash_names_its_job(stage, said, cached):
-    hand = stage.hand(tasks.CRASHING)
-    stage.worker()
-    hand.ready()
+    hand, *_ = stage.served(tasks.CRASHING)
     hand.send(1, hand.job())
     wait_for(said, f"candidate 7/2, seed {hand.job().seeds[0]}")
 
 
 def test_a_crash_in_an_evaluation_names_no_candidate(stage, said, cached):
-    hand = stage.hand(tasks.CRASHING)
-    stage.worker()
-    hand.ready()
+    hand, *_ = stage.served(tasks.CRASHING)
     hand.send(1, hand.job(kind="evaluate"))
     assert "candidate" not in wait_for(said, str(hand.job(kind="evaluate").seeds[0]))

@@ -111,9 +111,7 @@ def test_scores_are_the_same_bits_while_two_viewers_come_and_go_or_are_killed(st
 @pytest.mark.slow
 def test_frames_do_not_restart_the_coordinators_silence(stage, cached, viewer):
     """A worker that has results without a verdict says hello again after five silent beats, watched or not."""
-    hand = stage.hand(tasks.PAINTED)
-    stage.worker()
-    hand.ready()
+    hand, *_ = stage.served(tasks.PAINTED)
     watching = viewer(hand)
     hand.send(1, *(hand.job(episode) for episode in range(8)))
     hand.result(hand.job(0))  # without a verdict

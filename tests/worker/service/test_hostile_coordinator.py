@@ -19,9 +19,7 @@ from tests.support.stage import wait_for
 
 
 def test_a_batch_that_raises_costs_only_itself(stage, cached, said, monkeypatch):
-    hand = stage.hand()
-    stage.worker()
-    hand.ready()
+    hand, *_ = stage.served()
     take = RunSession._handle_batch
     monkeypatch.setattr(RunSession, "_handle_batch", lambda *_: 1 / 0)
     hand.send(1, hand.job())

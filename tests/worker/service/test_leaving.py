@@ -31,9 +31,7 @@ def test_with_exit_when_done_it_leaves_when_its_coordinator_says_that_the_run_ha
 @pytest.mark.parametrize("back", ["the same life", "the next life"])
 def test_with_exit_when_done_it_keeps_its_results_for_a_coordinator_that_comes_back(stage, cached, monkeypatch, back):
     monkeypatch.setattr(membership, "NEXT_RUN_AFTER", 0.0)
-    hand = stage.hand(tasks.SLOW_TOY)
-    _, served = stage.worker(exit_when_done=True)
-    hand.ready()
+    hand, _, served = stage.served(tasks.SLOW_TOY, exit_when_done=True)
     job = hand.job()
     hand.send(1, job)
     hand.beat(lambda beat: beat.running)
@@ -79,9 +77,7 @@ def test_with_exit_when_done_it_also_ends_where_no_coordinator_ever_let_it_in(th
 
 def test_a_worker_that_a_secured_router_shows_nothing_says_so_once(stage, said, cached, monkeypatch):
     monkeypatch.setattr(membership, "SEARCH_INTERVAL", 0.05)
-    hand = stage.hand()
-    made, _ = stage.worker()
-    hand.ready()
+    hand, made, _ = stage.served()
     object.__setattr__(made._link, "secured", True)  # frozen; a hand answers only hellos of an open fleet
     hand.vanish()
     wait_for(said, "shut out")
@@ -91,9 +87,7 @@ def test_a_worker_that_a_secured_router_shows_nothing_says_so_once(stage, said, 
 
 
 def test_it_says_to_its_coordinator_why_it_leaves(stage, cached):
-    hand = stage.hand()
-    made, served = stage.worker()
-    hand.ready()
+    hand, made, served = stage.served()
     made.stop()
     hand.beat(lambda beat: beat.reason)
     assert served.result(DEADLINE) is None
@@ -109,9 +103,7 @@ def test_it_says_why_it_fails_before_it_can_score(stage):
 
 
 def test_stopped_once_it_finishes_running_jobs_and_delivers(stage, cached):
-    hand = stage.hand(tasks.SLOW_TOY)
-    made, served = stage.worker()
-    hand.ready()
+    hand, made, served = stage.served(tasks.SLOW_TOY)
     running, queued = hand.job(0), hand.job(1)
     hand.send(1, running, queued)
     hand.beat(lambda beat: beat.running)
@@ -121,18 +113,6 @@ def test_stopped_once_it_finishes_running_jobs_and_delivers(stage, cached):
     assert not served.done()
     hand.send(2, accepted=(running,))
     assert served.result(DEADLINE) is None
-
-
-def test_stopped_twice_it_abandons_running_jobs(stage, said, cached):
-    hand = stage.hand(tasks.SLOW_TOY)
-    made, served = stage.worker()
-    hand.ready()
-    hand.send(1, hand.job())
-    hand.beat(lambda beat: beat.running)
-    made.stop()
-    made.stop()
-    assert served.result(DEADLINE) is None
-    wait_for(said, "0 jobs")
 
 
 def test_stopped_once_it_abandons_a_download(stage):
@@ -145,9 +125,7 @@ def test_stopped_once_it_abandons_a_download(stage):
 
 
 def test_jobs_that_arrive_while_it_drains_go_back(stage, cached):
-    hand = stage.hand(tasks.SLOW_TOY)
-    made, _ = stage.worker()
-    hand.ready()
+    hand, made, _ = stage.served(tasks.SLOW_TOY)
     running, late = hand.job(0), hand.job(1)
     hand.send(1, running)
     hand.beat(lambda beat: beat.running)

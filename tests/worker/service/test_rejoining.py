@@ -19,9 +19,7 @@ SLOW_BEATS = Intervals(beat=60.0, repeat=0.1)  # the longest valid ones
 
 @pytest.mark.slow
 def test_it_follows_its_run_into_the_coordinators_next_life(stage, cached):
-    hand = stage.hand(tasks.SLOW_TOY)
-    stage.worker()
-    hand.ready()
+    hand, *_ = stage.served(tasks.SLOW_TOY)
     done, running, queued = (hand.job(number) for number in range(3))
     hand.send(1, done, running, queued)
     hand.result(done)
@@ -41,9 +39,7 @@ def test_it_follows_its_run_into_the_coordinators_next_life(stage, cached):
 
 @pytest.mark.slow
 def test_a_batch_of_a_newer_numbering_makes_it_say_hello(stage, cached):
-    hand = stage.hand(tasks.SLOW_TOY)
-    stage.worker()
-    hand.ready()
+    hand, *_ = stage.served(tasks.SLOW_TOY)
     done, running, queued, later = (hand.job(number) for number in range(4))
     hand.send(1, done, running, queued)
     hand.result(done)
@@ -61,9 +57,7 @@ def test_a_batch_of_a_newer_numbering_makes_it_say_hello(stage, cached):
 
 
 def test_the_coordinators_next_life_gets_a_rollout_from_its_beginning(stage, cached):
-    hand = stage.hand(tasks.HEAVY)
-    stage.worker()
-    hand.ready()
+    hand, *_ = stage.served(tasks.HEAVY)
     kept = hand.job(0, "collect")
     hand.send(1, kept)
     data = hand.upload(kept)
@@ -76,9 +70,7 @@ def test_the_coordinators_next_life_gets_a_rollout_from_its_beginning(stage, cac
 
 
 def test_a_coordinator_that_comes_back_as_another_version_is_said_once_and_at_once(stage, cached, caplog):
-    hand = stage.hand()
-    stage.worker()
-    hand.ready()
+    hand, *_ = stage.served()
     notes = [record.facts for record in caplog.records if getattr(record, "facts", {}).get("event") == "other version"]
     assert not notes, "it is of the worker's own version"
     hand.vanish()
@@ -123,9 +115,7 @@ def test_a_cut_connection_makes_it_say_hello_again(stage, relay, cached):
 
 @pytest.mark.parametrize("owed", [True, False])
 def test_it_says_hello_to_a_silent_coordinator(stage, cached, owed):
-    hand = stage.hand()
-    stage.worker()
-    hand.ready()
+    hand, *_ = stage.served()
     if owed:
         hand.send(1, hand.job())
         hand.result(hand.job())
@@ -134,9 +124,7 @@ def test_it_says_hello_to_a_silent_coordinator(stage, cached, owed):
 
 @pytest.mark.slow
 def test_it_follows_its_run_to_another_name_with_its_results(stage, said, cached):
-    hand = stage.hand(tasks.SLOW_TOY)
-    stage.worker()
-    hand.ready()
+    hand, *_ = stage.served(tasks.SLOW_TOY)
     done, running = hand.job(0), hand.job(1)
     hand.send(1, done, running)
     hand.result(done)
@@ -153,34 +141,24 @@ def test_it_follows_its_run_to_another_name_with_its_results(stage, said, cached
 
 @pytest.mark.slow
 def test_it_stays_with_its_name_where_the_run_is_refused_under_another(stage, said, cached):
-    hand = stage.hand()
-    stage.worker()
-    hand.ready()
+    hand, *_ = stage.served()
     hand.leave()
     stage.also(hand, run="other").refusal = ("your moon is full", "wait")
     wait_for(said, "moon")
     stage.also(hand).ready()
 
 
-def test_another_run_of_the_same_name_is_joined_anew(stage, cached):
-    hand = stage.hand()
-    _, served = stage.worker()
-    hand.ready()
+@pytest.mark.parametrize("leaves", [False, True])
+def test_another_run_of_the_same_name_is_joined_anew_or_ends_a_worker_with_exit_when_done(stage, cached, leaves):
+    hand, _, served = stage.served(exit_when_done=leaves)
     hand.vanish()
     hand.nonce, hand.run_uid = SECOND, "f" * 32
     hand.appear()
-    assert hand.beat(lambda beat: beat.run_uid == "f" * 32).slots == 1
-    assert not served.done()
-
-
-def test_another_run_of_the_same_name_ends_a_worker_with_exit_when_done(stage, cached):
-    hand = stage.hand()
-    _, served = stage.worker(exit_when_done=True)
-    hand.ready()
-    hand.vanish()
-    hand.nonce, hand.run_uid = SECOND, "f" * 32
-    hand.appear()
-    assert isinstance(served.exception(DEADLINE), RefusedError)
+    if leaves:
+        assert isinstance(served.exception(DEADLINE), RefusedError)
+    else:
+        assert hand.beat(lambda beat: beat.run_uid == "f" * 32).slots == 1
+        assert not served.done()
 
 
 def test_a_stranger_that_answers_as_another_run_does_not_end_its_membership(stage, relay, cached):

@@ -58,21 +58,21 @@ def test_it_scores_and_the_same_job_gives_the_same_bits(harness):
 def test_a_collected_rollout_is_the_drive_of_the_candidate(harness):
     slot = harness(tasks.TOY)
     scored = slot.score()
-    slot.slot.submit([(job(0, "collect", spec=slot.spec), VECTOR)])
+    slot.submit(0, kind="collect")
     kept, file = slot.outcome()
     assert (kept.fitness, kept.steps) == (scored.fitness, scored.steps)
     assert kept.upload == hashlib.sha256(file).digest()
     with np.load(io.BytesIO(file), allow_pickle=False) as drive:
         assert drive["reward"].sum() == pytest.approx(scored.fitness, rel=1e-5)
         assert (len(drive["picture"]), bool(drive["ended"])) == (10, True)
-    slot.slot.submit([(job(0, "collect", spec=slot.spec), VECTOR)])
+    slot.submit(0, kind="collect")
     assert slot.outcome()[1] == file, "equal drives give equal files"
 
 
 def test_a_failed_collection_is_an_error_without_a_file(harness):
     slot = harness(tasks.RAISING)
     slot.wait_ready()
-    slot.slot.submit([(job(0, "collect", spec=slot.spec), VECTOR)])
+    slot.submit(0, kind="collect")
     failed, file = slot.outcome()
     assert (failed.fitness, failed.upload, file) == (None, None, None)
 
@@ -115,7 +115,7 @@ def test_an_abandoned_job_has_no_result_and_the_child_lives_on(harness):
     slot = harness(tasks.SLOW_TOY)
     slot.wait_ready()
     pid = slot.slot.pid
-    slot.slot.submit([(job(0, spec=slot.spec), VECTOR)])
+    slot.submit(0)
     slot.slot.abandon(job(0, spec=slot.spec).digest)
     while slot.slot.running:
         assert slot.slot.handle(slot.events.get(timeout=DEADLINE)[1]) == ()
@@ -139,8 +139,7 @@ def test_after_short_groups_the_next_one_is_queued_in_the_child(harness):
 def test_after_a_crash_the_next_child_gets_the_queued_group(harness):
     slot = harness(tasks.SLOW_TOY)
     slot.wait_ready()
-    for number in (0, 1):
-        slot.slot.submit([(job(number, spec=slot.spec), VECTOR)])
+    slot.submit(0, 1)
     os.kill(slot.slot.pid, signal.SIGKILL)
     crashed, scored = slot.result(), slot.result()
     assert (crashed.digest, crashed.fitness) == (job(0, spec=slot.spec).digest, None)
@@ -229,8 +228,7 @@ def test_a_slot_retries_without_descriptors_and_then_names_the_cause(harness, ra
     assert slot.score().fitness is not None
     resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
     try:
-        os.kill(slot.slot.pid, signal.SIGKILL)
-        slot.slot.handle(slot.gone())
+        slot.lose()
         for _ in range(STARVED_STARTS - 2):
             slot.pass_time()
         with pytest.raises(DreamfleetError, match="--slots"):
@@ -243,8 +241,7 @@ def test_children_that_end_without_a_result_are_replaced_after_growing_pauses(ha
     slot = harness(tasks.TOY)
     for number in range(4):
         slot.wait_ready()
-        os.kill(slot.slot.pid, signal.SIGKILL)
-        slot.slot.handle(slot.gone())
+        slot.lose()
         assert (slot.slot.pid == 0) == (number > 0)
         slot.slot.check(monotonic() + 0.4 * 2 ** (number - 1), 0.0)
         assert (slot.slot.pid == 0) == (number > 0)
@@ -257,8 +254,7 @@ def kill_as_it_starts(slot, times):
     pauses = []
     for _ in range(times):
         slot.pass_time()
-        os.kill(slot.slot.pid, signal.SIGKILL)
-        slot.slot.handle(slot.gone())
+        slot.lose()
         pauses.append(slot.slot._start_at - monotonic())
     return pauses
 
@@ -269,14 +265,12 @@ def test_a_short_host_is_tried_for_ten_minutes(harness):
         kill_as_it_starts(slot, FAILED_STARTS)  # it was never ready
     slot = harness(tasks.TOY)
     assert slot.score().fitness is not None
-    os.kill(slot.slot.pid, signal.SIGKILL)
-    slot.slot.handle(slot.gone())
+    slot.lose()
     pauses = kill_as_it_starts(slot, STARVED_STARTS - 1)
     assert pauses == pytest.approx([2, 4, 8, 16, 32, *[60] * 9], abs=1.0)
     slot.pass_time()
     assert slot.score().fitness is not None
-    os.kill(slot.slot.pid, signal.SIGKILL)
-    slot.slot.handle(slot.gone())
+    slot.lose()
     kill_as_it_starts(slot, STARVED_STARTS - 1)
     with pytest.raises(DreamfleetError, match=OUT_OF_MEMORY.text):
         kill_as_it_starts(slot, 1)
@@ -286,8 +280,7 @@ def test_a_short_host_is_tried_for_ten_minutes(harness):
 def test_a_host_that_stays_short_gives_its_jobs_back(harness):
     slot = harness(tasks.SLOW_TOY)
     slot.wait_ready()
-    for number in (0, 1):
-        slot.slot.submit([(job(number, spec=slot.spec), VECTOR)])
+    slot.submit(0, 1)
     os.kill(slot.slot.pid, signal.SIGKILL)
     assert slot.result().error == OUT_OF_MEMORY
     kill_as_it_starts(slot, FAILED_STARTS - 1)
@@ -313,8 +306,7 @@ def test_the_time_limit_of_a_start_grows_after_a_failure(harness):
 def test_a_child_that_ends_as_it_starts_blames_no_job(harness):
     slot = harness(tasks.SLOW_TOY)
     slot.wait_ready()
-    for number in (0, 1):
-        slot.slot.submit([(job(number, spec=slot.spec), VECTOR)])
+    slot.submit(0, 1)
     os.kill(slot.slot.pid, signal.SIGKILL)
     assert slot.result().error == OUT_OF_MEMORY
     os.kill(slot.slot.pid, signal.SIGKILL)  # the next child, which is starting and has the second job
@@ -372,8 +364,7 @@ def test_a_bundle_that_was_swapped_is_never_scored_with(harness, random_bundle, 
     slot = harness(tasks.TOY, path)
     slot.score()
     write_random_bundle(tmp_path / "other.zip", seed=1).path.replace(path)
-    os.kill(slot.slot.pid, signal.SIGKILL)
-    slot.slot.handle(slot.gone())  # another child starts
+    slot.lose()  # another child starts
     with pytest.raises(DreamfleetError, match=r"cached\.zip"):
         slot.wait_ready()
 
@@ -385,6 +376,5 @@ def test_a_removed_or_damaged_bundle_is_fetched_again(harness, random_bundle, tm
     slot = harness(tasks.TOY, path, restore_bundle=lambda: shutil.copyfile(random_bundle.path, path))
     before = slot.score()
     damage(path)
-    os.kill(slot.slot.pid, signal.SIGKILL)
-    slot.slot.handle(slot.gone())
+    slot.lose()
     assert slot.score().fitness == before.fitness

@@ -218,16 +218,12 @@ def _font() -> pygame.font.Font:
     return pygame.font.Font(pygame.font.get_default_font(), 42)
 
 
-def _grass_squares() -> NDArray[np.float64]:
-    size = car_racing.GRASS_DIM
-    return np.array([
-        [(size * x + size, size * y + 0), (size * x + 0, size * y + 0),
-         (size * x + 0, size * y + size), (size * x + size, size * y + size)]
-        for x in range(-20, 20, 2) for y in range(-20, 20, 2)
-    ], dtype=np.float64)  # fmt: skip
-
-
-GRASS = _grass_squares()
+_SIDE = car_racing.GRASS_DIM
+GRASS = np.array([
+    [(_SIDE * x + _SIDE, _SIDE * y), (_SIDE * x, _SIDE * y),
+     (_SIDE * x, _SIDE * y + _SIDE), (_SIDE * x + _SIDE, _SIDE * y + _SIDE)]
+    for x in range(-20, 20, 2) for y in range(-20, 20, 2)
+], dtype=np.float64)  # fmt: skip
 WHEEL = np.array([car_dynamics.WHEEL_W, car_dynamics.WHEEL_R, car_dynamics.SIZE, *car_dynamics.WHEEL_WHITE], float)
 
 

@@ -21,8 +21,7 @@ from dreamfleet.worker.worlds.car_racing.preprocessing import BOX
 
 _Reference: Any = car_racing.CarRacing  # untyped upstream
 log = logging.getLogger(__name__)
-QUICK_SEEDS = (20_001,)
-QUICK_STEPS = 24
+QUICK_SEED, QUICK_STEPS = 20_001, 24
 CHECK_INTERVAL = 50  # pictures; of an environment that judges, gymnasium draws one in so many too
 ActionSource = Callable[[int, NDArray[np.uint8], np.random.Generator], Any]  # step, 64x64 picture
 
@@ -47,7 +46,7 @@ def native_is_exact() -> bool:
     if not is_native_available():
         log.warning("no native picture was built (no C compiler at installation): gymnasium draws, 15 times slower")
         return False
-    difference = next((found for seed in QUICK_SEEDS if (found := compare(seed, QUICK_STEPS, random_action))), None)
+    difference = compare(QUICK_SEED, QUICK_STEPS, random_action)
     if difference is not None:
         log.warning(
             "the native picture differs from the installed gymnasium's (%s): gymnasium draws; pygame-ce or gymnasium "

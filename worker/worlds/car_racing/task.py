@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
 import numpy as np
+import pygame
 from gymnasium import spaces
 from gymnasium.envs.box2d.car_dynamics import Car
 from gymnasium.wrappers import TransformObservation
@@ -23,14 +24,13 @@ from dreamfleet.worker.tasks.registry import preprocessing_for
 from dreamfleet.worker.worldmodel.policy import ModelPolicy
 from dreamfleet.worker.worlds.car_racing.drivers import DRIVERS, PushedDriver, UniformDriver
 from dreamfleet.worker.worlds.car_racing.native_check import CHECK_INTERVAL, make_car_racing, native_is_exact
-from dreamfleet.worker.worlds.car_racing.preprocessing import PREPROCESSINGS
+from dreamfleet.worker.worlds.car_racing.preprocessing import BOX, PREPROCESSINGS
 from dreamfleet.worker.worlds.car_racing.random_network import RandomNetworkPolicy
 from dreamfleet.worker.worlds.car_racing.true_state import read_true_state
 
 if TYPE_CHECKING:
     from dreamfleet.common.artifacts.trained_agent import TrainedAgent
     from dreamfleet.worker.worlds.car_racing.agents import NetworkAgent
-    from dreamfleet.worker.worlds.car_racing.scene import CarRacingScene
 
 ENVIRONMENT = "CarRacing-v3"
 WORLD = World(
@@ -126,13 +126,27 @@ class CarRacingTask(Task):
 
     def make_scene(self, steps: int) -> CarRacingScene:
         """The track on a screen, for a person who drives."""
-        from dreamfleet.worker.worlds.car_racing.scene import CarRacingScene  # pygame, which scoring needs not
-
         return CarRacingScene(steps)
 
     def preprocessing(self, bundle: Bundle) -> Preprocessing:
         """The preprocessing of the bundle's pictures; `BundleError` if this task has no such pictures."""
         return preprocessing_for(bundle, self)
+
+
+class CarRacingScene:
+    """CarRacing, drawn by gymnasium at its full size of 1000x800."""
+
+    name, scale = "CarRacing", 1.0
+
+    def __init__(self, steps: int) -> None:
+        self.environment = make_car_racing(preprocessing=BOX.name, render_mode="rgb_array", max_episode_steps=steps)
+
+    def surface(self) -> pygame.Surface:
+        """Gymnasium's own surface; `render` returns a smaller copy."""
+        self.environment.render()
+        inner: Any = self.environment.unwrapped
+        drawn: pygame.Surface = inner.surf
+        return drawn
 
 
 def make_judging_environment(preprocessing: Preprocessing, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:

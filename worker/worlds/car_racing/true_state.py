@@ -52,14 +52,11 @@ class CentreLine:
         away = at - (self.points + shares[:, None] * ways)
         row = int((away**2).sum(axis=1).argmin())
         side = ways[row, 0] * away[row, 1] - ways[row, 1] * away[row, 0]
-        along = self.along[row] + shares[row] * (self.along[row + 1] - self.along[row])
-        return TrackPosition(
-            float(along), math.copysign(math.hypot(*away[row]), side), self._heading(row, float(shares[row]))
-        )
-
-    def _heading(self, row: int, share: float) -> float:
+        share = float(shares[row])
+        along = self.along[row] + share * (self.along[row + 1] - self.along[row])
         turned = wrap_angle(self.heading[(row + 1) % len(self.heading)] - self.heading[row])
-        return float(self.heading[row] + share * turned)
+        offset, heading = math.copysign(math.hypot(*away[row]), side), self.heading[row] + share * turned
+        return TrackPosition(float(along), offset, float(heading))
 
     def curvature(self, along: Any) -> Floats:
         """The curvature `(K,)` at distances `along` (K,), in radians per metre, interpolated between the points."""

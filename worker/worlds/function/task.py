@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.objective import KEY, Objective, takes_seed
+from dreamfleet.common.artifacts.task_options import check_options
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host.packages import find_distributions
 from dreamfleet.common.host.trusted_modules import import_trusted
@@ -67,8 +68,7 @@ class FunctionTask(Task):
 
     def describe(self, options: Mapping[str, Any]) -> Description:
         """As many outputs as parameters, without observations; `UsageError` for a wrong option."""
-        if unknown := set(options) - {KEY}:
-            raise UsageError(f"task {self.name} knows no option {', '.join(sorted(unknown))}: {KEY}")
+        check_options(f"task {self.name}", options, (KEY,))
         objective = Objective.of(options.get(KEY) or {})
         return Description(0, objective.dimension, self._packages, options=objective.options)
 

@@ -187,11 +187,14 @@ def action_meanings(environment: Environment) -> tuple[str, ...]:
 
 def describe_environment(environment: Environment, frames: int = 1) -> dict[str, Any]:
     """Fields of the environment's `World` that do not depend on its spaces; an action is held for `frames` steps."""
-    spec = environment.spec
+    spec, module = environment.spec, type(environment.unwrapped).__module__
     limit = (spec and spec.max_episode_steps) or DEFAULT_MAX_STEPS
-    rate = _frames_per_second(environment)
+    engine = next((packages for prefix, packages in ENGINES.items() if module.startswith(prefix)), None)
+    said: Any = environment.metadata.get("render_fps")
+    is_rate = isinstance(said, (int, float)) and isfinite(said) and said > 0
+    rate = float(said if is_rate else World.frames_per_second)
     return {
-        "packages": ("numpy", "gymnasium", *_engine_packages(environment)),
+        "packages": ("numpy", "gymnasium", *(distributions_of(module) if engine is None else engine)),
         "horizon": min(-(-limit // frames), ENVIRONMENT_LIMIT),
         "frames_per_second": min(max(1, round(rate / frames)), FASTEST),
         "threshold": spec.reward_threshold if spec else None,
@@ -199,22 +202,9 @@ def describe_environment(environment: Environment, frames: int = 1) -> dict[str,
     }
 
 
-def _frames_per_second(environment: Environment) -> float:
-    """What the environment says of its pictures; the default where that is no positive number."""
-    said: Any = environment.metadata.get("render_fps")
-    is_rate = isinstance(said, (int, float)) and isfinite(said) and said > 0
-    return float(said if is_rate else World.frames_per_second)
-
-
 def is_gymnasiums(environment: Environment) -> bool:
     """Whether gymnasium itself has this environment."""
     return type(environment.unwrapped).__module__.startswith(tuple(ENGINES))
-
-
-def _engine_packages(environment: Environment) -> tuple[str, ...]:
-    module = type(environment.unwrapped).__module__
-    engine = next((packages for prefix, packages in ENGINES.items() if module.startswith(prefix)), None)
-    return distributions_of(module) if engine is None else engine
 
 
 def distributions_of(module: str) -> tuple[str, ...]:

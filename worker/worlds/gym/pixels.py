@@ -34,9 +34,9 @@ from dreamfleet.worker.tasks.pictures import (
     SkipFrames,
     VectorActions,
     cut_and_resize,
+    find_axes,
     frame_difference,
     is_picture,
-    is_stack,
     parse_crop,
     tile_frames,
 )
@@ -230,7 +230,7 @@ class GymPixelTask(Task):
         entries = space.spaces if isinstance(space, spaces.Dict) else {"": space}
         pictures = [key for key, each in entries.items() if is_picture(each)]
         only = pictures[0] if len(pictures) == 1 else None
-        every = EVERY_FRAME if only is not None and is_stack(entries[only]) else ""
+        every = EVERY_FRAME if only is not None and "N" in find_axes(entries[only].shape or ()) else ""
         key = only if wanted in ("", every) else wanted
         if key is not None and key in pictures:
             seen = environment

@@ -19,6 +19,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import Actions, Discrete
+from dreamfleet.common.artifacts.task_options import check_options
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.worker.tasks.api import Assignment, Description, Policy, Task, World
@@ -99,8 +100,7 @@ class GymTask(Task):
         `normalise`: shift and scale observations by their mean and standard deviation in 20 episodes of random actions,
         with seeds from `seed` on.
         """
-        if unknown := set(options) - set(OPTIONS):
-            raise UsageError(f"task {self.name} knows no option {', '.join(sorted(unknown))}: {', '.join(OPTIONS)}")
+        check_options(f"task {self.name}", options, OPTIONS)
         arguments = dict(options.get("environment") or {})
         keys = list(dict.fromkeys(options.get("observation") or ()))
         environment = self._open(arguments, keys)

@@ -52,11 +52,7 @@ class TakeCoverOptions:
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> TakeCoverOptions:
-        """The options in a mapping: `environment` holds them by name; `skip` and `crop` are tics and crop.
-
-        >>> TakeCoverOptions.of({"environment": {"actions": "thirds"}, "skip": 1}).text
-        '{"environment": {"actions": "thirds", "tics": 1}}'
-        """
+        """The options in a mapping: `environment` holds them by name; `skip` and `crop` are tics and crop."""
         check_options("takecover", given, KNOWN)
         values = given.get("environment") or {}
         unknown = sorted(set(values) - set(OPTION_HELP)) if isinstance(values, Mapping) else [repr(values)]

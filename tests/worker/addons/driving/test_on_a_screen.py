@@ -1,5 +1,5 @@
 """The verb `drive` in a window on a virtual screen, with keys of a virtual keyboard.
-Tests worker/worlds/car_racing/scene.py and verb.py."""
+Tests verb.py."""
 
 import os
 import re

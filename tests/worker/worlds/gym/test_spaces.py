@@ -139,12 +139,3 @@ def test_each_number_is_chosen_by_its_own_outputs(space, outputs):
         assert actions.to_numbers(action).tolist() == [int(part.argmax()) for part in parts]
         chosen = np.concatenate([np.arange(len(part)) == part.argmax() for part in parts])
         assert np.array_equal(actions.to_outputs(action), chosen)
-
-
-@pytest.mark.parametrize("kind", ["many", "large"])
-def test_an_environment_of_many_numbered_actions_is_scored(kind):
-    scorer = Scorer(spec(kind))
-    size = scorer.spec.controller.size
-    assert scorer.world.actions.outputs == {"many": 33, "large": 4096}[kind]
-    assert scorer.score("score", np.random.default_rng(1).normal(size=size).astype(np.float32), 1).fitness == 20
-    scorer.close()
