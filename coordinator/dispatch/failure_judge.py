@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 
-from dreamfleet.coordinator.dispatch.failures import Attempt, JobFailure, host_of
+from dreamfleet.coordinator.dispatch.failures import Attempt, host_of
 from dreamfleet.coordinator.dispatch.member import Member
-from dreamfleet.coordinator.dispatch.pending_jobs import PendingJobs
+from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob, PendingJobs
 
 EQUAL_ATTEMPTS = 2  # that fail for one cause show that the episode fails
 ANY_ATTEMPTS = 3  # that fail for several causes show it too
@@ -27,37 +27,35 @@ class FailureJudge:
         self._jobs = jobs
         self._members = members
 
-    def is_new_cause(self, failure: JobFailure) -> bool:
+    def is_new_cause(self, failure: PendingJob) -> bool:
         """Whether a job's last attempt failed for a cause that was not seen before; of the first causes only."""
-        cause = failure.history[-1].error.cause
+        cause = failure.attempts[-1].error.cause
         is_new = cause not in self._causes and len(self._causes) < MAX_CAUSES
         if is_new:
             self._causes.add(cause)
         return is_new
 
-    def find_lasting(self) -> list[JobFailure]:
+    def find_lasting(self) -> list[PendingJob]:
         """The wanted jobs that fail wherever they are scored.
 
         R8: another host must have failed too, but not one that failed a job that was scored before.
         """
-        proofs = self._failed_proofs
-        hosts = self._present_hosts() - {attempt.host for each in proofs for attempt in each.history}
-        return [
-            each
-            for each in self._jobs.failures
-            if each not in proofs and is_lasting(each.history, self.working_hosts, hosts)
-        ]
+        failures = self._jobs.failures
+        hosts = self._present_hosts() - {one.host for each in failures if each.is_proof for one in each.attempts}
+        working = self.working_hosts
+        return [each for each in failures if not each.is_proof and is_lasting(each.attempts, working, hosts)]
 
-    def find_pausing(self) -> JobFailure | None:
+    def find_pausing(self) -> PendingJob | None:
         """A job that failed so often that the run must pause; `None` if there is none.
 
         R8: two workers, or three attempts on the only one, show that the job itself or every host is at fault. A host
-        that fails a job that was scored before is itself at fault, which is no matter while another is here that can.
+        that fails a job which others scored is faulty. This does not matter while another host works.
         """
-        passed = self._failed_proofs if self._present_hosts() & self.working_hosts else []
-        return next((each for each in self._jobs.failures if each not in passed and _is_pausing([each])), None)
+        forgives_proofs = bool(self._present_hosts() & self.working_hosts)
+        failures = (each for each in self._jobs.failures if not (each.is_proof and forgives_proofs))
+        return next((each for each in failures if _is_pausing([each])), None)
 
-    def find_broken_fleet(self, *, at_once: bool) -> JobFailure | None:
+    def find_broken_fleet(self, *, at_once: bool) -> PendingJob | None:
         """The job that failed most often, if all hosts that are here have failed and none of them has ever scored.
 
         R8: all open jobs must have failed, or with `at_once` ten of them while the run has no score from anywhere.
@@ -66,14 +64,14 @@ class FailureJudge:
         """
         failures = self._jobs.failures
         for each in failures:
-            if len(each.history) >= HOST_ATTEMPTS and not any(one.host in self.working_hosts for one in each.history):
+            if len(each.attempts) >= HOST_ATTEMPTS and not any(one.host in self.working_hosts for one in each.attempts):
                 return each
         if not self._present_hosts() or self.has_hope or not _is_pausing(failures):
             return None
         is_early = at_once and not self.working_hosts and len(failures) >= ENOUGH_JOBS
         if not is_early and len(failures) < len(self._jobs):
             return None
-        return max(failures, key=lambda each: len(each.history))
+        return max(failures, key=lambda each: len(each.attempts))
 
     @property
     def awaits_proof(self) -> bool:
@@ -95,17 +93,13 @@ class FailureJudge:
     @property
     def has_failed_proof(self) -> bool:
         """Whether a job that was scored before is wanted again and failed."""
-        return bool(self._failed_proofs)
-
-    @property
-    def _failed_proofs(self) -> list[JobFailure]:
-        return [each for each in self._jobs.failures if self._jobs[each.work.digest].is_proof]
+        return any(each.is_proof for each in self._jobs.failures)
 
     @property
     def has_hope(self) -> bool:
         """Whether a host is here that has scored, or that has not failed yet."""
         hosts = self._present_hosts()
-        tried = {attempt.host for each in self._jobs.failures for attempt in each.history}
+        tried = {attempt.host for each in self._jobs.failures for attempt in each.attempts}
         return bool(hosts & self.working_hosts or hosts - tried)
 
     def _present_hosts(self) -> set[str]:
@@ -131,6 +125,6 @@ def is_lasting(attempts: Sequence[Attempt], working: Collection[str], present: C
     return most >= EQUAL_ATTEMPTS or len(own) >= ANY_ATTEMPTS
 
 
-def _is_pausing(failures: Sequence[JobFailure]) -> bool:
-    attempts = [attempt for each in failures for attempt in each.history]
+def _is_pausing(failures: Sequence[PendingJob]) -> bool:
+    attempts = [attempt for each in failures for attempt in each.attempts]
     return len({each.worker for each in attempts}) > 1 or len(attempts) >= PAUSING_ATTEMPTS

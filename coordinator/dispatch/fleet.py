@@ -7,7 +7,7 @@ result, and a job that heartbeats do not list is given again.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import count
 from typing import Literal
 
@@ -18,20 +18,13 @@ from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.messages import MAX_SLOTS, Heartbeat, Result, Verdict, VerdictWord
 from dreamfleet.coordinator.dispatch.event_log import EventLog, Note, NoteKind
 from dreamfleet.coordinator.dispatch.failure_judge import FailureJudge
-from dreamfleet.coordinator.dispatch.failures import JobFailure, host_of
+from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.dispatch.host_stats import HostRecords
-from dreamfleet.coordinator.dispatch.member import (
-    DepartedWorkers,
-    DispatchGroup,
-    Lease,
-    LeaseKind,
-    Member,
-    MemberState,
-    SentBatch,
-)
-from dreamfleet.coordinator.dispatch.packing import BatchContent, OutgoingBatch, pack
-from dreamfleet.coordinator.dispatch.pending_jobs import JobState, PendingJob, PendingJobs
-from dreamfleet.coordinator.dispatch.speculative_execution import Move, SpeculativeExecution
+from dreamfleet.coordinator.dispatch.leases import Leases
+from dreamfleet.coordinator.dispatch.member import DepartedWorkers, DispatchGroup, Member, MemberState
+from dreamfleet.coordinator.dispatch.packing import SentBatch, pack
+from dreamfleet.coordinator.dispatch.pending_jobs import PendingJobs
+from dreamfleet.coordinator.dispatch.speculative_execution import SpeculativeExecution
 from dreamfleet.coordinator.dispatch.worker_selection import assign_jobs
 from dreamfleet.coordinator.jobs.checks import Check
 from dreamfleet.coordinator.jobs.work import Work
@@ -54,33 +47,23 @@ class Fleet:
 
     def __init__(self, heartbeat_interval: float, evaluation_share: float = 0.25) -> None:
         self._interval = heartbeat_interval  # seconds
-        self._speculation = SpeculativeExecution(heartbeat_interval)
         self._numberings = count(1)
         self._last_tick: float | None = None
-        self._now = 0.0  # of the event that is being handled
         self._planned_at: float | None = None  # when jobs were given that no commit has followed yet
         self._hosts = HostRecords()
         self.departed = DepartedWorkers()
         self.jobs = PendingJobs(evaluation_share)
         self.members: dict[str, Member] = {}
+        self.speculation = SpeculativeExecution(heartbeat_interval, self.jobs, self.members)
         self.counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()  # results and reports that were not accepted, by reason
         self.event_log = EventLog()
+        self.leases = Leases(self.jobs, self.members, self.event_log, self.counts)
         self.notes: list[Note] = []  # their writer clears them
         self.failure_judge = FailureJudge(self.jobs, self.members)
         self.drain_background = False  # only evaluations and kept rollouts are left to wait for
         self.paused = False
         self.checked: Work | None = None  # the job whose accepted result the last result repeats
-
-    def withdraw(self, digests: Iterable[bytes]) -> None:
-        """Want these jobs no more; results that still come are obsolete."""
-        for digest in digests:
-            if digest in self.jobs:
-                self._cancel(digest, self.jobs.remove(digest))
-
-    def give_up(self, failure: JobFailure) -> None:
-        """Withdraw a job whose episode fails wherever it is scored."""
-        self.withdraw([failure.work.digest])
 
     def add_worker(self, identity: str, slots: int, fingerprint: str, now: float) -> int:
         """Welcome a worker as a guest; return the numbering of its batches.
@@ -115,12 +98,12 @@ class Fleet:
     def note_refusal(self, note: Note, why: str) -> None:
         """Log that a worker, or a host, was refused; the caller bounds how many are (R26)."""
         self.notes.append(note)
-        self.event_log.add(self._now, "left", note.worker, why=f"refused: {why}")
+        self.event_log.add("left", note.worker, why=f"refused: {why}")
 
     def remove_worker(self, identity: str) -> None:
         """Forget a worker: others get its jobs. If it is alive it gets no answer, and so says hello again (R22)."""
         if member := self.members.pop(identity, None):
-            self._release_leases(member)
+            self.leases.release(member)
 
     def handle_heartbeat(self, identity: str, beat: Heartbeat, now: float) -> None:
         """Compare what a worker reports with what it was given.
@@ -128,28 +111,28 @@ class Fleet:
         R3, R20: a lease that the worker does not show ends. R11: a confirmed batch is not sent again. R19: the first
         heartbeat makes a guest a member.
         """
-        member, self._now = self.members.get(identity), now
+        member, self.event_log.now = self.members.get(identity), now
         if member is None:
             return
         self._mark_heard(member, now)
         if member.is_guest:  # R26: only now is it logged, as strangers could fill the log with names
-            self._note_arrival(identity, now, "back" if identity in self.departed else "joined")
+            self._note_arrival(identity, "back" if identity in self.departed else "joined")
             self.departed.remove(identity)
             if beat.reason:  # R24: it fails before it can score, and has no token that could vanish
                 self.handle_departure(identity, now)
         beat = self._check_numbering(member, beat)
         for sent in member.apply_heartbeat(beat, now):
-            for work in sent.content.work:
-                self.event_log.add(now, "seen", identity, work.digest)
+            for work in sent.work:
+                self.event_log.add("seen", identity, work.digest)
         running = {self.jobs.digest_of_tag(run.tag): run.steps for run in beat.running}
         finished = {self.jobs.digest_of_tag(tag) for tag in beat.unacked}
         listed = {self.jobs.digest_of_tag(tag) for tag in beat.queued} | finished | running.keys()
         for digest in member.update_leases(listed, running, finished, now):
-            self._drop_lease(member, digest)
+            self.leases.drop(member, digest)
         held = DispatchGroup(now, len(member.leases), only_scoring=False)
         for found in listed - member.leases.keys():
-            if found is not None and self._may_readopt(found, identity):
-                self._add_lease(member, found, beat.seen, held, now, running.get(found))
+            if found is not None and self.leases.may_readopt(found, identity):
+                self.leases.add(member, found, beat.seen, held, running.get(found))
         member.resend_before(max((lease.batch for each, lease in member.leases.items() if each in listed), default=0))
 
     def handle_result(
@@ -160,7 +143,7 @@ class Fleet:
         R5: a stranger's result is dropped. R7: a worker of this run gets a verdict on each result, a duplicate too, so
         it can stop repeating it. `checked` is the work of a result that repeats an accepted one (R32).
         """
-        member, self._now, self.checked = self.members.get(identity), now, None
+        member, self.event_log.now, self.checked = self.members.get(identity), now, None
         given = self.find_job_for_result(identity, result)
         if given is None and (member is None or member.is_guest):
             self.dropped["result of a stranger"] += 1  # a worker of this run repeats it after its first heartbeat
@@ -171,10 +154,10 @@ class Fleet:
         lease = None if member is None else member.leases.get(result.digest)
         verdict, work = self._judge(identity, result, given, host_class)
         if lease is not None and work is not None:
-            self._speculation.record_duration(now - lease.group.given_at, is_background=lease.is_background)
+            self.speculation.record_duration(now - lease.group.given_at, is_background=lease.is_background)
         if member is not None or verdict == "accepted":
             failed = given is not None and result.fitness is None
-            self.event_log.add(now, "failed" if failed else verdict, identity, result.digest)
+            self.event_log.add("failed" if failed else verdict, identity, result.digest)
         if member is not None:
             member.end_lease(result.digest)
             member.verdicts.append(Verdict(result.digest, verdict))
@@ -182,7 +165,7 @@ class Fleet:
             if work is not None:
                 member.host_stats.record_duration(work.kind, result.seconds)
         if verdict == "accepted":
-            self._speculation.record_episode(result.steps)
+            self.speculation.record_episode(result.steps)
         self.counts["accepted_steps" if verdict == "accepted" else "discarded_steps"] += result.steps
         self.counts[verdict] += 1
         return verdict, work
@@ -209,7 +192,7 @@ class Fleet:
             self.dropped["lease with more steps than a job has"] += 1
             self.jobs.record_overrun(digest, identity)
             member.cancels.append(digest)
-            self._drop_lease(member, digest)
+            self.leases.drop(member, digest)
 
     def defer_verdict(self, identity: str, digest: bytes, now: float) -> None:
         """Keep the lease of a job whose result came and whose upload is still on the way."""
@@ -228,7 +211,7 @@ class Fleet:
         silence starts a new numbering. R21: a gap in this process's own clock is added to all deadlines.
         """
         gap = now - self._last_tick if self._last_tick is not None else 0.0
-        self._last_tick = self._now = now
+        self._last_tick = self.event_log.now = now
         self.departed.expire(now)
         self.jobs.enqueue_due(now)
         for member in list(self.members.values()):
@@ -247,29 +230,30 @@ class Fleet:
                 self._restart_numbering(member)
                 self.counts["silences"] += 1
 
-    def dispatch(self, now: float, *, durable: bool = True) -> list[OutgoingBatch]:
+    def dispatch(self, now: float, *, durable: bool = True) -> list[SentBatch]:
         """Batches to send now: verdicts, cancellations, new jobs, and batches to send again.
 
         R6: verdicts wait until the journal has committed everything so far (`durable`), so a crash loses no result.
         R22: a member without news gets an empty batch, else it would say hello again.
         """
-        self._now = now
+        self.event_log.now = now
         self._share_slots()
         for member in self.members.values():
             member.record_turnarounds(now)
         is_planned = durable and self._planned_at == now  # the turn's jobs went out before its commit
         self._planned_at = None if durable or self.paused else now
         given = {} if self.paused or is_planned else self._plan(now)
-        sends: list[OutgoingBatch] = []
+        sends: list[SentBatch] = []
         for member in self.members.values():
             if member.state is not MemberState.PRESENT:
                 continue
-            batches = [
-                *self._overdue_batches(member, now),
-                *self._new_batches(member, given.get(member.identity, ()), durable, now),
-            ]
+            batches = list(member.take_overdue_batches(now, RESEND_AFTER * self._interval))
+            self.counts["resent_batches"] += len(batches)
+            for work in (work for batch in batches for work in batch.work):
+                self.event_log.add("sent again", member.identity, work.digest)
+            batches += self._new_batches(member, given.get(member.identity, ()), durable, now)
             if not batches and member.is_owed_reply(now, REPLY_AFTER * self._interval):
-                batches = [OutgoingBatch(member.identity, member.numbering, 0, BatchContent())]
+                batches = [SentBatch(member.identity, member.numbering)]
             member.last_sent = now if batches else member.last_sent
             sends += batches
         return sends
@@ -281,19 +265,10 @@ class Fleet:
         for member in able:
             member.drives_a_slot = max(1, (len(self.jobs) + self.jobs.unmade) // max(2 * slots, 1))
 
-    def longest_held(self, *, is_background: bool) -> float:
-        """Seconds after which a job has been away for too long."""
-        return self._speculation.longest_held(is_background=is_background)
-
     @property
     def has_workers(self) -> bool:
         """Whether any worker is present, also one that replaces its scoring processes and takes no job."""
         return any(member.state is MemberState.PRESENT for member in self.members.values())
-
-    @property
-    def takes_jobs(self) -> bool:
-        """Whether any worker may be given candidates' jobs."""
-        return any(member.takes_jobs for member in self.members.values())
 
     @property
     def lease_count(self) -> int:
@@ -317,37 +292,31 @@ class Fleet:
         """The work that each member is given now."""
         judge = self.failure_judge
         given = assign_jobs(
-            self.jobs, self.members, judge.working_hosts, now,
-            drain_background=self.drain_background, for_suspects=judge.hosts_for_suspects,
+            self.jobs, self.members, judge.working_hosts, judge.hosts_for_suspects, now,
+            drain_background=self.drain_background,
         )  # fmt: skip
         if not self.jobs.queue_length:
-            for move in self._speculation.plan(self.jobs, self.members, given, now):
-                self._apply_move(move, given, now)
-        for move in self._speculation.plan_trials(self.jobs, self.members, given.keys(), now):
-            self._apply_move(move, given, now)
+            for move in self.speculation.plan(given, now):
+                self.leases.move(move, given)
+        for move in self.speculation.plan_trials(given.keys(), now):
+            self.leases.move(move, given)
         return given
 
-    def _overdue_batches(self, member: Member, now: float) -> Iterator[OutgoingBatch]:
-        """Batches to send again, because no heartbeat has confirmed them in time (R11)."""
-        for number, sent in member.take_overdue_batches(now, RESEND_AFTER * self._interval):
-            self.counts["resent_batches"] += 1
-            for work in sent.content.work:
-                self.event_log.add(now, "sent again", member.identity, work.digest)
-            yield OutgoingBatch(member.identity, member.numbering, number, sent.content)
-
-    def _new_batches(self, member: Member, given: Sequence[Work], durable: bool, now: float) -> Iterator[OutgoingBatch]:
+    def _new_batches(self, member: Member, given: Sequence[Work], durable: bool, now: float) -> Iterator[SentBatch]:
         """New batches.
 
         R10: they are numbered without a gap, so the worker can report how many it has.
         """
         group = member.start_group(now)
-        for content in pack(given, member.cancels, member.verdicts if durable else []):
-            member.number += 1
-            member.unconfirmed[member.number] = SentBatch(content, now, now)
-            for work in content.work:
-                self._add_lease(member, work.digest, member.number, group, now)
-                self.event_log.add_given(now, member.identity, work.job)
-            yield OutgoingBatch(member.identity, member.numbering, member.number, content)
+        verdicts = member.verdicts if durable else []
+        for batch in pack(member.identity, member.numbering, given, member.cancels, verdicts):
+            member.number = batch.number = member.number + 1
+            batch.first_sent_at = batch.sent_at = now
+            member.unconfirmed[batch.number] = batch
+            for work in batch.work:
+                self.leases.add(member, work.digest, batch.number, group)
+                self.event_log.add_given(member.identity, work.job)
+            yield batch
         member.cancels = []
         if durable:
             member.verdicts = []
@@ -367,9 +336,10 @@ class Fleet:
             self.dropped["result of a job that was not given"] += 1
             return "refused", None
         if result.fitness is None:
-            self._record_failure(identity, result)
+            self.jobs.record_failure(identity, result, self.event_log.now)
+            self._note_failure(result.digest)
             if member := self.members.get(identity):
-                self._drop_lease(member, result.digest, counted=True)
+                self.leases.drop(member, result.digest, counted=True)
             return "refused", None
         if result.digest in self.jobs.checks:
             self.checked = given
@@ -379,71 +349,33 @@ class Fleet:
         self.counts["discarded_steps"] += pending.steps_lost_to(identity, result.steps)
         pending.holders -= {identity}
         if self.jobs.is_drawn(pending.work) and not pending.is_proof:
-            self.check_again(pending, Check(host_class, {host_of(identity)}))
+            self.leases.check_again(pending, Check(host_class, {host_of(identity)}))
         else:
-            self._cancel(result.digest, pending)
+            self.leases.cancel(pending)
         self.failure_judge.working_hosts.add(host_of(identity))
         return ("duplicate", None) if pending.is_proof else ("accepted", pending.work)
 
-    def check_again(self, pending: PendingJob, check: Check) -> None:
-        """Want an accepted job again from hosts that the check may ask; of its holders only these go on."""
-        digest = pending.work.digest
-        if digest in self.jobs:
-            self.jobs.remove(digest)
-        members = self.members
-        kept = {name for name in pending.holders if check.may_ask(host_of(name), members[name].host_class)}
-        pending.holders -= kept
-        self._cancel(digest, pending)
-        self.jobs.offer_check(pending.work, check, kept)
-
-    def _record_failure(self, identity: str, result: Result) -> None:
-        """Record a failed attempt; the first one of each cause is logged."""
-        self.jobs.record_failure(identity, result, self._now)
-        self._note_failure(result.digest)
-
     def _note_failure(self, digest: bytes) -> None:
+        """Count a failed attempt; the first one of each cause is logged."""
         self.counts["errors"] += 1
-        failure = self.jobs[digest].failure
+        failure = self.jobs[digest]
         if self.failure_judge.is_new_cause(failure):
-            self.note(f"{failure}; it is tried again", "retried")
-
-    def _cancel(self, digest: bytes, pending: PendingJob) -> None:
-        """End all leases of a job that is wanted no more.
-
-        R9: each holder gets a cancellation, so nobody works for nothing; except a trial copy, whose duration is wanted.
-        """
-        for holder in pending.holders:
-            member = self.members[holder]
-            lease = member.end_lease(digest)
-            if lease is not None:
-                member.record_superseded(lease, self._now)
-            if digest not in member.trial_copies:
-                member.cancels.append(digest)
-            self.counts["discarded_steps"] += (lease and lease.steps) or 0
-
-    def _may_readopt(self, digest: bytes, identity: str) -> bool:
-        """Whether a worker that lists a wanted job gets its lease back.
-
-        R5: only if it may have been given the job. R17: a job has at most two holders.
-        """
-        pending = self.jobs[digest]
-        free = pending.state is not JobState.COPIED and identity not in pending.overrun_by
-        return free and self.jobs.may_have_been_given(digest, identity)
+            self.note(f"{failure.describe_failure()}; it is tried again", "retried")
 
     def _restart_numbering(self, member: Member) -> None:
         """Start a new numbering: its jobs are given again, unless a heartbeat lists them."""
-        self._release_leases(member)
+        self.leases.release(member)
         member.start_numbering(next(self._numberings))
 
     def _mark_heard(self, member: Member, now: float) -> None:
         member.last_heard = now
         if member.silent and not member.is_guest:  # a guest's silence was not logged either
-            self._note_arrival(member.identity, now, "back")
+            self._note_arrival(member.identity, "back")
         member.silent = False
         member.held_at_silence.clear()
 
-    def _note_arrival(self, identity: str, now: float, what: Literal["joined", "back"]) -> None:
-        self.event_log.add(now, what, identity)
+    def _note_arrival(self, identity: str, what: Literal["joined", "back"]) -> None:
+        self.event_log.add(what, identity)
         self.jobs.forgive_losses(identity)
         words = "joined" if what == "joined" else "is back"
         self.notes.append(Note(f"worker {identity} {words}", what, identity))
@@ -455,63 +387,15 @@ class Fleet:
         freed = f"; {plural(len(member.leases), 'job')} requeued" if member.leases else ""
         gone: EventKind = "silent" if member.gone_since is None else "lost" if member.is_lost else "left"
         self.notes.append(Note(f"worker {member.identity} {what}{freed}", gone, member.identity))
-        self.event_log.add(now, gone, member.identity, why=member.farewell)
+        self.event_log.add(gone, member.identity, why=member.farewell)
         if member.is_lost:
-            self._record_losses(member)
+            # One of the jobs in its hands may have ended it.
+            held = {digest for digest, lease in member.leases.items() if not lease.finished} | member.held_at_silence
+            for digest in held & self.jobs.keys():
+                if self.jobs.record_loss(member.identity, digest, self.event_log.now):
+                    self._note_failure(digest)
         elif member.silent:  # it may have ended: its token says so later
             member.held_at_silence = set(member.leases)
         if member.leases:
             (self._hosts.get(member.identity) or member.host_stats).record_loss(now - member.joined_at)
-        self._release_leases(member)
-
-    def _record_losses(self, member: Member) -> None:
-        """Note which jobs were in the hands of a worker that ended without a word: one of them may have ended it."""
-        held = {digest for digest, lease in member.leases.items() if not lease.finished} | member.held_at_silence
-        for digest in held & self.jobs.keys():
-            if self.jobs.record_loss(member.identity, digest, self._now):
-                self._note_failure(digest)
-
-    def _add_lease(
-        self, member: Member, digest: bytes, batch: int, group: DispatchGroup, now: float, steps: int | None = None
-    ) -> None:
-        pending = self.jobs[digest]
-        job = pending.work.job
-        kind = LeaseKind(pending.is_background, job.runs_alone, bool(job.driven))
-        member.add_lease(digest, Lease(batch, group, kind, steps=steps, steps_seen_at=now))
-        self.jobs.add_holder(digest, member.identity)
-
-    def _apply_move(self, move: Move, given: dict[str, list[Work]], now: float) -> None:
-        """Give a job to an idle slot, as a copy or instead of to its former holder."""
-        if move.donor:
-            donor = self.members[move.donor]
-            donor.end_lease(move.digest)
-            donor.cancels.append(move.digest)
-            self.jobs.remove_holder(move.digest, donor.identity)
-            self.event_log.add(now, "recalled", donor.identity, move.digest)
-        else:
-            self.event_log.add(now, "copied", move.taker, move.digest)
-        if move.trial:
-            self.members[move.taker].trial_copies[move.digest] = DispatchGroup(now, 0)
-        self.counts["recalled" if move.donor else "copied"] += 1
-        self.jobs.add_holder(move.digest, move.taker)
-        given.setdefault(move.taker, []).append(self.jobs[move.digest].work)
-
-    def _drop_lease(self, member: Member, digest: bytes, *, counted: bool = False) -> None:
-        """End a lease without a valid result; `counted`: what the worker did is counted as redundant already.
-
-        R3: when the last lease of a wanted job ends, the job goes back into the queue.
-        """
-        lease = member.end_lease(digest)
-        if lease is not None and not counted and digest in self.jobs:
-            self.jobs.record_lost_steps(digest, member.identity, None if lease.finished else lease.steps or 0)
-        if self.jobs.remove_holder(digest, member.identity):
-            self.counts["reissued"] += 1
-            self.event_log.add(self._now, "reissued", member.identity, digest)
-            self.jobs.enqueue(digest)
-
-    def _release_leases(self, member: Member) -> None:
-        """End all leases of a member (R3: each job goes back into the queue)."""
-        for digest in list(member.leases):
-            self._drop_lease(member, digest)
-        member.unconfirmed.clear()
-        member.trial_copies.clear()
+        self.leases.release(member)

@@ -7,12 +7,11 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from enum import Enum, auto
-from typing import NamedTuple
 
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.protocol.messages import MAX_LEASES, MOST_TOGETHER, Heartbeat, Job, Result, Verdict
 from dreamfleet.coordinator.dispatch.host_stats import HostStats
-from dreamfleet.coordinator.dispatch.packing import BatchContent
+from dreamfleet.coordinator.dispatch.packing import SentBatch
 
 TRIAL_SECONDS = 60.0  # after which a trial copy without a result is forgotten
 MAX_BACKOFF = 4  # doublings of the pause before a batch is sent again
@@ -40,41 +39,19 @@ class DispatchGroup:
     only_scoring: bool = True  # whether the worker held only candidates' jobs, so that the time measures its speed
 
 
-class LeaseKind(NamedTuple):
-    """What decides how much of a worker a job takes."""
-
-    is_background: bool
-    runs_alone: bool
-    driven: bool
-
-
 @dataclass
 class Lease:
     """A job that a worker holds: sent in `batch`, then running once a heartbeat shows its `steps`."""
 
     batch: int
     group: DispatchGroup
-    kind: LeaseKind
+    is_background: bool = False  # its job evaluates or collects
+    is_driven: bool = False
     absent_heartbeats: int = 0  # in a row that confirm the batch and do not list the job
     steps: int | None = None  # environment steps so far, once a heartbeat has shown the job running
     steps_seen_at: float = 0.0  # when the last heartbeat came
     finished: bool = False  # the last heartbeat listed its result, which has not come
     upload_pending_since: float | None = None  # when its result first came, while its upload is still on the way
-
-    @property
-    def is_background(self) -> bool:
-        """Whether its job evaluates or collects."""
-        return self.kind.is_background
-
-
-@dataclass
-class SentBatch:
-    """A batch that its worker has not confirmed."""
-
-    content: BatchContent
-    sent_at: float  # the last time; -inf: send it again at once
-    first_sent_at: float
-    times: int = 1
 
 
 @dataclass
@@ -111,7 +88,7 @@ class Member:
     resent: int = 0  # batches that were sent again
     # By digest, in the order in which they were given; `add_lease` and `end_lease` change them.
     leases: dict[bytes, Lease] = field(default_factory=dict)
-    held: Counter[LeaseKind] = field(default_factory=Counter)  # how many of its leases are of each kind
+    held: Counter[tuple[bool, bool]] = field(default_factory=Counter)  # leases by `is_background`, `is_driven`
     held_at_silence: set[bytes] = field(default_factory=set)  # its jobs when it became silent
     trial_copies: dict[bytes, DispatchGroup] = field(default_factory=dict)  # copies that measure it, wanted or not
     returned: list[DispatchGroup] = field(default_factory=list)  # groups with a new result since the last dispatch
@@ -183,34 +160,33 @@ class Member:
 
     def share_of(self, job: Job) -> int:
         """How much of its `capacity` a job takes: one that runs alone takes a whole slot, a drive its part of one."""
-        return self._share(runs_alone=job.runs_alone, driven=bool(job.driven))
+        return self._share(job.runs_alone, bool(job.driven))
 
-    def _share(self, *, runs_alone: bool, driven: bool) -> int:
+    def _share(self, runs_alone: bool, is_driven: bool) -> int:
         if runs_alone:
             return self.batch_size
-        is_driven = driven or self.batch_size <= self.together
-        return math.ceil(self.batch_size / min(self.together, self.drives_a_slot)) if is_driven else 1
+        if not is_driven and self.batch_size > self.together:
+            return 1
+        return math.ceil(self.batch_size / min(self.together, self.drives_a_slot))
 
     @property
     def held_share(self) -> int:
         """How much of its `capacity` its leases take; more than all of it if some wait there."""
         if self.batch_size == 1:
             return len(self.leases)
-        return sum(
-            count * self._share(runs_alone=kind.runs_alone, driven=kind.driven) for kind, count in self.held.items()
-        )
+        return sum(count * self._share(*kind) for kind, count in self.held.items())
 
     def add_lease(self, digest: bytes, lease: Lease) -> None:
         """Note that it is given a job."""
         self.end_lease(digest)
         self.leases[digest] = lease
-        self.held[lease.kind] += 1
+        self.held[lease.is_background, lease.is_driven] += 1
 
     def end_lease(self, digest: bytes) -> Lease | None:
         """Note that it has a job no more; return the lease, `None` if it had none."""
         lease = self.leases.pop(digest, None)
         if lease is not None:
-            self.held[lease.kind] -= 1
+            self.held[lease.is_background, lease.is_driven] -= 1
         return lease
 
     @property
@@ -221,7 +197,7 @@ class Member:
     @property
     def background_slots(self) -> int:
         """Slots that evaluations and collected rollouts take."""
-        return sum(count for kind, count in self.held.items() if kind.is_background)
+        return self.held[True, False] + self.held[True, True]
 
     def start_numbering(self, numbering: int) -> None:
         """Number its batches from 1 again, and forget what was to be sent: the worker repeats its results.
@@ -250,7 +226,7 @@ class Member:
         arrived = [self.unconfirmed.pop(number) for number in list(self.unconfirmed) if number <= beat.seen]
         if arrived and all(sent.times == 1 for sent in arrived):  # of a repeated batch, any sending may have arrived
             since = max(self.last_delivery, min(sent.first_sent_at for sent in arrived))
-            self.host_stats.record_transfer(sum(sent.content.size for sent in arrived), now - since)
+            self.host_stats.record_transfer(sum(sent.size for sent in arrived), now - since)
             self.host_stats.record_round_trip(now - max(sent.first_sent_at for sent in arrived))
         if arrived:
             self.last_delivery = now
@@ -271,22 +247,22 @@ class Member:
             lease.finished = digest in finished
         return [digest for digest, lease in self.leases.items() if lease.absent_heartbeats >= ABSENT_HEARTBEATS]
 
-    def take_overdue_batches(self, now: float, patience: float) -> Iterator[tuple[int, SentBatch]]:
-        """Batches to send again, with their numbers.
+    def take_overdue_batches(self, now: float, patience: float) -> Iterator[SentBatch]:
+        """Batches to send again.
 
         R11: a batch is due after `patience` and the time that the link needs for all that is on the way, then after
         twice as long each time, so a slow link is not flooded.
         """
         ahead = 0
-        for number, sent in self.unconfirmed.items():
-            ahead += sent.content.size
+        for sent in self.unconfirmed.values():
+            ahead += sent.size
             # The link is free since the last delivery.
             since = sent.sent_at if sent.sent_at == -math.inf else max(sent.sent_at, self.last_delivery)
             pause = patience + self.host_stats.transfer_seconds(ahead)
             if now - since > pause * 2 ** min(sent.times - 1, MAX_BACKOFF):
                 sent.sent_at, sent.times = now, sent.times + 1
                 self.resent += 1
-                yield number, sent
+                yield sent
 
     def resend_before(self, batch: int) -> None:
         """Send unconfirmed batches with lower numbers again at once.

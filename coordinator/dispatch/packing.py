@@ -1,8 +1,8 @@
-"""Work, cancellations and verdicts, cut into batches that fit the message limit."""
+"""What a worker is sent: jobs, cancellations and verdicts, cut into batches that fit the message limit."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from msgspec.structs import replace
@@ -15,40 +15,34 @@ _ENVELOPE, _JOB, _VECTOR, _CANCEL, _VERDICT = 1024, 400, 160, 40, 80
 
 
 @dataclass
-class BatchContent:
-    """What one batch carries; `size` is an upper bound of its bytes."""
+class SentBatch:
+    """What one worker is sent at once; number 0 is an empty batch that only shows that the coordinator is there."""
 
+    identity: str
+    numbering: int
+    number: int = 0
     vectors: list[VectorPart] = field(default_factory=list)
     work: list[Work] = field(default_factory=list)
     cancels: list[bytes] = field(default_factory=list)
     verdicts: list[Verdict] = field(default_factory=list)
-    size: int = _ENVELOPE
-
-    def has_vector(self, vector: bytes) -> bool:
-        """Whether the batch carries a part of the vector with this hash."""
-        return any(part.id == vector for part in reversed(self.vectors))
-
-
-@dataclass(frozen=True)
-class OutgoingBatch:
-    """A numbered batch for one worker; number 0 is an empty one that only shows that the coordinator is there."""
-
-    identity: str
-    numbering: int
-    number: int
-    content: BatchContent
+    size: int = _ENVELOPE  # an upper bound of its bytes
+    first_sent_at: float = 0.0
+    sent_at: float = 0.0  # the last time; -inf: send it again at once
+    times: int = 1  # that it was sent
 
 
-def pack(work: Sequence[Work], cancels: Sequence[bytes], verdicts: Sequence[Verdict]) -> list[BatchContent]:
-    """Everything, in order, in as few batches as fit.
+def pack(
+    identity: str, numbering: int, work: Sequence[Work], cancels: Sequence[bytes], verdicts: Sequence[Verdict]
+) -> list[SentBatch]:
+    """Everything, in order, in as few batches as fit; they have no numbers yet.
 
     R13: each batch fits the message limit; a long vector travels in parts, and its job comes with the last part.
     """
-    batches = [BatchContent()]
+    batches = [SentBatch(identity, numbering)]
 
-    def reserve(size: int) -> BatchContent:
+    def reserve(size: int) -> SentBatch:
         if batches[-1].size + size > MAX_MESSAGE:
-            batches.append(BatchContent())
+            batches.append(SentBatch(identity, numbering))
         batches[-1].size += size
         return batches[-1]
 
@@ -57,20 +51,17 @@ def pack(work: Sequence[Work], cancels: Sequence[bytes], verdicts: Sequence[Verd
     for digest in cancels:
         reserve(_CANCEL).cancels.append(digest)
     for each in work:
-        _pack_work(each, batches, reserve)
+        is_there = any(part.id == each.job.vector for part in reversed(batches[-1].vectors))
+        if is_there and batches[-1].size + _JOB <= MAX_MESSAGE:
+            reserve(_JOB).work.append(each)
+            continue
+        *parts, last = vector_parts(each)
+        for part in parts:
+            reserve(_VECTOR + len(part.data)).vectors.append(part)
+        batch = reserve(_VECTOR + len(last.data) + _JOB)
+        batch.vectors.append(last)
+        batch.work.append(each)
     return [batch for batch in batches if batch.size > _ENVELOPE]
-
-
-def _pack_work(each: Work, batches: list[BatchContent], reserve: Callable[[int], BatchContent]) -> None:
-    if batches[-1].has_vector(each.job.vector) and batches[-1].size + _JOB <= MAX_MESSAGE:
-        reserve(_JOB).work.append(each)
-        return
-    *parts, last = vector_parts(each)
-    for part in parts:
-        reserve(_VECTOR + len(part.data)).vectors.append(part)
-    batch = reserve(_VECTOR + len(last.data) + _JOB)
-    batch.vectors.append(last)
-    batch.work.append(each)
 
 
 def vector_parts(work: Work) -> Iterator[VectorPart]:

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import heapq
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from enum import Enum, auto
 
-from dreamfleet.common.protocol.failures import Failure
+from dreamfleet.common.printable import truncate
+from dreamfleet.common.protocol.failures import Failure, describe_job
 from dreamfleet.common.protocol.messages import TAG_BYTES, Kind, Result
 from dreamfleet.coordinator.dispatch.deficit_round_robin import DeficitCounter
-from dreamfleet.coordinator.dispatch.failures import WORKER_ENDED, Attempt, JobFailure, host_of, pause_before_retry
+from dreamfleet.coordinator.dispatch.failures import LONGEST_ERROR, WORKER_ENDED, Attempt, host_of, pause_before_retry
 from dreamfleet.coordinator.jobs.checks import Check
 from dreamfleet.coordinator.jobs.work import Work
 
 MAX_FAILED = 64  # failed attempts of a job that are remembered
+MAX_NAMED = 4  # workers that the description of a failure names
 MAX_HOLDERS = 2  # workers that a job is leased to at a time
 SUSPECT_LOSSES = 2  # workers that ended while they held a job: it may be what ended them
 NO_REASON = Failure("no fitness and no reason", "no reason")
@@ -79,17 +82,29 @@ class PendingJob:
         return sum(steps if made is None else min(made, steps) for made in gone)
 
     @property
-    def failure(self) -> JobFailure:
-        """Its failures so far."""
-        return JobFailure(self.work, self.attempts, self.retry_at)
+    def errors(self) -> dict[str, str]:
+        """The last error of each worker that failed it, in words."""
+        return {each.worker: each.error.text for each in self.attempts}
 
+    @property
+    def attempts_by_worker(self) -> dict[str, int]:
+        """How often it failed on each worker."""
+        return dict(Counter(each.worker for each in self.attempts))
 
-@dataclass(frozen=True)
-class NextJob:
-    """The job to give next; `by_share`: a background job that goes before candidates' jobs."""
-
-    digest: bytes
-    by_share: bool
+    def describe_failure(self) -> str:
+        """What failed, on which workers, how often, and why, in one sentence."""
+        job, errors, attempts = self.work.job, self.errors, self.attempts_by_worker
+        names = list(errors)
+        number = "two" if len(names) == 2 else str(len(names))
+        where = "on one worker" if len(names) == 1 else f"on {number} workers"
+        parts = [
+            f"{name} ({'once' if attempts[name] == 1 else f'{attempts[name]} times'}): "
+            f"{truncate(errors[name], LONGEST_ERROR)}"
+            for name in names[:MAX_NAMED]
+        ]
+        more = [f"and {len(names) - MAX_NAMED} more"] if len(names) > MAX_NAMED else []
+        subject = describe_job(job.kind, job.generation, job.candidate, job.seeds)
+        return f"{subject}, failed {where}: {'; '.join(parts + more)}"
 
 
 class PendingJobs(Mapping[bytes, PendingJob]):
@@ -212,11 +227,11 @@ class PendingJobs(Mapping[bytes, PendingJob]):
             pending.queued = pending.order
             heapq.heappush(self._background_queue if pending.is_background else self._queue, (pending.order, digest))
 
-    def next(self, slots: int, *, idle: bool, drain_background: bool) -> NextJob | None:
+    def next(self, slots: int, *, idle: bool, drain_background: bool) -> tuple[bytes, bool] | None:
         """Take the next job from its queue; `None` if none may be given now.
 
         `slots` is the fleet's number of slots, `idle` whether one of them is. With `drain_background` background
-        jobs may use all slots.
+        jobs may use all slots. The answer is the digest, and whether a background job goes before candidates' jobs.
         """
         while (next_job := self._next_queue(slots, idle=idle, drain_background=drain_background)) is not None:
             queue, by_share = next_job
@@ -225,7 +240,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
                 continue  # answered or withdrawn meanwhile, and perhaps wanted again since, with an entry of its own
             pending.queued = None
             if pending.state is JobState.QUEUED:  # else a former holder has its lease again
-                return NextJob(digest, by_share)
+                return digest, by_share
         return None
 
     def add_holder(self, digest: bytes, worker: str, *, by_share: bool = False) -> None:
@@ -335,9 +350,9 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         return pending
 
     @property
-    def failures(self) -> list[JobFailure]:
+    def failures(self) -> list[PendingJob]:
         """Wanted jobs that failed somewhere."""
-        return [pending.failure for pending in self._failing.values()]
+        return list(self._failing.values())
 
     def clear_failures(self) -> None:
         """Forget all failures, so that each job may be tried anew."""

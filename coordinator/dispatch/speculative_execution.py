@@ -7,7 +7,7 @@ without a recent record, beside one with a record, first gets a trial copy of a 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from dreamfleet.coordinator.dispatch.failures import host_of
@@ -38,10 +38,14 @@ class Move:
 
 
 class SpeculativeExecution:
-    """Plans moves of jobs to idle slots, from the typical length and duration of accepted jobs."""
+    """Plans moves of `jobs` to idle slots of `members`, from the typical length and duration of accepted jobs."""
 
-    def __init__(self, heartbeat_interval: float) -> None:
+    def __init__(
+        self, heartbeat_interval: float, jobs: Mapping[bytes, PendingJob], members: Mapping[str, Member]
+    ) -> None:
         self._heartbeat_interval = heartbeat_interval
+        self._jobs = jobs
+        self._members = members
         self._typical_steps = 0.0  # of an episode
         self._typical_seconds = {False: 0.0, True: 0.0}  # from giving a job to its result, by whether it is background
 
@@ -58,43 +62,34 @@ class SpeculativeExecution:
         """Note the length of an accepted episode."""
         self._typical_steps += SMOOTHING * (steps - self._typical_steps) if self._typical_steps else steps
 
-    def plan(
-        self,
-        jobs: Mapping[bytes, PendingJob],
-        members: Mapping[str, Member],
-        given: Mapping[str, Sequence[Work]],
-        now: float,
-    ) -> Iterator[Move]:
+    def plan(self, given: Mapping[str, Sequence[Work]], now: float) -> Iterator[Move]:
         """Moves to the idle slots, the fastest member first; `given` is the work that is about to be sent.
 
         R17: an idle slot helps with what other workers hold, so the last jobs of a generation end sooner.
         """
-        takers = [member for member in members.values() if member.takes_jobs]
-        loads = {each.identity: each.held_share + _share(each, given.get(each.identity, ())) for each in takers}
+        takers = [member for member in self._members.values() if member.takes_jobs]
+        loads = {
+            each.identity: each.held_share + sum(each.share_of(work.job) for work in given.get(each.identity, ()))
+            for each in takers
+        }
         idle = [member for member in takers if loads[member.identity] < member.free_capacity]
         moved: set[bytes] = set()
         stragglers: dict[tuple[bool, bool], list[Straggler]] = {}
         for taker in sorted(
             idle, key=lambda member: (member.host_stats.expected_seconds(1), -member.slot_steps_per_second)
         ):
-            for move in self._moves(taker, takers, loads, jobs, moved, stragglers, now):
+            for move in self._moves(taker, takers, loads, moved, stragglers, now):
                 moved.add(move.digest)
-                job = jobs[move.digest].work.job
+                job = self._jobs[move.digest].work.job
                 loads[taker.identity] += taker.share_of(job)
                 if move.donor:
-                    loads[move.donor] -= members[move.donor].share_of(job)
+                    loads[move.donor] -= self._members[move.donor].share_of(job)
                 yield move
 
     def _moves(
-        self,
-        taker: Member,
-        members: Sequence[Member],
-        loads: Mapping[str, int],
-        jobs: Mapping[bytes, PendingJob],
-        moved: set[bytes],
-        stragglers: dict[tuple[bool, bool], list[Straggler]],
-        now: float,
-    ) -> Iterator[Move]:
+        self, taker: Member, members: Sequence[Member], loads: Mapping[str, int], moved: set[bytes],
+        stragglers: dict[tuple[bool, bool], list[Straggler]], now: float,
+    ) -> Iterator[Move]:  # fmt: skip
         """Moves to one member until its slots are full; `stragglers` are those that other takers found."""
         others = [member for member in members if member is not taker]
         if not taker.host_stats.has_history and any(is_dependable(other, now) for other in others):
@@ -105,46 +100,44 @@ class SpeculativeExecution:
         while loads[taker.identity] < taker.free_capacity:
             jobs_held = len(taker.leases) + loads[taker.identity] - taker.held_share
             expected = self._expected_seconds(taker, jobs_held + 1)
-            if (move := self._find_recall(taker, expected, others, loads, jobs, moved, now)) is not None:
-                yield move
-                continue
-            if (copied := _find_straggler(stragglers[known], taker, expected, jobs, moved)) is None:
+            move = self._find_recall(taker, expected, others, loads, moved, now)
+            if move is None and (copied := self._find_straggler(stragglers[known], taker, expected, moved)) is not None:
+                move = Move(copied, taker.identity)
+            if move is None:
                 return
-            yield Move(copied, taker.identity)
+            yield move
 
     def _expected_seconds(self, taker: Member, jobs: int) -> float:
         if not taker.host_stats.has_history and taker.slot_steps_per_second and self._typical_steps:
             return self._typical_steps / taker.slot_steps_per_second
         return taker.host_stats.expected_seconds(jobs)
 
-    def plan_trials(
-        self, jobs: Mapping[bytes, PendingJob], members: Mapping[str, Member], busy: Collection[str], now: float
-    ) -> Iterator[Move]:
+    def plan_trials(self, busy: Collection[str], now: float) -> Iterator[Move]:
         """One trial copy for each idle member without a recent record, if another one has a record.
 
         R16: a member is measured on a job for which nobody waits, before anything depends on it.
         """
-        takers = [member for member in members.values() if member.takes_jobs]
+        takers = [member for member in self._members.values() if member.takes_jobs]
         for taker in takers:
             if taker.leases or not taker.free_capacity or taker.identity in busy or not _is_trial_due(taker, now):
                 continue
             known = [other for other in takers if other is not taker and is_dependable(other, now)]
             donors = sorted(known, key=lambda member: -len(member.leases) / member.capacity)
             copied = (digest for donor in donors for digest, lease in reversed(donor.leases.items())
-                      if not lease.is_background and _may_take(digest, taker, jobs))  # fmt: skip
+                      if not lease.is_background and self._may_take(digest, taker))  # fmt: skip
             if (digest := next(copied, None)) is not None:
                 yield Move(digest, taker.identity, trial=True)
 
     def _find_recall(
-        self, taker: Member, expected: float, others: Sequence[Member], loads: Mapping[str, int],
-        jobs: Mapping[bytes, PendingJob], moved: set[bytes], now: float,
+        self, taker: Member, expected: float, others: Sequence[Member], loads: Mapping[str, int], moved: set[bytes],
+        now: float,
     ) -> Move | None:  # fmt: skip
         """The latest job of the most loaded member with more leases than free slots: it waits there, not begun."""
         donors = [member for member in others if loads[member.identity] > member.free_capacity]
         for donor in sorted(donors, key=lambda member: -loads[member.identity] / member.capacity):
             for digest, lease in reversed(donor.leases.items()):
                 waits = lease.steps is None and lease.upload_pending_since is None and digest not in moved
-                if waits and _may_take(digest, taker, jobs):
+                if waits and self._may_take(digest, taker):
                     known = taker.host_stats.has_history and donor.host_stats.has_history
                     if known and _seconds_until_due(donor, lease, now) <= expected and not donor.background_slots:
                         break  # its holder should return it sooner
@@ -186,40 +179,32 @@ class SpeculativeExecution:
             left = max(left, steps / holder.slot_steps_per_second)
         return left
 
+    def _find_straggler(
+        self, stragglers: Sequence[Straggler], taker: Member, expected: float, moved: Collection[bytes]
+    ) -> bytes | None:
+        """The job of another worker that `taker` should copy, as it would need `expected` seconds; `None`: none.
 
-def _find_straggler(
-    stragglers: Sequence[Straggler], taker: Member, expected: float, jobs: Mapping[bytes, PendingJob],
-    moved: Collection[bytes],
-) -> bytes | None:  # fmt: skip
-    """The job of another worker that `taker` should copy, as it would need `expected` seconds; `None` if there is none.
+        `stragglers` begin with the longest.
+        """
+        for left, digest, holder in stragglers:
+            if left <= MARGIN * expected and left != math.inf:
+                break
+            if holder is not taker and digest not in moved and self._may_take(digest, taker):
+                return digest
+        return None
 
-    `stragglers` begin with the longest.
-    """
-    for left, digest, holder in stragglers:
-        if left <= MARGIN * expected and left != math.inf:
-            break
-        if holder is not taker and digest not in moved and _may_take(digest, taker, jobs):
-            return digest
-    return None
+    def _may_take(self, digest: bytes, taker: Member) -> bool:
+        """Whether a job has one holder and may be given to `taker`.
 
-
-def _share(member: Member, given: Iterable[Work]) -> int:
-    """How much of a member's capacity the work that it is about to be sent takes."""
-    return sum(member.share_of(work.job) for work in given)
-
-
-def _may_take(digest: bytes, taker: Member, jobs: Mapping[bytes, PendingJob]) -> bool:
-    """Whether a job has one holder and may be given to `taker`.
-
-    R17: a job has at most two holders, which bounds the wasted work. R8: what may have ended its workers has one, and
-    so has a job that is to show whether its holder can score.
-    """
-    job = jobs.get(digest)
-    if job is None or job.is_suspect or job.is_proof:
-        return False
-    if job.check is not None and not job.check.may_ask(host_of(taker.identity), taker.host_class):
-        return False
-    return job.state is JobState.LEASED and taker.identity not in job.avoided_workers
+        R17: a job has at most two holders, which bounds the wasted work. R8: what may have ended its workers has one,
+        and so has a job that is to show whether its holder can score.
+        """
+        job = self._jobs.get(digest)
+        if job is None or job.is_suspect or job.is_proof:
+            return False
+        if job.check is not None and not job.check.may_ask(host_of(taker.identity), taker.host_class):
+            return False
+        return job.state is JobState.LEASED and taker.identity not in job.avoided_workers
 
 
 def _is_trial_due(taker: Member, now: float) -> bool:

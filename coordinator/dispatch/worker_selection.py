@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections import Counter
 from collections.abc import Collection, Mapping
 from functools import cached_property
 
 from dreamfleet.coordinator.dispatch.failures import host_of
-from dreamfleet.coordinator.dispatch.member import Member, MemberState
+from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob, PendingJobs
 from dreamfleet.coordinator.jobs.checks import Check
 from dreamfleet.coordinator.jobs.work import Work
@@ -154,15 +153,23 @@ class WorkerSelection:
 
 
 class JobAssignment:
-    """The work that each member is given at one moment, and who may be given more."""
+    """The work that each member is given at one moment, and who may be given more.
 
-    def __init__(self, jobs: PendingJobs, members: Mapping[str, Member]) -> None:
+    `working_hosts` are those that have scored, `for_suspects` those that may be given suspects; empty: any host.
+    """
+
+    def __init__(
+        self, jobs: PendingJobs, members: Mapping[str, Member], working_hosts: Collection[str],
+        for_suspects: Collection[str],
+    ) -> None:  # fmt: skip
         self.given: dict[str, list[Work]] = {}
         self.shares = {name: member.held_share for name, member in members.items() if member.credit > 0}
         self._full_at = {name: share + members[name].credit for name, share in self.shares.items()}
         self._idle = {name for name, share in self.shares.items() if share < members[name].capacity}
         self._jobs = jobs
         self._members = members
+        self._working_hosts = working_hosts
+        self._for_suspects = for_suspects
 
     @property
     def has_idle(self) -> bool:
@@ -176,11 +183,11 @@ class JobAssignment:
 
     def give(self, digest: bytes, name: str, *, by_share: bool = False) -> None:
         """Give a job to a member."""
-        job = self._jobs[digest].work.job
-        self.given.setdefault(name, []).append(self._jobs[digest].work)
+        work = self._jobs[digest].work
+        self.given.setdefault(name, []).append(work)
         self._jobs.add_holder(digest, name, by_share=by_share)
         if name in self.shares:
-            self.shares[name] += self._members[name].share_of(job)
+            self.shares[name] += self._members[name].share_of(work.job)
             if self.shares[name] >= self._members[name].capacity:
                 self._idle.discard(name)
             if self.shares[name] >= self._full_at[name]:
@@ -189,52 +196,80 @@ class JobAssignment:
     def give_checks(self) -> None:
         """Give jobs whose accepted results another host is to repeat, each to the least loaded one that may (R32)."""
         for pending in [each for each in self._jobs.checks.values() if not each.holders]:
-            digest = pending.work.digest
             able = [name for name, member in self._members.items() if self._may_check(pending, member)]
-            if able:
-                self.give(digest, min(able, key=lambda name: self._load(name) / self._members[name].capacity))
+            self._give_to_least_loaded(pending, able)
 
     def give_copy(self, digest: bytes, first: str) -> None:
         """Give a job that is to be checked to a second host of the class at once, so that nobody waits for it later.
 
         R32: both get it in its turn, so its place says nothing.
         """
-        member = self._members[first]
-        check = Check(member.host_class, {host_of(first)})
-        able = [name for name in self.shares if check.may_ask(host_of(name), self._members[name].host_class)]
-        if able and not self._jobs[digest].avoided_workers:
-            self.give(digest, min(able, key=lambda name: self._load(name) / self._members[name].capacity))
+        check = Check(self._members[first].host_class, {host_of(first)})
+        if not self._jobs[digest].avoided_workers:
+            able = [name for name in self.shares if check.may_ask(host_of(name), self._members[name].host_class)]
+            self._give_to_least_loaded(self._jobs[digest], able)
+
+    def _give_to_least_loaded(self, pending: PendingJob, able: Collection[str]) -> None:
+        if able:
+            name = min(able, key=lambda name: self._load(name) / self._members[name].capacity)
+            self.give(pending.work.digest, name)
 
     def _may_check(self, pending: PendingJob, member: Member) -> bool:
         check, load = pending.check, self._load(member.identity) - member.held_share
-        free = member.can_score and member.state is MemberState.PRESENT and member.check_credit > load
         may = check is not None and check.may_ask(host_of(member.identity), member.host_class)
-        return free and may and member.identity not in pending.avoided_workers
+        has_room = member.can_score and member.check_credit > load
+        return may and has_room and member.identity not in pending.avoided_workers
 
     def _load(self, name: str) -> int:
         """How much of a member's capacity its jobs take, those that it is given now included."""
         member = self._members[name]
-        own = (member.share_of(work.job) for work in self.given.get(name, ()))
-        return member.held_share + sum(own)
+        return member.held_share + sum(member.share_of(work.job) for work in self.given.get(name, ()))
+
+    def find_eligible(self, pending: PendingJob) -> Collection[str]:
+        """The members with credit that may be given a job.
+
+        R8: a suspect goes to hosts that have scored, if any, and to no worker that holds another. A job that was scored
+        before goes to hosts that have not scored, if one is here: it is to show whether they can. No job goes to a
+        worker where it failed, unless every present one is such: then to those where it failed least often. A process
+        that was killed once must not stop the run. A stranger's hello cannot keep a failed job from being tried again,
+        and neither can a worker that was never ready, so guests and these do not count.
+        """
+        free: Collection[str] = self.shares
+        allowed = self._allowed_members(pending)
+        if allowed is not self._members or pending.is_suspect:
+            busy = self._jobs.holders_of_suspects() if pending.is_suspect else ()
+            free = [name for name in free if name in allowed and name not in busy]
+        avoided = pending.avoided_workers
+        if not avoided:
+            return free
+        if eligible := [name for name in free if name not in avoided]:
+            return eligible
+        if any(name not in avoided for name, member in allowed.items() if member.has_been_ready):
+            return []
+        failed = pending.attempts_by_worker
+        fewest = min((failed.get(name, 0) for name in free), default=0)
+        return [name for name in free if failed.get(name, 0) == fewest]
+
+    def _allowed_members(self, pending: PendingJob) -> Mapping[str, Member]:
+        if pending.is_suspect and self._for_suspects:
+            return {name: each for name, each in self._members.items() if host_of(name) in self._for_suspects}
+        if pending.is_proof:
+            new = {name: each for name, each in self._members.items() if host_of(name) not in self._working_hosts}
+            return new if any(each.takes_jobs for each in new.values()) else self._members
+        return self._members
 
 
 def assign_jobs(
-    jobs: PendingJobs,
-    members: Mapping[str, Member],
-    working_hosts: Collection[str],
-    now: float,
-    *,
-    drain_background: bool,
-    for_suspects: Collection[str] | None = None,
-) -> dict[str, list[Work]]:
+    jobs: PendingJobs, members: Mapping[str, Member], working_hosts: Collection[str], for_suspects: Collection[str],
+    now: float, *, drain_background: bool,
+) -> dict[str, list[Work]]:  # fmt: skip
     """Take queued jobs one by one and choose a member with credit for each; the work by member.
 
-    With `drain_background` background jobs may use all slots. `for_suspects` are the hosts that may be given suspects:
-    the working ones by default, any host if it is empty. A job without a suitable member stays queued. Where very many
-    slots are idle, they alone get jobs, so that they begin sooner; the next turn gives what workers hold in advance.
+    `working_hosts` and `for_suspects` are those of a `JobAssignment`. With `drain_background` background jobs may use
+    all slots. A job without a suitable member stays queued. Where very many slots are idle, they alone get jobs, so
+    that they begin sooner; the next turn gives what workers hold in advance.
     """
-    for_suspects = working_hosts if for_suspects is None else for_suspects
-    assignment = JobAssignment(jobs, members)
+    assignment = JobAssignment(jobs, members, working_hosts, for_suspects)
     assignment.give_checks()
     shares = assignment.shares
     selection = WorkerSelection(members, shares, jobs.queue_length, now)
@@ -242,67 +277,27 @@ def assign_jobs(
     passed_over = []
     is_large = assignment.idle_slots >= MANY_IDLE
     while shares and (assignment.has_idle or not is_large):
-        if (next_job := jobs.next(slots, idle=assignment.has_idle, drain_background=drain_background)) is None:
+        if (found := jobs.next(slots, idle=assignment.has_idle, drain_background=drain_background)) is None:
             break
-        pending = jobs[next_job.digest]
-        allowed: Mapping[str, Member] = members
-        free: Collection[str] = shares
-        if pending.is_suspect or pending.is_proof:
-            allowed = _allowed_members(pending, members, for_suspects if pending.is_suspect else working_hosts)
-            busy = jobs.holders_of_suspects() if pending.is_suspect else ()
-            free = [name for name in shares if name in allowed and name not in busy]
-        eligible = _eligible_workers(pending, free, allowed)
+        digest, by_share = found
+        pending = jobs[digest]
+        eligible = assignment.find_eligible(pending)
         if not eligible:
-            passed_over.append(next_job.digest)
+            passed_over.append(digest)
             continue
         awaited = drain_background and pending.is_background
         name = selection.pick_for_background(eligible) if awaited else selection.pick(eligible)
         if name is None and not pending.avoided_workers and not pending.is_proof:
-            passed_over.append(next_job.digest)
+            passed_over.append(digest)
             break  # the jobs after it wait for a faster worker too
         name = name or min(eligible, key=lambda name: shares[name])
         selection.assign(name)
-        assignment.give(next_job.digest, name, by_share=next_job.by_share)
+        assignment.give(digest, name, by_share=by_share)
         if jobs.is_drawn(pending.work) and not pending.is_suspect and not pending.is_proof:
-            assignment.give_copy(next_job.digest, name)
+            assignment.give_copy(digest, name)
     for digest in passed_over:
         jobs.enqueue(digest)
     return assignment.given
-
-
-def _allowed_members(
-    pending: PendingJob, members: Mapping[str, Member], working_hosts: Collection[str]
-) -> Mapping[str, Member]:
-    """Which members may be given a job at all.
-
-    R8: a suspect goes to the `working_hosts`, if any. A job that was scored before goes to hosts that have not scored,
-    if one is here: it is to show whether they can.
-    """
-    if pending.is_suspect and working_hosts:
-        return {name: member for name, member in members.items() if host_of(name) in working_hosts}
-    if pending.is_proof:
-        new = {name: member for name, member in members.items() if host_of(name) not in working_hosts}
-        return new if any(member.takes_jobs for member in new.values()) else members
-    return members
-
-
-def _eligible_workers(pending: PendingJob, free: Collection[str], members: Mapping[str, Member]) -> Collection[str]:
-    """Which of these `free` members may be given a job; `members` are all that may be given it.
-
-    R8: not one where it failed, unless every present member is such: then those where it failed least often. A process
-    that was killed once must not stop the run. A stranger's hello cannot keep a failed job from being tried again, and
-    neither can a worker that was never ready, so guests and these do not count.
-    """
-    avoided = pending.avoided_workers
-    if not avoided:
-        return free
-    if eligible := [name for name in free if name not in avoided]:
-        return eligible
-    if any(name not in avoided for name, member in members.items() if member.has_been_ready):
-        return []
-    failed = Counter(each.worker for each in pending.attempts)
-    fewest = min((failed[name] for name in free), default=0)
-    return [name for name in free if failed[name] == fewest]
 
 
 def is_dependable(member: Member, now: float) -> bool:

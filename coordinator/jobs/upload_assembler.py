@@ -11,16 +11,9 @@ from dataclasses import dataclass, field
 
 from dreamfleet.common.protocol.messages import MAX_PART, MAX_UPLOAD, UploadPart
 
+MAX_OPEN, MAX_SIZE = 64, 4 * MAX_UPLOAD  # open uploads, and their bytes
+MAX_IDLE = 60.0  # seconds without a new part: several times the longest pause of a worker between repetitions
 TOO_MANY = "too many uploads"  # why an upload was dropped
-
-
-@dataclass(frozen=True)
-class UploadLimits:
-    """The most open uploads, their most bytes, and the most seconds without a new part."""
-
-    count: int = 64
-    size: int = 4 * MAX_UPLOAD
-    idle: float = 60.0  # several times the longest pause of a worker between repetitions
 
 
 @dataclass
@@ -37,9 +30,8 @@ class PartialUpload:
 class UploadAssembler:
     """The open uploads by worker and job; `dropped` counts refused parts and uploads by reason."""
 
-    def __init__(self, limits: UploadLimits | None = None) -> None:
+    def __init__(self) -> None:
         self.dropped: Counter[str] = Counter()
-        self._limits = limits or UploadLimits()
         self._open: dict[tuple[str, bytes], PartialUpload] = {}
 
     def __len__(self) -> int:
@@ -81,7 +73,7 @@ class UploadAssembler:
 
     def tick(self, now: float) -> None:
         """Drop uploads without progress; their workers send them again from the beginning."""
-        for key in [key for key, upload in self._open.items() if now - upload.grew_at > self._limits.idle]:
+        for key in [key for key, upload in self._open.items() if now - upload.grew_at > MAX_IDLE]:
             del self._open[key]
             self.dropped["abandoned upload"] += 1
 
@@ -93,7 +85,7 @@ class UploadAssembler:
         if upload is not None:  # the episode was driven again, with another result
             del self._open[key]
             self.dropped["replaced upload"] += 1
-        if len(self._open) >= self._limits.count or self.size + part.total > self._limits.size:
+        if len(self._open) >= MAX_OPEN or self.size + part.total > MAX_SIZE:
             self.dropped[TOO_MANY] += 1
             return None
         self._open[key] = PartialUpload(part.sha256, part.total, now)

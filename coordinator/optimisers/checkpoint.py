@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,28 +49,16 @@ class Checkpoint:
 
     @classmethod
     def unpack(cls, data: bytes) -> Checkpoint:
-        """Read what `packed` wrote, in version 0.1 too; `JournalError` if it is damaged. Pickle is never loaded."""
+        """Read what `packed` wrote; `JournalError` if it is damaged. Pickle is never loaded."""
         try:
-            return cls._of(read_arrays(data, _LIMITS))
+            arrays = read_arrays(data, _LIMITS)
+            head = {name: arrays.pop(name) for name in [*arrays] if name.startswith(PREFIX)}
+            name, requirement, mean, sigma = (head[PREFIX + each] for each in ("name", "requirement", "mean", "sigma"))
+            found = Head(str(name), str(requirement), mean, float(sigma), head.get(PREFIX + "origin"))
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             why = one_line(str(error))
             raise JournalError(f"the journal's last state is damaged ({why}): restore it from a copy") from error
-
-    @classmethod
-    def _of(cls, arrays: State) -> Checkpoint:
-        head = {name: arrays.pop(name) for name in [*arrays] if name.startswith(PREFIX)}
-        if not head:
-            return cls(_version_01_head(arrays), arrays)
-        name, requirement, mean, sigma = (head[PREFIX + each] for each in ("name", "requirement", "mean", "sigma"))
-        return cls(Head(str(name), str(requirement), mean, float(sigma), head.get(PREFIX + "origin")), arrays)
-
-
-def _version_01_head(arrays: State) -> Head:
-    """Move the head of a version 0.1 state, which is always of pycma, out of the arrays."""
-    if "cma" not in arrays:
-        raise JournalError("the journal's last state is damaged: it does not name the optimiser that wrote it")
-    sigma = untag(json.loads(str(arrays["about"]))["sigma"])
-    return Head("cma", f"cma=={arrays.pop('cma')}", arrays["mean"].astype(np.float64), float(sigma))
+        return cls(found, arrays)
 
 
 def tag(value: Any) -> list[Any]:

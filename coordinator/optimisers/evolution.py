@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, cast
+from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,76 +21,50 @@ from dreamfleet.coordinator.optimisers.api import Search
 from dreamfleet.coordinator.optimisers.checkpoint import PREFIX, Checkpoint, Head
 from dreamfleet.coordinator.optimisers.registry import build_optimiser, check_memory
 
-Covariance = Literal["diagonal", "full"]
-
-
-@dataclass(frozen=True)
-class EvolutionConfig:
-    """What makes one search: `dimension` parameters, `population` candidates a generation, first step `sigma0`."""
-
-    dimension: int
-    population: int
-    sigma0: float
-    covariance: Covariance
-    seed: int
-    optimiser: str = "cma"
-    optimiser_options: tuple[str, ...] = ()  # each as name=value
-    space: SearchSpace | None = None  # what the search keeps to; `None`: all parameters
-    archive: tuple[str, ...] = ()  # its axes, each as MEASURE=LOW:HIGH:CELLS
-
-    def __post_init__(self) -> None:
-        if self.population < 2:
-            raise UsageError(f"population must be at least 2, not {self.population}")
-        if not 0 < self.sigma0 < float("inf"):
-            raise UsageError(f"sigma0 must be a positive number, not {self.sigma0}")
-
-    @classmethod
-    def of(cls, settings: RunSettings, stage: Stage, subspace: Subspace | None = None) -> EvolutionConfig:
-        """As a run's settings say for the search that goes on in this stage; `subspace` is the run's."""
-        return cls(
-            settings.controller.size,
-            stage.settings.population,
-            stage.settings.sigma0,
-            settings.covariance,
-            search_seed(settings.seed, stage.search),
-            settings.optimiser,
-            settings.optimiser_options,
-            None if subspace is None or stage.whole else SearchSpace(subspace, settings.controller),
-            settings.archive,
-        )
-
-    def search(self, start: NDArray[np.float64]) -> Search:
-        """What the optimiser is built from, to begin at `start` `(dimension,)`: of a subspace at its origin."""
-        mean = start if self.space is None else np.zeros(self.space.dimension)
-        return Search(mean, self.population, self.sigma0, self.seed, self.options, parse_axes(self.archive))
-
-    @property
-    def options(self) -> dict[str, str]:
-        """The optimiser's options."""
-        # It is a setting of its own, older than options; its default is none, so that every optimiser takes it.
-        covariance = () if self.covariance == "diagonal" else (f"covariance={self.covariance}",)
-        return _options([*self.optimiser_options, *covariance])
-
-    @property
-    def searched_dimension(self) -> int:
-        """The number of parameters, or of a subspace's coordinates."""
-        return self.dimension if self.space is None else self.space.dimension
-
 
 class Evolution:
     """Maximises fitness by the run's optimiser; a checkpoint is taken between an update and the next `ask`.
 
-    >>> evolution = Evolution(EvolutionConfig(dimension=3, population=4, sigma0=0.1, covariance="diagonal", seed=1))
+    >>> evolution = Evolution("cma", Search(mean=np.zeros(3), population=4, sigma0=0.1, seed=1))
     >>> candidates = evolution.ask()
     >>> evolution.tell(np.array([1.0, 2.0, 3.0, 4.0]))
     """
 
-    def __init__(self, config: EvolutionConfig, start: NDArray[np.float64] | None = None) -> None:
-        self._config = config
-        check_memory(config.optimiser, config.searched_dimension, config.population, config.options)
-        self._origin = np.zeros(config.dimension) if start is None else np.asarray(start, dtype=np.float64)
-        self._optimiser = build_optimiser(config.optimiser, config.search(self._origin))
+    def __init__(self, optimiser: str, search: Search, space: SearchSpace | None = None) -> None:
+        """`search` begins at parameters `(dimension,)`; in a `space` these are the zero of its coordinates."""
+        if search.population < 2:
+            raise UsageError(f"population must be at least 2, not {search.population}")
+        if not 0 < search.sigma0 < float("inf"):
+            raise UsageError(f"sigma0 must be a positive number, not {search.sigma0}")
+        self._name = optimiser
+        self._space = space
+        self._origin = np.asarray(search.mean, dtype=np.float64)
+        mean = self._origin if space is None else np.zeros(space.dimension)
+        self._search = replace(search, mean=mean)
+        check_memory(optimiser, self._search.dimension, search.population, search.options)
+        self._optimiser = build_optimiser(optimiser, self._search)
         self._is_open = False  # after `ask`, before `tell`
+
+    @classmethod
+    def of(
+        cls, settings: RunSettings, stage: Stage, subspace: Subspace | None, start: NDArray[np.float64] | None
+    ) -> Evolution:
+        """As a run's settings say for the search that goes on in this stage, at `start` `(dimension,)` or at zeros.
+
+        `subspace` is the run's.
+        """
+        # It is a setting of its own, older than options; its default is none, so that every optimiser takes it.
+        covariance = () if settings.covariance == "diagonal" else (f"covariance={settings.covariance}",)
+        search = Search(
+            np.zeros(settings.controller.size) if start is None else start,
+            stage.settings.population,
+            stage.settings.sigma0,
+            search_seed(settings.seed, stage.search),
+            parse_options([*settings.optimiser_options, *covariance]),
+            parse_axes(settings.archive),
+        )
+        space = None if subspace is None or stage.whole else SearchSpace(subspace, settings.controller)
+        return cls(settings.optimiser, search, space)
 
     @property
     def mean(self) -> NDArray[np.float64]:
@@ -112,7 +86,7 @@ class Evolution:
     def ask(self) -> NDArray[np.float64]:
         """The next population `(population, dimension)`; `DreamfleetError` if the optimiser breaks its contract."""
         self._is_open = True
-        return self._check(self._optimiser.ask(), self._config.population)
+        return self._check(self._optimiser.ask(), self._search.population)
 
     def redraw(self, indices: Sequence[int]) -> NDArray[np.float64]:
         """Replace these candidates of the open population; the new ones `(len(indices), dimension)`.
@@ -124,22 +98,20 @@ class Evolution:
     def check_redraws(self) -> None:
         """`UsageError` if the optimiser cannot draw single candidates anew."""
         if not callable(getattr(self._optimiser, "redraw", None)):
-            raise UsageError(
-                f"optimiser {self._config.optimiser!r} cannot redraw single candidates: pass --on-failure worst"
-            )
+            raise UsageError(f"optimiser {self._name!r} cannot redraw single candidates: pass --on-failure worst")
 
     def _check(self, drawn: object, count: int) -> NDArray[np.float64]:
         """The parameters `(count, dimension)` of what the optimiser drew."""
         asked = np.asarray(drawn, dtype=np.float64)
-        wanted = count, self._config.searched_dimension
+        wanted = count, self._search.dimension
         if asked.shape != wanted:
-            raise DreamfleetError(f"optimiser {self._config.optimiser!r} asked for {asked.shape} numbers, not {wanted}")
+            raise DreamfleetError(f"optimiser {self._name!r} asked for {asked.shape} numbers, not {wanted}")
         asked = self._to_parameters(asked)
         with np.errstate(over="ignore"):
             travels = np.isfinite(asked.astype(np.float32)).all() and np.isfinite(self.sigma)
         if not travels:
             raise DreamfleetError(
-                f"optimiser {self._config.optimiser!r} asked for what no single-precision number can hold, at "
+                f"optimiser {self._name!r} asked for what no single-precision number can hold, at "
                 f"step size {self.sigma:g}: it cannot continue; start one --from it with other --sigma0 or --optimiser"
             )
         return asked
@@ -150,8 +122,8 @@ class Evolution:
         `measures` `(population, axes)` are of a run with an archive, NaN for a candidate that failed; an optimiser that
         does not take them gets none.
         """
-        if fitness.shape != (self._config.population,) or not np.isfinite(fitness).all():
-            raise ValueError(f"an update needs {self._config.population} finite numbers")  # pycma accepts NaN silently
+        if fitness.shape != (self._search.population,) or not np.isfinite(fitness).all():
+            raise ValueError(f"an update needs {self._search.population} finite numbers")  # pycma accepts NaN silently
         if getattr(self._optimiser, "takes_measures", False):
             cast(Any, self._optimiser).tell(fitness, measures)
         else:
@@ -169,11 +141,11 @@ class Evolution:
         unfit = [name for name, array in state.items() if name.startswith(PREFIX) or array.dtype.hasobject]
         if unfit:
             raise DreamfleetError(
-                f"optimiser {self._config.optimiser!r} has a state that cannot be kept, in {', '.join(unfit)}: arrays "
+                f"optimiser {self._name!r} has a state that cannot be kept, in {', '.join(unfit)}: arrays "
                 f"hold numbers or text, and names that begin with {PREFIX!r} are taken"
             )
-        origin = None if self._config.space is None else self._origin
-        head = Head(self._config.optimiser, self._optimiser.requirement, self.mean, self.sigma, origin)
+        origin = None if self._space is None else self._origin
+        head = Head(self._name, self._optimiser.requirement, self.mean, self.sigma, origin)
         return Checkpoint(head, state)
 
     def _read_origin(self, head: Head) -> NDArray[np.float64]:
@@ -187,12 +159,12 @@ class Evolution:
 
     def _to_parameters(self, coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
         """The parameters `(..., dimension)` of the optimiser's coordinates."""
-        space = self._config.space
+        space = self._space
         return coordinates if space is None else space.lift(self._origin, coordinates)
 
     def restore(self, state: bytes) -> None:
         """Continue from a packed `state` of an equal configuration; `JournalError` if another optimiser wrote it."""
-        checkpoint, name, requirement = Checkpoint.unpack(state), self._config.optimiser, self._optimiser.requirement
+        checkpoint, name, requirement = Checkpoint.unpack(state), self._name, self._optimiser.requirement
         head = checkpoint.head
         if head.name != name:
             raise JournalError(f"this state was written by optimiser {head.name!r}, not by {name!r}")
@@ -201,7 +173,7 @@ class Evolution:
                 f"this run was written with {head.requirement}: pip install {head.requirement} (now {requirement})"
             )
         try:
-            if self._config.space is not None:
+            if self._space is not None:
                 self._origin = self._read_origin(head)
             self._optimiser.restore(checkpoint.state)
         except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
@@ -210,7 +182,7 @@ class Evolution:
         self._is_open = False
 
 
-def _options(given: Sequence[str]) -> dict[str, str]:
+def parse_options(given: Sequence[str]) -> dict[str, str]:
     """Options from `name=value` each; an empty text is none."""
     options: dict[str, str] = {}
     for text in filter(None, given):

@@ -33,7 +33,7 @@ def dump(strategy: Any) -> dict[str, NDArray[Any]]:
     """The strategy's leaves: arrays under their dotted path, and one text `about` for scalars and lists."""
     arrays: dict[str, NDArray[Any]] = {}
     about: dict[str, Any] = {}
-    for path, _, _, value in _leaves(strategy):
+    for path, value in _leaves(strategy):
         if isinstance(value, np.ndarray):
             arrays[path] = value.copy()
         elif isinstance(value, (list, range)):
@@ -53,7 +53,10 @@ def restore(strategy: Any, arrays: Mapping[str, NDArray[Any]]) -> None:
     written: dict[int, bytes] = {}
     for path in [*(name for name in arrays if name != "about"), *about]:
         if path in about or path.rpartition(".")[0] not in about:
-            owner, name = _owner(strategy, path)
+            *parents, name = path.split(".")
+            owner = strategy
+            for parent in parents:
+                owner = vars(owner)[parent]
             _assign(owner, name, _value(path, about, arrays), written)
 
 
@@ -62,14 +65,14 @@ def is_before_first_update(arrays: Mapping[str, NDArray[Any]]) -> bool:
     return int(untag(json.loads(str(arrays["about"]))["countiter"])) == 0
 
 
-def _leaves(value: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any, str, Any]]:
-    """(path, owner, name, leaf) for every leaf below `value`."""
+def _leaves(value: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
+    """The dotted path and the value of every leaf below `value`."""
     for name, child in vars(value).items():
         path = f"{prefix}{name}"
         if name in _SKIPPED or path in _SKIPPED or callable(child):
             continue
         if _is_leaf(child):
-            yield path, value, name, child
+            yield path, child
         elif hasattr(child, "__dict__") and depth < _MAX_DEPTH:
             yield from _leaves(child, f"{path}.", depth + 1)
 
@@ -91,14 +94,6 @@ def _value(path: str, about: dict[str, Any], arrays: Mapping[str, NDArray[Any]])
         return untag(about[path])
     tags = about[path][2]
     return [arrays[f"{path}.{i}"].copy() if tag == ["array"] else untag(tag) for i, tag in enumerate(tags)]
-
-
-def _owner(strategy: Any, path: str) -> tuple[Any, str]:
-    *parents, name = path.split(".")
-    owner = strategy
-    for parent in parents:
-        owner = vars(owner)[parent]
-    return owner, name
 
 
 def _assign(owner: Any, name: str, value: Any, written: dict[int, bytes]) -> None:

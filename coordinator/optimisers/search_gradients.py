@@ -41,10 +41,6 @@ class SearchGradient(ABC):
     def _begin(self) -> None:  # noqa: B027 - not abstract: most have nothing more to begin with
         """Read options, and set what more is adapted."""
 
-    @abstractmethod
-    def _update(self, fitness: Floats) -> None:
-        """Change mean and deviations by the open samples, whose fitness is `(population,)`."""
-
     @property
     def mean(self) -> Floats:
         """The distribution's mean `(dimension,)`."""
@@ -76,9 +72,9 @@ class SearchGradient(ABC):
         self._samples[list(indices)] = drawn
         return self._mean + self._deviations * drawn
 
+    @abstractmethod
     def tell(self, fitness: Floats) -> None:
-        """Update the distribution by the ranks of `fitness` `(population,)`."""
-        self._update(fitness)
+        """Update mean and deviations by the ranks of the open samples' `fitness` `(population,)`."""
 
     def prepare(self) -> None:  # noqa: B027 - not abstract: doing nothing is all there is to do
         """Do nothing: samples are drawn in `ask`."""
@@ -164,7 +160,8 @@ class OpenES(_AdamMean):
         super()._begin()
         self._decay = self._number("sigma_decay", 1.0, most=1.0)
 
-    def _update(self, fitness: Floats) -> None:
+    def tell(self, fitness: Floats) -> None:
+        """As of any search gradient."""
         self._climb(_weighted_sum(_centred_ranks(fitness), self._samples) / len(fitness) / self.sigma)
         self._deviations = self._deviations * self._decay
 
@@ -191,7 +188,8 @@ class Pepg(_AdamMean):
         super()._begin()
         self._sigma_rate = self._number("sigma_rate", 0.2, most=1.0)
 
-    def _update(self, fitness: Floats) -> None:
+    def tell(self, fitness: Floats) -> None:
+        """As of any search gradient."""
         ranks = _centred_ranks(fitness)
         # Ranks sum to zero: a pair's two terms are the symmetric estimate, with the mean rank as its baseline.
         gradient = _weighted_sum(ranks, self._samples) / len(fitness) / self._deviations
@@ -212,7 +210,8 @@ class Snes(SearchGradient):
 
     mirrored = False
 
-    def _update(self, fitness: Floats) -> None:
+    def tell(self, fitness: Floats) -> None:
+        """As of any search gradient."""
         count, dimension = self._samples.shape
         best_first = np.maximum(0, math.log(count / 2 + 1) - np.log(np.arange(1, count + 1)))
         utilities = _by_rank(fitness, (best_first / best_first.sum() - 1 / count)[::-1])

@@ -96,14 +96,15 @@ class WorkerAdmission:
             member.host_class = self.class_of(member.host_class, member.fingerprint)
             self._enforce_class(member)
 
-    def bar(self, host: str, bar: StoredBar, incarnation: int) -> None:
-        """Keep a host out of this run from now on, by the journal too; its workers are removed."""
+    def bar(self, host: str, bar: StoredBar, incarnation: int) -> set[str]:
+        """Keep a host out of this run from now on, by the journal too; its workers are removed. The hosts: this one."""
         self._journal.verification.bar(host, bar, incarnation)
         self.barred[host], why = bar, bar.why
         for worker in [each for each in self._fleet.members if host_of(each) == host]:
             self._fleet.remove_worker(worker)
         self.refused_workers.add(host, f"it is barred from this run: {why}")
         self._fleet.note_refusal(Note(f"host {host} is barred from this run: {why}", "barred", host), f"barred: {why}")
+        return {host}
 
     def unbar(self, host: str) -> None:
         """Let a host join this run again, by the journal too."""

@@ -36,7 +36,6 @@ from dreamfleet.coordinator.run.external_generations import CANCELLED, ExternalG
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.run.shown_state import shown_state
 from dreamfleet.coordinator.storage.batch_records import StoredBatch
-from dreamfleet.coordinator.storage.journal import Journal
 
 MAX_WAITING = 256  # batches
 MAX_WAITING_SIZE = 8 * MAX_BATCH  # bytes of their vectors
@@ -47,11 +46,11 @@ Parameters = Callable[[str], str | None]
 
 
 class Batches:
-    """Takes, reads and cancels the batches of a `run` named `name`, whose journal is `journal`."""
+    """Takes, reads and cancels the batches of a `run` named `name`."""
 
-    def __init__(self, run: Run, journal: Journal, name: str) -> None:
+    def __init__(self, run: Run, name: str) -> None:
         self._run = run
-        self._journal = journal
+        self._journal = run.journal
         self._name = name
         self._uploads = UploadAssembler()
         self._remarked = False  # on test seeds: once in a coordinator's life
@@ -185,7 +184,8 @@ class Batches:
         if batch.state not in FINAL:
             self._journal.batches.cancel(batch.id)
             if batch.generation is not None:
-                self._run.cancel_generation()
+                self._run.generation.cancel()
+                self._run.fleet.leases.withdraw(self._run.generation.unwanted)
         return self._describe(self._journal.batches.find(batch.id) or batch, 0)
 
     def _describe(self, batch: StoredBatch, offset: int) -> BatchReply:

@@ -13,7 +13,6 @@ from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint, Head
 from dreamfleet.coordinator.optimisers.evolution import Evolution
 from dreamfleet.coordinator.run.generations import Generations, fitness_statistics
-from dreamfleet.coordinator.storage.batch_records import StoredBatch
 
 CANCELLED = "cancelled"  # the error of a candidate that was not scored when its batch was cancelled
 
@@ -37,18 +36,6 @@ class NoSearch:
 
 class ExternalGenerations(Generations):
     """Opens a generation for each batch, oldest first; while none waits, the open generation is empty."""
-
-    is_external = True
-
-    @property
-    def has_waiting(self) -> bool:  # type: ignore[override]
-        """Whether a batch waits."""
-        return self._journal.batches.next_waiting() is not None
-
-    @property
-    def open_batches(self) -> int:  # type: ignore[override]
-        """How many batches wait or are scored."""
-        return self._journal.batches.open_count()
 
     def begin(self) -> Generation:
         """Restore the open batch of the last incarnation, or open the next one."""
@@ -107,10 +94,6 @@ class ExternalGenerations(Generations):
     def can_reseed(self, _generation: Generation) -> bool:
         """Never: the seeds are the submitter's."""
         return False
-
-    def batch_of(self, generation: Generation) -> StoredBatch | None:
-        """The batch that the generation scores; `None` for an empty one."""
-        return self._journal.batches.of(generation.number)
 
     def _search(self, _stage: Stage, _start: NDArray[np.float64] | None) -> Evolution:
         return cast(Evolution, NoSearch(self._settings.controller.size))

@@ -17,7 +17,7 @@ from dreamfleet.coordinator.jobs.generation import CandidateScores, Generation
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.jobs.work import Work, vector_bytes
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
-from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
+from dreamfleet.coordinator.optimisers.evolution import Evolution
 from dreamfleet.coordinator.settings.start import SUBSPACE_FACT, stored_start_mean, stored_subspace
 from dreamfleet.coordinator.storage.journal import Journal, StoredOpenGeneration
 
@@ -27,10 +27,6 @@ RECENT = 5  # generations, the open one included, whose failures `--failure-limi
 
 class Generations:
     """Opens and closes generations, one at a time. `evaluations` maps a generation to its finished evaluation."""
-
-    is_external = False  # whether others submit the candidates
-    has_waiting = False  # whether a batch of theirs waits
-    open_batches = 0  # how many of theirs wait or are scored
 
     def __init__(
         self, journal: Journal, settings: RunSettings, agenda: StageTracker, history: History,
@@ -70,6 +66,21 @@ class Generations:
         """Ratio of the distribution's longest axis to its shortest; `None` if the strategy does not provide it."""
         return self._strategy.axis_ratio
 
+    @property
+    def stage_text(self) -> str:
+        """The open generation's stage, in words."""
+        stage = self.begun.stage
+        return f"stage {stage.number} of {len(self._agenda)} ({stage.description})"
+
+    @property
+    def stage_note(self) -> str | None:
+        """That the open generation begins a stage, and why, in words; `None` if it does not."""
+        begun, number = self.begun, len(self.history)
+        if begun.since != number:
+            return None
+        origin = "" if begun.origin is None else f", from the mean of generation {begun.origin}"
+        return f"{self.stage_text} begins with generation {number} after {begun.why}{origin}"
+
     def prepare(self) -> None:
         """Prepare the next population while workers are busy."""
         self._strategy.prepare()
@@ -108,7 +119,7 @@ class Generations:
         begun = self._begin_search(number)
         state, sigma = self._strategy.state(), self._strategy.sigma
         vectors = [vector_bytes(x) for x in self._strategy.ask()]
-        seeds = self._seeds(number, begun.stage.settings.episodes)
+        seeds = training_seeds(self._settings.seed, number, begun.stage.settings.episodes)
         self._journal.open_generation(number, state, sigma, seeds, vectors)
         self.redrawn, self._rounds, self._reseeds = set(), 0, 0
         may_have_results = self._journal.recalls.has_set_aside
@@ -140,7 +151,7 @@ class Generations:
 
     def first_seeds(self, number: int) -> list[int]:
         """The seeds of a generation of the journal, as it was first asked for."""
-        return self._seeds(number, len(self._journal.seeds_of(number)))
+        return training_seeds(self._settings.seed, number, len(self._journal.seeds_of(number)))
 
     def close(self, generation: Generation, seconds: float) -> StoredGeneration:
         """Give the strategy the generation's fitness and journal the generation, which took `seconds`.
@@ -150,13 +161,9 @@ class Generations:
         fitness, measures = generation.fitness(), generation.measures()
         statistics = fitness_statistics(fitness)
         closed = StoredGeneration(
-            number=generation.number,
-            **statistics,
-            sigma=self._strategy.sigma,
-            steps=generation.steps,
-            seconds=seconds,
-            failed=len(self.redrawn.union(generation.failed)),
-        )
+            number=generation.number, **statistics, sigma=self._strategy.sigma, steps=generation.steps,
+            seconds=seconds, failed=len(self.redrawn.union(generation.failed)),
+        )  # fmt: skip
         self._strategy.tell(_ranked(fitness, statistics["worst"]), measures)
         self._journal.recalls.set_surplus_aside(generation.number, generation.surplus)
         self._journal.close_generation(closed, fitness, measures)
@@ -198,18 +205,17 @@ class Generations:
         number, indices = generation.number, generation.failed
         if self.can_reseed(generation):
             self._reseeds += 1
-            self._journal.set_seeds(number, self._seeds(number, generation.episodes, self._reseeds))
+            seeds = training_seeds(self._settings.seed, number, generation.episodes, self._reseeds)
+            self._journal.set_seeds(number, seeds)
             who = "all candidates" if generation.all_failed else "all candidates of the better half"
-            found = f"{who} failed in generation {number}: it gets other seeds"
-        elif indices and self._can_redraw:
-            self._rounds += 1
-            self.redrawn.update(indices)
-            self._journal.redraw(number, indices, [vector_bytes(x) for x in self._strategy.redraw(indices)])
-            names = f"candidate {indices[0]}" if len(indices) == 1 else f"candidates {', '.join(map(str, indices))}"
-            found = f"{names} of generation {number} failed and {'is' if len(indices) == 1 else 'are'} redrawn"
-        else:
+            return f"{who} failed in generation {number}: it gets other seeds"
+        if not (indices and self._can_redraw):
             return None
-        return found
+        self._rounds += 1
+        self.redrawn.update(indices)
+        self._journal.redraw(number, indices, [vector_bytes(x) for x in self._strategy.redraw(indices)])
+        names = f"candidate {indices[0]}" if len(indices) == 1 else f"candidates {', '.join(map(str, indices))}"
+        return f"{names} of generation {number} failed and {'is' if len(indices) == 1 else 'are'} redrawn"
 
     def count_recent_failures(self, generation: Generation, since: int) -> tuple[int, range]:
         """Failed candidates of the open generation and those before it, and the generations that were counted.
@@ -248,10 +254,7 @@ class Generations:
         return self._agenda.advance_to(number, self.history.rows, self._evaluations)
 
     def _search(self, stage: Stage, start: NDArray[np.float64] | None) -> Evolution:
-        return Evolution(EvolutionConfig.of(self._settings, stage, self._subspace), start)
-
-    def _seeds(self, number: int, episodes: int, reseeds: int = 0) -> list[int]:
-        return training_seeds(self._settings.seed, number, episodes, reseeds)
+        return Evolution.of(self._settings, stage, self._subspace, start)
 
     def _recall(self, stored: StoredOpenGeneration, begun: BegunStage) -> Generation:
         generation = self._generation(stored.number, stored.vectors, stored.seeds, begun)
@@ -262,17 +265,11 @@ class Generations:
         self, number: int, vectors: Sequence[bytes], seeds: Sequence[int], begun: BegunStage, *,
         in_parts: bool = False,
     ) -> Generation:  # fmt: skip
-        run_spec, stage = self._settings.task, begun.stage
+        stage = begun.stage
         return Generation(
-            number,
-            stage.settings.task,
-            vectors,
-            seeds,
-            racing=stage.settings.racing,
-            run_spec=run_spec,
-            driven=stage.driven_episodes,
-            in_parts=in_parts,
-        )
+            number, stage.settings.task, vectors, seeds, racing=stage.settings.racing, run_spec=self._settings.task,
+            driven=stage.driven_episodes, in_parts=in_parts,
+        )  # fmt: skip
 
 
 def _ranked(fitness: NDArray[np.float64], worst: float) -> NDArray[np.float64]:

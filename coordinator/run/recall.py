@@ -18,7 +18,7 @@ from dreamfleet.common.runs.stages import StageTracker
 from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollections
-from dreamfleet.coordinator.run.failure_limit import forget_acceptance
+from dreamfleet.coordinator.run.failure_policy import forget_acceptance
 from dreamfleet.coordinator.run.generations import Generations
 from dreamfleet.coordinator.run.report import withdraw_controller
 from dreamfleet.coordinator.storage.journal import Journal

@@ -23,29 +23,17 @@ SAVE_INTERVAL = 5.0  # seconds between two saves of means without evaluation: ea
 
 
 @dataclass(frozen=True)
-class ValidationScore:
-    """A mean's score on validation tracks. Unless it is `confirmed`, the mean was also chosen by these tracks."""
-
-    mean: float
-    error: float | None  # standard error of the mean; `None` for one episode
-    episodes: int
-    confirmed: bool
-
-    @classmethod
-    def of(cls, found: StoredEvaluation | StoredConfirmation) -> ValidationScore:
-        """From a journal record."""
-        return cls(found.mean, found.error, found.episodes, isinstance(found, StoredConfirmation))
-
-
-@dataclass(frozen=True)
 class ReportedMean:
-    """A mean `(size,)`, as float32 bytes, with its generation and its score, if it has one."""
+    """A mean `(size,)`, as float32 bytes, with its generation and its score on validation tracks, if it has one.
+
+    Unless that is confirmed, the mean was also chosen by these tracks.
+    """
 
     run_uid: str
     settings: RunSettings
     generation: int
     vector: bytes
-    judged: ValidationScore | None
+    judged: StoredEvaluation | StoredConfirmation | None
     steps: int  # environment steps of the run by then
 
     def controller(self) -> Controller:
@@ -57,7 +45,7 @@ class ReportedMean:
             "validation_mean": judged and judged.mean,
             "validation_error": judged and judged.error,
             "validation_episodes": judged and judged.episodes,
-            "confirmed": judged is not None and judged.confirmed,
+            "confirmed": isinstance(judged, StoredConfirmation),
             "settings": asdict(self.settings),
             "steps": self.steps,
         }
@@ -85,18 +73,17 @@ class ControllerWriter:
         """Report a closed generation's mean, unless an evaluated mean is reported; an external run has none."""
         if self._settings.is_external:
             return
-        judged = self.current.judged if self.current is not None else None
-        if self.current is not None and judged is not None:
-            generation, mean = self.current.generation, self.current.vector
-        self.current = ReportedMean(self._run_uid, self._settings, generation, mean, judged, steps)
+        if self.current is not None and self.current.judged is not None:
+            self.current = replace(self.current, steps=steps)
+        else:
+            self.current = ReportedMean(self._run_uid, self._settings, generation, mean, None, steps)
         self._due = self._due or now >= self._next
         if self._due:
             self._next = now + SAVE_INTERVAL
 
     def set_judged(self, found: StoredEvaluation | StoredConfirmation, mean: bytes, steps: int) -> None:
         """Report the best evaluated mean, or the confirmed one."""
-        judged = ValidationScore.of(found)
-        self.current = ReportedMean(self._run_uid, self._settings, found.generation, mean, judged, steps)
+        self.current = ReportedMean(self._run_uid, self._settings, found.generation, mean, found, steps)
         self._due = True
 
     def finish(self) -> None:

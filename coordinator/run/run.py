@@ -6,49 +6,42 @@ of a generation may be sent before it is durable: a coordinator that dies in bet
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import asdict
-from datetime import UTC, datetime
 from math import nan
 
 from msgspec.structs import replace
 
 from dreamfleet.common.errors import NotWritableNowError
-from dreamfleet.common.printable import plural
-from dreamfleet.common.protocol.host_classes import HostClasses
+from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol.messages import Job, Result
-from dreamfleet.common.protocol.result_bounds import MAX_SECONDS
-from dreamfleet.common.protocol.stop_kind import PauseKind, StopKind, StopReason
-from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
-from dreamfleet.common.runs.run_folder import ENDING, EPISODE_LIMIT, STOP_KIND
+from dreamfleet.common.protocol.stop_kind import PauseKind, StopReason
+from dreamfleet.common.runs.records import RunSettings
+from dreamfleet.common.runs.run_folder import EPISODE_LIMIT
 from dreamfleet.common.runs.stages import StageTracker
-from dreamfleet.common.schema.times import elapsed_seconds
 from dreamfleet.coordinator.dispatch.event_log import Note
-from dreamfleet.coordinator.dispatch.failures import JobFailure, host_of, shorten
+from dreamfleet.coordinator.dispatch.failures import LONGEST_ERROR, host_of
 from dreamfleet.coordinator.dispatch.fleet import Fleet
+from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.jobs.work import Work
 from dreamfleet.coordinator.run.admission import WorkerAdmission
 from dreamfleet.coordinator.run.background_jobs import BackgroundJobs
 from dreamfleet.coordinator.run.external_generations import ExternalGenerations
-from dreamfleet.coordinator.run.failure_limit import FailureLimit
+from dreamfleet.coordinator.run.failure_policy import FailurePolicy
 from dreamfleet.coordinator.run.generations import Generations
 from dreamfleet.coordinator.run.recall import BAR_BY_OPERATOR, find_bar_problem, recall, unbar_words
 from dreamfleet.coordinator.run.run_state import Pause, Running, RunState
-from dreamfleet.coordinator.run.stop_reason import find_stop_reason
+from dreamfleet.coordinator.run.stop_reason import find_stop_reason, store_reason, stored_reason
 from dreamfleet.coordinator.run.verification import Verification
-from dreamfleet.coordinator.run.work_clock import WorkClock
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 
-OTHER_SEEDS = "; if the seeds of the first generation are bad for every candidate, begin a run with another --seed"
-LOST_WORKERS = "; the last lines of these workers, and `dmesg` on their hosts, may say what ended them"
 PAUSED = "paused"  # the fact that somebody paused the run
 BY_HAND = Pause(PauseKind.BY_HAND, "by hand")
+LONGEST_TICK = 2.0  # seconds between ticks; a longer gap means that this process was suspended
 WRITE_RETRY = 2.0  # seconds until a full disk or a locked journal is tried again
 
 
@@ -60,6 +53,7 @@ class Run:
         anchor_key: bytes = b"",
     ) -> None:  # fmt: skip
         """`anchor_key` is the key of this host, by which workers on it show that they are (R32)."""
+        self.journal = journal  # whose only writer is the thread of this run
         self.settings = settings
         self.limits = limits
         self.fleet = Fleet(network.beat, network.evaluation_share)
@@ -71,11 +65,9 @@ class Run:
         self.episode_limit = None if limit is None else int(limit)  # steps; of the environment itself, if it is known
         self.incarnation = journal.begin_incarnation()
         self._notes: list[Note] = []  # that are in the journal and not in the log
-        self._journal = journal
-        self._unpublished: list[StoredGeneration] = []
         self.admission = WorkerAdmission(journal, settings, self.fleet, strict=network.strict, anchor_key=anchor_key)
         self.verification = Verification(journal, self.fleet, self.admission, network.verify, self.incarnation)
-        reached = self._stored_end_reason()
+        reached = stored_reason(journal, limits)
         self.state: RunState = Running() if reached is None else Running().reach_limit(reached)
         closed, evaluations = journal.read_closed()
         self.history = History(closed)
@@ -86,39 +78,13 @@ class Run:
         evaluated = self.background_jobs.evaluations.finished
         kind = ExternalGenerations if settings.is_external else Generations
         self.generations = kind(journal, settings, self._agenda, self.history, evaluated)
-        self.failure_limit = FailureLimit(journal, self.generations, network.failure_limit)
+        self.failure_policy = FailurePolicy(journal, self.fleet, self.generations, settings, network.failure_limit)
         self.generation = self.generations.begin()
-        self.work_clock = WorkClock(now, self.generations.seconds)  # of the open generation
+        self.open_seconds = self.generations.seconds  # in which the open generation could be scored
         self.fleet.failure_judge.working_hosts.update(map(host_of, journal.results.workers()))
         if self.incarnation > 1:  # the last incarnation may have sent the next generation's jobs before it was durable
             self.fleet.jobs.previous_epoch_until = self.generation.number + 1
         self._begin(now)
-
-    @property
-    def best(self) -> StoredEvaluation | None:
-        """The best evaluated mean."""
-        return self.background_jobs.evaluations.best
-
-    @property
-    def confirmed(self) -> StoredConfirmation | None:
-        """The confirmed score of the reported mean; `None` if that is not confirmed."""
-        return self.background_jobs.confirmed
-
-    @property
-    def elapsed(self) -> float | None:
-        """Wall-clock seconds since the run began; `None` if a clock was set so that they cannot be right."""
-        seconds = elapsed_seconds(self.created, datetime.now(UTC).isoformat())
-        return None if seconds is None else round(min(seconds, MAX_SECONDS), 1)
-
-    @property
-    def journal(self) -> Journal:
-        """The journal, whose only writer is the thread of this run."""
-        return self._journal
-
-    @property
-    def classes(self) -> HostClasses:
-        """The host classes of the accepted results."""
-        return self._journal.results.classes
 
     @property
     def dropped(self) -> Counter[str]:
@@ -131,7 +97,7 @@ class Run:
 
     def record_result(self, work: Work, result: Result, worker: str, fingerprint: str, host_class: str) -> None:
         """Journal an accepted result, then count it for the generation or the background job that wants it."""
-        self._journal.results.add(work.job, result, worker, fingerprint, self.incarnation, host_class)
+        self.journal.results.add(work.job, result, worker, fingerprint, self.incarnation, host_class)
         self.admission.adopt_class(host_class, fingerprint)
         self.verification.note_accepted(work.job, result, worker)
         assert result.fitness is not None
@@ -147,10 +113,10 @@ class Run:
 
     def tick(self, now: float) -> None:
         """Let time pass: departed workers, silent workers, stalled uploads, and the generation's own time."""
-        self._now = now
+        since, self._now = self._now, now
         self.fleet.tick(now)
-        has_work = self.generation.population > 0 and not self.fleet.paused
-        self.work_clock.tick(now, is_working=has_work and self.fleet.has_workers)
+        if self.generation.population and self.state.gives_jobs and self.fleet.has_workers:
+            self.open_seconds += min(now - since, LONGEST_TICK)
         self.background_jobs.rollout_collections.uploads.tick(now)
 
     def advance(self, now: float) -> bool:
@@ -173,8 +139,8 @@ class Run:
             if self.verification.holds_generation:
                 break
             reseeds = self.generations.can_reseed(self.generation)
-            if not reseeds and (why := self.failure_limit.find_excess(self.generation)) is not None:
-                self.pause(Pause(PauseKind.FAILED_CANDIDATES, f"{why} (`dreamfleet story` lists why)"))
+            if not reseeds and (excess := self.failure_policy.find_excess(self.generation)) is not None:
+                self.pause(excess)
             elif (note := self.generations.try_again(self.generation)) is not None:
                 self.fleet.note(note, "reseeded")
                 self._replace_generation(self.generations.reload(self.generation.number))
@@ -192,12 +158,12 @@ class Run:
         call succeeds.
         """
         stalled = self.state.stalled
-        if stalled is None and self._journal.has_writes:
-            self._journal.set_seconds(self.generation.number, self.work_clock.seconds)
+        if stalled is None and self.journal.has_writes:
+            self.journal.set_seconds(self.generation.number, self.open_seconds)
         elif stalled is not None and self._now < stalled.retry_at:
             return False
         try:
-            self._journal.commit()
+            self.journal.commit()
             if not self.state.is_rewound:
                 self.background_jobs.report.save()
         except NotWritableNowError as error:
@@ -213,7 +179,7 @@ class Run:
     def _take_lock(self) -> bool:
         """Take the journal's lock before changes that nothing may interrupt; whether that succeeded."""
         try:
-            self._journal.take_lock()
+            self.journal.take_lock()
         except NotWritableNowError as error:
             self.wait_until_writable(error)
             return False
@@ -228,22 +194,18 @@ class Run:
 
     def leave(self) -> None:
         """Make everything durable and write the reported controller before the coordinator exits."""
-        self._journal_notes()
-        self._journal.end_incarnation()
-        self._journal.set_seconds(self.generation.number, self.work_clock.seconds)
-        self._journal.commit()
+        self._write_notes()
+        self.journal.end_incarnation()
+        self.journal.set_seconds(self.generation.number, self.open_seconds)
+        self.journal.commit()
         if self.state.stalled is not None:
             self._enter(self.state.recover())
         if not self.state.is_rewound:
             self.background_jobs.report.save(at_once=True)
 
-    def prepare(self) -> None:
-        """Prepare the next generation while workers are busy."""
-        self.generations.prepare()
-
     def keep_paused(self) -> bool:
         """Stay paused if the coordinator is started again before somebody resumes the run; whether that is durable."""
-        self._journal.set_fact(PAUSED, BY_HAND.text)  # kept until it can be written
+        self.journal.set_fact(PAUSED, BY_HAND.text)  # kept until it can be written
         return self.commit()
 
     def pause(self, pause: Pause) -> None:
@@ -261,7 +223,16 @@ class Run:
         Why the run cannot continue now, in words; empty if it does.
         """
         if not self.state.is_over and self._take_lock():
-            self._resume()
+            if self.state.paused is not None:
+                self.fleet.note("resumed", "resumed")
+            self._go_on()
+            self.verification.resume()
+            self.journal.drop_fact(PAUSED)
+            self.failure_policy.accept(self.generation.number)
+            self.fleet.jobs.offer(self.background_jobs.retry_failed())
+            if self.generation.has_failures:
+                self.journal.drop_failures(self.generation.number)
+                self._replace_generation(self.generations.reload(self.generation.number))
         why = self.obstacle
         return f"it cannot continue now: {why}; repeat `resume` then" if why else ""
 
@@ -271,18 +242,6 @@ class Run:
         if (stalled := self.state.stalled) is not None:
             return stalled.why
         return "results are being recalled" if self.state.is_rewound else ""
-
-    def _resume(self) -> None:
-        if self.state.paused is not None:
-            self.fleet.note("resumed", "resumed")
-        self._go_on()
-        self.verification.resume()
-        self._journal.drop_fact(PAUSED)
-        self.failure_limit.accept(self.generation.number)
-        self.fleet.jobs.offer(self.background_jobs.retry_failed())
-        if self.generation.has_failures:
-            self._journal.drop_failures(self.generation.number)
-            self._replace_generation(self.generations.reload(self.generation.number))
 
     def _go_on(self) -> None:
         """Dispatch again, what failed too."""
@@ -296,21 +255,16 @@ class Run:
         """
         if self.state.is_rewound or self.state.stalled or not self._take_lock():
             return f"the run cannot be changed now: {self.obstacle}; ask again"
-        known = {
-            *map(host_of, (*self._journal.results.workers(recalled=True), *self.fleet.members, *self.fleet.departed))
-        }
+        scored = self.journal.results.workers(recalled=True)
+        known = {*map(host_of, (*scored, *self.fleet.members, *self.fleet.departed))}
         if problem := find_bar_problem(host, self.admission.barred, known, is_barred=is_barred):
             return problem
         if is_barred:
-
-            def bar() -> set[str]:
-                self.admission.bar(host, BAR_BY_OPERATOR, self.incarnation)
-                return {host}
-
-            return "" if self._rewind(bar) else f"it cannot be barred now: {self.obstacle}; ask again"
+            done = self._rewind(lambda: self.admission.bar(host, BAR_BY_OPERATOR, self.incarnation))
+            return "" if done else f"it cannot be barred now: {self.obstacle}; ask again"
         self.admission.unbar(host)
         self.fleet.note(unbar_words(host), "unbarred")
-        self._journal_notes()
+        self._write_notes()
         return "" if self.commit() else f"that cannot be written now: {self.obstacle}; it counts once it is written"
 
     def _rewind(self, bar: Callable[[], Collection[str]]) -> bool:
@@ -324,61 +278,44 @@ class Run:
         try:
             hosts = bar()
             self.background_jobs.report.withdraw()
-            self.fleet.note(recall(self._journal, self.settings, hosts), "recalled")
-            self._journal_notes()
-            self._journal.commit()
+            self.fleet.note(recall(self.journal, self.settings, hosts), "recalled")
+            self._write_notes()
+            self.journal.commit()
         except NotWritableNowError as error:
-            self._journal.forget_writes()
+            self.journal.forget_writes()
             self.fleet.notes = before  # without that it was done
             self.wait_until_writable(error)
-            self._journal_notes()  # so that the next commit fails too, until there is room
+            self._write_notes()  # so that the next commit fails too, until there is room
             return False
         return True
 
     def _settle_failures(self) -> None:
-        """Make lasting failures facts of the run (R8), and pause it where too many candidates or all hosts fail."""
-        judge, is_judged = self.fleet.failure_judge, self.settings.on_failure != "pause"
-        judge.lacks_proof = False
-        if is_judged:
+        """Make lasting failures facts of the run (R8), and pause it where all hosts fail."""
+        judge = self.fleet.failure_judge
+        if self.failure_policy.judges:
             for lasting in judge.find_lasting():
                 self._record_failure(lasting)
-        if (paused := self.state.paused) is not None:
-            if paused.until_host and judge.has_hope:
-                self.fleet.note("a host has joined that may be able to score: the run continues", "continues")
-                self._go_on()
-            return
-        if is_judged and (failure := judge.find_broken_fleet(at_once=self.failure_limit.share < 1)) is not None:
-            proof = self.generations.find_scored(self.generation)
-            if proof is None or judge.has_failed_proof or not self.fleet.jobs.offer_proof(proof):
-                hint = LOST_WORKERS if failure.is_loss else OTHER_SEEDS if proof is None else ""
-                jobs, until_host = self.fleet.jobs, not judge.has_hope
-                why = (
-                    f"no present host has ever scored a job, and {len(jobs.failures)} of "
-                    f"{plural(len(jobs) + jobs.unmade, 'open job')} failed, such as {failure}; "
-                    f"the run continues {'when another host joins, or ' * until_host}with `dreamfleet resume`{hint}"
-                )
-                self.pause(Pause(PauseKind.NO_ABLE_HOST, why, until_host=until_host))
-        elif not is_judged and (failure := judge.find_pausing()) is not None:
-            self.pause(Pause(PauseKind.FAILED_JOB, f"{failure}; `dreamfleet resume` tries it again"))
-        elif judge.awaits_proof:
-            proof = self.generations.find_scored(self.generation)
-            judge.lacks_proof = proof is None or not self.fleet.jobs.offer_proof(proof)
+        if (paused := self.state.paused) is None:
+            if (pause := self.failure_policy.find_pause(self.generation)) is not None:
+                self.pause(pause)
+        elif paused.until_host and judge.has_hope:
+            self.fleet.note("a host has joined that may be able to score: the run continues", "continues")
+            self._go_on()
 
-    def _record_failure(self, failure: JobFailure) -> None:
+    def _record_failure(self, failure: PendingJob) -> None:
         """Journal that a job's episode fails wherever it is scored; it is wanted no more."""
-        job = failure.work.job
-        self.fleet.give_up(failure)
-        error = failure.history[-1].error
-        error = replace(error, text=shorten(error.text))
-        self._journal.add_failure(job, error, list(failure.attempts), len(failure.history))
-        self.fleet.note(f"{failure}; it counts as failed", "given up")
+        job, error = failure.work.job, failure.attempts[-1].error
+        self.fleet.leases.withdraw([job.digest])
+        error = replace(error, text=truncate(error.text, LONGEST_ERROR))
+        self.journal.add_failure(job, error, list(failure.attempts_by_worker), len(failure.attempts))
+        self.fleet.note(f"{failure.describe_failure()}; it counts as failed", "given up")
         self._count(job, nan, 0)
         if job.kind == "score":
-            self.fleet.withdraw(self.generation.unwanted)
+            self.fleet.leases.withdraw(self.generation.unwanted)
 
     def _open_batch(self) -> bool:
         """Open the next batch of a run that waits for one; whether one was opened."""
-        if self.generation.population or self.state.paused or not self.generations.has_waiting:
+        if self.generation.population or self.state.paused or self.journal.batches.next_waiting() is None:
             return False
         if not self._take_lock():
             return False
@@ -386,42 +323,32 @@ class Run:
         self.fleet.jobs.offer(self.generation.missing)
         return True
 
-    def cancel_generation(self) -> None:
-        """Want no more results of the open generation: its batch is cancelled."""
-        self.generation.cancel()
-        self.fleet.withdraw(self.generation.unwanted)
-
     def _begin_generation(self, generation: Generation) -> None:
         self.generation = generation
         self.verification.restore(generation.counted)
-        self.work_clock.restart()
+        self.open_seconds = 0.0
         self.fleet.jobs.begin_generation(generation.number)
 
     def _replace_generation(self, generation: Generation) -> None:
         """Score the open generation as it is now: of a race whose first half is open again, nothing of the second."""
         self.generation, missing, counted = generation, generation.missing, generation.counted
         wanted = {each.digest for each in missing}
-        self.fleet.withdraw(each for each in self.fleet.jobs.plain_scores() if each not in wanted)
+        self.fleet.leases.withdraw(each for each in self.fleet.jobs.plain_scores() if each not in wanted)
         self.verification.keep_to(counted)
         self.verification.restore(counted)  # what failed candidates have was checked no more
         self.fleet.jobs.offer(missing)
 
     def take_notes(self) -> list[Note]:
         """What happened since the last call, for the log; the journal keeps it too."""
-        self._journal_notes()
+        self._write_notes()
         notes, self._notes = self._notes, []
         return notes
 
-    def _journal_notes(self) -> None:
+    def _write_notes(self) -> None:
         for note in self.fleet.notes:
-            self._journal.add_event(*note)
+            self.journal.add_event(*note)
             self._notes.append(note)
         self.fleet.notes = []
-
-    def take_closed(self) -> list[StoredGeneration]:
-        """Generations closed since the last call."""
-        closed, self._unpublished = self._unpublished, []
-        return closed
 
     @property
     def _is_waiting(self) -> bool:
@@ -434,16 +361,16 @@ class Run:
     def _begin(self, now: float) -> None:
         generation = self.generation
         if len(self._agenda) > 1:
-            self.fleet.note(f"generation {generation.number} is in {self._stage_text}", "stage")
+            self.fleet.note(f"generation {generation.number} is in {self.generations.stage_text}", "stage")
         self.fleet.jobs.begin_generation(generation.number)
         self.verification.restore(generation.counted)
         work = self.background_jobs.begin(self.generations.mean, now)
         if self.state.reached is None and not generation.done and (reason := self._stop_reason(generation)):
-            self._begin_ending(reason)
-        if self._journal.fact(PAUSED) is not None:
+            self._reach_limit(reason)
+        if self.journal.fact(PAUSED) is not None:
             self.pause(BY_HAND)
         if self.state.reached is None:
-            self._journal.drop_fact("ended")
+            self.journal.drop_fact("ended")
             self.fleet.jobs.offer([*work, *generation.missing])
         else:
             self.fleet.jobs.offer(work)
@@ -452,34 +379,20 @@ class Run:
                 self.commit()
 
     def _close(self, now: float) -> None:
-        closed = self.generations.close(self.generation, self.work_clock.seconds)
-        self._unpublished.append(closed)
+        closed = self.generations.close(self.generation, self.open_seconds)
         mean = self.generations.mean
         # Opened even if the run ends here: a later incarnation with wider limits continues from it.
         generation = self.generations.open(closed.number + 1)
         reason = self._stop_reason(generation)
         self.fleet.jobs.offer(self.background_jobs.schedule(closed.number, mean, now, last=reason is not None))
-        self._note_stage_changes(generation)
+        if (note := self.generations.stage_note) is not None:
+            self.fleet.note(note, "next stage")
         self._begin_generation(generation)
         if reason:
-            self.fleet.withdraw(self.fleet.jobs.digests_of_kind("score"))
-            self._begin_ending(reason)
+            self.fleet.leases.withdraw(self.fleet.jobs.digests_of_kind("score"))
+            self._reach_limit(reason)
         else:
             self.fleet.jobs.offer(generation.missing)
-
-    def _note_stage_changes(self, generation: Generation) -> None:
-        """Note for the log that a generation opens in another stage, and why."""
-        begun, number = self.generations.begun, generation.number
-        if begun.since == number:
-            origin = "" if begun.origin is None else f", from the mean of generation {begun.origin}"
-            self.fleet.note(
-                f"{self._stage_text} begins with generation {number} after {begun.why}{origin}", "next stage"
-            )
-
-    @property
-    def _stage_text(self) -> str:
-        stage = self.generations.begun.stage
-        return f"stage {stage.number} of {len(self._agenda)} ({stage.description})"
 
     def _stop_reason(self, generation: Generation) -> StopReason | None:
         if self.settings.is_external:
@@ -490,9 +403,7 @@ class Run:
         """Once a limit is reached and no background job is left: confirm the reported mean, then end the run."""
         if self.state.reached is None or self.state.is_over:
             return
-        if self.background_jobs.in_progress or self.fleet.jobs.checks:
-            return
-        if not self._take_lock():
+        if self.background_jobs.in_progress or self.fleet.jobs.checks or not self._take_lock():
             return
         if work := self.background_jobs.confirm():
             self.fleet.note(self.background_jobs.round_description, "confirming")
@@ -502,24 +413,16 @@ class Run:
                 self.fleet.note("no confirmed score: every episode of the confirmation failed", "unconfirmed")
             self._end()
 
-    def _begin_ending(self, reason: StopReason) -> None:
-        """Journal the reached limit with all limits: the last evaluations may make it look unreached again."""
+    def _reach_limit(self, reason: StopReason) -> None:
         self._enter(self.state.reach_limit(reason))
-        self._journal.set_fact(ENDING, json.dumps([reason.text, asdict(self.limits)]))
-        self._journal.set_fact(STOP_KIND, reason.kind or "")
-
-    def _stored_end_reason(self) -> StopReason | None:
-        """The limit that an earlier incarnation reached; `None` if this one has other limits."""
-        reason, limits = json.loads(self._journal.fact(ENDING) or "[null, null]")
-        if limits != asdict(self.limits):
-            return None
-        return StopReason(StopKind.parse(self._journal.fact(STOP_KIND)), reason)
+        store_reason(self.journal, self.limits, reason)
 
     def _end(self) -> None:
         ended = self.state.end()
         self._enter(ended)
-        self.fleet.withdraw(self.fleet.jobs.digests_of_kind("score"))  # a new host may still have one to show itself
-        self._journal.end(ended.reason.text)
-        self._journal_notes()
-        self._journal.add_event(f"ended: {ended.reason.text}")
+        # A new host may still have a job to show itself.
+        self.fleet.leases.withdraw(self.fleet.jobs.digests_of_kind("score"))
+        self.journal.end(ended.reason.text)
+        self._write_notes()
+        self.journal.add_event(f"ended: {ended.reason.text}")
         self.background_jobs.report.finish()

@@ -32,7 +32,7 @@ def shown_state(run: Run) -> ShownState:
         return ShownState("paused", stalled.why)
     if not run.fleet.has_workers:
         return ShownState(WAITS_FOR_WORKERS)
-    if (why := run.verification.waiting) and not run.fleet.takes_jobs:
+    if (why := run.verification.waiting) and not any(each.takes_jobs for each in run.fleet.members.values()):
         return ShownState("paused", why)
     if not run.generation.population:
         return ShownState(WAITS_FOR_BATCH)

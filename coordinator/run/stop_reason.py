@@ -2,31 +2,32 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
+
 from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.protocol.function_values import value_of
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.stop_kind import StopKind, StopReason
 from dreamfleet.common.protocol.tasks import steps_word
+from dreamfleet.common.runs.run_folder import ENDING, STOP_KIND
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.run.background_jobs import BackgroundJobs
 from dreamfleet.coordinator.settings.limits import LimitsConfig
+from dreamfleet.coordinator.storage.journal import Journal
 
 
 def find_stop_reason(
     limits: LimitsConfig, history: History, jobs: BackgroundJobs, generation: Generation, task: TaskSpec
 ) -> StopReason | None:
-    """Why the run of `task` ends before `generation` is scored; `None` if it continues."""
+    """Why the run of `task` ends before `generation` is scored; `None` if it continues.
+
+    It is the first limit that is reached. The cost does not grow with the run.
+    """
     if generation.is_one_point:
         text = f"the search has converged: all candidates of generation {generation.number} are equal"
         return StopReason(StopKind.ONE_POINT, text)
-    return _find_reached_limit(limits, history, jobs, task)
-
-
-def _find_reached_limit(
-    limits: LimitsConfig, history: History, jobs: BackgroundJobs, task: TaskSpec
-) -> StopReason | None:
-    """The first limit that is reached. The cost does not grow with the run."""
     if limits.generations and len(history) >= limits.generations:
         return StopReason(StopKind.GENERATIONS, plural(len(history), "generation"))
     if limits.steps and history.steps >= limits.steps:
@@ -49,3 +50,15 @@ def _find_reached_limit(
     if best is not None and limits.parted and jobs.have_fallen_behind(limits.parted):
         return StopReason(StopKind.PARTED, f"the evaluated mean fell behind generation {best.generation}'s")
     return None
+
+
+def store_reason(journal: Journal, limits: LimitsConfig, reason: StopReason) -> None:
+    """Journal the reached limit with all limits: the last evaluations may make it look unreached again."""
+    journal.set_fact(ENDING, json.dumps([reason.text, asdict(limits)]))
+    journal.set_fact(STOP_KIND, reason.kind or "")
+
+
+def stored_reason(journal: Journal, limits: LimitsConfig) -> StopReason | None:
+    """The limit that an earlier incarnation reached; `None` if this one has other limits."""
+    reason, reached = json.loads(journal.fact(ENDING) or "[null, null]")
+    return StopReason(StopKind.parse(journal.fact(STOP_KIND)), reason) if reached == asdict(limits) else None

@@ -17,7 +17,7 @@ from dreamfleet.common.protocol.messages import Job, Result
 from dreamfleet.common.schema.validation import MAX_TEXT
 from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.dispatch.fleet import Fleet
-from dreamfleet.coordinator.dispatch.member import Member, MemberState
+from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob
 from dreamfleet.coordinator.jobs.checks import Answer, Check, Decision, decide
 from dreamfleet.coordinator.jobs.work import Work
@@ -118,7 +118,7 @@ class Verification:
         """Check no candidate's result but those of these jobs: others count no more."""
         digests = {each.digest for each in counted}
         checked = [(digest, each.work.kind) for digest, each in self._jobs.checks.items()]
-        self._fleet.withdraw(digest for digest, kind in checked if kind == "score" and digest not in digests)
+        self._fleet.leases.withdraw(digest for digest, kind in checked if kind == "score" and digest not in digests)
 
     def record(self, work: Work, result: Result, worker: str) -> None:
         """Compare a result of a job whose result was accepted before; a repeated message changes nothing."""
@@ -143,7 +143,7 @@ class Verification:
             if is_scoring and job.kind == "score":
                 continue  # a host may still come while the generation is open
             since = self._due_since.setdefault(digest, now)
-            if now - since > self._fleet.longest_held(is_background=job.kind != "score"):
+            if now - since > self._fleet.speculation.longest_held(is_background=job.kind != "score"):
                 self._pass_over(pending, now)
             elif not pending.holders and not self._can_be_asked(pending):
                 self._decide(pending)
@@ -156,7 +156,7 @@ class Verification:
             self._answers[digest] = [first]
             del self._held[digest]
             self._due_since.pop(digest, None)
-            self._fleet.check_again(pending, Check(pending.check.host_class, {first.host}))
+            self._fleet.leases.check_again(pending, Check(pending.check.host_class, {first.host}))
 
     def _can_be_asked(self, pending: PendingJob) -> bool:
         check = pending.check
@@ -165,7 +165,7 @@ class Verification:
         )
 
     def _scoring_members(self) -> list[Member]:
-        return [each for each in self._fleet.members.values() if each.can_score and each.state is MemberState.PRESENT]
+        return [each for each in self._fleet.members.values() if each.can_score]
 
     def _pass_over(self, pending: PendingJob, now: float) -> None:
         """Ask those who have the job no more: they took too long."""
@@ -174,7 +174,7 @@ class Verification:
         check, late = pending.check, {host_of(name) for name in pending.holders}
         self._due_since[digest] = now
         if digest in self._held and late:
-            self._fleet.check_again(pending, Check(check.host_class, check.answered, check.passed_over | late))
+            self._fleet.leases.check_again(pending, Check(check.host_class, check.answered, check.passed_over | late))
         elif digest not in self._held:
             check.passed_over |= late
             self._decide(pending)
@@ -191,7 +191,7 @@ class Verification:
         decision = decide(answers, present, bool(present - answered), anchors)
         if decision.ask_other or decision.ask_again:
             only = decision.ask_again or None
-            self._fleet.check_again(pending, Check(check.host_class, answered, check.passed_over, only))
+            self._fleet.leases.check_again(pending, Check(check.host_class, answered, check.passed_over, only))
         elif decision.held or (decision.by_anchor and any(each.by_anchor for each in self._admission.barred.values())):
             self._hold(pending, answered)
         else:
@@ -203,7 +203,7 @@ class Verification:
         assert check is not None
         if self._held.get(digest, frozenset()) != frozenset(hosts):
             self._held[digest] = frozenset(hosts)
-            self._fleet.check_again(pending, Check(check.host_class, set(hosts)))
+            self._fleet.leases.check_again(pending, Check(check.host_class, set(hosts)))
             self._fleet.note(self.waiting, "differing")
 
     def _finish(self, pending: PendingJob, decision: Decision) -> None:
@@ -218,10 +218,9 @@ class Verification:
             return
         self._write(found)
         if outcome == "differs":
-            self._fleet.note(
-                f"{found.what}; none gives the same twice, so the task is not deterministic there", "unsteady"
-            )
-        self._fleet.withdraw([job.digest])
+            text = f"{found.what}; none gives the same twice, so the task is not deterministic there"
+            self._fleet.note(text, "unsteady")
+        self._fleet.leases.withdraw([job.digest])
         self._forget(job.digest)
 
     def _forget(self, *digests: bytes) -> None:
@@ -237,15 +236,14 @@ class Verification:
 
     def condemn(self) -> set[str]:
         """Bar the hosts that were found wrong, in the journal too; their names."""
-        hosts = set()
+        hosts: set[str] = set()
         for found in self._findings.values():
             self._write(found)
             for host in sorted(found.decision.wrong):
                 by_anchor = found.decision.by_anchor
                 witness = "the coordinator's own host" if by_anchor else "another host"
                 why = f"{found.what}; {witness} confirms that {printable(host)} is wrong"
-                self._admission.bar(host, StoredBar(why, by_anchor), self._incarnation)
-                hosts.add(host)
+                hosts |= self._admission.bar(host, StoredBar(why, by_anchor), self._incarnation)
         self._findings.clear()
         return hosts
 

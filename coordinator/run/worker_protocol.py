@@ -21,9 +21,7 @@ from dreamfleet.common.protocol.messages import (
     HelloReply,
     HelloRequest,
     Intervals,
-    Job,
     JobBatch,
-    Kind,
     Result,
     ResultBatch,
     UploadPart,
@@ -31,7 +29,7 @@ from dreamfleet.common.protocol.messages import (
 from dreamfleet.common.protocol.result_bounds import LONGEST_EPISODE, max_steps, rejection_reason
 from dreamfleet.common.schema.validation import MAX_TEXT, to_plain
 from dreamfleet.coordinator.dispatch.failures import LONGEST_ERROR
-from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
+from dreamfleet.coordinator.dispatch.packing import SentBatch
 from dreamfleet.coordinator.dispatch.refusals import Refusal
 from dreamfleet.coordinator.jobs.work import Work
 from dreamfleet.coordinator.run.run import Run
@@ -103,7 +101,7 @@ class WorkerProtocol:
         for running in beat.running:
             digest = self._fleet.jobs.digest_of_tag(running.tag)
             work = None if digest is None else self._fleet.jobs.work(digest)
-            if work is not None and running.steps > self._most_steps(work.job):
+            if work is not None and running.steps > max_steps(self._horizon_of(work)):
                 self._fleet.overrun(worker, work.digest)
 
     def handle_results(self, worker: str, batch: ResultBatch, now: float) -> None:
@@ -138,9 +136,8 @@ class WorkerProtocol:
         else:
             uploads.add(worker, part, now)
 
-    def job_batch(self, batch: OutgoingBatch, *, leave: bool = False, ended: bool = False) -> JobBatch:
+    def job_batch(self, batch: SentBatch, *, leave: bool = False, ended: bool = False) -> JobBatch:
         """The message for a batch; with `leave` it asks the worker to leave the run, with `ended` it says why."""
-        content = batch.content
         reason = self._run.state.ended if ended else None
         return JobBatch(
             run_uid=self._run.uid,
@@ -148,10 +145,10 @@ class WorkerProtocol:
             nonce=self._nonce,
             numbering=batch.numbering,
             number=batch.number,
-            vectors=tuple(content.vectors),
-            jobs=tuple(work.job for work in content.work),
-            cancels=tuple(content.cancels),
-            verdicts=tuple(content.verdicts),
+            vectors=tuple(batch.vectors),
+            jobs=tuple(work.job for work in batch.work),
+            cancels=tuple(batch.cancels),
+            verdicts=tuple(batch.verdicts),
             leave=leave,
             ended=ended,
             why="" if reason is None else truncate(reason.text, MAX_REASON),
@@ -161,12 +158,16 @@ class WorkerProtocol:
         self, worker: str, reported: Result, work: Work | None, fingerprint: str, host_class: str, now: float
     ) -> None:
         """Judge one result; `work` is the wanted job that it names, `None` if it names none."""
-        kind, horizon = ("evaluate", None) if work is None else (work.kind, work.job.horizon)
-        bounded = fail_if_excessive(reported, kind, horizon or self._horizon, self._measures)
+        bounded = fail_if_excessive(reported, self._horizon_of(work), self._measures)
         result: Result | None = bounded
-        if kind == "collect":
-            result = self._receive_rollout(worker, bounded)
-        if result is None:
+        if work is not None and work.kind == "collect":
+            try:
+                given = self._fleet.find_job_for_result(worker, bounded)
+                result = self._collections.receive(worker, bounded, given)
+            except NotWritableNowError as error:  # the worker sends both again
+                self._run.wait_until_writable(error)
+                result = None
+        if result is None:  # its rollout is on its way, or the disk is full
             self._fleet.defer_verdict(worker, reported.digest, now)
             return
         _, accepted = self._fleet.handle_result(worker, result, now, host_class)
@@ -176,26 +177,18 @@ class WorkerProtocol:
             self._run.verification.record(self._fleet.checked, result, worker)
         self._collections.uploads.forget(reported.digest)
 
-    def _receive_rollout(self, worker: str, result: Result) -> Result | None:
-        """The result of a kept rollout with its file saved; `None` while the file is on its way or the disk is full."""
-        try:
-            return self._collections.receive(worker, result, self._fleet.find_job_for_result(worker, result))
-        except NotWritableNowError as error:  # the worker sends both again
-            self._run.wait_until_writable(error)
-            return None
-
-    def _most_steps(self, job: Job) -> int:
-        """The most steps that a job can report while it runs."""
-        return max_steps(LONGEST_EPISODE if job.kind == "evaluate" else job.horizon or self._horizon)
+    def _horizon_of(self, work: Work | None) -> int:
+        """The most steps of a job's episode; evaluations drive whole ones, whose length only the task knows."""
+        if work is None or work.kind == "evaluate":
+            return LONGEST_EPISODE
+        return work.job.horizon or self._horizon
 
 
-def fail_if_excessive(result: Result, kind: Kind, horizon: int, measures: int = 0) -> Result:
+def fail_if_excessive(result: Result, horizon: int, measures: int) -> Result:
     """The result, turned into a failure of the job if its numbers would spoil the run's, or lacks `measures` of them.
 
-    `horizon` is that of a scored or kept episode. Evaluations drive whole episodes, whose length only the task knows.
+    `horizon` are the most steps that the job's episode can have.
     """
-    if kind == "evaluate":
-        horizon = LONGEST_EPISODE
     steps = min(result.steps, max_steps(horizon))
     if result.fitness is None:
         return replace(result, steps=steps)

@@ -11,7 +11,7 @@ from dreamfleet.common.protocol.messages import ControlReply
 from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.common.schema.validation import MAX_TEXT
 from dreamfleet.coordinator.dispatch.member import Member
-from dreamfleet.coordinator.dispatch.packing import BatchContent, OutgoingBatch
+from dreamfleet.coordinator.dispatch.packing import SentBatch
 from dreamfleet.coordinator.run.run import BY_HAND, Run
 from dreamfleet.coordinator.run.run_state import Pause
 
@@ -69,7 +69,7 @@ class Control:
                 again = resume_command
         return ControlReply(v=keys.PROTOCOL_VERSION, run=self._name, accepted=not why, why=why, again=again)
 
-    def advance(self, now: float) -> list[OutgoingBatch]:
+    def advance(self, now: float) -> list[SentBatch]:
         """Stop once draining or disbanding is done; batches that ask the workers to leave, repeated every beat."""
         if self._draining and not self._run.fleet.lease_count:
             self._stop()
@@ -83,7 +83,7 @@ class Control:
             return _empty_batches(present)
         return []
 
-    def last_batches(self) -> list[OutgoingBatch]:
+    def last_batches(self) -> list[SentBatch]:
         """Empty batches that say that the run has ended, for those present, which leave it."""
         return _empty_batches(each for each in self._run.fleet.members.values() if each.gone_since is None)
 
@@ -111,5 +111,5 @@ class Control:
         self._disbanding_since = self._now
 
 
-def _empty_batches(members: Iterable[Member]) -> list[OutgoingBatch]:
-    return [OutgoingBatch(each.identity, each.numbering, 0, BatchContent()) for each in members]
+def _empty_batches(members: Iterable[Member]) -> list[SentBatch]:
+    return [SentBatch(each.identity, each.numbering) for each in members]

@@ -152,7 +152,8 @@ def _serve_life(request: RunRequest, stop: Stop) -> Run:
             run = Run(journal, settings, request.limits, request.network, monotonic(), anchor_key)
             return OpenRun(run, file_watch, served)
 
-        service = _service(request, revocations, _score_word(settings, bundle))
+        word = score_word(settings.task.task) if bundle is None else bundle.manifest.facts.score_word
+        service = _service(request, revocations, word)
         stop.stop_service = service.stop
         if stop.is_requested:
             service.stop()
@@ -173,10 +174,6 @@ def _check_file_system(folder: Path) -> None:
     if is_network(kind := file_system_type(folder)):
         log.warning("%s is on a network file system (%s): read this run's files on this host alone, or a `runs backup`",
                     folder, kind)  # fmt: skip
-
-
-def _score_word(settings: RunSettings, bundle: Bundle | None) -> str:
-    return score_word(settings.task.task) if bundle is None else bundle.manifest.facts.score_word
 
 
 def _watch_revocations(request: RunRequest, journal: Journal | None) -> RevocationWatcher:
@@ -206,21 +203,15 @@ def _open_journal(
     with reporting_unwritable_folder(request.runs_dir, "choose another --runs-dir", JournalError):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     stack.enter_context(run_lock(folder))
-    return stack.enter_context(closing(_write_facts(request, folder, settings, bundle, known)))
-
-
-def _write_facts(
-    request: RunRequest, folder: Path, settings: RunSettings, bundle: Bundle | None, known: Mapping[str, str]
-) -> Journal:
     facts = serving_facts(request.limits, request.network)
     if request.config is not None:
         start = request.start.facts if request.start else {}
         subspace = {SUBSPACE_FACT: request.config.loaded_subspace.text} if request.config.loaded_subspace else {}
         own = {**facts, **start, **subspace, **known}
-        created = Journal.create(folder, settings, bundle.path if bundle else None, own)
-        remember_run(created.fact("uid") or "", settings.task.task, settings.task.options)
-        return created
-    journal = Journal(folder / JOURNAL)
+        journal = stack.enter_context(closing(Journal.create(folder, settings, bundle.path if bundle else None, own)))
+        remember_run(journal.fact("uid") or "", settings.task.task, settings.task.options)
+        return journal
+    journal = stack.enter_context(closing(Journal(folder / JOURNAL)))
     for name, text in facts.items():
         journal.set_fact(name, text)
     journal.commit()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import queue
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from time import monotonic, time
 from typing import Any
 
@@ -75,27 +75,23 @@ class NameLock:
 
     def _listen(self, now: float, wait: float) -> None:
         """Handle tokens and notes, waiting at most `wait` seconds for the first; ask new coordinators for theirs."""
-        try:
-            self._handle(*self._inbox.get(timeout=wait), now) if wait else self._handle(*self._inbox.get_nowait(), now)
+        with suppress(queue.Empty):
             while True:
-                self._handle(*self._inbox.get_nowait(), now)
-        except queue.Empty:
-            pass
+                self._handle(*self._inbox.get(timeout=wait), now)
+                wait = 0.0
         for nonce in self._leader_check.due_to_ask(now):
             self._ask(nonce)
 
     def _handle(self, kind: str, event: Any, now: float) -> None:
-        if kind == "token":
-            nonce = str(event.key_expr).rsplit("/", 1)[-1]
-            if event.kind == zenoh.SampleKind.DELETE:
-                self._leader_check.vanish(nonce)
-            else:
-                self._leader_check.appear(nonce, now)
+        if kind == "note":
+            with suppress(MalformedError):
+                self._leader_check.record_note(decode_json(ClaimNote, event))
             return
-        try:
-            self._leader_check.record_note(decode_json(ClaimNote, event))
-        except MalformedError:
-            return
+        nonce = str(event.key_expr).rsplit("/", 1)[-1]
+        if event.kind == zenoh.SampleKind.DELETE:
+            self._leader_check.vanish(nonce)
+        else:
+            self._leader_check.appear(nonce, now)
 
     def _ask(self, nonce: str) -> None:
         def record_note(reply: zenoh.Reply) -> None:

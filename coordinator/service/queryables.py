@@ -31,7 +31,7 @@ def declare_status(
 
     def declare(part: str) -> Any:
         def answer(query: zenoh.Query) -> None:
-            payload = encode_part(latest(), part, query.parameters)
+            payload = encode_part(latest(), part, query.parameters.get)
             query.reply(keys.status(name, part), payload, encoding="application/json")
 
         return session.declare_queryable(keys.status(name, part), guarded_callback(answer, error_counter))
@@ -39,22 +39,17 @@ def declare_status(
     return [declare(part) for part in PARTS]
 
 
-class BundleServer:
-    """Serves a run's world model in parts."""
+def declare_bundle(
+    session: zenoh.Session, key: str, bundle: ServedBundle, head: dict[str, Any], error_counter: ErrorCounter
+) -> Any:
+    """Declare a queryable that serves a run's world model in parts.
 
-    def __init__(self, bundle: ServedBundle, key: str, head: dict[str, Any]) -> None:
-        """`head` holds the fields of every part: the run, the incarnation and the bundle's hash."""
-        self._bundle = bundle
-        self._key = key
-        self._head = head
+    `head` holds the fields of every part: the run, the incarnation and the bundle's hash.
+    """
 
-    def declare(self, session: zenoh.Session, error_counter: ErrorCounter) -> Any:
-        """Answer until the returned queryable is undeclared."""
-        return session.declare_queryable(self._key, guarded_callback(self._answer, error_counter))
-
-    def _answer(self, query: zenoh.Query) -> None:
+    def answer(query: zenoh.Query) -> None:
         parameters = query.parameters
-        if str(query.key_expr) != self._key:
+        if str(query.key_expr) != key:
             query.reply_err(_error_body("name a world model by its run and hash, without wildcards"))
             return
         try:
@@ -62,9 +57,11 @@ class BundleServer:
         except ValueError:
             query.reply_err(_error_body("offset and length must be whole numbers"))
             return
-        offset, total, data = self._bundle.read_part(offset, length)
-        part = BundlePart(**self._head, offset=offset, total=total, data=data)
-        query.reply(self._key, encode(part), encoding=encoding(BundlePart))
+        offset, total, data = bundle.read_part(offset, length)
+        part = BundlePart(**head, offset=offset, total=total, data=data)
+        query.reply(key, encode(part), encoding=encoding(BundlePart))
+
+    return session.declare_queryable(key, guarded_callback(answer, error_counter))
 
 
 def guarded_callback(answer: Answer, error_counter: ErrorCounter) -> Any:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import queue
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from time import monotonic
@@ -34,7 +34,7 @@ from dreamfleet.common.schema.validation import MalformedError
 from dreamfleet.common.security.certificate_ledger import RevocationWatcher
 from dreamfleet.common.security.credentials import worker_seat_identity
 from dreamfleet.common.transport.session import Network, open_session
-from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
+from dreamfleet.coordinator.dispatch.packing import SentBatch
 from dreamfleet.coordinator.dispatch.refusals import Refusal
 from dreamfleet.coordinator.run.batches import Batches
 from dreamfleet.coordinator.run.run import Run
@@ -46,7 +46,7 @@ from dreamfleet.coordinator.service.control import Control
 from dreamfleet.coordinator.service.inbound_queue import InboundQueue
 from dreamfleet.coordinator.service.metrics_server import serve_metrics
 from dreamfleet.coordinator.service.name_lock import NameLock
-from dreamfleet.coordinator.service.queryables import BundleServer, declare_status
+from dreamfleet.coordinator.service.queryables import declare_bundle, declare_status
 from dreamfleet.coordinator.service.run_log import RunLog
 from dreamfleet.coordinator.service.snapshot import Snapshot, take_snapshot
 from dreamfleet.coordinator.service.status import encode_status
@@ -131,7 +131,7 @@ class Service:
         self._name_lock.announce(run.uid, run.incarnation)
         self._protocol = WorkerProtocol(run, name, self._nonce, self._intervals)
         self._control = Control(run, name, self._intervals.beat, self.stop)
-        self._batch_queries = BatchQueries(Batches(run, run.journal, name), name)
+        self._batch_queries = BatchQueries(Batches(run, name), name)
         self._kept_revocations = KeptRevocations(run.journal, self._revocations.authority)
         self._kept_revocations.keep(self._revocations.revoked_seats)
         self._started = monotonic()
@@ -151,13 +151,13 @@ class Service:
         if opened.bundle is not None:
             sha256 = run.settings.task.bundle
             head = {"run_uid": run.uid, "incarnation": run.incarnation, "sha256": bytes.fromhex(sha256)}
-            server = BundleServer(opened.bundle, keys.bundle(name, sha256), head)
-            declared.append(server.declare(session, self._error_counter))
+            key = keys.bundle(name, sha256)
+            declared.append(declare_bundle(session, key, opened.bundle, head, self._error_counter))
         self._run_log.begin()
         return declared
 
     def _loop(self, session: zenoh.Session) -> None:
-        snapshot_at = monotonic()
+        snapshot_at, published = monotonic(), len(self._run.history)
         while not (self._stopping or isinstance(self._run.state, Ended)):
             self._drain_events()
             now = monotonic()
@@ -174,12 +174,13 @@ class Service:
                 self._stopping = self._stopping or durable
                 continue
             self._put(session, self._run.fleet.dispatch(now, durable=durable))
-            self._run.prepare()
+            self._run.generations.prepare()
             # A new state is in the snapshot before it is announced: a client that hears of it and asks must see it.
             if now - snapshot_at >= SNAPSHOT_INTERVAL or shown_state(self._run).word != self._snapshot.status.state:
                 self._snapshot, snapshot_at = self._take_snapshot(), now
                 self._run_log.check(self._snapshot, now)
-            closed = self._run.take_closed()
+            closed = self._run.history.rows[published:]
+            published += len(closed)
             self._publish(session, closed)
             self._batch_queries.send(session, (each.number for each in closed), now, durable=durable)
             self._run_log.report_closed(closed)
@@ -226,7 +227,7 @@ class Service:
 
         return zenoh.handlers.Callback(enqueue, indirect=False)
 
-    def _put(self, session: zenoh.Session, batches: list[OutgoingBatch], *, ended: bool = False) -> None:
+    def _put(self, session: zenoh.Session, batches: list[SentBatch], *, ended: bool = False) -> None:
         for batch in batches:
             try:
                 message = encode(self._protocol.job_batch(batch, leave=self._control.disbanding, ended=ended))
@@ -253,12 +254,10 @@ class Service:
     def _drain_events(self) -> None:
         """Handle the events that have arrived; without any, wait for one until a commit or a tick is due."""
         patience = min(max(self._commit_at - monotonic(), 0.0), TICK) if self._has_uncommitted else TICK
-        try:
-            self._handle(*self._events.get(timeout=patience))
+        with suppress(queue.Empty):
             for _ in range(MOST_EVENTS):
-                self._handle(*self._events.get(timeout=0.0))
-        except queue.Empty:
-            pass
+                self._handle(*self._events.get(timeout=patience))
+                patience = 0.0
 
     def _handle(self, kind: str, event: Any) -> None:
         """Handle one event. An exception drops that event alone, for no message may end the run: its sender repeats it.
@@ -344,22 +343,13 @@ class Service:
             self._snapshot = self._take_snapshot()  # a client that asks after this answer must see its effect
             query.reply(query.key_expr, encode_json(reply), encoding="application/json")
 
-    def _publish(self, session: zenoh.Session, generations: list[StoredGeneration]) -> None:
+    def _publish(self, session: zenoh.Session, generations: Sequence[StoredGeneration]) -> None:
         for closed in generations:
             event = GenerationEvent(
-                v=keys.PROTOCOL_VERSION,
-                run=self._name,
-                run_uid=self._run.uid,
-                incarnation=self._run.incarnation,
-                generation=closed.number,
-                mean=closed.mean,
-                std=closed.std,
-                best=closed.best,
-                worst=closed.worst,
-                sigma=closed.sigma,
-                seconds=closed.seconds,
-                environment_steps=self._run.history.steps,
-            )
+                v=keys.PROTOCOL_VERSION, run=self._name, run_uid=self._run.uid, incarnation=self._run.incarnation,
+                generation=closed.number, mean=closed.mean, std=closed.std, best=closed.best, worst=closed.worst,
+                sigma=closed.sigma, seconds=closed.seconds, environment_steps=self._run.history.steps,
+            )  # fmt: skip
             session.put(keys.event_generation(self._name), encode_json(event), encoding="application/json")
 
     def _take_snapshot(self) -> Snapshot:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
 from functools import cache
 
 from dreamfleet.common.client.status import (
@@ -23,12 +24,14 @@ from dreamfleet.common.client.status import (
     WorkerStatus,
 )
 from dreamfleet.common.host.packages import package_version
+from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol.result_bounds import MAX_SECONDS, clamp_count
 from dreamfleet.common.runs.records import StoredEvaluation
-from dreamfleet.coordinator.dispatch.event_log import EventLogView
-from dreamfleet.coordinator.dispatch.failures import JobFailure, shorten
+from dreamfleet.common.schema.times import elapsed_seconds
+from dreamfleet.coordinator.dispatch.event_log import FleetEvent
 from dreamfleet.coordinator.dispatch.host_stats import HostStats
 from dreamfleet.coordinator.dispatch.member import Member
+from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob
 from dreamfleet.coordinator.jobs.generation import CandidateScores
 from dreamfleet.coordinator.jobs.history import HistoryView
 from dreamfleet.coordinator.run.report import ReportedMean
@@ -51,7 +54,7 @@ class Snapshot:
     candidate_scores: CandidateScores
     last: CandidateScores | None
     reported: ReportedMean | None
-    event_log: EventLogView
+    event_log: tuple[FleetEvent, ...]  # the newest last
     now: float  # seconds of the clock that the event log uses
 
     def full_status(self) -> Status:
@@ -132,24 +135,30 @@ def _status(
         failures=tuple(_failure(each, now) for each in failures[:MOST_FAILURES]),
         dropped=dict(dropped),
         refused=_refused(run),
-        confirmed=run.confirmed,
+        confirmed=run.background_jobs.confirmed,
         confirming=EpisodeProgress(*run.background_jobs.confirming),
         ending=reached is not None,
         failed=run.history.failed,
         equal=0 if run.settings.is_external else run.history.equal.count,
         has_risen=run.history.equal.has_risen,
-        elapsed=run.elapsed,
+        elapsed=_elapsed(run),
         closing=0 if run.state.ended else run.background_jobs.episodes_until_end(ending=reached is not None),
         strict=run.admission.strict,
-        classes=run.classes,
+        classes=run.journal.results.classes,
         checks=run.verification.summary,
         expires=expires,
         share=run.fleet_share,
         episode_limit=run.episode_limit,
         score_word=score_word,
         archive=None if (archive := run.generations.archive) is None else archive.status,
-        open_batches=run.generations.open_batches,
+        open_batches=run.journal.batches.open_count() if run.settings.is_external else 0,
     )
+
+
+def _elapsed(run: Run) -> float | None:
+    """Wall-clock seconds since the run began; `None` if a clock was set so that they cannot be right."""
+    seconds = elapsed_seconds(run.created, datetime.now(UTC).isoformat())
+    return None if seconds is None else round(min(seconds, MAX_SECONDS), 1)
 
 
 def _open_generation(run: Run) -> GenerationStatus:
@@ -158,7 +167,7 @@ def _open_generation(run: Run) -> GenerationStatus:
         number=run.generation.number,
         episodes_done=run.generation.done,
         episodes=run.generation.total,
-        seconds=min(round(run.work_clock.seconds, 1), MAX_SECONDS),
+        seconds=min(round(run.open_seconds, 1), MAX_SECONDS),
         sigma=run.generations.sigma,
         temperature=run.generation.spec.temperature,
         stage=_stage(run),
@@ -208,33 +217,25 @@ def _episodes_per_second(present: Sequence[Member], seconds: Callable[[HostStats
 
 def _refused(run: Run) -> dict[str, str]:
     latest = list(run.admission.refused_workers.latest.items())[-MOST_NAMED:]
-    return {name: shorten(why, LONGEST) for name, why in latest}
+    return {name: truncate(why, LONGEST) for name, why in latest}
 
 
 def _waste(counts: Mapping[str, int]) -> Waste:
     discarded, accepted = counts["discarded_steps"], counts["accepted_steps"]
-    return Waste(
-        discarded_steps=clamp_count(discarded),
-        share=round(discarded / (discarded + accepted), 4) if discarded else 0.0,
-        reissued=counts["reissued"],
-        recalled=counts["recalled"],
-        copied=counts["copied"],
-        duplicate=counts["duplicate"],
-        obsolete=counts["obsolete"],
-        errors=counts["errors"],
-        resent_batches=counts["resent_batches"],
-        silences=counts["silences"],
-    )
+    shown = "reissued", "recalled", "copied", "duplicate", "obsolete", "errors", "resent_batches", "silences"
+    share = round(discarded / (discarded + accepted), 4) if discarded else 0.0
+    return Waste(discarded_steps=clamp_count(discarded), share=share, **{name: counts[name] for name in shown})
 
 
-def _failure(failure: JobFailure, now: float) -> FailureStatus:
-    job, names = failure.work.job, list(failure.errors)[:MOST_NAMED]
+def _failure(failure: PendingJob, now: float) -> FailureStatus:
+    job, errors, attempts = failure.work.job, failure.errors, failure.attempts_by_worker
+    names = list(errors)[:MOST_NAMED]
     return FailureStatus(
         candidate=f"{job.generation}/{job.candidate}",
         kind=job.kind,
         seeds=job.seeds,
-        errors={name: shorten(failure.errors[name], LONGEST) for name in names},
-        attempts={name: failure.attempts[name] for name in names},
+        errors={name: truncate(errors[name], LONGEST) for name in names},
+        attempts={name: attempts[name] for name in names},
         retry_in=round(failure.retry_at - now, 1) if failure.retry_at > now else None,
     )
 

@@ -6,14 +6,14 @@ import base64
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from dreamfleet.common.client.status import STATUS_SCHEMA_VERSION, Event, Population, Status, WorkerStatus
 from dreamfleet.common.protocol.codec import encode_json
 from dreamfleet.common.protocol.messages import MAX_MESSAGE
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration, with_error
 from dreamfleet.common.schema.validation import to_plain
-from dreamfleet.coordinator.dispatch.event_log import FleetEvent
+from dreamfleet.coordinator.dispatch.event_log import FleetEvent, latest
 from dreamfleet.coordinator.jobs.generation import CandidateScores
 from dreamfleet.coordinator.service.snapshot import Snapshot
 
@@ -27,30 +27,27 @@ T = TypeVar("T")
 Row = TypeVar("Row", WorkerStatus, StoredGeneration, StoredEvaluation)
 
 
-class Parameters(Protocol):
-    """A query's parameters."""
-
-    def get(self, key: str) -> str | None:
-        """The value of a parameter; `None` if the query lacks it."""
-
-
-def encode_part(snapshot: Snapshot, part: str, parameters: Parameters) -> bytes:
-    """The JSON answer of a status key; the empty `part` is the whole status.
+def encode_part(snapshot: Snapshot, part: str, get: Callable[[str], str | None]) -> bytes:
+    """The JSON answer of a status key; the empty `part` is the whole status. `get` gives the query's parameters.
 
     Long parts come in pages from `offset` on, `best` with a slice of the controller's parameters, and `story` with as
     many of the last events as fit.
     """
     if part == "":
         return encode_status(snapshot)
-    offset, limit = _number(parameters.get("offset"), 0), _number(parameters.get("limit"), 10**9)
+    offset, limit = _number(get("offset"), 0), _number(get("limit"), 10**9)
+    page = slice(offset, offset + min(limit, PAGE))
+    history = snapshot.history.part(offset, min(limit, PAGE))
     documents: dict[str, Callable[[], dict[str, Any]]] = {
         "generation": lambda: _generation(snapshot),
-        "workers": lambda: _workers(snapshot, offset, limit),
-        "history": lambda: _history(snapshot, offset, limit),
-        "evaluations": lambda: _evaluations(snapshot, offset, limit),
-        "candidates": lambda: _candidates(snapshot, parameters.get("generation"), offset, limit),
+        "workers": lambda: _page("workers", snapshot.workers[page], offset, len(snapshot.workers)),
+        "history": lambda: _page("history", history, offset, len(snapshot.history)),
+        "evaluations": lambda: _page(
+            "evaluations", snapshot.evaluations[page], offset, len(snapshot.evaluations), with_error
+        ),
+        "candidates": lambda: _candidates(snapshot, get("generation"), offset, limit),
         "best": lambda: _best(snapshot, offset),
-        "story": lambda: _story(snapshot, parameters),
+        "story": lambda: _story(snapshot, get),
     }
     head = {"schema": STATUS_SCHEMA_VERSION, "run": snapshot.status.run, "run_uid": snapshot.status.run_uid}
     return json.dumps({**head, **documents[part]()}, allow_nan=False).encode()
@@ -92,20 +89,10 @@ def _generation(snapshot: Snapshot) -> dict[str, Any]:
     return {**asdict(snapshot.status.generation), "last": None if last is None else asdict(last)}
 
 
-def _workers(snapshot: Snapshot, offset: int, limit: int) -> dict[str, Any]:
-    rows = _head(snapshot.workers[offset : offset + min(limit, PAGE)], PAGE_BYTES)
-    return {"offset": offset, "total": len(snapshot.workers), "workers": [asdict(each) for each in rows]}
-
-
-def _history(snapshot: Snapshot, offset: int, limit: int) -> dict[str, Any]:
-    rows = _head(snapshot.history.part(offset, min(limit, PAGE)), PAGE_BYTES)
-    return {"offset": offset, "total": len(snapshot.history), "history": [asdict(each) for each in rows]}
-
-
-def _evaluations(snapshot: Snapshot, offset: int, limit: int) -> dict[str, Any]:
-    found = snapshot.evaluations
-    rows = _head(found[offset : offset + min(limit, PAGE)], PAGE_BYTES)
-    return {"offset": offset, "total": len(found), "evaluations": [with_error(each) for each in rows]}
+def _page(
+    name: str, rows: Iterable[Row], offset: int, total: int, plain: Callable[[Row], dict[str, Any]] = asdict
+) -> dict[str, Any]:
+    return {"offset": offset, "total": total, name: [plain(each) for each in _head(rows, PAGE_BYTES)]}
 
 
 def _candidates(snapshot: Snapshot, generation: str | None, offset: int, limit: int) -> dict[str, Any]:
@@ -115,12 +102,12 @@ def _candidates(snapshot: Snapshot, generation: str | None, offset: int, limit: 
     return asdict(_population(chosen, offset, min(limit, CANDIDATES), PAGE_BYTES))
 
 
-def _story(snapshot: Snapshot, parameters: Parameters) -> dict[str, Any]:
+def _story(snapshot: Snapshot, get: Callable[[str], str | None]) -> dict[str, Any]:
     """The last events, the newest last: of a worker, a candidate's jobs (`generation/index`) or kinds, or all."""
-    worker, what = parameters.get("worker") or "", parameters.get("what") or ""
-    generation, slash, index = (parameters.get("job") or "").partition("/")
+    worker, what = get("worker") or "", get("what") or ""
+    generation, slash, index = (get("job") or "").partition("/")
     chosen = (_number(generation, -1), _number(index, -1)) if slash else None
-    found = list(snapshot.event_log.latest(worker, chosen, what.split(",") if what else ()))
+    found = list(latest(snapshot.event_log, worker, chosen, what.split(",") if what else ()))
     plain = (asdict(_event(each, snapshot.now)) for each in found)
     rows = _fitting(plain, PAGE_BYTES, lambda row: len(json.dumps(row)) + 2)
     return {"total": len(found), "story": rows[::-1]}

@@ -203,12 +203,9 @@ def _check_subspace(subspace: Subspace, spec: TaskSpec, shape: ControllerShape, 
 
 def _try_optimiser(settings: RunSettings, stage: Stage, subspace: Subspace | None) -> None:
     """Build the run's optimiser once, so that a search which it cannot do is refused before the run exists."""
-    from dreamfleet.coordinator.optimisers.evolution import (  # heavy: `--help` reads this module too
-        Evolution,
-        EvolutionConfig,
-    )
+    from dreamfleet.coordinator.optimisers.evolution import Evolution  # heavy: `--help` reads this module too
 
-    evolution = Evolution(EvolutionConfig.of(settings, stage, subspace))
+    evolution = Evolution.of(settings, stage, subspace, None)
     if settings.on_failure == "redraw":
         if stage.settings.racing:
             raise UsageError("--on-failure redraw cannot be combined with --racing: a late candidate has no first half")

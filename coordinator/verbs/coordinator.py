@@ -235,11 +235,12 @@ def _report(
     again, ended = request.resume_command(), run.state.ended
     path = request.folder / CONTROLLER
     controller = path if path.is_file() else None
+    best, confirmed = run.background_jobs.evaluations.best, run.background_jobs.confirmed
     facts: dict[str, Any] = {
         "run": request.name, "ended": ended.text if ended else None, "controller": controller, "continue": again,
-        "best": run.best and with_error(run.best), "confirmed": run.confirmed and with_error(run.confirmed),
+        "best": best and with_error(best), "confirmed": confirmed and with_error(confirmed),
     }  # fmt: skip
-    judged = run.confirmed or run.best
+    judged = confirmed or best
     word = score_word_of_run(run.settings.task, request.folder / BUNDLE)
     score = f"; {describe_score(in_values(judged, run.settings.task), word)}" if judged else ""
     if ended is None:

@@ -18,7 +18,7 @@ class Evaluated(Bench):
 
     def fetch(self):
         for send in self.run.fleet.dispatch(self.now):
-            self.given += [work.job for work in send.content.work]
+            self.given += [work.job for work in send.work]
 
     def finish(self, index):
         job = self.given.pop(index)

@@ -86,7 +86,7 @@ def test_the_events_of_a_killed_workers_jobs_are_printed_while_the_run_lives(pro
 
 @pytest.mark.slow
 def test_a_coordinator_from_before_stories_is_said_to_be_old_and_not_absent(processes):
-    status = encode_part(snapshot(), "", {})
+    status = encode_part(snapshot(), "", {}.get)
     with open_session(Network(listen=(processes.endpoint,))) as session:
         key = keys.status("night")
         session.declare_queryable(key, lambda query: query.reply(key, status))

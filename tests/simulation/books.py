@@ -6,7 +6,7 @@ from collections import Counter
 
 from dreamfleet.common.protocol.messages import TAG_BYTES
 from dreamfleet.coordinator.dispatch.fleet import Fleet
-from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
+from dreamfleet.coordinator.dispatch.packing import SentBatch
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJobs
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.worker.service.backlog import MAX_UNUSED_VECTORS
@@ -46,7 +46,7 @@ def check_coordinator(fleet: Fleet) -> None:
             _require(digest in jobs, "a lease is on a job that nobody wants")
             _require(name in jobs[digest].holders, "a lease is on a job that it does not hold")
         _require(not (member.silent and member.leases), "a silent worker holds leases")
-        kinds = Counter(lease.kind for lease in member.leases.values())
+        kinds = Counter((lease.is_background, lease.is_driven) for lease in member.leases.values())
         _require(+member.held == kinds, "a worker's leases are miscounted")
         _require(all(number <= member.number for number in member.unconfirmed), "a batch is unseen that was not sent")
     _require(jobs._background_held == is_background, "what fills the slack is miscounted")
@@ -67,10 +67,10 @@ def check_opening(fleet: Fleet, run: Run) -> None:
     )
 
 
-def check_credit(fleet: Fleet, send: OutgoingBatch) -> None:
+def check_credit(fleet: Fleet, send: SentBatch) -> None:
     """A batch with new work fits the credit of its worker; one that is sent again was within it then."""
     member = fleet.members[send.identity]
-    if send.content.work and send.number == member.number and member.unconfirmed[send.number].times == 1:
+    if send.work and send.number == member.number and member.unconfirmed[send.number].times == 1:
         _require(len(member.leases) <= 2 * member.capacity, "a worker was given more than its credit", "credit")
 
 
@@ -87,7 +87,7 @@ class Sendings:
         """It was awake for so long."""
         self._awake += seconds
 
-    def sent(self, fleet: Fleet, send: OutgoingBatch) -> None:
+    def sent(self, fleet: Fleet, send: SentBatch) -> None:
         """A batch has left."""
         batch = id(fleet.members[send.identity]), send.number
         self._last[batch] = self._awake
@@ -102,7 +102,7 @@ class Sendings:
             for number in member.unconfirmed if member.is_reachable else ():
                 batch = id(member), number
                 quiet = self._awake - max(self._last.get(batch, self._awake), free)
-                size = sum(sent.content.size for sent in member.unconfirmed.values())
+                size = sum(sent.size for sent in member.unconfirmed.values())
                 link = member.host_stats.transfer_seconds(size)
                 patience = (SENT_AGAIN_WITHIN + link) * min(2 ** (self._times[batch] - 1), MAX_PATIENCE)
                 _require(quiet <= patience, "a batch that was not seen is not sent again", "promptness")

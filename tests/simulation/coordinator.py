@@ -11,7 +11,7 @@ from typing import Any, cast
 from unittest.mock import patch
 
 from dreamfleet.common.protocol.messages import HelloRequest, Intervals, JobBatch
-from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
+from dreamfleet.coordinator.dispatch.packing import SentBatch
 from dreamfleet.coordinator.jobs import rollout_collection
 from dreamfleet.coordinator.optimisers import evolution
 from dreamfleet.coordinator.run.report import ControllerWriter
@@ -31,7 +31,7 @@ LINGER = 0.005
 ANCHOR_KEY = bytes(32)  # of the coordinator's own host
 
 OPENED, COMMITTED = "opened", "committed"
-Step = OutgoingBatch | str | None
+Step = SentBatch | str | None
 """A batch to send, the name of a moment, or any other moment at which a life may end."""
 
 
@@ -92,11 +92,10 @@ class Coordinator:
         if self.run.state.is_rewound:
             return
         yield from self.fleet.dispatch(now)
-        self.run.prepare()
-        self.run.take_closed()
+        self.run.generations.prepare()
         self.run.take_notes()
 
-    def batch(self, send: OutgoingBatch) -> JobBatch:
+    def batch(self, send: SentBatch) -> JobBatch:
         """A send as it travels."""
         return self.worker_protocol.job_batch(send)
 

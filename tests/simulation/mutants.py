@@ -19,9 +19,10 @@ import numpy as np
 
 from dreamfleet.common.protocol.messages import MAX_PART
 from dreamfleet.common.runs.stages import StageTracker, stages_of
-from dreamfleet.coordinator.dispatch import failure_judge, fleet, member, packing
+from dreamfleet.coordinator.dispatch import failure_judge, member, packing
 from dreamfleet.coordinator.dispatch.fleet import Fleet
-from dreamfleet.coordinator.dispatch.member import Member, SentBatch
+from dreamfleet.coordinator.dispatch.leases import Leases
+from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJobs
 from dreamfleet.coordinator.jobs.checks import Check
 from dreamfleet.coordinator.jobs.confirmation import Confirmation
@@ -124,7 +125,7 @@ def generations_do_not_wait_for_their_checks(_original):
 # The coordinator: fleet, wanted jobs, member, packing.
 
 
-@mutant(Fleet, "_release_leases")
+@mutant(Leases, "release")
 def fleet_forgets_to_queue_what_a_lost_worker_held(_original):
     def release(self, member):
         member.leases.clear()
@@ -158,9 +159,9 @@ def fleet_believes_every_result_of_the_generation_that_is_open(original):
     return judge
 
 
-@mutant(fleet, "SentBatch")
+@mutant(Member, "take_overdue_batches")
 def fleet_never_sends_a_batch_again(_original):
-    return lambda content, _at, first: SentBatch(content, math.inf, first)
+    return lambda self, now, patience: iter(())
 
 
 @mutant(member, "ABSENT_HEARTBEATS")
@@ -323,7 +324,8 @@ def failures_become_facts_after_one_attempt(_original):
 @mutant(Run, "commit")
 def run_commits_only_what_closes_a_generation(original):
     def commit(self):
-        if self._unpublished:
+        if len(self.history) > self.__dict__.setdefault("committed", len(self.history)):
+            self.committed = len(self.history)
             original(self)
 
     return commit
@@ -355,7 +357,7 @@ def stages_begin_without_the_evaluation_that_decides(original):
 @mutant(Generations, "_search", first_stage=1, anew=True)
 def a_stage_that_is_continued_searches_as_the_first_one(original):
     def search(self, stage, start):
-        return original(self, stage if hasattr(self, "terms") and self.last else stages_of(self._settings)[0], start)
+        return original(self, stage if self.last else stages_of(self._settings)[0], start)
 
     return search
 

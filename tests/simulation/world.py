@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from dreamfleet.common.protocol.messages import HelloRequest, Job, JobBatch
-from dreamfleet.coordinator.dispatch.packing import OutgoingBatch
+from dreamfleet.coordinator.dispatch.packing import SentBatch
 from dreamfleet.coordinator.run.run import BY_HAND
 from tests.simulation import books
 from tests.simulation.coordinator import COMMITTED, LINGER, OPENED, TICK, Coordinator, simulated_surroundings
@@ -166,7 +166,7 @@ class World:
                 return
             if step == OPENED:
                 books.check_opening(life.fleet, life.run)
-            elif isinstance(step, OutgoingBatch):
+            elif isinstance(step, SentBatch):
                 books.check_credit(life.fleet, step)
                 self._sendings.sent(life.fleet, step)
                 self._send_down(life, step)
@@ -177,7 +177,7 @@ class World:
         for worker, message in inbox:
             life.hear(worker, message, self.now)
 
-    def _dies(self, step: OutgoingBatch | str | None) -> bool:
+    def _dies(self, step: SentBatch | str | None) -> bool:
         kill = self.kill
         if kill is None:
             return False
@@ -358,7 +358,7 @@ class World:
             self._transmit_down(host, request.worker, Welcome(life.nonce, question, numbering))
         self.wake_coordinator(LINGER)
 
-    def _send_down(self, life: Coordinator, send: OutgoingBatch) -> None:
+    def _send_down(self, life: Coordinator, send: SentBatch) -> None:
         host = int(send.identity.partition("/")[0][1:])
         batch = life.batch(send)
         self.witness.promised(self.disk, batch)

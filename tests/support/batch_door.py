@@ -37,7 +37,7 @@ class Door:
 
     def begin(self):
         self.run = Run(self.journal, SETTINGS, LimitsConfig(), NetworkConfig(), self.now)
-        self.batches = Batches(self.run, self.journal, "search")
+        self.batches = Batches(self.run, "search")
         self.step()
 
     def restart(self):
@@ -72,7 +72,7 @@ class Door:
         for work in self.run.generation.missing[:most]:
             fitness = float(np.frombuffer(work.vector, "<f4").sum()) + work.job.seeds[0]
             self.scored.append(work.job.digest)
-            self.run.fleet.withdraw([work.job.digest])
+            self.run.fleet.leases.withdraw([work.job.digest])
             self.run.record_result(work, Result(work.job.digest, fitness, 7, 0.1, None, None), "a/1", "f", "c")
         self.step()
 

@@ -53,4 +53,4 @@ def fleet_of(*names, capacity=1, jobs=10):
 
 
 def digests(sends, name):
-    return [each.job.digest for send in sends if send.identity == name for each in send.content.work]
+    return [each.job.digest for send in sends if send.identity == name for each in send.work]

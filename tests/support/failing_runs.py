@@ -52,7 +52,7 @@ class Failing(Bench):
             for name in self.hosts:
                 self.handle_heartbeat(name, host_class=self.host_class)
             for send in self.run.fleet.dispatch(self.now):
-                for work in send.content.work:
+                for work in send.work:
                     self.answer_one(send.identity, work.job)
         raise AssertionError("the run does not end")
 

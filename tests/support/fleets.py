@@ -88,9 +88,8 @@ class Played:
             host = next((host for host in self.hosts if host.identity == send.identity), None)
             if host is None:
                 continue
-            content = send.content
-            size = 200 + sum(len(part.data) for part in content.vectors) + JOB_BYTES * len(content.work)
-            size += 40 * (len(content.cancels) + len(content.verdicts))
+            size = 200 + sum(len(part.data) for part in send.vectors) + JOB_BYTES * len(send.work)
+            size += 40 * (len(send.cancels) + len(send.verdicts))
             self.sent_bytes += size
             host.busy_until = max(host.busy_until, self.now) + size / host.bandwidth
             self._at(host.busy_until + host.delay, self._arrive, host, send)
@@ -120,12 +119,12 @@ class Played:
         if send.number in host.seen or not send.number:
             return
         host.seen.add(send.number)
-        for digest in send.content.cancels:
+        for digest in send.cancels:
             host.queued.pop(digest, None)
             host.running = [each for each in host.running if each != digest] if host.width == 1 else host.running
-        for verdict in send.content.verdicts:
+        for verdict in send.verdicts:
             host.unacked.pop(verdict.digest, None)
-        host.queued |= {work.job.digest: None for work in send.content.work}
+        host.queued |= {work.job.digest: None for work in send.work}
         self._fill(host)
 
     def _fill(self, host):

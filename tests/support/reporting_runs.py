@@ -22,7 +22,7 @@ class Reporting(Bench):
     def step(self):
         """Answer the first job."""
         for send in self.run.fleet.dispatch(self.now):
-            self.given += [work.job for work in send.content.work]
+            self.given += [work.job for work in send.work]
         job = self.given.pop(0)
         fitness = SCORES[job.generation] if job.kind == "evaluate" else float(job.digest[0])
         self.answer(Result(job.digest, fitness, 10, 0.1, None, None))

@@ -107,20 +107,20 @@ class Bench:
 
     def verdicts(self):
         sends = self.run.fleet.dispatch(self.now)
-        return [(send.identity, each.digest, each.verdict) for send in sends for each in send.content.verdicts]
+        return [(send.identity, each.digest, each.verdict) for send in sends for each in send.verdicts]
 
     def reach_collection(self):
         """Score the only generation; the collection jobs, each with its holder."""
         while not self.run.fleet.drain_background:
             for send in self.run.fleet.dispatch(self.now):
-                for work in send.content.work:
+                for work in send.work:
                     self.deliver(send.identity, Result(work.job.digest, 1.0, 10, 0.1, None, None))
         return self.collecting()
 
     def collecting(self):
         given = {}
         for send in self.run.fleet.dispatch(self.now):
-            given.update({work.job.episode: (send.identity, work.job) for work in send.content.work})
+            given.update({work.job.episode: (send.identity, work.job) for work in send.work})
         return [given[episode] for episode in sorted(given)]
 
     def kept(self):

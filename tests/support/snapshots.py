@@ -16,7 +16,7 @@ def score(bench, count, fitness=lambda job: job.candidate + job.episode / 2):
     """Answer `count` jobs, one after the other."""
     while count:
         for send in bench.run.fleet.dispatch(bench.now):
-            bench.given = getattr(bench, "given", []) + [work.job for work in send.content.work]
+            bench.given = getattr(bench, "given", []) + [work.job for work in send.work]
         job = bench.given.pop(0)
         bench.answer(Result(job.digest, fitness(job), 10, 0.1, None, None))
         count -= 1
@@ -27,4 +27,4 @@ def snapshot_of(bench):
 
 
 def answered(snapshot, part="", **parameters):
-    return read_document(encode_part(snapshot, part, {name: str(value) for name, value in parameters.items()}))
+    return read_document(encode_part(snapshot, part, {name: str(value) for name, value in parameters.items()}.get))

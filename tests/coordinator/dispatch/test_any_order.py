@@ -62,11 +62,10 @@ class Worker:
 
     def take(self, send):
         """Take a batch; return whether to say hello, because its numbering is unknown."""
-        content = send.content
         batch = JobBatch(
             **HEAD, nonce="n", numbering=send.numbering, number=send.number,
-            vectors=tuple(content.vectors), cancels=tuple(content.cancels),
-            jobs=tuple(work.job for work in content.work), verdicts=tuple(content.verdicts),
+            vectors=tuple(send.vectors), cancels=tuple(send.cancels),
+            jobs=tuple(work.job for work in send.work), verdicts=tuple(send.verdicts),
         )  # fmt: skip
         if batch.numbering != self.backlog.numbering:
             return batch.numbering > self.backlog.numbering
@@ -180,13 +179,13 @@ class AnyOrder(RuleBasedStateMachine):
     def dispatch(self, durable=True):
         for send in self.fleet.dispatch(self.now, durable=durable):
             self.batches.append((send.identity, self.life, send))
-            if any(send.content is content for content in self.sent):
+            if any(send is each for each in self.sent):
                 continue  # sent again
-            self.sent.append(send.content)
-            assert durable or not send.content.verdicts, "a verdict before the journal"
-            for verdict in send.content.verdicts:
+            self.sent.append(send)
+            assert durable or not send.verdicts, "a verdict before the journal"
+            for verdict in send.verdicts:
                 self.judged[send.identity, verdict.digest] += 1
-            if send.content.work:
+            if send.work:
                 assert len(self.fleet.members[send.identity].leases) <= 2 * SLOTS, "credit"
 
     @precondition(lambda self: self.batches)

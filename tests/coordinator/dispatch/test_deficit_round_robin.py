@@ -9,6 +9,7 @@ from dreamfleet.common.protocol.messages import TAG_BYTES, Heartbeat, Result, Ru
 from dreamfleet.coordinator.dispatch.deficit_round_robin import OUTLIER, DeficitCounter
 from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.jobs.work import make_work, vector_bytes
+from tests.support.dispatched import A, B, beat, fleet_of
 from tests.support.samples import HEAD, SPEC
 
 
@@ -81,8 +82,8 @@ class Simulated:
         if self.now >= self._beat_at:
             self._beat()
         for send in self.fleet.dispatch(self.now):
-            backlog, cancels = self._backlog[send.identity], set(send.content.cancels)
-            backlog += [each.job for each in send.content.work]
+            backlog, cancels = self._backlog[send.identity], set(send.cancels)
+            backlog += [each.job for each in send.work]
             backlog[:] = [job for job in backlog if job.digest not in cancels]
         for name, backlog in self._backlog.items():
             while backlog and len(self._running[name]) < self.slots:
@@ -203,16 +204,12 @@ def test_a_job_that_comes_back_undone_reserves_nothing():
 
 
 def test_a_lost_workers_evaluation_goes_again_at_once():
-    fleet = Fleet(1.0)
-    for name in ("a/00000001", "b/00000002"):
-        fleet.add_worker(name, 1, "f", 0.0)
+    fleet = fleet_of(A, jobs=0)
     fleet.jobs.offer(make_work(SPEC, "evaluate", 0, 0, vector_bytes(np.zeros(4)), [1]))
     fleet.jobs.offer(make_work(SPEC, "score", 1, 0, vector_bytes(np.ones(4)), range(9)))
-    head = {**HEAD, "nonce": "n", "numbering": 1, "seen": 0, "load": 0.0, "steps_per_second": 0.0, "drawn_by": "-"}
-    fleet.handle_heartbeat("a/00000001", Heartbeat(**head, capacity=1, slots=1, queued=(), running=(), unacked=()), 0.0)
-    assert [each.job.kind for send in fleet.dispatch(0.0) for each in send.content.work] == ["evaluate", "score"]
-    fleet.handle_departure("a/00000001", 0.1)
+    assert [each.job.kind for send in fleet.dispatch(0.0) for each in send.work] == ["evaluate", "score"]
+    fleet.handle_departure(A, 0.1)
     fleet.tick(1.0)
-    head["numbering"] = 2
-    fleet.handle_heartbeat("b/00000002", Heartbeat(**head, capacity=1, slots=1, queued=(), running=(), unacked=()), 1.0)
-    assert [each.job.kind for send in fleet.dispatch(1.0) for each in send.content.work] == ["evaluate", "score"]
+    fleet.add_worker(B, 1, "f", 1.0)
+    fleet.handle_heartbeat(B, beat(), 1.0)
+    assert [each.job.kind for send in fleet.dispatch(1.0) for each in send.work] == ["evaluate", "score"]

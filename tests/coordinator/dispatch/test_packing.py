@@ -18,6 +18,10 @@ def work_of(size, candidates, episodes):
     return [work for index, vector in enumerate(vectors) for work in make_work(SPEC, "score", 0, index, vector, seeds)]
 
 
+def packed(work=(), cancels=(), verdicts=()):
+    return pack("a/00000001", 1, work, cancels, verdicts)
+
+
 def message(content):
     return JobBatch(
         **HEAD, nonce="n", numbering=1, number=1, vectors=tuple(content.vectors),
@@ -28,7 +32,7 @@ def message(content):
 
 @pytest.mark.parametrize(("size", "candidates", "episodes"), [(867, 64, 16), (1, 300, 1), (30_000, 3, 2), (11, 1, 1)])
 def test_no_batch_is_larger_than_a_message(size, candidates, episodes):
-    batches = pack(work_of(size, candidates, episodes), [b"c" * 32] * 500, [Verdict(b"v" * 32, "accepted")] * 900)
+    batches = packed(work_of(size, candidates, episodes), [b"c" * 32] * 500, [Verdict(b"v" * 32, "accepted")] * 900)
     assert all(len(encode(message(batch))) <= MAX_MESSAGE for batch in batches)
     assert sum(len(batch.work) for batch in batches) == candidates * episodes
     assert sum(len(batch.verdicts) for batch in batches) == 900
@@ -36,14 +40,14 @@ def test_no_batch_is_larger_than_a_message(size, candidates, episodes):
 
 
 def test_a_vector_is_sent_once_a_batch():
-    (batch,) = pack(work_of(100, 2, 3), [], [])
+    (batch,) = packed(work_of(100, 2, 3))
     assert len(batch.vectors) == 2
     assert len(batch.work) == 6
 
 
 def test_a_long_vector_comes_in_parts_before_its_job():
     (work,) = work_of(30_000, 1, 1)
-    batches = pack([work], [], [])
+    batches = packed([work])
     received = bytearray()
     for batch in batches:
         for part in batch.vectors:
@@ -55,4 +59,4 @@ def test_a_long_vector_comes_in_parts_before_its_job():
 
 
 def test_nothing_to_say_is_no_batch():
-    assert pack([], [], []) == []
+    assert packed() == []

@@ -3,7 +3,7 @@
 import random
 
 from dreamfleet.coordinator.dispatch.host_stats import HostStats
-from dreamfleet.coordinator.dispatch.member import Lease, LeaseKind, Member
+from dreamfleet.coordinator.dispatch.member import Lease, Member
 from dreamfleet.coordinator.dispatch.worker_selection import WorkerSelection
 
 
@@ -20,8 +20,8 @@ def crowd(source):
         member = Member(f"w{number}", capacity, "f", 1, 100.0, source.choice([0.0, 90.0]), stats, capacity)
         member.is_guest, member.is_held = False, source.random() < 0.1
         for each in range(source.randrange(2 * capacity + 1)):
-            kind = LeaseKind(source.random() < 0.1, False, False)
-            member.add_lease(bytes([number, each]), Lease(0, member.start_group(100.0), kind))
+            lease = Lease(0, member.start_group(100.0), source.random() < 0.1)
+            member.add_lease(bytes([number, each]), lease)
         members[member.identity] = member
     return members
 

@@ -47,7 +47,7 @@ class Judging(Bench):
 
     def step(self):
         for send in self.run.fleet.dispatch(self.now):
-            self.held += [work.job for work in send.content.work]
+            self.held += [work.job for work in send.work]
         job = self.held.pop(0)
         fitness = drive(job) if job.kind == "evaluate" else float(job.digest[0])
         if job.kind == "evaluate":
@@ -218,12 +218,12 @@ def test_a_run_that_ended_goes_on_and_is_confirmed_again(make):
     assert bench.outcome()[0] == first
     bench.limits = LimitsConfig(generations=9)
     bench.restart()
-    assert bench.run.confirmed == first
+    assert bench.run.background_jobs.confirmed == first
     before, Judging.judged = {job.digest for job in bench.judged}, []
     while len(bench.run.history) < 9:
         bench.step()
-        best = bench.run.best
-        assert (bench.run.confirmed is None) == (best.generation >= 3)
+        best = bench.run.background_jobs.evaluations.best
+        assert (bench.run.background_jobs.confirmed is None) == (best.generation >= 3)
         provenance = bench.run.background_jobs.report.current.controller().provenance
         assert (provenance["confirmed"], provenance["generation"]) == (
             (False, best.generation) if best.generation >= 3 else (True, first.generation)
@@ -251,4 +251,4 @@ def test_one_evaluation_needs_no_choice(make):
     assert sorted(track for track in bench.tracks[0] if track >= CHOOSING_OFFSET) == list(
         range(CONFIRMING_OFFSET, CONFIRMING_OFFSET + 8)
     )
-    assert isinstance(bench.run.best, StoredEvaluation)
+    assert isinstance(bench.run.background_jobs.evaluations.best, StoredEvaluation)

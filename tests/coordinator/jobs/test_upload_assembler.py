@@ -1,4 +1,5 @@
 import hashlib
+from unittest.mock import patch
 
 import pytest
 from hypothesis import given
@@ -6,7 +7,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from dreamfleet.common.protocol.messages import MAX_PART, MAX_UPLOAD, UploadPart
-from dreamfleet.coordinator.jobs.upload_assembler import UploadAssembler, UploadLimits
+from dreamfleet.coordinator.jobs import upload_assembler
+from dreamfleet.coordinator.jobs.upload_assembler import MAX_IDLE, UploadAssembler
 from tests.support.samples import HEAD
 
 A, B = "a/00000001", "b/00000002"
@@ -87,27 +89,28 @@ def test_a_part_that_cannot_be_one_is_dropped_and_counted(changes, why):
 
 @given(st.lists(st.tuples(st.integers(0, 20), st.integers(1, MAX_UPLOAD)), max_size=60))
 def test_what_strangers_open_is_bounded_in_number_and_size(opened):
-    limits = UploadLimits(count=4, size=MAX_UPLOAD)
-    uploads = UploadAssembler(limits)
+    uploads = UploadAssembler()
     for number, total in opened:
         part = replace(
             parts()[0], digest=bytes([number]) * 32, total=total, data=bytes(min(total, MAX_PART)), sha256=bytes(32)
         )
-        uploads.add(f"w/{number:08x}", part, 0.0)
-        assert len(uploads) <= limits.count
-        assert uploads.size <= limits.size
+        with patch.multiple(upload_assembler, MAX_OPEN=4, MAX_SIZE=MAX_UPLOAD):
+            uploads.add(f"w/{number:08x}", part, 0.0)
+        assert len(uploads) <= 4
+        assert uploads.size <= MAX_UPLOAD
 
 
-def test_an_upload_that_stands_still_is_abandoned_and_makes_room():
-    uploads = UploadAssembler(UploadLimits(count=1, idle=10.0))
+def test_an_upload_that_stands_still_is_abandoned_and_makes_room(monkeypatch):
+    monkeypatch.setattr(upload_assembler, "MAX_OPEN", 1)
+    uploads = UploadAssembler()
     first, *others = parts()
     uploads.add(B, first, 0.0)
     uploads.add(A, first, 1.0)
-    uploads.tick(9.0)
+    uploads.tick(MAX_IDLE)
     assert uploads.dropped == {"too many uploads": 1}
-    uploads.tick(10.5)
+    uploads.tick(MAX_IDLE + 0.5)
     for part in (first, *others):
-        uploads.add(A, part, 11.0)
+        uploads.add(A, part, MAX_IDLE + 1)
     assert uploads.get_complete(A, DIGEST, sha256()) == DATA
     assert uploads.dropped == {"too many uploads": 1, "abandoned upload": 1}
 

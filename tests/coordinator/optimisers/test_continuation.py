@@ -1,13 +1,13 @@
 """Every optimiser that ships, and one of a third party, against the same contract. Tests api.py and pycma_state.py."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from dreamfleet.common.errors import JournalError
+from dreamfleet.common.protocol.measures import parse_axes
+from dreamfleet.coordinator.optimisers.api import Search
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
-from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
+from dreamfleet.coordinator.optimisers.evolution import Evolution
 from dreamfleet.coordinator.optimisers.registry import known_optimisers
 
 OWN = "tests.support.optimisers:ParentsAndChildren"
@@ -18,9 +18,11 @@ SIZES = [(2, 4), (31, 7), *(pytest.param(*each, marks=pytest.mark.long) for each
 EVERY_OPTIMISER = pytest.mark.parametrize(("optimiser", "covariance"), OPTIMISERS)
 
 
-def config(optimiser, covariance="diagonal", dimension=12, population=8):
-    archive = ARCHIVE if optimiser in FILLS_AN_ARCHIVE else ()
-    return EvolutionConfig(dimension, population, 0.1, covariance, 3, optimiser, archive=archive)
+def config(optimiser, covariance="diagonal", dimension=12, population=8, start=None, seed=3):
+    archive = parse_axes(ARCHIVE) if optimiser in FILLS_AN_ARCHIVE else ()
+    options = {} if covariance == "diagonal" else {"covariance": covariance}
+    mean = np.zeros(dimension) if start is None else start
+    return optimiser, Search(mean, population, 0.1, seed, options, archive)
 
 
 def fitness(candidates, generation):
@@ -35,14 +37,14 @@ def step(evolution, generation):
 
 
 def continued(setting, state):
-    evolution = Evolution(setting)
+    evolution = Evolution(*setting)
     evolution.restore(state)
     return evolution
 
 
 def assert_continues(setting, checkpoints, generations):
     """From each checkpoint to the end: the populations, means, step sizes and last state are the same bits."""
-    uninterrupted, states, asked = Evolution(setting), {}, []
+    uninterrupted, states, asked = Evolution(*setting), {}, []
     for generation in range(generations):
         if generation in checkpoints:
             states[generation] = uninterrupted.state().packed()
@@ -66,7 +68,7 @@ def test_it_asks_the_same_bits_whether_it_was_interrupted_or_not(optimiser, cova
 @EVERY_OPTIMISER
 def test_it_can_be_interrupted_between_any_two_generations(optimiser, covariance):
     setting = config(optimiser, covariance)
-    uninterrupted, interrupted = Evolution(setting), Evolution(setting)
+    uninterrupted, interrupted = Evolution(*setting), Evolution(*setting)
     for generation in range(60):
         step(uninterrupted, generation)
         interrupted = continued(setting, interrupted.state().packed())
@@ -82,8 +84,8 @@ def test_it_can_be_interrupted_between_any_two_generations(optimiser, covariance
 )
 def test_it_continues_up_to_convergence_and_beyond(optimiser, dimension, population):
     """As `test_evolution` shows of pycma; where fitness no longer differs, and the step size is next to nothing."""
-    setting, start = EvolutionConfig(dimension, population, 1e-8, "diagonal", 3, optimiser), np.ones(dimension)
-    uninterrupted, again = Evolution(setting, start), Evolution(setting, start)
+    setting = optimiser, Search(np.ones(dimension), population, 1e-8, 3)
+    uninterrupted, again = Evolution(*setting), Evolution(*setting)
     for generation in range(200):
         again = continued(setting, again.state().packed())
         for each in (uninterrupted, again):
@@ -114,19 +116,19 @@ def test_a_full_matrix_continues_at_the_real_size(optimiser):
 
 @EVERY_OPTIMISER
 def test_it_maximises_and_the_seed_makes_its_run(optimiser, covariance):
-    one, same = (Evolution(config(optimiser, covariance)) for _ in range(2))
+    one, same = (Evolution(*config(optimiser, covariance)) for _ in range(2))
     first = fitness(one.mean[None], 0)
     for generation in range(200):
         assert np.array_equal(step(one, generation), step(same, generation))
     assert fitness(one.mean[None], 0) > first + 5
-    other = Evolution(replace(config(optimiser, covariance), seed=4))
-    assert not np.array_equal(other.ask(), Evolution(config(optimiser, covariance)).ask())
+    other = Evolution(*config(optimiser, covariance, seed=4))
+    assert not np.array_equal(other.ask(), Evolution(*config(optimiser, covariance)).ask())
 
 
 @EVERY_OPTIMISER
 def test_it_begins_at_the_given_mean(optimiser, covariance):
     start = np.linspace(-3, 3, 12)
-    evolution = Evolution(config(optimiser, covariance), start)
+    evolution = Evolution(*config(optimiser, covariance, start=start))
     assert np.array_equal(evolution.mean, start)
     again = continued(config(optimiser, covariance), evolution.state().packed())
     assert np.array_equal(again.mean, start)
@@ -137,7 +139,7 @@ def test_it_begins_at_the_given_mean(optimiser, covariance):
 
 @EVERY_OPTIMISER
 def test_working_ahead_changes_no_bit(optimiser, covariance):
-    ahead, plain = (Evolution(config(optimiser, covariance)) for _ in range(2))
+    ahead, plain = (Evolution(*config(optimiser, covariance)) for _ in range(2))
     for generation in range(5):
         ahead.prepare()
         ahead.prepare()
@@ -147,7 +149,7 @@ def test_working_ahead_changes_no_bit(optimiser, covariance):
 
 @EVERY_OPTIMISER
 def test_a_state_is_arrays_without_pickle_and_holds_mean_and_step_size(optimiser, covariance):
-    evolution = Evolution(config(optimiser, covariance))
+    evolution = Evolution(*config(optimiser, covariance))
     step(evolution, 0)
     kept = evolution.state()
     step(evolution, 1)
@@ -160,7 +162,7 @@ def test_a_state_is_arrays_without_pickle_and_holds_mean_and_step_size(optimiser
 
 @EVERY_OPTIMISER
 def test_a_state_of_another_version_is_refused_with_the_remedy(optimiser, covariance):
-    evolution = Evolution(config(optimiser, covariance))
+    evolution = Evolution(*config(optimiser, covariance))
     kept = evolution.state()
     older = f"{kept.head.requirement.split('==')[0]}==0.0.1"
     changed = Checkpoint(type(kept.head)(optimiser, older, kept.head.mean, kept.head.sigma), kept.state)
@@ -170,4 +172,4 @@ def test_a_state_of_another_version_is_refused_with_the_remedy(optimiser, covari
 
 def test_a_state_of_another_optimiser_is_refused():
     with pytest.raises(JournalError, match=r"'cmaes-sep'.* 'cma'"):
-        Evolution(config("cma")).restore(Evolution(config("cmaes-sep")).state().packed())
+        Evolution(*config("cma")).restore(Evolution(*config("cmaes-sep")).state().packed())

@@ -8,14 +8,15 @@ import pytest
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.coordinator.optimisers import registry
 from dreamfleet.coordinator.optimisers.api import Search
-from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
+from dreamfleet.coordinator.optimisers.evolution import Evolution, parse_options
 from dreamfleet.coordinator.optimisers.registry import build_optimiser, check_memory
 
 MODULE = "tests.support.optimisers"
 
 
 def build(optimiser, *options, covariance="diagonal", dimension=12, population=8):
-    return Evolution(EvolutionConfig(dimension, population, 0.1, covariance, 3, optimiser, options))
+    own = [] if covariance == "diagonal" else [f"covariance={covariance}"]
+    return Evolution(optimiser, Search(np.zeros(dimension), population, 0.1, 3, parse_options([*options, *own])))
 
 
 def test_what_ships_is_registered():
@@ -37,8 +38,9 @@ def test_an_optimiser_of_ones_own_is_found_by_entry_point(tmp_path):
     (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\nothers = {MODULE}:ParentsAndChildren\n")
     code = (
         f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
-        "from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig\n"
-        "evolution = Evolution(EvolutionConfig(2, 4, 0.1, 'diagonal', 3, 'others'))\n"
+        "import numpy as np; from dreamfleet.coordinator.optimisers.api import Search\n"
+        "from dreamfleet.coordinator.optimisers.evolution import Evolution\n"
+        "evolution = Evolution('others', Search(np.zeros(2), 4, 0.1, 3))\n"
         "print(evolution.state().head.requirement)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

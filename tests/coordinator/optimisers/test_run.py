@@ -27,7 +27,7 @@ def drive(path, bundle, optimiser, restart_at=()):
             bench.restart()
         while bench.run.state.ended is None and bench.run.generation.number == generation:
             for send in bench.run.fleet.dispatch(bench.now):
-                for work in send.content.work:
+                for work in send.work:
                     fitness = float(np.frombuffer(work.vector, "<f4").sum())
                     bench.answer(Result(work.job.digest, fitness, 10, 0.1, None, None))
     assert bench.run.state.ended is not None

@@ -57,7 +57,7 @@ class Classed(Bench):
         self.run.commit()
 
     def given(self):
-        return {send.identity: [work.job for work in send.content.work] for send in self.run.fleet.dispatch(self.now)}
+        return {send.identity: [work.job for work in send.work] for send in self.run.fleet.dispatch(self.now)}
 
     def stored(self):
         with RunFolder(self.path) as folder:
@@ -138,7 +138,7 @@ def test_hosts_of_one_fingerprint_may_be_of_two_classes_and_of_two_fingerprints_
     bench.deliver(A, done(jobs[A][0]))
     assert bench.run.generation.done == 2
     assert bench.stored() == {"b" * 16}
-    (share,) = bench.run.classes.largest
+    (share,) = bench.run.journal.results.classes.largest
     assert (share.results, set(share.fingerprints)) == (2, {"here", "there"})
 
 
@@ -169,10 +169,10 @@ def test_a_run_that_is_not_strict_accepts_all_classes_and_records_each_results_c
     assert bench.hello(A) is bench.hello(B) is None
     # If the class of the first accepted result is that of its fingerprint, so are all.
     assert bench.stored() == ({HERE, ELSEWHERE} if classes[A] == HERE else {*classes.values()})
-    assert bench.run.classes.mixed
+    assert bench.run.journal.results.classes.mixed
     bench.journal.close()
     with RunFolder(bench.path) as folder:
-        assert folder.classes == bench.run.classes
+        assert folder.classes == bench.run.journal.results.classes
 
 
 @pytest.mark.slow

@@ -41,12 +41,12 @@ def test_batches_are_listed_open_ones_first(door):
     for each in "abcd":
         door.submit(each, first=ord(each))
     door.step()
-    assert door.run.generations.open_batches == 4
+    assert door.run.journal.batches.open_count() == 4
     door.work()
     door.query("cancel", id="c")
     listed = [(each.id, each.state, each.generation) for each in door.query("list").batches]
     assert listed == [("b", "running", 1), ("d", "waiting", None), ("c", "cancelled", None), ("a", "complete", 0)]
-    assert door.run.generations.open_batches == 2
+    assert door.run.journal.batches.open_count() == 2
 
 
 def test_parts_arrive_in_any_order_and_again(door):

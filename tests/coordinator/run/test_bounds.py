@@ -23,7 +23,8 @@ from dreamfleet.common.protocol.result_bounds import (
     to_finite,
 )
 from dreamfleet.common.protocol.stop_kind import PauseKind, StopKind
-from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
+from dreamfleet.coordinator.optimisers.api import Search
+from dreamfleet.coordinator.optimisers.evolution import Evolution
 from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.service.status import encode_part
 from tests.support.failures import failure
@@ -46,7 +47,7 @@ def bench(tmp_path, random_bundle):
 
 def deliver_all(bench, numbers, kinds=("score", "evaluate", "collect")):
     fitness, steps, seconds = numbers
-    given = [(send.identity, work.job) for send in bench.run.fleet.dispatch(bench.now) for work in send.content.work]
+    given = [(send.identity, work.job) for send in bench.run.fleet.dispatch(bench.now) for work in send.work]
     for name, job in given:
         if job.kind in kinds:
             bench.deliver(name, Result(job.digest, fitness, steps, seconds, None, None))
@@ -59,7 +60,7 @@ def answers_of(bench):
     """Every answer of the run's status keys, decoded."""
     snapshot = take_snapshot(bench.run, "night", {}, 1.0, bench.now)
     return {
-        part: json.loads(encode_part(snapshot, part, {}))
+        part: json.loads(encode_part(snapshot, part, {}.get))
         for part in ("", "history", "workers", "candidates", "generation", "best")
     }
 
@@ -112,9 +113,7 @@ def test_huge_counts_of_slots_and_steps_can_be_encoded(bench):
 
 def test_an_error_with_too_many_steps_is_an_error(bench):
     for _ in range(3):
-        given = [
-            (send.identity, each.job) for send in bench.run.fleet.dispatch(bench.now) for each in send.content.work
-        ]
+        given = [(send.identity, each.job) for send in bench.run.fleet.dispatch(bench.now) for each in send.work]
         for name, job in given[:1]:
             bench.deliver(name, Result(job.digest, None, MAX_COUNT, 0.1, failure("boom"), None))
             assert bench.run.fleet.jobs[job.digest].attempts[-1].error == failure("boom")
@@ -140,7 +139,7 @@ def test_clamped_numbers_can_be_encoded(steps, value):
 
 @pytest.mark.parametrize("optimiser", ["cma", "cmaes-sep", "cmaes-lra"])
 def test_an_optimiser_accepts_all_fitness_within_the_bounds(optimiser):
-    evolution = Evolution(EvolutionConfig(6, 8, 0.1, "diagonal", 1, optimiser))
+    evolution = Evolution(optimiser, Search(np.zeros(6), 8, 0.1, 1))
     for scale in (LARGEST_FITNESS, 1.0, 1e-300):
         for _ in range(20):
             asked = evolution.ask()

@@ -18,7 +18,7 @@ from dreamfleet.coordinator.storage.verification_records import StoredBar
 from dreamfleet.coordinator.views.export import export_csv, export_parquet, rows_of
 from dreamfleet.coordinator.views.stored_run import StoredRun
 from tests.support import batch_door
-from tests.support.failing_runs import SETTINGS, Failing
+from tests.support.failing_runs import SETTINGS
 
 SEEDS = range(6)
 
@@ -79,9 +79,9 @@ def stories():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
-def test_the_sums_over_candidates_are_their_generations(tmp_path, random_bundle, stories, seed):
+def test_the_sums_over_candidates_are_their_generations(begin, stories, seed):
     settings, fails, chance = drawn(seed)
-    bench = Failing(tmp_path / "night", random_bundle.path, settings, fails=fails, limit=1.0)
+    bench = begin(fails, settings, limit=1.0)
     recalls = 0
     for _ in range(50):
         until = chance.randint(3, 60)
@@ -96,12 +96,11 @@ def test_the_sums_over_candidates_are_their_generations(tmp_path, random_bundle,
         bench.restart()
     bench.journal.commit()
     stories.update(check(bench.path), recalls=recalls, runs=1)
-    bench.journal.close()
 
 
-def test_every_table_has_the_same_candidates(tmp_path, random_bundle):
+def test_every_table_has_the_same_candidates(begin, tmp_path):
     settings, fails, _ = drawn(1)
-    bench = Failing(tmp_path / "night", random_bundle.path, settings, fails=fails, limit=1.0)
+    bench = begin(fails, settings, limit=1.0)
     bench.serve()
     bench.journal.close()
     with StoredRun(bench.path) as run:

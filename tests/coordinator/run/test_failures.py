@@ -1,5 +1,5 @@
 """Candidates whose episodes fail wherever they are scored.
-Tests failure_limit.py, work_clock.py and common/protocol/failures.py."""
+Tests failure_policy.py and common/protocol/failures.py."""
 
 import itertools
 import json
@@ -19,40 +19,24 @@ from dreamfleet.coordinator.jobs import generation
 from dreamfleet.coordinator.run.run import BY_HAND
 from dreamfleet.coordinator.run.shown_state import shown_state
 from dreamfleet.coordinator.settings.limits import LimitsConfig
-from tests.support.failing_runs import GENERATIONS, SETTINGS, Failing, by_vector, finished, pause_kinds
+from tests.support.failing_runs import GENERATIONS, SETTINGS, Failing, by_vector, pause_kinds
 from tests.support.failures import failure
 from tests.support.run_bench import A, B
 
 NEW = "new/1"
 
 
-def story_of_killed(path, bundle, results, settings, **options):
-    """The story of a run whose coordinator is killed each time that so many results and errors have come."""
-    bench = Failing(path / "killed" / "night", bundle.path, settings, **options)
+def killed(bench, results):
+    """The bench's story if its coordinator is killed each time that so many results and errors have come."""
     while not bench.run.state.ended:
         bench.serve(stop=lambda run: run.fleet.counts["accepted"] + run.fleet.counts["errors"] > results)
         if not bench.run.state.ended:
             bench.restart()
-    story = bench.story()
-    bench.journal.close()
-    return story
-
-
-@pytest.fixture
-def failing(tmp_path, random_bundle):
-    made = []
-
-    def build(name, **options):
-        made.append(finished(tmp_path / name, random_bundle, **options))
-        return made[-1]
-
-    yield build
-    for each in made:
-        each.journal.close()
+    return bench.story()
 
 
 def test_a_failed_candidate_ranks_last_and_the_run_ends(failing):
-    bench = failing("one", fails=by_vector(0.15))
+    bench = failing(fails=by_vector(0.15))
     rows, candidates, *_ = bench.story()
     assert bench.run.state.ended
     assert len(rows) == GENERATIONS
@@ -66,28 +50,25 @@ def test_a_failed_candidate_ranks_last_and_the_run_ends(failing):
 
 
 @pytest.mark.parametrize("on_failure", ["worst", "redraw"])
-def test_the_bits_are_the_same_on_any_fleet_and_through_restarts(failing, tmp_path, random_bundle, on_failure):
+def test_the_bits_are_the_same_on_any_fleet_and_through_restarts(failing, begin, on_failure):
     settings = replace(SETTINGS, on_failure=on_failure, evaluate_every=1, evaluation_episodes=3, confirm_episodes=4)
 
     def fails(job):
         return (job.vector[0] + job.seeds[0]) % 256 < 40
 
-    whole = failing("whole", settings=settings, fails=fails, limit=1.0).story()
+    whole = failing(settings=settings, fails=fails, limit=1.0).story()
     assert sum(each.failed for each in whole[0])
-    lone = Failing(tmp_path / "lone" / "night", random_bundle.path, settings, fails=fails, limit=1.0)
+    lone = begin(fails, settings, limit=1.0)
     lone.hosts = [A]
     lone.run.fleet.handle_departure(B, lone.now)
     lone.serve()
     assert lone.story() == whole
-    assert story_of_killed(tmp_path, random_bundle, 12, settings, fails=fails, limit=1.0) == whole
-    lone.journal.close()
+    assert killed(begin(fails, settings, limit=1.0), 12) == whole
 
 
 def test_a_candidate_that_is_drawn_anew_is_another_and_the_old_one_stays_in_the_journal(failing):
     fails = by_vector(0.15)
-    kept, drawn = (
-        failing(each, settings=replace(SETTINGS, on_failure=each), fails=fails) for each in ("worst", "redraw")
-    )
+    kept, drawn = (failing(fails=fails, settings=replace(SETTINGS, on_failure=each)) for each in ("worst", "redraw"))
     with RunFolder(kept.path) as before, RunFolder(drawn.path) as after:
         failures = [each for each in before.failures() if each.generation == 0]
         assert failures
@@ -98,8 +79,8 @@ def test_a_candidate_that_is_drawn_anew_is_another_and_the_old_one_stays_in_the_
     assert old >= len(failures)
 
 
-def test_a_run_whose_every_episode_fails_pauses_and_resume_tries_again(tmp_path, random_bundle):
-    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: True)
+def test_a_run_whose_every_episode_fails_pauses_and_resume_tries_again(begin):
+    bench = begin(lambda job: True)
     bench.serve()
     assert pause_kinds(bench) == [PauseKind.NO_ABLE_HOST]
     bench.fails = lambda job: False
@@ -107,11 +88,10 @@ def test_a_run_whose_every_episode_fails_pauses_and_resume_tries_again(tmp_path,
     bench.serve()
     assert bench.run.state.ended
     assert sum(each.failed for each in bench.run.history.rows) == 0
-    bench.journal.close()
 
 
-def test_more_failures_than_the_limit_pause_the_run_and_resume_scores_these_candidates_again(tmp_path, random_bundle):
-    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate > 1)
+def test_more_failures_than_the_limit_pause_the_run_and_resume_scores_these_candidates_again(begin):
+    bench = begin(lambda job: job.candidate > 1)
     bench.serve()
     assert (pause_kinds(bench), len(bench.run.generation.failed)) == ([PauseKind.FAILED_CANDIDATES], 4)
     bench.fails = lambda job: job.candidate > 3
@@ -119,12 +99,11 @@ def test_more_failures_than_the_limit_pause_the_run_and_resume_scores_these_cand
     bench.serve()
     assert bench.run.state.ended
     assert [each.failed for each in bench.run.history.rows] == [2, 2, 2]
-    bench.journal.close()
 
 
-def test_all_candidates_failing_is_a_pause_that_says_so_whatever_the_limit(tmp_path, random_bundle):
-    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate >= 0)
-    bench.run.failure_limit.share = 1.0
+def test_all_candidates_failing_is_a_pause_that_says_so_whatever_the_limit(begin):
+    bench = begin(lambda job: job.candidate >= 0)
+    bench.run.failure_policy.share = 1.0
     bench.run.fleet.failure_judge.working_hosts = {"a", "b"}
     bench.serve()
     assert (pause_kinds(bench), bench.run.generation.all_failed) == ([PauseKind.FAILED_CANDIDATES], True)
@@ -132,31 +111,27 @@ def test_all_candidates_failing_is_a_pause_that_says_so_whatever_the_limit(tmp_p
     bench.run.resume()
     bench.serve()
     assert bench.run.state.ended
-    bench.journal.close()
 
 
 def test_one_generation_with_many_failures_does_not_pause_a_run_that_had_few(failing):
-    bench = failing("night", fails=lambda job: job.kind == "score" and job.generation == 2 and job.candidate > 1)
+    bench = failing(fails=lambda job: job.kind == "score" and job.generation == 2 and job.candidate > 1)
     assert bench.run.state.ended
     assert [each.failed for each in bench.run.history.rows] == [0, 0, 4]
 
 
-def test_after_resume_the_same_failures_do_not_pause_the_generation_again(tmp_path, random_bundle):
-    bench = Failing(
-        tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate > 1 - job.generation
-    )
+def test_after_resume_the_same_failures_do_not_pause_the_generation_again(begin):
+    bench = begin(lambda job: job.candidate > 1 - job.generation)
     bench.serve()
     assert (pause_kinds(bench), bench.run.generation.number) == ([PauseKind.FAILED_CANDIDATES], 0)
     bench.run.resume()
     bench.serve()
     assert (pause_kinds(bench), bench.run.generation.number) == ([PauseKind.FAILED_CANDIDATES], 1)
     assert bench.run.history.rows[0].failed == 4
-    bench.journal.close()
 
 
 @pytest.mark.parametrize("on_failure", ["worst", "redraw"])
 def test_a_seed_on_which_all_candidates_fail_is_replaced_with_the_same_bits_through_restarts(
-    failing, tmp_path, random_bundle, on_failure
+    failing, begin, on_failure
 ):
     settings = replace(SETTINGS, on_failure=on_failure)
     bad = {training_seed(settings.seed, 1, each) for each in (0, 1, 3)}  # so it takes two other sets of seeds
@@ -164,7 +139,7 @@ def test_a_seed_on_which_all_candidates_fail_is_replaced_with_the_same_bits_thro
     def fails(job):
         return job.seeds[0] in bad
 
-    bench = failing("whole", settings=settings, fails=fails)
+    bench = failing(settings=settings, fails=fails)
     whole = bench.story()
     assert bench.run.state.ended
     assert [each.failed for each in whole[0]] == [0, 0, 0], (
@@ -172,12 +147,12 @@ def test_a_seed_on_which_all_candidates_fail_is_replaced_with_the_same_bits_thro
     )
     (seeds,) = bench.journal._connection.execute("SELECT seeds FROM generation WHERE number = 1").fetchone()
     assert json.loads(seeds) == [training_seed(settings.seed, 1, each) for each in (4, 5)]
-    assert story_of_killed(tmp_path, random_bundle, 26, settings, fails=fails) == whole
+    assert killed(begin(fails, settings), 26) == whole
 
 
 def test_a_bad_seed_of_the_first_generation_is_replaced_before_the_limit_counts(failing):
     bad = training_seed(SETTINGS.seed, 0, 0)
-    bench = failing("first", fails=lambda job: job.seeds[0] == bad)
+    bench = failing(fails=lambda job: job.seeds[0] == bad)
     assert bench.run.state.ended
     assert [each.failed for each in bench.run.history.rows] == [0, 0, 0]
 
@@ -185,14 +160,14 @@ def test_a_bad_seed_of_the_first_generation_is_replaced_before_the_limit_counts(
 def test_seeds_on_which_the_whole_better_half_fails_are_replaced_in_a_race(failing):
     settings = replace(SETTINGS, racing=True, episodes=4, population=8)
     bad = training_seed(settings.seed, 1, 2)  # of the second half
-    bench = failing("race", settings=settings, fails=lambda job: job.seeds[0] == bad)
+    bench = failing(settings=settings, fails=lambda job: job.seeds[0] == bad)
     assert bench.run.state.ended
     assert [each.failed for each in bench.run.history.rows] == [0, 0, 0]
     (seeds,) = bench.journal._connection.execute("SELECT seeds FROM generation WHERE number = 1").fetchone()
     assert json.loads(seeds) == [training_seed(settings.seed, 1, each) for each in (4, 5, 6, 7)]
 
 
-def test_redraws_count_each_candidate_once_and_go_on_where_all_failed(tmp_path, random_bundle):
+def test_redraws_count_each_candidate_once_and_go_on_where_all_failed(begin):
     settings = replace(SETTINGS, on_failure="redraw")
     first = []
 
@@ -200,24 +175,23 @@ def test_redraws_count_each_candidate_once_and_go_on_where_all_failed(tmp_path, 
         first.append(job.digest) if len(first) < 12 and job.digest not in first else None
         return job.digest in first
 
-    bench = Failing(tmp_path / "night", random_bundle.path, settings, fails=fails)
-    bench.run.failure_limit.share = 1.0
+    bench = begin(fails, settings)
+    bench.run.failure_policy.share = 1.0
     bench.run.fleet.failure_judge.working_hosts = {"a", "b"}
     bench.serve()
     assert bench.run.state.ended
     assert bench.run.history.rows[0].failed <= 6
-    bench.journal.close()
 
 
-def test_racing_with_failures_is_the_same_through_restarts(failing, tmp_path, random_bundle):
+def test_racing_with_failures_is_the_same_through_restarts(failing, begin):
     settings = replace(SETTINGS, racing=True, episodes=4, population=8)
     fails = by_vector(0.1)
-    whole = failing("whole", settings=settings, fails=fails).story()
-    assert story_of_killed(tmp_path, random_bundle, 14, settings, fails=fails) == whole
+    whole = failing(settings=settings, fails=fails).story()
+    assert killed(begin(fails, settings), 14) == whole
 
 
-def test_a_host_that_never_scored_condemns_nobody(tmp_path, random_bundle):
-    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: False)
+def test_a_host_that_never_scored_condemns_nobody(begin):
+    bench = begin()
     healthy, bench.answer_one = bench.answer_one, None
     bench.answer_one = lambda name, job: (
         healthy(name, job)
@@ -227,13 +201,12 @@ def test_a_host_that_never_scored_condemns_nobody(tmp_path, random_bundle):
     bench.serve()
     assert bench.run.state.ended
     assert sum(each.failed for each in bench.run.history.rows) == 0
-    bench.journal.close()
 
 
 @pytest.fixture
-def left(tmp_path, random_bundle):
+def left(begin):
     """A run whose only host is gone; all open jobs failed on it once."""
-    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate < 2)
+    bench = begin(lambda job: job.candidate < 2)
     bench.hosts = [A]
     bench.run.fleet.handle_departure(B, bench.now)
     answer = bench.answer_one
@@ -241,8 +214,7 @@ def left(tmp_path, random_bundle):
     bench.serve(stop=lambda run: len(run.fleet.jobs.failures) == len(run.fleet.jobs) == 4)
     bench.answer_one = answer
     bench.run.fleet.handle_departure(A, bench.now)
-    yield bench
-    bench.journal.close()
+    return bench
 
 
 def replace_host(bench):
@@ -282,8 +254,8 @@ def test_a_failing_job_goes_to_the_host_where_it_failed_least(left):
     assert [each.failed for each in left.run.history.rows] == [2] * GENERATIONS
 
 
-def test_a_host_that_was_never_ready_keeps_no_job_from_being_tried_again(tmp_path, random_bundle):
-    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate == 0)
+def test_a_host_that_was_never_ready_keeps_no_job_from_being_tried_again(begin):
+    bench = begin(lambda job: job.candidate == 0)
     bench.hosts = [A]
     member = bench.run.fleet.members[B]
     member.capacity, member.was_ready = 0, False
@@ -292,7 +264,6 @@ def test_a_host_that_was_never_ready_keeps_no_job_from_being_tried_again(tmp_pat
     bench.serve()
     assert bench.run.state.ended
     assert [each.failed for each in bench.run.history.rows] == [1] * GENERATIONS
-    bench.journal.close()
 
 
 def test_a_new_host_that_fails_the_proof_pauses_the_run(left):
@@ -324,37 +295,34 @@ def test_a_host_that_has_scored_ends_the_pause_of_a_fleet_that_cannot(left):
     assert [each.failed for each in left.run.history.rows] == [2] * GENERATIONS
 
 
-def test_a_run_that_nobody_can_score_pauses_before_every_job_was_tried(tmp_path, random_bundle):
+def test_a_run_that_nobody_can_score_pauses_before_every_job_was_tried(begin):
     settings = replace(SETTINGS, population=40)
     for limit, tried in ((0.5, 10), (1.0, 80)):
-        bench = Failing(
-            tmp_path / str(tried) / "night", random_bundle.path, settings, fails=lambda job: True, limit=limit
-        )
+        bench = begin(lambda job: True, settings, limit=limit)
         bench.serve()
         assert pause_kinds(bench) == [PauseKind.NO_ABLE_HOST]
         assert (len(bench.run.fleet.jobs.failures) < 80) == (tried < 80)
         assert sum(each.what == "retried" for each in bench.run.take_notes()) == 1
-        bench.journal.close()
 
 
 def test_a_shortage_of_the_host_is_no_failure_of_the_candidate(failing):
-    whole = failing("whole", fails=lambda job: False).story()
-    short = failing("short", fails=lambda job: False, host_errors=[Failure.of_host("killed by SIGKILL")] * 9)
+    whole = failing(fails=lambda job: False).story()
+    short = failing(fails=lambda job: False, host_errors=[Failure.of_host("killed by SIGKILL")] * 9)
     assert short.story() == whole
     assert short.run.fleet.counts["errors"] == 9
 
 
 def test_an_evaluation_counts_its_scored_episodes_and_one_without_any_ends(failing):
     settings = replace(SETTINGS, evaluate_every=1, evaluation_episodes=3, confirm_episodes=4)
-    partly = failing("partly", settings=settings, fails=lambda job: job.kind == "evaluate" and job.episode % 3 == 0)
+    partly = failing(settings=settings, fails=lambda job: job.kind == "evaluate" and job.episode % 3 == 0)
     _, _, _, evaluations, confirmed = partly.story()
     assert [(each.episodes, each.failed) for each in evaluations] == [(2, 1)] * GENERATIONS
     assert confirmed.episodes + confirmed.failed == 4
     assert confirmed.failed
-    none = failing("none", settings=settings, fails=lambda job: job.kind == "evaluate", limit=1.0)
+    none = failing(settings=settings, fails=lambda job: job.kind == "evaluate", limit=1.0)
     assert none.run.state.ended
     assert none.story()[3:] == ([], None)
-    late = failing("late", settings=settings, fails=lambda job: job.episode >= CONFIRMING_OFFSET)
+    late = failing(settings=settings, fails=lambda job: job.episode >= CONFIRMING_OFFSET)
     assert late.run.state.ended
     with RunFolder(late.path) as folder:
         assert folder.confirmation() is None
@@ -362,44 +330,43 @@ def test_an_evaluation_counts_its_scored_episodes_and_one_without_any_ends(faili
 
 def test_racing_goes_on_without_the_failed_ones(failing):
     racing = replace(SETTINGS, racing=True, episodes=4)
-    bench = failing("race", settings=racing, fails=by_vector(0.1))
+    bench = failing(settings=racing, fails=by_vector(0.1))
     rows = bench.story()[0]
     assert len(rows) == GENERATIONS
     assert sum(each.failed for each in rows)
 
 
-def test_time_without_workers_or_paused_is_no_time_of_the_run(tmp_path, random_bundle):
-    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: False)
+def test_time_without_workers_or_paused_is_no_time_of_the_run(begin):
+    bench = begin()
     bench.run.limits = LimitsConfig(minutes=1.0)
     bench.run.pause(BY_HAND)
     for _ in range(100):
         bench.now += 1.0
         bench.run.tick(bench.now)
         bench.run.commit()
-    assert bench.run.work_clock.seconds == 0.0
+    assert bench.run.open_seconds == 0.0
     bench.run.resume()
     for name in (A, B):
         bench.handle_heartbeat(name, host_class=bench.host_class)
     bench.now += 1.0
     bench.run.tick(bench.now)
-    assert bench.run.work_clock.seconds == 1.0
+    assert bench.run.open_seconds == 1.0
     bench.hosts = []
     for name in (A, B):
         bench.run.fleet.handle_departure(name, bench.now)
     for _ in range(100):
         bench.now += 1.0
         bench.run.tick(bench.now)
-    assert bench.run.work_clock.seconds <= 2.0
+    assert bench.run.open_seconds <= 2.0
     bench.run.leave()
     bench.hosts = [A, B]
-    spent = bench.run.work_clock.seconds
+    spent = bench.run.open_seconds
     bench.restart()
-    assert bench.run.work_clock.seconds == pytest.approx(spent), "the open generation's time outlives its coordinator"
-    bench.journal.close()
+    assert bench.run.open_seconds == pytest.approx(spent), "the open generation's time outlives its coordinator"
 
 
-def test_a_pause_by_hand_outlives_its_coordinator(tmp_path, random_bundle):
-    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: False)
+def test_a_pause_by_hand_outlives_its_coordinator(begin):
+    bench = begin()
     bench.journal.set_patience(0.05)
     with closing(sqlite3.connect(bench.path / "journal.sqlite")) as other:
         other.execute("BEGIN IMMEDIATE")
@@ -416,7 +383,6 @@ def test_a_pause_by_hand_outlives_its_coordinator(tmp_path, random_bundle):
     bench.restart()
     bench.serve()
     assert bench.run.state.ended
-    bench.journal.close()
 
 
 class Lethal(Failing):
@@ -449,31 +415,29 @@ class Lethal(Failing):
             super().answer_one(name, job)
 
 
-def test_an_episode_that_ends_its_worker_counts_as_failed_and_its_company_does_not(tmp_path, random_bundle):
-    bench = Lethal(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate == 3)
+def test_an_episode_that_ends_its_worker_counts_as_failed_and_its_company_does_not(begin):
+    bench = begin(lambda job: job.candidate == 3, kind=Lethal)
     bench.serve(turns=3000)
     assert bench.run.state.ended
     assert [each.failed for each in bench.run.history.rows] == [1] * GENERATIONS
     with RunFolder(bench.path) as folder:
         facts = folder.failures()
     assert {each.candidate for each in facts} == {3}
-    bench.journal.close()
 
 
-def test_an_episode_that_ends_workers_on_hosts_of_ever_new_names_counts_as_failed_too(tmp_path, random_bundle):
-    bench = Lethal(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate == 3)
+def test_an_episode_that_ends_workers_on_hosts_of_ever_new_names_counts_as_failed_too(begin):
+    bench = begin(lambda job: job.candidate == 3, kind=Lethal)
     bench.new_names = True
     bench.serve(turns=3000)
     assert bench.run.state.ended
     assert [each.failed for each in bench.run.history.rows] == [1] * GENERATIONS
-    bench.journal.close()
 
 
 @pytest.mark.parametrize("has_scored", [False, True])
-def test_fifty_kills_on_one_host_pause_only_a_run_that_it_never_scored(tmp_path, random_bundle, has_scored):
+def test_fifty_kills_on_one_host_pause_only_a_run_that_it_never_scored(begin, has_scored):
     """Ten jobs that fail before the first score pause it: it says how many, and what ends the pause."""
     settings = replace(SETTINGS, population=16)
-    bench = Lethal(tmp_path / "night", random_bundle.path, settings, fails=lambda job: False)
+    bench = begin(settings=settings, kind=Lethal)
     bench.hosts = [A]
     bench.run.fleet.handle_departure(B, bench.now)
     if has_scored:
@@ -492,20 +456,18 @@ def test_fifty_kills_on_one_host_pause_only_a_run_that_it_never_scored(tmp_path,
         bench.serve()
     assert bench.run.state.ended
     assert [each.failed for each in bench.run.history.rows] == [0] * GENERATIONS
-    bench.journal.close()
 
 
-def test_a_run_whose_every_episode_ends_its_worker_pauses(tmp_path, random_bundle):
-    bench = Lethal(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: True)
+def test_a_run_whose_every_episode_ends_its_worker_pauses(begin):
+    bench = begin(lambda job: True, kind=Lethal)
     bench.new_names = True
     bench.serve(turns=3000)
     assert pause_kinds(bench) == [PauseKind.NO_ABLE_HOST]
-    bench.journal.close()
 
 
-def test_a_cut_link_is_no_end_of_a_worker(tmp_path, random_bundle):
+def test_a_cut_link_is_no_end_of_a_worker(begin):
     """A worker of the same life that is back was never gone: nothing that it held is a suspect."""
-    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: False)
+    bench = begin()
     bench.hosts = [A]
     bench.run.fleet.handle_departure(B, bench.now)
     for _ in range(20):
@@ -522,33 +484,29 @@ def test_a_cut_link_is_no_end_of_a_worker(tmp_path, random_bundle):
     bench.serve()
     assert bench.run.state.ended
     assert sum(each.failed for each in bench.run.history.rows) == 0
-    bench.journal.close()
 
 
-def test_a_host_that_replaces_its_scoring_process_counts_as_here(tmp_path, random_bundle):
+def test_a_host_that_replaces_its_scoring_process_counts_as_here(begin):
     """Its heartbeats name no capacity meanwhile."""
-    bench = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: job.candidate == 0)
+    bench = begin(lambda job: job.candidate == 0)
     bench.hosts = [A]
     bench.run.fleet.handle_departure(B, bench.now)
     bench.serve(stop=lambda run: run.generation.done >= 10 or run.fleet.jobs.failures)
     bench.run.fleet.members[A].capacity = 0
     bench.run.advance(bench.now)
     assert bench.run.state.paused is None
-    worked = bench.run.work_clock.seconds
+    worked = bench.run.open_seconds
     bench.now += 1.0
     bench.run.tick(bench.now)
-    assert bench.run.work_clock.seconds > worked
-    bench.journal.close()
+    assert bench.run.open_seconds > worked
 
 
 @pytest.mark.parametrize("on_failure", ["worst", "pause"])
 @pytest.mark.parametrize("is_broken", [False, True])
-def test_a_run_ends_though_a_suspect_failed_on_the_only_host_that_has_scored(
-    tmp_path, random_bundle, on_failure, is_broken
-):
+def test_a_run_ends_though_a_suspect_failed_on_the_only_host_that_has_scored(begin, on_failure, is_broken):
     """Another host has scored nothing: it gets a job that was scored before, and the suspect does not wait for it."""
     settings = replace(SETTINGS, on_failure=on_failure)
-    bench = Failing(tmp_path / "night", random_bundle.path, settings, fails=lambda job: False)
+    bench = begin(settings=settings)
     bench.run.fleet.handle_departure(B, bench.now)
     bench.hosts, answer, failed = [A], bench.answer_one, set()
     for each in bench.run.fleet.jobs.values():
@@ -569,17 +527,15 @@ def test_a_run_ends_though_a_suspect_failed_on_the_only_host_that_has_scored(
     bench.serve()
     assert bench.run.state.ended
     assert [each.failed for each in bench.run.history.rows] == [0] * GENERATIONS
-    bench.journal.close()
 
 
-def test_a_resume_in_the_second_half_of_a_race_wants_the_first_half_before(tmp_path, random_bundle):
+def test_a_resume_in_the_second_half_of_a_race_wants_the_first_half_before(begin):
     racing = replace(SETTINGS, racing=True, population=4)
-    bench = Failing(tmp_path / "night", random_bundle.path, racing, fails=lambda job: job.candidate == 0, limit=1.0)
+    bench = begin(lambda job: job.candidate == 0, racing, limit=1.0)
     bench.serve(stop=lambda run: any(each.work.episode == 1 for each in run.fleet.jobs.values()))
     bench.run.pause(BY_HAND)
     bench.run.resume()  # it forgets the failures, so the better half is not known
     assert [(each.work.template.candidate, each.work.episode) for each in bench.run.fleet.jobs.values()] == [(0, 0)]
-    bench.journal.close()
 
 
 class Quiet(Failing):
@@ -592,14 +548,11 @@ class Quiet(Failing):
         self.worker_protocol.handle_results(name, batch, self.now)
 
 
-def test_where_all_that_was_made_has_failed_the_rest_of_the_generation_goes_on(tmp_path, random_bundle, monkeypatch):
+def test_where_all_that_was_made_has_failed_the_rest_of_the_generation_goes_on(begin, monkeypatch):
     stories = []
     for part in (10_000, 1):
         monkeypatch.setattr(generation, "PART_JOBS", part)
-        bench = Quiet(
-            tmp_path / str(part), random_bundle.path, SETTINGS, fails=lambda job: job.candidate < 3, limit=1.0
-        )
+        bench = begin(lambda job: job.candidate < 3, kind=Quiet, limit=1.0)
         bench.serve()
         stories.append(bench.story())
-        bench.journal.close()
     assert stories[0] == stories[1]

@@ -40,11 +40,10 @@ class LongRun:
             self.worker_protocol.handle_heartbeat(A, self.handle_heartbeat(), self.now)
             for send in self.run.fleet.dispatch(self.now):
                 self.seen = max(self.seen, send.number)
-                self.answer(send.content.work)
+                self.answer(send.work)
             self.run.advance(self.now)
             self.run.commit()
         encode_status(take_snapshot(self.run, "long", {}, self.now, self.now))
-        self.run.take_closed()
         self.run.take_notes()
         return process_time() - begun
 

@@ -7,7 +7,7 @@ import pytest
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.coordinator.run.recall import recall
-from tests.support.failing_runs import SETTINGS, Failing, pause_kinds
+from tests.support.failing_runs import SETTINGS, pause_kinds
 from tests.support.failures import failure
 from tests.support.run_bench import A, B
 
@@ -24,10 +24,10 @@ def serve_alone(bench, name, until):
 
 
 @pytest.fixture
-def left(tmp_path, random_bundle):
+def left(begin):
     """The host of generation 0 lost two workers with all jobs of generation 1, whose former scores were recalled."""
     settings = replace(SETTINGS, population=2, episodes=1)
-    bench = Failing(tmp_path / "night", random_bundle.path, settings, fails=lambda job: False)
+    bench = begin(settings=settings)
     serve_alone(bench, A, 1)
     serve_alone(bench, B, 2)
     recall(bench.journal, settings, {"b"})
@@ -37,7 +37,7 @@ def left(tmp_path, random_bundle):
     for life in (A, "a/00000009"):
         bench.run.admission.admit(bench.request(life), bench.now)
         bench.handle_heartbeat(life, host_class=bench.host_class)
-        assert len(bench.run.fleet.dispatch(bench.now)[0].content.work) == 2
+        assert len(bench.run.fleet.dispatch(bench.now)[0].work) == 2
         bench.run.fleet.handle_departure(life, bench.now)
         bench.now += 1.0
         bench.run.tick(bench.now)
@@ -45,8 +45,7 @@ def left(tmp_path, random_bundle):
     assert all(each.is_suspect for each in bench.run.fleet.jobs.values())
     bench.hosts = [NEW]
     bench.run.admission.admit(bench.request(NEW), bench.now)
-    yield bench
-    bench.journal.close()
+    return bench
 
 
 def test_a_new_host_gets_the_suspects_when_the_only_host_that_has_scored_is_gone(left):

@@ -13,8 +13,8 @@ from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.common.runs.stages import StageTracker, stages_of
 from dreamfleet.coordinator.jobs.history import History
-from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
-from dreamfleet.coordinator.run.failure_limit import LIMIT_FROM
+from dreamfleet.coordinator.optimisers.evolution import Evolution
+from dreamfleet.coordinator.run.failure_policy import LIMIT_FROM
 from dreamfleet.coordinator.run.generations import Generations
 from dreamfleet.coordinator.run.recall import bar_stored, recall
 from dreamfleet.coordinator.settings.network import NetworkConfig
@@ -31,11 +31,16 @@ def settings_of(optimiser):
     return replace(SETTINGS, evaluate_every=1, evaluation_episodes=2, **named)
 
 
-def ended(path, bundle, settings, fails=lambda job: False):
-    bench = Failing(path / "run", bundle, settings, fails=fails)
-    bench.serve()
-    assert bench.run.state.ended
-    return bench
+@pytest.fixture
+def ended(failing):
+    """Begins a run and serves it to its end."""
+
+    def build(settings=None, **options):
+        bench = failing(settings=settings or settings_of("cma"), **options)
+        assert bench.run.state.ended
+        return bench
+
+    return build
 
 
 def outcome(bench):
@@ -80,10 +85,10 @@ def bar(bench, host, others):
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_race_from_which_lies_are_recalled_is_one_without_them(tmp_path, random_bundle, seed):
+def test_a_race_from_which_lies_are_recalled_is_one_without_them(ended, begin, seed):
     settings = replace(RACE, seed=seed)
-    honest = ended(tmp_path / "honest", random_bundle.path, settings)
-    bench = Lying(tmp_path / "run", random_bundle.path, settings, fails=None)
+    honest = ended(settings)
+    bench = begin(None, settings, Lying)
     bench.serve()
     bar(bench, "a", [B])
     assert bench.story() == honest.story()
@@ -105,12 +110,9 @@ class Broken(Failing):
             super().answer_one(name, job)
 
 
-def test_a_race_that_is_resumed_after_the_fault_of_a_host_is_one_without_it(tmp_path, random_bundle):
-    honest = ended(tmp_path / "honest", random_bundle.path, RACE)
-    bench = Broken(
-        tmp_path / "run", random_bundle.path, RACE,
-        fails=lambda job: bench.is_broken and job.candidate < 2 and job.episode == 0,
-    )  # fmt: skip
+def test_a_race_that_is_resumed_after_the_fault_of_a_host_is_one_without_it(ended, begin):
+    honest = ended(RACE)
+    bench = begin(lambda job: bench.is_broken and job.candidate < 2 and job.episode == 0, RACE, Broken)
     bench.serve(stop=lambda run: any(work.episode == 2 for work in run.generation.counted))
     assert bench.run.generation.failed == [0, 1]
     bench.is_broken = False
@@ -121,14 +123,10 @@ def test_a_race_that_is_resumed_after_the_fault_of_a_host_is_one_without_it(tmp_
     assert sums(bench) == sums(honest)
 
 
-def test_what_a_candidate_has_that_failed_for_a_while_is_checked_once_it_is_scored(
-    tmp_path, random_bundle, monkeypatch
-):
+def test_what_a_candidate_has_that_failed_for_a_while_is_checked_once_it_is_scored(begin, monkeypatch):
     monkeypatch.setattr(run_bench, "NetworkConfig", partial(NetworkConfig, verify=1.0))
-    bench = Broken(
-        tmp_path / "run", random_bundle.path, replace(SETTINGS, episodes=4),
-        fails=lambda job: bench.is_broken and job.candidate == 0 and job.episode == 1,
-    )  # fmt: skip
+    settings = replace(SETTINGS, episodes=4)
+    bench = begin(lambda job: bench.is_broken and job.candidate == 0 and job.episode == 1, settings, Broken)
     bench.serve(stop=lambda run: run.generation.failed)
     bench.is_broken = False
     bench.run.resume()
@@ -147,14 +145,14 @@ def new_generations(bench):
 
 
 def next_population(settings, state):
-    evolution = Evolution(EvolutionConfig.of(settings, stages_of(settings)[0]))
+    evolution = Evolution.of(settings, stages_of(settings)[0], None, None)
     evolution.restore(state)
     return evolution.ask()
 
 
 @pytest.mark.parametrize("optimiser", OPTIMISERS)
-def test_a_replayed_strategy_asks_for_what_the_stored_one_asks_for(tmp_path, random_bundle, optimiser):
-    bench = ended(tmp_path, random_bundle.path, settings_of(optimiser))
+def test_a_replayed_strategy_asks_for_what_the_stored_one_asks_for(ended, optimiser):
+    bench = ended(settings_of(optimiser))
     for number in (GENERATIONS - 1, GENERATIONS):
         stored = bench.journal.generation(number).state
         replayed = new_generations(bench).replay(number).packed()
@@ -163,8 +161,8 @@ def test_a_replayed_strategy_asks_for_what_the_stored_one_asks_for(tmp_path, ran
 
 
 @pytest.mark.parametrize("optimiser", OPTIMISERS)
-def test_a_run_of_which_all_is_recalled_comes_to_the_same(tmp_path, random_bundle, optimiser):
-    bench = ended(tmp_path, random_bundle.path, settings_of(optimiser))
+def test_a_run_of_which_all_is_recalled_comes_to_the_same(ended, optimiser):
+    bench = ended(settings_of(optimiser))
     before = outcome(bench)
     recall(bench.journal, bench.settings, {"a"})
     assert bench.journal.last_generation().number == 0
@@ -176,9 +174,9 @@ def test_a_run_of_which_all_is_recalled_comes_to_the_same(tmp_path, random_bundl
     assert outcome(bench) == before
 
 
-def test_candidates_that_were_drawn_anew_are_drawn_anew_again(tmp_path, random_bundle):
+def test_candidates_that_were_drawn_anew_are_drawn_anew_again(ended):
     settings = replace(settings_of("cma"), on_failure="redraw")
-    bench = ended(tmp_path, random_bundle.path, settings, lambda job: job.kind == "score" and job.digest[0] % 8 == 0)
+    bench = ended(settings, fails=lambda job: job.kind == "score" and job.digest[0] % 8 == 0)
     before = outcome(bench)
     recall(bench.journal, bench.settings, {"b"})
     bench.journal.commit()
@@ -188,8 +186,8 @@ def test_candidates_that_were_drawn_anew_are_drawn_anew_again(tmp_path, random_b
     assert outcome(bench) == before
 
 
-def test_what_other_hosts_scored_in_dropped_generations_is_not_scored_again(tmp_path, random_bundle):
-    bench = ended(tmp_path, random_bundle.path, settings_of("cma"))
+def test_what_other_hosts_scored_in_dropped_generations_is_not_scored_again(ended):
+    bench = ended()
     mine = {digest for (digest,) in bench.journal.read("SELECT digest FROM result WHERE worker LIKE 'b/%'")}
     recall(bench.journal, bench.settings, {"a"})
     bench.journal.commit()
@@ -203,8 +201,8 @@ def test_what_other_hosts_scored_in_dropped_generations_is_not_scored_again(tmp_
     assert {digest for (digest,) in bench.journal.read(again)} == mine
 
 
-def test_what_a_host_brought_to_dropped_generations_counts_no_more_once_it_is_barred(tmp_path, random_bundle):
-    bench = ended(tmp_path, random_bundle.path, settings_of("cma"))
+def test_what_a_host_brought_to_dropped_generations_counts_no_more_once_it_is_barred(ended):
+    bench = ended()
     before = outcome(bench)
     for host in ("a", "b"):
         recall(bench.journal, bench.settings, {host})
@@ -217,8 +215,8 @@ def test_what_a_host_brought_to_dropped_generations_counts_no_more_once_it_is_ba
     assert outcome(bench) == before
 
 
-def test_a_journal_of_another_host_is_not_rewound(tmp_path, random_bundle):
-    bench = ended(tmp_path, random_bundle.path, settings_of("cma"))
+def test_a_journal_of_another_host_is_not_rewound(ended):
+    bench = ended()
     bench.journal.write("UPDATE candidate SET vector = ? WHERE generation = 0 AND number = 0", bytes(24))
     with pytest.raises(JournalError):
         new_generations(bench).replay(2)
@@ -250,8 +248,8 @@ def test_files_of_recalled_rollouts_are_removed_and_those_that_are_collected_aga
     bench.journal.close()
 
 
-def test_a_host_is_barred_from_a_run_that_has_ended_and_comes_again(tmp_path, random_bundle):
-    bench = ended(tmp_path, random_bundle.path, settings_of("cma"))
+def test_a_host_is_barred_from_a_run_that_has_ended_and_comes_again(ended):
+    bench = ended()
     before = outcome(bench)
     bench.journal.close()
     with pytest.raises(UsageError, match=r"\bc\b.* a, b"):
@@ -283,10 +281,8 @@ def test_of_an_external_run_complete_batches_stay_and_what_the_host_brought_is_k
     journal.close()
 
 
-def test_a_reported_controller_is_withdrawn_before_its_recall_is_durable_and_a_life_writes_it_again(
-    tmp_path, random_bundle, monkeypatch
-):
-    bench = ended(tmp_path, random_bundle.path, settings_of("cma"))
+def test_a_reported_controller_is_withdrawn_before_its_recall_is_durable_and_a_life_writes_it_again(ended, monkeypatch):
+    bench = ended()
     path = bench.path / CONTROLLER
     before = Controller.load(path)
 
@@ -311,21 +307,17 @@ def test_a_reported_controller_is_withdrawn_before_its_recall_is_durable_and_a_l
     bench.hosts = [B]
     bench.serve()
     assert Controller.load(path).sha256 == before.sha256
-    bench.journal.close()
 
 
-def test_a_life_without_a_closed_generation_has_no_reported_controller(tmp_path, random_bundle):
-    bench = Failing(tmp_path / "run", random_bundle.path, settings_of("cma"), fails=None)
+def test_a_life_without_a_closed_generation_has_no_reported_controller(begin):
+    bench = begin(None, settings_of("cma"))
     (bench.path / CONTROLLER).write_bytes(b"of what was recalled")
     bench.restart()
     assert not (bench.path / CONTROLLER).exists()
-    bench.journal.close()
 
 
-def test_a_bar_that_is_killed_leaves_a_run_without_a_controller_or_all_of_the_recall(
-    tmp_path, random_bundle, monkeypatch
-):
-    bench = ended(tmp_path, random_bundle.path, settings_of("cma"))
+def test_a_bar_that_is_killed_leaves_a_run_without_a_controller_or_all_of_the_recall(ended, monkeypatch):
+    bench = ended()
     bench.journal.close()
     commits, commit = [], Journal.commit
 
@@ -346,8 +338,8 @@ def test_a_bar_that_is_killed_leaves_a_run_without_a_controller_or_all_of_the_re
     assert not (bench.path / CONTROLLER).exists()
 
 
-def test_a_bar_on_a_full_disk_is_refused_and_changes_nothing(tmp_path, random_bundle, monkeypatch):
-    bench = Failing(tmp_path / "run", random_bundle.path, settings_of("cma"), fails=lambda job: False)
+def test_a_bar_on_a_full_disk_is_refused_and_changes_nothing(begin, monkeypatch):
+    bench = begin(settings=settings_of("cma"))
     bench.serve(stop=lambda run: len(run.history) == 2)
     bench.run.commit()
     with RunFolder(bench.path) as run:
@@ -373,7 +365,6 @@ def test_a_bar_on_a_full_disk_is_refused_and_changes_nothing(tmp_path, random_bu
     assert bench.run.bar("a") == ""
     bench.restart()
     assert [*bench.run.admission.barred] == ["a"]
-    bench.journal.close()
 
 
 def test_rollouts_of_a_barred_host_are_removed_though_nobody_serves_the_run(tmp_path, random_bundle):
@@ -391,10 +382,8 @@ def test_rollouts_of_a_barred_host_are_removed_though_nobody_serves_the_run(tmp_
 
 
 @pytest.mark.parametrize(("since", "kept"), [(1, "1"), (3, None)])
-def test_failures_that_were_accepted_after_the_generation_that_opens_again_count_again(
-    tmp_path, random_bundle, since, kept
-):
-    bench = ended(tmp_path, random_bundle.path, settings_of("cma"))
+def test_failures_that_were_accepted_after_the_generation_that_opens_again_count_again(ended, since, kept):
+    bench = ended()
     bench.journal.set_fact(LIMIT_FROM, str(since))
     recall(bench.journal, bench.settings, {"a"})
     assert bench.journal.fact(LIMIT_FROM) == kept

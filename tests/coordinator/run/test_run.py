@@ -7,14 +7,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from dreamfleet.common.protocol.messages import (
-    Result,
-    ResultBatch,
-)
+from dreamfleet.common.protocol.messages import Result, ResultBatch
 from dreamfleet.common.protocol.stop_kind import PauseKind, StopKind
 from dreamfleet.common.runs.records import StoredEvaluation
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
+from dreamfleet.coordinator.jobs.rollout_collection import NOT_KEPT
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from tests.support.failures import failure
 from tests.support.run_bench import DRIVES, SETTINGS, A, B, Bench, drive_of, result_of
@@ -34,13 +32,13 @@ def test_a_run_that_checks_nothing_says_nothing_of_checks(bench):
 def test_a_kill_between_dispatch_and_commit_loses_nothing(bench):
     results = []
     for send in bench.run.fleet.dispatch(bench.now):
-        for work in send.content.work:
+        for work in send.work:
             results.append(Result(work.job.digest, float(work.job.candidate), 10, 0.1, None, None))
             batch = ResultBatch(run_uid=bench.run.uid, incarnation=1, fingerprint="f", results=(results[-1],))
             bench.worker_protocol.handle_results(send.identity, batch, bench.now)
     assert bench.run.advance(bench.now)
     early = bench.run.fleet.dispatch(bench.now, durable=False)
-    assert not any(send.content.verdicts for send in early)
+    assert not any(send.verdicts for send in early)
     opened = [work.vector for work in bench.run.generation.work]
 
     bench.restart()
@@ -92,8 +90,8 @@ def test_a_collected_rollout_without_its_upload_is_an_error(bench):
     (name, job), _ = bench.reach_collection()
     bench.verdicts()
     bench.deliver(name, msgspec.structs.replace(result_of(job), upload=None))
-    assert ("refused" in verdict for *_, verdict in bench.verdicts())
-    assert "not kept" in next(iter(bench.run.fleet.jobs.failures[0].errors.values()))
+    assert {verdict for *_, verdict in bench.verdicts()} == {"refused"}
+    assert bench.run.fleet.jobs.failures[0].attempts[0].error == NOT_KEPT
 
 
 def test_a_restart_during_an_upload_repeats_it_and_keeps_finished_rollouts(bench):
@@ -117,7 +115,7 @@ def fail(bench, name, digest, error):
 
 
 def test_a_pause_names_candidate_seed_every_worker_how_often_and_why(bench):
-    given = {send.identity: send.content.work for send in bench.run.fleet.dispatch(bench.now)}
+    given = {send.identity: send.work for send in bench.run.fleet.dispatch(bench.now)}
     work = given[A][0]
     seed, name = work.job.seeds[0], f"candidate 0/{work.job.candidate}"
     fail(bench, A, work.job.digest, "boom")
@@ -140,10 +138,10 @@ def test_a_pause_on_the_only_worker_names_one_worker_and_three_failures(bench):
         bench.run.tick(bench.now)
         bench.handle_heartbeat(A)
         for send in bench.run.fleet.dispatch(bench.now):
-            digest = digest or (send.content.work[0].job.digest if send.content.work else None)
+            digest = digest or (send.work[0].job.digest if send.work else None)
         fail(bench, A, digest, "boom")
     (failure,) = bench.run.fleet.jobs.failures
-    assert (bench.run.state.paused.pauses[0].kind, failure.attempts) == (PauseKind.FAILED_JOB, {A: 3})
+    assert (bench.run.state.paused.pauses[0].kind, failure.attempts_by_worker) == (PauseKind.FAILED_JOB, {A: 3})
 
 
 STEPS = st.one_of(
@@ -206,7 +204,7 @@ def test_a_run_whose_population_is_one_point_ends_with_that_reason(tmp_path, ran
     for _ in range(2):
         while bench.run.state.ended is None:
             for send in bench.run.fleet.dispatch(bench.now):
-                for work in send.content.work:
+                for work in send.work:
                     bench.deliver(send.identity, Result(work.job.digest, 1.0, 10, 0.1, None, None))
         assert bench.run.state.ended.kind is StopKind.ONE_POINT
         closed = len(bench.run.history)
@@ -224,7 +222,7 @@ def test_parted_compares_the_same_scores_before_and_after_a_restart(tmp_path, ra
     bench = Bench(tmp_path / "night", random_bundle.path, settings, generations=3)
     while bench.run.state.ended is None:
         for send in bench.run.fleet.dispatch(bench.now):
-            for work in send.content.work:
+            for work in send.work:
                 bench.deliver(send.identity, Result(work.job.digest, work.job.digest[0] / 10, 10, 0.1, None, None))
 
     def compared():
@@ -252,7 +250,7 @@ def test_a_reached_limit_stays_reached_when_the_last_evaluation_contradicts_it(t
 
     def step():
         for send in bench.run.fleet.dispatch(bench.now):
-            for work in send.content.work:
+            for work in send.work:
                 noise = work.job.digest[0] / 1000
                 fitness = level.get(work.job.generation, 9.0) + noise if work.job.kind == "evaluate" else noise
                 bench.deliver(send.identity, Result(work.job.digest, fitness, 10, 0.1, None, None))

@@ -5,14 +5,11 @@ import pytest
 from dreamfleet.common.errors import NotWritableNowError
 from dreamfleet.coordinator.run.run import BY_HAND, PAUSED
 from dreamfleet.coordinator.run.shown_state import ShownState, shown_state
-from tests.support.failing_runs import SETTINGS, Failing
 
 
 @pytest.fixture
-def bench(tmp_path, random_bundle):
-    made = Failing(tmp_path / "night", random_bundle.path, SETTINGS, fails=lambda job: False)
-    yield made
-    made.journal.close()
+def bench(begin):
+    return begin()
 
 
 def test_a_run_that_ends_in_a_pause_shows_why_it_ended(bench):

@@ -1,21 +1,16 @@
 """What happened to a run, in its journal."""
 
-from dataclasses import replace
-
 import pytest
 
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.run.run import BY_HAND
 from dreamfleet.coordinator.storage.journal import MAX_EVENTS
-from tests.support.failing_runs import SETTINGS, Failing
 from tests.support.run_bench import A
 
 
 @pytest.fixture
-def bench(tmp_path, random_bundle):
-    made = Failing(tmp_path / "night", random_bundle.path, replace(SETTINGS), fails=lambda job: job.candidate == 1)
-    yield made
-    made.journal.close()
+def bench(begin):
+    return begin(lambda job: job.candidate == 1)
 
 
 def texts(bench):

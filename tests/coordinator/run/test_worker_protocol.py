@@ -21,7 +21,7 @@ def given_jobs(bench):
     bench.run.fleet.handle_departure(B, bench.now)
     bench.now += 1
     bench.run.tick(bench.now)
-    return [(send.identity, work.job) for send in bench.run.fleet.dispatch(bench.now) for work in send.content.work]
+    return [(send.identity, work.job) for send in bench.run.fleet.dispatch(bench.now) for work in send.work]
 
 
 def scored(job):

@@ -6,7 +6,7 @@ import pytest
 
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.stop_kind import PauseKind
-from dreamfleet.coordinator.run.failure_limit import LIMIT_FROM
+from dreamfleet.coordinator.run.failure_policy import LIMIT_FROM
 from dreamfleet.coordinator.run.run import BY_HAND, PAUSED
 from dreamfleet.coordinator.run.run_state import Pause
 from dreamfleet.coordinator.service.control import DISBAND_TIMEOUT, DRAINING, Control

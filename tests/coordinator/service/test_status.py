@@ -88,7 +88,8 @@ def large(population, workers, generations, text="x"):
     last = dataclasses.replace(candidate_scores, generation=generations - 1)
     event_log = EventLog()
     for number in range(3 * workers):
-        event_log.add(number / 10, "accepted", fleet[number % workers].worker)
+        event_log.now = number / 10
+        event_log.add("accepted", fleet[number % workers].worker)
     closed = History(rows(generations)).view(), looks(generations)
     return Snapshot(status, fleet, *closed, candidate_scores, last, None, event_log.view(), 1e6)
 
@@ -101,7 +102,7 @@ def test_no_answer_is_longer_than_a_message_however_large_the_run(population, wo
     settings = replace(snapshot.status.settings, task=longest)
     snapshot = replace(snapshot, status=replace(snapshot.status, settings=settings))
     for part in PARTS:
-        payload = encode_part(snapshot, part, {})
+        payload = encode_part(snapshot, part, {}.get)
         assert len(payload) <= MAX_MESSAGE, part
     status = read_status(answered(snapshot))
     assert status.population.total == population
@@ -218,7 +219,7 @@ def test_a_workers_status_holds_its_job_seconds_round_trip_and_resent_batches(be
     bench.now = 0.25
     bench.handle_heartbeat(A)
     assert snapshot_of(bench).workers[0].round_trip == 0.25
-    bench.answer(Result(send.content.work[0].job.digest, 1.0, 10, 0.1, None, None))
+    bench.answer(Result(send.work[0].job.digest, 1.0, 10, 0.1, None, None))
     bench.run.fleet.dispatch(bench.now)  # its verdict, which no beat shows as seen
     bench.run.fleet.dispatch(bench.now + 30.0)
     last = snapshot_of(bench).workers[0]

@@ -199,7 +199,7 @@ def test_whether_hosts_of_the_second_time_are_of_the_first_ones_class_is_said(ma
 def test_a_result_is_counted_once_when_it_is_repeated(make):
     bench = make()
     for send in bench.run.fleet.dispatch(bench.now):
-        bench.given += [work.job for work in send.content.work]
+        bench.given += [work.job for work in send.work]
     job = bench.given.pop(0)
     before = bench.journal.results.effort
     for _ in range(2):

@@ -16,7 +16,7 @@ from dreamfleet.common.runs.records import StageSettings
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import begun_stages
 from dreamfleet.coordinator.jobs.work import vector_bytes
-from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
+from dreamfleet.coordinator.optimisers.evolution import Evolution
 from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.settings.fork import Fork
 from dreamfleet.coordinator.settings.limits import LimitsConfig
@@ -134,7 +134,7 @@ def test_a_restart_begins_at_the_first_mean_and_what_follows_at_the_best_also_af
     assert [(each.stage.number, each.since) for each in begun] == [(1, 0), (2, 3), (3, 6), (4, 9)]
     best = np.frombuffer(calm.journal.evaluated_vector(1), "<f4").astype(float)
     starts = zip(begun, [None] * 3 + [best], strict=True)
-    anew = [Evolution(EvolutionConfig.of(settings, each.stage), at).ask() for each, at in starts]
+    anew = [Evolution.of(settings, each.stage, None, at).ask() for each, at in starts]
     assert [found[each.since] for each in begun] == [list(map(vector_bytes, each)) for each in anew]
     assert found[0] != found[3] != found[6]
     bench.die_by(random.Random(1))

@@ -14,7 +14,8 @@ from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.records import RunSettings, StageSettings
 from dreamfleet.common.runs.run_provenance import RunProvenance
 from dreamfleet.common.runs.stages import stages_of
-from dreamfleet.coordinator.optimisers.evolution import Evolution, EvolutionConfig
+from dreamfleet.coordinator.optimisers.api import Search
+from dreamfleet.coordinator.optimisers.evolution import Evolution
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.rerun import Rerun
@@ -29,8 +30,10 @@ def few(inputs=9, bundle="ab" * 32):
     return Subspace(random.normal(size=(2, inputs)).astype(np.float32), np.zeros(2, np.float32), ("a", "b"), bundle)
 
 
-def config(optimiser="cma", covariance="diagonal"):
-    return EvolutionConfig(SHAPE.size, 8, 0.3, covariance, 3, optimiser, (), SearchSpace(few(), SHAPE))
+def build(optimiser="cma", covariance="diagonal", start=None):
+    options = {} if covariance == "diagonal" else {"covariance": covariance}
+    search = Search(np.zeros(SHAPE.size) if start is None else start, 8, 0.3, 3, options)
+    return Evolution(optimiser, search, SearchSpace(few(), SHAPE))
 
 
 def run(evolution, generations):
@@ -42,10 +45,10 @@ def run(evolution, generations):
 @pytest.mark.parametrize(("optimiser", "covariance"), OPTIMISERS)
 def test_it_keeps_to_the_subspace_and_continues_to_the_bit(optimiser, covariance):
     start = np.random.default_rng(2).normal(size=SHAPE.size)
-    whole, first = (Evolution(config(optimiser, covariance), start) for _ in range(2))
+    whole, first = (build(optimiser, covariance, start) for _ in range(2))
     run(whole, range(12))
     run(first, range(5))
-    second = Evolution(config(optimiser, covariance))  # a resumed run does not know where its search began
+    second = build(optimiser, covariance)  # a resumed run does not know where its search began
     second.restore(first.state().packed())
     run(second, range(5, 12))
     asked = whole.ask()
@@ -55,19 +58,19 @@ def test_it_keeps_to_the_subspace_and_continues_to_the_bit(optimiser, covariance
 
 
 def test_a_state_without_its_origin_is_damaged():
-    other = Evolution(replace(config(), space=None, dimension=6))
+    other = Evolution("cma", Search(np.zeros(6), 8, 0.3, 3))
     with pytest.raises(JournalError):
-        Evolution(config()).restore(other.state().packed())
+        build().restore(other.state().packed())
 
 
 @pytest.mark.parametrize(
     "origin", [np.full(SHAPE.size, "a"), np.full(SHAPE.size, np.nan), np.full(SHAPE.size, 1e300), np.zeros(3)]
 )
 def test_a_damaged_origin_is_the_journals_fault(origin):
-    checkpoint = Evolution(config()).state()
+    checkpoint = build().state()
     state = replace(checkpoint, head=replace(checkpoint.head, origin=origin)).packed()
     with pytest.raises(JournalError):
-        Evolution(config()).restore(state)
+        build().restore(state)
 
 
 @pytest.fixture
@@ -86,8 +89,8 @@ def test_it_is_frozen_by_its_hash_and_a_later_stage_leaves_it(settings):
     assert RunSettings.from_json(found.to_json()) == found
     first, second = stages_of(found)
     assert (first.whole, second.whole, second.starts_new_search) == (False, True, True)
-    assert EvolutionConfig.of(found, first, subspace).space is not None
-    assert EvolutionConfig.of(found, second, subspace).space is None
+    searches = [Evolution.of(found, stage, subspace, None) for stage in (first, second)]
+    assert [each.state().head.origin is None for each in searches] == [False, True]
 
 
 @pytest.mark.parametrize(

@@ -77,7 +77,7 @@ def test_a_live_runs_archive_is_drawn_from_its_journal_and_goes_on_after_a_resta
     def score(generations):
         while len(bench.run.history) < generations:
             for send in bench.run.fleet.dispatch(bench.now):
-                for work in send.content.work:
+                for work in send.work:
                     place = work.job.candidate + work.job.generation
                     bench.answer(Result(work.job.digest, float(place), 10, 0.1, None, None, measures=(place, 0.7)))
 
