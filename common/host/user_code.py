@@ -80,7 +80,7 @@ def describe_error(error: BaseException) -> str:
 def find_user_line(error: BaseException) -> str:
     """The last line of a user's file that led to the error, else the last of all: `mine.py:12: assert x > 0`."""
     frames = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(error.__traceback__)]
-    own = [each for each in frames if _is_users(each[0])]
+    own = [each for each in frames if not each[0].startswith(("<", str(_PACKAGE), *_LIBRARIES))]
     if not frames:
         return ""
     file, line = (own or frames)[-1]
@@ -126,7 +126,3 @@ def _user_arguments(name: str) -> list[str]:
     """What a user's code of this module sees."""
     text = os.environ.get(ARGUMENTS)
     return [str(each) for each in json.loads(text)] if text else [name]
-
-
-def _is_users(file: str) -> bool:
-    return not file.startswith(("<", str(_PACKAGE), *_LIBRARIES))

@@ -84,7 +84,8 @@ class HostClasses:
     @property
     def rows(self) -> list[tuple[str, str]]:
         """Each listed class, and a text of its results and hosts."""
-        return [(printable(each.host_class), _describe_hosts(each)) for each in self.largest]
+        hosts = ((each, ", ".join(f"[{printable(name)}]" for name in each.fingerprints)) for each in self.largest)
+        return [(printable(each.host_class), f"{plural(each.results, 'result')} of {names}") for each, names in hosts]
 
 
 def count_results(rows: Iterable[tuple[str, str, int]]) -> Counter[tuple[str, str]]:
@@ -109,8 +110,3 @@ def effective_class(reported: str, fingerprint: str, run: str | None) -> str:
 def _fingerprints(counted: ResultCounts, host_class: str) -> tuple[str, ...]:
     own = Counter({fingerprint: results for (each, fingerprint), results in counted.items() if each == host_class})
     return tuple(truncate(fingerprint, MAX_FINGERPRINT_CHARS) for fingerprint, _ in own.most_common(MAX_LISTED))
-
-
-def _describe_hosts(each: HostClassShare) -> str:
-    hosts = [f"[{printable(fingerprint)}]" for fingerprint in each.fingerprints]
-    return f"{plural(each.results, 'result')} of {', '.join(hosts)}"

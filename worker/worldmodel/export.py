@@ -139,7 +139,7 @@ def _encode(
         for index in layers:
             value = _convolve(graph, value, vae, config, index)
         flat = graph.node("Reshape", value, graph.shape(-1, config.flat))
-        return lambda name: _linear(graph, flat, vae, name)
+        return lambda name: graph.linear(flat, vae[f"{name}.weight"].T, vae[f"{name}.bias"])
     step = PIXEL_STEP
     for index in layers:
         steps, window = (step, ranges.step_of(index)), _window(config.down[index])
@@ -179,10 +179,6 @@ def _folded(vae: Weights, part: str, layer: int, config: VAEConfig) -> tuple[NDA
     outputs = 0 if part == "encoder" else 1  # the kernel's output axis, which torch swaps in transposed convolutions
     kernel = kernel * np.expand_dims(scale, [axis for axis in range(4) if axis != outputs])
     return kernel, (bias - vae[f"{norm}.running_mean"]) * scale + vae[f"{norm}.bias"]
-
-
-def _linear(graph: GraphBuilder, value: str, weights: Weights, name: str) -> str:
-    return graph.linear(value, weights[f"{name}.weight"].T, weights[f"{name}.bias"])
 
 
 def _layer(graph: GraphBuilder, features: str, weights: str, biases: str, *, ordered: bool = False) -> str:

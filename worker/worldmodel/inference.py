@@ -23,7 +23,6 @@ from dreamfleet.worker.worldmodel.choice_memory import ChoiceMemory, Layer, comp
 
 Floats = NDArray[np.float32]
 Pictures = NDArray[np.uint8]
-NAMES = ("weights", "biases")  # inputs of a controller's layer
 ATTENTION = "attention"  # output of dream graphs with attention
 
 
@@ -169,10 +168,10 @@ class Controllers:
         return self.choices.choose(state, lambda: self._decide(latent, state))
 
     def _unpack(self, parameters: Floats) -> None:
-        layers = [(np.ascontiguousarray(a), np.ascontiguousarray(b)) for a, b in self.shape.unpack(parameters)]
-        numbered = enumerate(layers)
-        named = [(f"{kind}{index}", each) for index, pair in numbered for kind, each in zip(NAMES, pair, strict=True)]
-        self._layers, self._feed, self._parameters = layers, dict(named), parameters
+        self._layers = [(np.ascontiguousarray(a), np.ascontiguousarray(b)) for a, b in self.shape.unpack(parameters)]
+        for index, (weights, biases) in enumerate(self._layers):
+            self._feed |= {f"weights{index}": weights, f"biases{index}": biases}
+        self._parameters = parameters
 
     def _decide(self, latent: Floats, state: Floats) -> Floats:
         parts = [latent, state[:, : self._hidden]] if self._hidden else [latent]
@@ -221,7 +220,6 @@ class DreamStep:
         self._choices, self._reward = self._controllers.choices, RewardLabel(bundle)
         self._run_options = onnxruntime.RunOptions()
         self._run_options.only_execute_path_to_fetches = True
-        self._zero_noise: dict[str, Floats] = {}
         self.shape = bundle.controller_shape
         self.hidden_size = bundle.manifest.hidden
         self.memory_size: int = sizes["state"][1]  # columns of the state that are the world model's
@@ -247,11 +245,7 @@ class DreamStep:
         temperature: float, mask: Floats | None = None, chosen: Floats | None = None,
     ) -> DreamOutput:  # fmt: skip
         """Dream the next step under actions `(N, actions)`; `chosen` are the controllers' own if others are applied."""
-        own = self._model_state(state)
-        feed = {"latent": latent, "action": action, "state": own, "uniform": uniform, "normal": normal}
-        feed["temperature"] = np.array([temperature], dtype=np.float32)
-        if self.chance.dropout:
-            feed["mask"] = np.ones((len(latent), self.hidden_size), np.float32) if mask is None else mask
+        feed = self._feed(latent, action, state, uniform, normal, temperature, mask)
         given = dict(zip(self._names, self._run(self._names, feed), strict=True))
         none = np.zeros(len(latent), dtype=np.float32)
         heads = given.get("reward", none), given.get("done", none)
@@ -260,9 +254,8 @@ class DreamStep:
 
     def advance(self, latent: Floats, action: Floats, state: Floats, chosen: Floats | None = None) -> Floats:
         """The next state alone, for reality, where the next latent is seen; `chosen` as in `imagine`."""
-        return self._next_state(
-            self._run_output("next_state", latent, action, state), state, action if chosen is None else chosen
-        )
+        after = self._run_output("next_state", latent, action, state)
+        return self._next_state(after, state, action if chosen is None else chosen)
 
     def attend(self, latent: Floats, action: Floats, state: Floats) -> Floats:
         """The attention weights (N, window) of the last inputs at this step, oldest first."""
@@ -270,18 +263,20 @@ class DreamStep:
 
     def _run_output(self, output: str, latent: Floats, action: Floats, state: Floats) -> Floats:
         """Compute one output that does not depend on the random numbers."""
-        if len(self._zero_noise.get("uniform", "")) != len(latent):
-            zeros = np.zeros((len(latent), self.latent_size), dtype=np.float32)
-            self._zero_noise = {"uniform": zeros, "normal": zeros, "temperature": np.ones(1, np.float32)}
-            if self.chance.dropout:
-                self._zero_noise["mask"] = np.ones((len(latent), self.hidden_size), np.float32)
-        feed = {**self._zero_noise, "latent": latent, "action": action, "state": self._model_state(state)}
-        (found,) = self._run([output], feed, self._run_options)
+        zeros = np.zeros((len(latent), self.latent_size), dtype=np.float32)
+        (found,) = self._run([output], self._feed(latent, action, state, zeros, zeros), self._run_options)
         return np.asarray(found, dtype=np.float32)
 
-    def _model_state(self, state: Floats) -> Floats:
-        """The columns of a state that are the world model's."""
-        return np.ascontiguousarray(state[:, : self.memory_size]) if self._choices.columns else state
+    def _feed(
+        self, latent: Floats, action: Floats, state: Floats, uniform: Floats, normal: Floats,
+        temperature: float = 1.0, mask: Floats | None = None,
+    ) -> dict[str, Floats]:  # fmt: skip
+        own = np.ascontiguousarray(state[:, : self.memory_size]) if self._choices.columns else state
+        feed = {"latent": latent, "action": action, "state": own, "uniform": uniform, "normal": normal}
+        feed["temperature"] = np.array([temperature], dtype=np.float32)
+        if self.chance.dropout:
+            feed["mask"] = np.ones((len(latent), self.hidden_size), np.float32) if mask is None else mask
+        return feed
 
     def _next_state(self, models: Floats, state: Floats, chosen: Floats) -> Floats:
         """The world model's next state followed by the controllers' memory of their choices."""

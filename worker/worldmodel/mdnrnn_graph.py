@@ -123,7 +123,7 @@ def export_dream(rnn: Weights, config: MDNRNNConfig, ranges: Ranges | None = Non
     *mixtures, reward, done = columns
     if config.joint:
         uniform, _ = graph.split(uniform, 1, config.latent - 1)
-    exponential = add_exponential if _is_rounded(ranges) else _exponential
+    exponential = add_exponential if _is_rounded(ranges) else lambda graph, value: graph.node("Exp", value)
     mean, deviation = _select_mixture(graph, mixtures, uniform, temperature, exponential)
     noise = graph.node("Mul", normal, graph.node("Sqrt", temperature))
     spread = graph.node("Mul", exponential(graph, deviation), noise)
@@ -152,10 +152,6 @@ def _heads(graph: GraphBuilder, hidden: str, rnn: Weights, config: MDNRNNConfig,
 
 def _is_rounded(ranges: Ranges | None) -> bool:
     return ranges is not None and bool(ranges.inputs)
-
-
-def _exponential(graph: GraphBuilder, value: str) -> str:
-    return graph.node("Exp", value)
 
 
 def mixture_major_order(config: MDNRNNConfig) -> NDArray[Any]:

@@ -1,6 +1,7 @@
 """Simulators draw where there is no display."""
 
 import os
+import re
 import sys
 
 import gymnasium
@@ -72,7 +73,7 @@ def test_the_choice_is_said_where_mujoco_draws(host, monkeypatch):
     draw_offscreen()
     assert not describe_choice()
     monkeypatch.setitem(sys.modules, "mujoco", os)
-    assert "MUJOCO_GL=egl" in describe_choice()
+    assert re.search("MUJOCO_GL.*egl", describe_choice())
 
 
 class Arm(gymnasium.Env):

@@ -2,6 +2,7 @@
 Tests authority.py and certificate_ledger.py."""
 
 import errno
+import json
 import os
 import re
 import shutil
@@ -201,11 +202,11 @@ def test_the_verbs_create_list_and_revoke(tmp_path, capsys):
     assert main(["access", "issue", "worker", "w1", *folder, "--connect", *HERE, "--out", str(out)]) == 0
     assert read_join_file(out).name == "w1"
     assert main(["access", "revoke", "w1", *folder]) == 0
-    assert main(["access", "list", *folder]) == 0
-    listed = capsys.readouterr().out
-    assert "revoked" in listed
-    assert listed.count("*.1") == 2  # as it was issued, and in the list
-    assert "BEGIN" not in listed
+    said = capsys.readouterr().out
+    assert main(["access", "list", *folder, "--json"]) == 0
+    (row,) = json.loads(listed := capsys.readouterr().out)
+    assert (row["name"], row["workers"], row["state"]) == ("w1", "*.1", "revoked")
+    assert "BEGIN" not in said + listed
     assert main(["access", "init", *folder]) == 2
     assert main(["access", "issue", "worker", "w2", *folder, "--connect", "tcp/h:1", "--out", f"{out}2"]) == 2
     assert main(["access", "issue", "coordinator", "c", *folder, "--out", f"{out}2"]) == 2
