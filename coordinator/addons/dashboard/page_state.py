@@ -40,36 +40,18 @@ def page_state(look: RunSnapshot) -> dict[str, Any]:
     status = look.status
     view = LiveRunView.of_status(status, look.word)
     link = OVER if status.is_over else LIVE if look.lost is None else LOST
-    return {
-        "run": status.run,
-        "uid": status.run_uid,
-        "link": link,
-        "stored": look.folder is not None,
-        "state": {LOST: "coordinator lost", LIVE: status.state}.get(link, _ended_state(status)),
-        "sentence": _lost_sentence(look) if link == LOST else _sentence(view),
-        "lost": look.lost if link == LOST else None,
-        "heard": look.heard,
-        "eta": _eta(view.eta) if link == LIVE else None,
-        "task": printable(_task(view)),
-        "word": look.word,
-        "tiles": _tiles(view, link),
-        "candidates": _candidates(look.population, status),
-        "evaluation": _progress(status, look.word),
-        "search": _search(view),
-        "redundant": _redundant_work(view),
-        "troubles": _problems(status),
-        "fleet": _fleet(status, link),
-        "workers": _workers(look, link),
-    }
-
-
-def _ended_state(status: Status) -> str:
-    return "ended" if status.state == "ended" else "left open"
-
-
-def _task(view: LiveRunView) -> str:
+    states = {LIVE: status.state, LOST: "coordinator lost", OVER: "ended" if status.state == "ended" else "left open"}
     stage = [] if view.stage is None else [f"stage {view.stage.number} of {view.stage.total}"]
-    return ", ".join([view.about, view.population, *stage])
+    return {
+        "run": status.run, "uid": status.run_uid, "link": link, "stored": look.folder is not None,
+        "state": states[link], "sentence": _lost_sentence(look) if link == LOST else _sentence(view),
+        "lost": look.lost if link == LOST else None, "heard": look.heard,
+        "eta": _eta(view.eta) if link == LIVE else None,
+        "task": printable(", ".join([view.about, view.population, *stage])), "word": look.word,
+        "tiles": _tiles(view, link), "candidates": _candidates(look.population, status),
+        "evaluation": _progress(status, look.word), "search": _search(view), "redundant": _redundant_work(view),
+        "troubles": _problems(status), "fleet": _fleet(status, link), "workers": _workers(look, link),
+    }  # fmt: skip
 
 
 def _sentence(view: LiveRunView) -> str:
@@ -81,13 +63,12 @@ def _sentence(view: LiveRunView) -> str:
 
 
 def _lost_sentence(look: RunSnapshot) -> str:
-    rest = "--join where it had one" if look.folder else "--runs-dir and --join where it had them"
-    words = (
-        ("dreamfleet coordinator --resume", look.status.run) if look.folder is None else (resume_command(look.folder),)
-    )
+    command, rest = f"dreamfleet coordinator --resume {look.status.run}", "--runs-dir and --join where it had them"
+    if look.folder is not None:
+        command, rest = resume_command(look.folder), "--join where it had one"
     return (
         "Its coordinator was killed, or the network is cut. The page goes on once it answers again. "
-        f"After a kill, continue it: {printable(' '.join(words))}, with {rest}"
+        f"After a kill, continue it: {printable(command)}, with {rest}"
     )
 
 
@@ -118,11 +99,8 @@ def _archive_tile(archive: ArchiveStatus) -> dict[str, str]:
     if archive.best is None:
         return tile("archive", f"0 of {archive.cells:,}", "cells filled; once a generation closes")
     best = f"the best elite {format_number(archive.best)} in cell {','.join(map(str, archive.best_cell))}"
-    return tile(
-        "archive",
-        f"{archive.filled:,} of {archive.cells:,}",
-        f"cells filled; QD score {format_number(archive.qd_score)}; {best}",
-    )
+    caption = f"cells filled; QD score {format_number(archive.qd_score)}; {best}"
+    return tile("archive", f"{archive.filled:,} of {archive.cells:,}", caption)
 
 
 def tile(name: str, value: str, caption: str) -> dict[str, str]:
@@ -223,8 +201,8 @@ def _fleet(status: Status, link: str) -> str:
 
 def _workers(look: RunSnapshot, link: str) -> dict[str, list[Any]]:
     """Columns with a row a worker, sorted by host. Momentary values are empty unless the run is live."""
-    order = sorted(range(len(look.workers)), key=lambda index: look.workers[index].worker)
-    rows = [look.workers[index] for index in order]
+    with_lanes = sorted(zip(look.workers, look.lanes, strict=True), key=lambda row: row[0].worker)
+    rows = [worker for worker, _ in with_lanes]
     return {
         "worker": [printable(each.worker) for each in rows],
         "state": [printable(each.state) if link == LIVE else NONE for each in rows],
@@ -236,5 +214,5 @@ def _workers(look: RunSnapshot, link: str) -> dict[str, list[Any]]:
         "load": [each.load if link == LIVE else None for each in rows],
         "heard": [round(each.heard, 1) if link == LIVE else None for each in rows],
         "picture": [printable(each.drawn_by) for each in rows],
-        "lane": [look.lanes[index] for index in order],
+        "lane": [lane for _, lane in with_lanes],
     }

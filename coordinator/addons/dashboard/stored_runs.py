@@ -55,19 +55,12 @@ def describe_run(runs_dir: Path, name: str) -> dict[str, Any]:
         spent = cumulative_effort(start, efforts, len(history))
         total = sum((each.effort for each in efforts), start)
         view, plain = view_of(run), expand_task_options(asdict(settings))
+        rows = setting_rows(settings, plain, run.episode_limit)
         return {
-            "run": run.name,
-            "state": printable(run.state),
-            "ended": run.ended is not None,
-            "tiles": _tiles(run, view, total),
+            "run": run.name, "state": printable(run.state), "ended": run.ended is not None,
             "again": printable(resume_command(run.path)) if run.state == "open" else "",
-            "facts": _about(run, view),
-            "outcome": _outcome(run, view, total),
-            "settings": [
-                (name, printable(value), differs)
-                for name, value, differs in setting_rows(settings, plain, run.episode_limit)
-            ],
-            "world": _world(run),
+            "tiles": _tiles(run, view, total), "facts": _about(run, view), "outcome": _outcome(run, view, total),
+            "settings": [(name, printable(value), differs) for name, value, differs in rows], "world": _world(run),
             "curves": curves(data, read_quartiles(run, settings, downsample(history)), spent, view.word),
             "archive": describe_archive(EliteArchive.of(run)),
             "generations": [_generation_row(in_values(each, run.spec)) for each in history[-LAST:][::-1]],
@@ -80,13 +73,11 @@ def describe_hosts(runs_dir: Path, name: str) -> dict[str, Any]:
         state, ended = run.state, parse_time(run.ended_at or "")
         until = time.time() if state == "live" else None if ended is None else ended.timestamp()
         return {
-            "run": run.name,
-            "state": printable(state),
+            "run": run.name, "state": printable(state), "task": printable(run.spec.task),
             "classes": printable(run.classes.description),
             "checks": "" if run.checks is None else printable(run.checks.description),
-            "task": printable(run.spec.task),
             **host_history(run.work_by_worker(), run.generation_times(), run.events(), until),
-        }
+        }  # fmt: skip
 
 
 def describe_archive(archive: EliteArchive | None) -> dict[str, Any] | None:

@@ -38,7 +38,7 @@ def bring_up(
 
     Calls `on_statuses` when all are up and when they ended, `on_log_line` for each line of a log.
     """
-    with _opened(hosts, fleet_address, on_log_line or _ignore_line) as (remote_hosts, stop):
+    with _opened(hosts, fleet_address, on_log_line) as (remote_hosts, stop):
         rows = _run_in_threads(remote_hosts, RemoteHost.bring_up, stop, RemoteHost.close)
         if stop():
             raise StoppedError("some workers may run: the same command continues, and `dreamfleet down` ends them")
@@ -69,7 +69,7 @@ def _follow_until_ended(remote_host: RemoteHost) -> HostStatus:
 def _run_on_all(
     hosts: Sequence[Host], fleet_address: FleetAddress, do: Callable[[RemoteHost], HostStatus]
 ) -> list[HostStatus]:
-    with _opened(hosts, fleet_address, _ignore_line) as (remote_hosts, stop):
+    with _opened(hosts, fleet_address) as (remote_hosts, stop):
         rows = _run_in_threads(remote_hosts, do, stop, RemoteHost.close)
         if stop():
             raise StoppedError("interrupted: the same command continues")
@@ -78,12 +78,13 @@ def _run_on_all(
 
 @contextmanager
 def _opened(
-    hosts: Sequence[Host], fleet_address: FleetAddress, on_log_line: OnLogLine
+    hosts: Sequence[Host], fleet_address: FleetAddress, on_log_line: OnLogLine | None = None
 ) -> Iterator[tuple[list[RemoteHost], Stop]]:
     """Yield the hosts, whose connections are closed at the end, and whether a signal asks to stop."""
+    take_line = on_log_line or (lambda _host, _line: None)
     with stop_on_signals() as stop, ExitStack() as stack:
         remote_hosts = [
-            RemoteHost(each, fleet_address, partial(log.info, "%s %s", each.name), partial(on_log_line, each.name))
+            RemoteHost(each, fleet_address, partial(log.info, "%s %s", each.name), partial(take_line, each.name))
             for each in hosts
         ]
         for remote_host in remote_hosts:
@@ -117,7 +118,3 @@ def _status_of(remote_host: RemoteHost, do: Callable[[RemoteHost], HostStatus]) 
         return do(remote_host)
     except DreamfleetError as error:
         return HostStatus(remote_host.host.name, FAILED, str(error))
-
-
-def _ignore_line(_host: str, _line: str) -> None:
-    """Drop a line of a log."""

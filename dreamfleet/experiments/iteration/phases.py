@@ -268,19 +268,13 @@ def other_means(evaluations: Sequence[StoredEvaluation], reported: int | None, c
 
 
 def _describe_run(run: RunFolder) -> dict[str, Any]:
-    history = run.history()
+    history, confirmed, score = run.history(), run.confirmation(), None
+    if (judged := confirmed or best_evaluation(run.evaluations())) is not None:
+        word = Bundle.open(run.bundle_path, run.spec.bundle).manifest.facts.score_word
+        score = {"mean": judged.mean, "error": judged.error, "word": word, "generation": judged.generation,
+                 "episodes": judged.episodes, "confirmed": confirmed is not None}  # fmt: skip
     steps = sum(each.steps for each in history)
-    return {"run": run.name, "ended": run.ended, "generations": len(history), "steps": steps, "score": _score(run)}
-
-
-def _score(run: RunFolder) -> dict[str, Any] | None:
-    confirmed = run.confirmation()
-    judged = confirmed or best_evaluation(run.evaluations())
-    if judged is None:
-        return None
-    word = Bundle.open(run.bundle_path, run.spec.bundle).manifest.facts.score_word
-    facts = {"generation": judged.generation, "episodes": judged.episodes, "confirmed": confirmed is not None}
-    return {"mean": judged.mean, "error": judged.error, "word": word, **facts}
+    return {"run": run.name, "ended": run.ended, "generations": len(history), "steps": steps, "score": score}
 
 
 def _copy(before: Path, path: Path) -> None:

@@ -86,7 +86,10 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
         config = replace(config, init=str(Path(config.init).resolve()))
     # Until --init has been copied, nothing was made, and all settings may change.
     new = begun is None or (not begun.entries and bool(config.init))
-    more = _common_run_flags(args, config)
+    # Before `--run-flags` come the config file, and the world's preset unless the settings name one.
+    named = "preset" in configured_values(RunConfig, "run", args.sources["file"], args.sources["environment"])
+    file = ("--config", str(args.config)) if args.config else ()
+    more = (*file, *(() if named else ("--preset", default_run_preset(config.task))))
     first, limits = parse_run_flags([*more, *config.flags_of_run(1)], args.sources, "iterate")
     later, _ = parse_run_flags([*more, *config.flags_of_run(2)], args.sources, "iterate")  # wrong flags end it now
     task = first.task or config.task or default_world()
@@ -122,14 +125,6 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
     iteration.begin()
     iteration.ledger.save(layout.ledger)
     return iteration
-
-
-def _common_run_flags(args: argparse.Namespace, config: IterateConfig) -> tuple[str, ...]:
-    """Flags that come before `--run-flags`: the config file, and the world's preset unless the settings name one."""
-    sources = args.sources
-    named = "preset" in configured_values(RunConfig, "run", sources["file"], sources["environment"])
-    file = ("--config", str(args.config)) if args.config else ()
-    return (*file, *(() if named else ("--preset", default_run_preset(config.task))))
 
 
 def _check_run(config: IterateConfig, run: RunConfig, layout: IterationFolder) -> None:

@@ -6,7 +6,6 @@ import sqlite3
 import sys
 from collections import Counter
 from contextlib import closing
-from importlib.util import find_spec
 from multiprocessing import active_children
 
 import pytest
@@ -210,38 +209,3 @@ def test_an_example_without_its_package_ends_the_coordinator_before_its_run(kind
     with hidden(kind):
         assert main(["coordinator", "--runs-dir", str(tmp_path / "runs")]) == 2
     assert not (tmp_path / "runs" / "run").exists()
-
-
-def test_wandb_offline_has_a_folder_for_each_life(runs, monkeypatch):
-    if find_spec("wandb") is None:
-        pytest.skip("needs the package wandb")
-    monkeypatch.setenv("WANDB_MODE", "offline")
-    monkeypatch.setenv("DREAMFLEET_TRUST", "wandb_sink")
-    monkeypatch.syspath_prepend(EXAMPLES)
-    for _ in range(2):
-        with live_log(runs / "reality", ["wandb_sink:WandbSink"]):
-            pass
-    sizes = [path.stat().st_size for path in (runs / "reality" / "wandb").glob("offline-run-*/*.wandb")]
-    assert len(sizes) == 2
-    assert min(sizes) > len(wanted(runs / "reality"))
-
-
-@pytest.mark.filterwarnings("ignore")  # of its libraries
-def test_mlflow_has_every_point_once_also_in_a_second_life(runs, tmp_path, monkeypatch):
-    mlflow = pytest.importorskip("mlflow")
-    address = f"sqlite:///{tmp_path}/mlflow.db"
-    for _ in range(2):
-        assert write_example(runs, monkeypatch, SinkName("mlflow_sink:MlflowSink", address)) == []
-    client = mlflow.MlflowClient(tracking_uri=address)
-    (run,) = client.search_runs([client.get_experiment_by_name("dreamfleet").experiment_id])
-    found = Counter(
-        (key, each.step) for key in run.data.metrics for each in client.get_metric_history(run.info.run_id, key)
-    )
-    assert found == wanted(runs / "reality")
-
-
-def write_example(runs, monkeypatch, name):
-    monkeypatch.syspath_prepend(EXAMPLES)
-    monkeypatch.setenv("DREAMFLEET_TRUST", name.module)
-    delete_from(runs / "reality", 1)
-    return write(runs / "reality", name)

@@ -15,14 +15,20 @@ from dreamfleet.coordinator.addons.spawn.agent import COMPLETE, CREATED, MARK, S
 from tests.support.processes import ROOT
 
 
+def answer(asked, capsys):
+    agent.handle_request(asked, Channel())
+    return json.loads(capsys.readouterr().out.splitlines()[-1].removeprefix(MARK))
+
+
+def ending(asked):
+    return {"do": "end", "root": str(asked["root"]), "names": None, "now": True, "keep": False}
+
+
 def test_a_missing_file_is_reported_and_the_lock_released(tmp_path, capsys):
     asked = {"do": "start", "root": str(tmp_path / "place"), "name": "box", "python": str(tmp_path / "gone"),
              "words": [], "env": {}, "slots": 1, "held": False, "digest": "1"}  # fmt: skip
     for _ in range(2):
-        agent.handle_request(asked, Channel())
-        said = capsys.readouterr().out
-        assert said.startswith(f'{MARK}{{"failed"'), said
-        assert "No such file" in said
+        assert "No such file" in answer(asked, capsys)["failed"]
 
 
 def test_a_folder_removed_while_waiting_for_its_lock_is_created_again(tmp_path, monkeypatch):
@@ -43,10 +49,8 @@ def test_a_foreign_folder_is_left_alone(tmp_path, capsys):
     for path in kept:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
-    agent.handle_request({"do": "end", "root": str(tmp_path), "names": None, "now": False, "keep": False}, Channel())
-    assert '"ok"' in capsys.readouterr().out
-    agent.handle_request({"do": "start", "root": str(tmp_path), "name": "box"}, Channel())
-    assert "--remote-dir" in capsys.readouterr().out
+    assert answer(ending({"root": tmp_path}), capsys)["ok"] == {"ended": []}
+    assert "--remote-dir" in answer({"do": "start", "root": str(tmp_path), "name": "box"}, capsys)["failed"]
     assert all(path.exists() for path in kept)
 
 
@@ -98,14 +102,13 @@ def test_damaged_files_of_the_agent_are_read_as_nothing(tmp_path, capsys, damage
     (host_folder.worker("box") / STATE).write_bytes(damage)
     (root / "workers" / ".DS_Store").touch()
     assert agent.inspect_host(host_folder, {})["workers"][0]["running"] is False
-    agent.handle_request({"do": "end", "root": str(root), "names": None, "now": True, "keep": False}, Channel())
-    assert '"ok"' in capsys.readouterr().out
+    assert "ok" in answer(ending({"root": root}), capsys)
     assert not any(root.glob("*"))
 
 
 def test_what_cannot_be_removed_stays_ours_and_is_named_with_the_command(tmp_path, monkeypatch, capsys):
     host_folder, remove = HostFolder(str(tmp_path / "place"), Channel()), shutil.rmtree
-    asked = {"do": "end", "root": str(host_folder.root), "names": None, "now": True, "keep": False}
+    asked = ending({"root": host_folder.root})
     with host_folder.locked():
         (host_folder.environment("one") / "lib").mkdir(parents=True)
     (host_folder.environment("one") / "lib").chmod(0o500)
@@ -114,13 +117,10 @@ def test_what_cannot_be_removed_stays_ours_and_is_named_with_the_command(tmp_pat
         raise PermissionError(13, os.strerror(13), str(folder))
 
     monkeypatch.setattr(shutil, "rmtree", refused)
-    agent.handle_request(asked, Channel())
-    said = capsys.readouterr().out
-    assert '"failed"' in said
-    assert f"cd {host_folder.root} && rm -rf environments" in said
+    assert f"cd {host_folder.root} && rm -rf environments" in answer(asked, capsys)["failed"]
     assert host_folder.is_ours
     monkeypatch.setattr(shutil, "rmtree", remove)
-    agent.handle_request(asked, Channel())
+    answer(asked, capsys)
     assert not host_folder.root.exists()
 
 
@@ -139,15 +139,6 @@ def started(tmp_path):
     yield {"do": "start", "root": str(host_folder.root), "name": "box", "held": False, "digest": "1"}, folder, child.pid
     child.kill()
     child.wait()
-
-
-def answer(asked, capsys):
-    agent.handle_request(asked, Channel())
-    return json.loads(capsys.readouterr().out.splitlines()[-1].removeprefix(MARK))
-
-
-def ending(asked):
-    return {"do": "end", "root": asked["root"], "names": None, "now": True, "keep": False}
 
 
 def test_a_worker_is_this_hosts_after_the_host_is_renamed(started, capsys, monkeypatch):
