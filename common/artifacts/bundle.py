@@ -315,7 +315,6 @@ def read_bytes_or_none(path: Path) -> bytes | None:
 
 
 def _read_part(archive: Archive, path: Path, manifest: BundleManifest, name: str) -> bytes:
-    """One part, checked against its hash in the manifest."""
     data = archive.read(name)
     if hashlib.sha256(data).hexdigest() != manifest.parts.get(name):
         raise BundleError(f"{path}: part {name} is damaged; fetch or build the bundle again")

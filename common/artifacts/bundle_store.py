@@ -146,7 +146,6 @@ def shipped_bundles() -> dict[str, Path]:
 
 
 def _shipped_deltas() -> Iterator[tuple[Path, DeltaManifest]]:
-    """The deltas that ship, each with its manifest."""
     for path in sorted(pretrained_folder().glob(f"*{DELTA_SUFFIX}")):
         yield path, _read_delta_manifest(path)
 
@@ -161,7 +160,6 @@ def _read_delta_manifest(path: Path) -> DeltaManifest:
 
 
 def _read_members(path: Path) -> dict[str, bytes]:
-    """All members of a zip, by name."""
     try:
         with open_regular(path, LIMITS.size) as file, open_archive(file, LIMITS) as archive:
             return {name: archive.read(name) for name in archive.names}

@@ -31,7 +31,6 @@ class Driving:
                 raise UsageError(f"{self.WHOSE}{name} must be {self.HELP[name]}, not {getattr(self, name)!r}")
 
     def _valid(self) -> dict[str, bool]:
-        """Whether each option has one of its values."""
         return {
             "decide_every": type(self.decide_every) is int and 1 <= self.decide_every <= 50,
             "feedback": self.feedback in ("none", "last"),

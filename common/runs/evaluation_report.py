@@ -153,7 +153,6 @@ def check_seed_range(first_seed: int, episodes: int) -> None:
 
 
 def _describe_driving(found: EpisodeResults) -> list[str]:
-    """The figures on driving that the environment reports; may be empty."""
     parts = []
     if found.finished is not None:
         parts.append(f"laps finished: {found.finished} of {len(found.drives)}")

@@ -129,7 +129,6 @@ def _check_world(config: RunConfig, bundle: Bundle) -> None:
 
 
 def _driving(config: RunConfig, bundle: Bundle) -> Driving:
-    """How the run's controllers drive."""
     given, preset = (
         parse_arguments("--variant", each, "pedals=one") for each in (config.variant, config.preset_variant)
     )

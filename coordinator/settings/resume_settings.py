@@ -56,7 +56,6 @@ def choose_addresses(
 
 
 def _read(stored: RunFolder, name: str, section: type[Any]) -> Table:
-    """The values of a section that the run stored."""
     try:
         return read_table(section, f"the {name} kept with run {stored.name}", json.loads(stored.fact(name) or "{}"))
     except (ValueError, AttributeError) as error:

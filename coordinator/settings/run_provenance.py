@@ -31,7 +31,6 @@ def build_provenance(
 
 
 def _start(journal: Journal) -> StartProvenance | None:
-    """Where the run began; `None`: at zero."""
     source, mean = journal.fact(START_SOURCE), journal.fact(START_MEAN)
     if source is None or mean is None:
         return None

@@ -64,7 +64,6 @@ def _check_tables(file: Table) -> None:
 
 
 def _with_stages(args: argparse.Namespace, config: RunConfig) -> RunConfig:
-    """The configuration with the stages that its schedule, or the configuration file, holds."""
     found = find_schedule(config.schedule, args.sources["file"])
     if found is None:
         return config
@@ -75,7 +74,6 @@ def _with_stages(args: argparse.Namespace, config: RunConfig) -> RunConfig:
 
 
 def _with_subspace(config: RunConfig) -> RunConfig:
-    """The configuration with the subspace that it names."""
     from dreamfleet.common.runs.lookup import find_subspace
 
     if config.subspace is None:

@@ -105,7 +105,6 @@ class StartPoint:
 
 
 def _key_of(text: str) -> str:
-    """Of a NAME=VALUE."""
     return text.partition("=")[0]
 
 

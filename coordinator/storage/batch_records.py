@@ -37,10 +37,9 @@ class BatchRecords:
 
     def add(self, batch_id: str, content: bytes, seeds: Sequence[int], population: int, vectors: bytes) -> None:
         """Write a batch that waits; `vectors` are float32, row by row."""
-        self._journal.write(
-            "INSERT INTO batch (number, id, content, seeds, population, vectors, submitted, state) "
-            "VALUES (?, ?, ?, ?, ?, ?, ?, 'waiting')",
-            self.count(), batch_id, content, json.dumps(list(seeds)), population, vectors, time(),
+        self._journal.insert(
+            "batch", number=self.count(), id=batch_id, content=content, seeds=json.dumps(list(seeds)),
+            population=population, vectors=vectors, submitted=time(), state="waiting",
         )  # fmt: skip
 
     def begin(self, batch_id: str, generation: int) -> None:

@@ -9,8 +9,9 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from tempfile import gettempdir
 
@@ -98,10 +99,12 @@ class FileWatch:
 
     def _rescue(self, folder: Path | None) -> str:
         """Copy the data of the open connection to the first place that accepts it; returns the message for people."""
+        rescues = [] if folder is None else [partial(self._rescue_into, folder)]
+        rescues += [partial(self._rescue_beside, parent) for parent in (self._folder.parent, Path(gettempdir()))]
         failures = []
-        for place in self._rescue_places(folder):
+        for rescue in rescues:
             try:
-                return place()
+                return rescue()
             except (OSError, DreamfleetError) as error:
                 failures.append(str(error))
         return (
@@ -109,21 +112,13 @@ class FileWatch:
             f"what it held could not be rescued: {'; '.join(dict.fromkeys(failures))}"
         )
 
-    def _rescue_places(self, folder: Path | None) -> Iterator[Callable[[], str]]:
-        if folder is not None:
-            yield lambda: self._rescue_into(folder)
-        for parent in (self._folder.parent, Path(gettempdir())):
-            yield lambda parent=parent: self._rescue_beside(parent)  # type: ignore[misc]
-
     def _rescue_into(self, folder: Path) -> str:
         """Into the run's own folder, under the journal's own name if that is free."""
         target = folder / JOURNAL
         copy = free_path(folder / f"journal-{RESCUED}.sqlite")
         self._journal.save_copy(copy)
         foreign = file_identity(target) not in (None, self._own_files[JOURNAL])
-        for each in sqlite_side_files(
-            target
-        ):  # a log without its own journal would damage whatever has the journal's name
+        for each in sqlite_side_files(target):  # a log without its journal would damage whatever has that one's name
             if each.exists() and file_identity(each) == self._own_files.get(each.name):
                 each.unlink()
             elif each.exists() and not foreign:
@@ -164,9 +159,7 @@ class FileWatch:
                 log.warning("the run's copy of its world model was removed while it was served: written again",
                             extra={"facts": {"event": "bundle written"}})  # fmt: skip
         except OSError as error:
-            log.warning(
-                "the run's copy of its world model was removed, and cannot be written again: %s", error.strerror
-            )
+            log.warning("the run's copy of its world model was removed, and cannot be written: %s", error.strerror)
 
 
 def file_identity(path: Path) -> Identity | None:

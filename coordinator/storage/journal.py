@@ -168,10 +168,7 @@ class Journal(JournalConnection):
         self, number: int, state: Checkpoint, sigma: float, seeds: Sequence[int], vectors: Sequence[bytes]
     ) -> None:
         """Write a population, and the strategy's state before `ask`; the two latest states stay."""
-        self.write(
-            "INSERT INTO generation (number, seeds, opened, sigma) VALUES (?, ?, ?, ?)",
-            number, json.dumps(list(seeds)), time(), sigma,
-        )  # fmt: skip
+        self.insert("generation", number=number, seeds=json.dumps(list(seeds)), opened=time(), sigma=sigma)
         rows = [(number, index, vector) for index, vector in enumerate(vectors)]
         self.write_all("INSERT INTO candidate (generation, number, vector) VALUES (?, ?, ?)", rows)
         self.checksums.write_state(number, state)
@@ -227,19 +224,16 @@ class Journal(JournalConnection):
 
     def add_failure(self, job: Job, error: Failure, workers: Sequence[str], attempts: int) -> None:
         """Write that a job's episode failed for good."""
-        self.write(
-            "INSERT INTO failure (digest, kind, generation, candidate, episode, seed, error, cause, fault, workers, "
-            "attempts, incarnation, happened) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            job.digest, job.kind, job.generation, job.candidate, job.episode, job.seeds[0], error.text, error.cause,
-            error.kind, ",".join(workers), attempts, self._incarnation, time(),
+        self.insert(
+            "failure", digest=job.digest, kind=job.kind, generation=job.generation, candidate=job.candidate,
+            episode=job.episode, seed=job.seeds[0], error=error.text, cause=error.cause, fault=error.kind,
+            workers=",".join(workers), attempts=attempts, incarnation=self._incarnation, happened=time(),
         )  # fmt: skip
 
     def add_event(self, text: str, what: str = "", worker: str = "") -> None:
         """Write what happened to the run, for people, and to which worker; the last `MAX_EVENTS` are kept."""
-        self.write(
-            "INSERT INTO event (happened, incarnation, text, what, worker) VALUES (?, ?, ?, ?, ?)",
-            time(), self._incarnation, text, what, worker,
-        )  # fmt: skip
+        about = {"text": text, "what": what, "worker": worker}
+        self.insert("event", happened=time(), incarnation=self._incarnation, **about)
         self.write("DELETE FROM event WHERE number <= (SELECT max(number) FROM event) - ?", MAX_EVENTS)
 
     def drop_failures(self, generation: int) -> None:
@@ -248,10 +242,7 @@ class Journal(JournalConnection):
 
     def schedule_evaluation(self, evaluation: Evaluation) -> None:
         """Write that the mean of a generation is to be evaluated."""
-        self.write(
-            "INSERT INTO evaluation (generation, vector, episodes) VALUES (?, ?, ?)",
-            evaluation.generation, evaluation.vector, evaluation.episodes,
-        )  # fmt: skip
+        self.insert("evaluation", **vars(evaluation))
 
     def drop_failures_of(self, digests: Sequence[bytes]) -> None:
         """Forget the failures of these jobs, so that they are scored again."""
@@ -266,10 +257,7 @@ class Journal(JournalConnection):
 
     def schedule_collection(self, collection: RolloutCollection) -> None:
         """Write that drives of a generation's mean are to be kept."""
-        self.write(
-            "INSERT INTO collection (generation, vector, episodes) VALUES (?, ?, ?)",
-            collection.generation, collection.vector, collection.episodes,
-        )  # fmt: skip
+        self.insert("collection", **vars(collection))
 
     def scheduled_collections(self) -> list[RolloutCollection]:
         """Everything that was scheduled to be kept, oldest first."""

@@ -197,6 +197,11 @@ class JournalConnection:
         """Run a statement before the next read or commit."""
         self.write_all(statement, [values])
 
+    def insert(self, table: str, **values: Any) -> None:
+        """Add a row with these values, by column, before the next read or commit."""
+        marks = ", ".join("?" * len(values))
+        self.write(f"INSERT INTO {table} ({', '.join(values)}) VALUES ({marks})", *values.values())  # noqa: S608
+
     def write_all(self, statement: str, rows: list[tuple[Any, ...]]) -> None:
         """Run a statement once for each row of values, before the next read or commit."""
         if self._writes and self._writes[-1][0] == statement:

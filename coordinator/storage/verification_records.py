@@ -58,10 +58,9 @@ class VerificationRecords:
 
     def add(self, job: Job, worker: str, checker: str, outcome: Outcome) -> None:
         """Write the outcome of re-scoring a result of `worker`; the `checker` is empty if nobody did."""
-        self._journal.write(
-            "INSERT INTO verification (digest, kind, generation, worker, checker, outcome, happened) "
-            "VALUES (?, ?, ?, ?, ?, ?, ?)",
-            job.digest, job.kind, job.generation, worker, checker, outcome, time(),
+        self._journal.insert(
+            "verification", digest=job.digest, kind=job.kind, generation=job.generation, worker=worker,
+            checker=checker, outcome=outcome, happened=time(),
         )  # fmt: skip
 
     def counts(self) -> Counter[str]:

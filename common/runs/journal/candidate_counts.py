@@ -61,14 +61,11 @@ class CandidateCounts:
         query = "SELECT digest FROM failure WHERE kind = 'score' AND generation = ?"
         return {digest for (digest,) in self._journal.rows("b", query, number)}
 
-    def _scored_elsewhere(self, missing: Collection[bytes], *, is_open: bool) -> Iterable[bytes]:
+    def _scored_elsewhere(self, missing: Collection[bytes], *, is_open: bool) -> Iterator[bytes]:
         """Those of these jobs that another batch brought, in a closed one all; their effort is of its generation."""
-        if not self._shares_results:
-            return ()
-        return self._brought(missing) if is_open else missing
-
-    def _brought(self, missing: Collection[bytes]) -> Iterator[bytes]:
-        """Those of these jobs that have a result, in any generation."""
-        for these, some in digest_terms([*missing]):
-            query = f"SELECT DISTINCT digest FROM result WHERE kind = 'score' AND {these}"  # noqa: S608
-            yield from (digest for (digest,) in self._journal.rows("b", query, *some))
+        if not is_open and self._shares_results:
+            yield from missing
+        elif self._shares_results:
+            for these, some in digest_terms([*missing]):
+                query = f"SELECT DISTINCT digest FROM result WHERE kind = 'score' AND {these}"  # noqa: S608
+                yield from (digest for (digest,) in self._journal.rows("b", query, *some))

@@ -153,7 +153,6 @@ WORK_QUERY = (
 
 
 def _connect_read_only(path: Path, *, rolled_back: bool = False) -> sqlite3.Connection:
-    """An open journal."""
     # In a read-only folder SQLite cannot create the shared-memory file. It needs none where no write-ahead log is left.
     immutable = "" if os.access(path.parent, os.W_OK) or _has_log(path) else "&immutable=1"
     try:

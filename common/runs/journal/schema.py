@@ -105,7 +105,6 @@ def check_schema(connection: sqlite3.Connection, path: object) -> None:
 
 @cache
 def _columns() -> frozenset[tuple[str, str]]:
-    """Tables and columns of a journal."""
     with closing(sqlite3.connect(":memory:")) as connection:
         create_tables(connection)
         return frozenset(connection.execute(_COLUMNS))

@@ -146,22 +146,20 @@ def test_a_folder_name_with_uri_characters_is_read(folder):
     look(strange)
 
 
-def test_a_confirmed_score_of_no_episodes_is_damaged(folder):
+@pytest.mark.parametrize(
+    ("fact", "text"),
+    [
+        ("confirmed", '{"generation": 1, "episodes": 0, "mean": 1.0, "std": 1.0, "closed": 9}'),
+        ("settings", lambda text: json.dumps({**json.loads(text), "of_tomorrow": 1})),
+    ],
+)
+def test_a_score_of_no_episodes_and_settings_with_an_unknown_field_are_refused(folder, fact, text):
     with closing(sqlite3.connect(folder / "journal.sqlite")) as journal, journal:
-        text = '{"generation": 1, "episodes": 0, "mean": 1.0, "std": 1.0, "closed": 9}'
-        journal.execute("INSERT OR REPLACE INTO run VALUES ('confirmed', ?)", (text,))
-    journal.close()
+        facts = dict(journal.execute("SELECT key, value FROM run"))
+        facts[fact] = text if isinstance(text, str) else text(facts[fact])
+        journal.executemany("INSERT OR REPLACE INTO run VALUES (?, ?)", facts.items())
     with RunFolder(folder) as run, pytest.raises(JournalError):
-        run.confirmation()
-
-
-def test_settings_with_an_unknown_field_are_refused(folder):
-    with closing(sqlite3.connect(folder / "journal.sqlite")) as journal, journal:
-        (text,) = journal.execute("SELECT value FROM run WHERE key = 'settings'").fetchone()
-        more = json.dumps({**json.loads(text), "of_tomorrow": 1})
-        journal.execute("UPDATE run SET value = ? WHERE key = 'settings'", (more,))
-    with RunFolder(folder) as run, pytest.raises(JournalError):
-        run.settings  # noqa: B018
+        run.confirmation(), run.settings
 
 
 def test_a_locked_journal_is_not_called_damaged(folder, monkeypatch):

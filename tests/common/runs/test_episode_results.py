@@ -77,14 +77,6 @@ def test_a_report_round_trips_with_its_statistics(tmp_path):
     assert plain["drives"][1]["steps"] == 500
 
 
-def test_a_report_without_newer_fields_is_read(tmp_path):
-    plain = json.loads(JUDGEMENT.to_json())
-    del plain["threshold"], plain["failed"]
-    path = tmp_path / "older.json"
-    path.write_text(json.dumps(plain))
-    assert read_evaluation_report(path) == JUDGEMENT
-
-
 BROKEN = FailedEpisode(10_007, "ValueError: no road")
 
 
@@ -113,7 +105,14 @@ def test_an_episode_that_fails_now_is_not_reproduced():
         assert "seed 10002, E: x" in found.description
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"drives": []}', JUDGEMENT.to_json().replace("910.0", '"910"')])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "", "[]", "{}", '{"drives": []}', JUDGEMENT.to_json().replace("910.0", '"910"'),
+        JUDGEMENT.to_json().replace("910.0", "1e308"), JUDGEMENT.to_json().replace("910.0", "NaN"),
+        JUDGEMENT.to_json().replace("10001", "10000"),  # a seed twice
+    ],
+)  # fmt: skip
 def test_an_invalid_report_is_a_one_line_error(tmp_path, text):
     path = tmp_path / "report.json"
     path.write_text(text)
@@ -155,23 +154,6 @@ def test_the_verb_compares_each_report_with_the_first(tmp_path, capsys):
     rows = json.loads(capsys.readouterr().out)["differences"]
     assert [(each["mean"], each["clear"]) for each in rows] == [(10.0, True), (0.0, False)]
     assert command_line.main(["compare", str(paths[0])]) == UsageError.exit_code
-
-
-@pytest.mark.parametrize("scores", [(1e308, 2, 3), (float("nan"), 2, 3)])
-def test_scores_out_of_range_are_no_report(tmp_path, scores):
-    path = tmp_path / "a.json"
-    path.write_text(json.dumps({**json.loads(scored(1, 2, 3).to_json()), "drives": [
-        {"seed": seed, "score": score, "steps": 9} for seed, score in enumerate(scores)
-    ]}))  # fmt: skip
-    with pytest.raises(UsageError, match=r"a\.json"):
-        read_evaluation_report(path)
-
-
-def test_a_duplicate_seed_is_no_report(tmp_path):
-    path = tmp_path / "a.json"
-    path.write_text(scored(1, 2).to_json().replace("10001", "10000"))
-    with pytest.raises(UsageError, match=r"a\.json"):
-        read_evaluation_report(path)
 
 
 def test_other_differences_than_the_controllers_are_noted(tmp_path, capsys):

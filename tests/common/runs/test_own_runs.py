@@ -60,15 +60,16 @@ def test_what_was_not_trusted_is_not_remembered(ledger):
     assert not ledger.exists()
 
 
-@pytest.mark.parametrize("text", ["5", "null", "[]", '["gym:my_world:Catch-v0"]', "[", "\x00", '["a", "b", "c", "d"]'])
-def test_a_damaged_ledger_trusts_nothing(text, ledger):
-    ledger.write_text(text)
-    trust_own_run(UID, TASK, OPTIONS)
-    assert not is_trusted("my_world")
+TEXTS = "5", "null", "[]", '["gym:my_world:Catch-v0"]', "[", "\x00", '["a", "b", "c", "d"]'
 
 
-def test_a_ledger_that_others_may_write_trusts_nothing(ledger):
-    ledger.parent.chmod(0o777)
+@pytest.mark.parametrize("harm", [
+    *(lambda ledger, text=text: ledger.write_text(text) for text in TEXTS),
+    lambda ledger: ledger.parent.chmod(0o777),
+    lambda ledger: (ledger.unlink(), os.mkfifo(ledger)),
+])  # fmt: skip
+def test_a_ledger_that_is_damaged_or_that_others_may_write_trusts_nothing(harm, ledger):
+    harm(ledger)
     trust_own_run(UID, TASK, OPTIONS)
     assert not is_trusted("my_world")
 
@@ -83,13 +84,6 @@ def test_a_folder_that_others_may_write_is_not_trusted(world, caplog):
 def test_a_module_of_another_place_is_not_trusted(tmp_path, monkeypatch):
     (tmp_path / "my_world.py").write_text("")
     monkeypatch.syspath_prepend(tmp_path)
-    trust_own_run(UID, TASK, OPTIONS)
-    assert not is_trusted("my_world")
-
-
-def test_a_fifo_in_its_place_does_not_hang(ledger):
-    ledger.unlink()
-    os.mkfifo(ledger)
     trust_own_run(UID, TASK, OPTIONS)
     assert not is_trusted("my_world")
 

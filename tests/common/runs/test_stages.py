@@ -43,32 +43,23 @@ def test_unchanged_settings_are_those_of_the_stage_before():
 def test_another_population_or_step_size_starts_a_new_search():
     later = [StageSettings(population=9), StageSettings(sigma0=0.1), StageSettings(population=6),
              StageSettings(horizon=5, patience=3, episodes=4, racing=True)]  # fmt: skip
-    assert [stages_of(scheduled(StageSettings(1), each))[1].starts_new_search for each in later] == [
-        True,
-        True,
-        False,
-        False,
-    ]
-
-
-def test_a_continued_search_belongs_to_the_stage_that_started_it():
+    second = [stages_of(scheduled(StageSettings(1), each))[1] for each in later]
+    assert [each.starts_new_search for each in second] == [True, True, False, False]
     stages = stages_of(scheduled(StageSettings(1), StageSettings(1, sigma0=0.2), StageSettings(horizon=5)))
-    assert [each.search for each in stages] == [1, 2, 2]
+    assert [each.search for each in stages] == [1, 2, 2], "a continued search is of the stage that started it"
 
 
-def test_a_stage_ends_after_its_own_generations():
-    settings = scheduled(StageSettings(3), StageSettings(1), StageSettings(2), StageSettings())
-    assert numbers(settings, history(*[10] * 8)) == [1, 1, 1, 2, 3, 3, 4, 4, 4]
-
-
-def test_a_stage_ends_after_its_own_steps():
-    settings = scheduled(StageSettings(steps=25), StageSettings(steps=1, horizon=50), StageSettings())
-    assert numbers(settings, history(10, 10, 10, 10, 10)) == [1, 1, 1, 2, 3, 3]
-
-
-def test_a_score_ends_a_stage_once_its_evaluation_is_one_interval_old():
-    settings = scheduled(StageSettings(score=50.0), StageSettings(horizon=50))
-    assert numbers(settings, history(*[10] * 8), evaluated({1: 10.0, 3: 50.0, 5: 0.0})) == [1] * 6 + [2] * 3
+@pytest.mark.parametrize(
+    ("stages", "means", "found"),
+    [
+        ((StageSettings(3), StageSettings(1), StageSettings(2), StageSettings()), {}, [1, 1, 1, 2, 3, 3, 4, 4, 4]),
+        ((StageSettings(steps=25), StageSettings(steps=1, horizon=50), StageSettings()), {}, [1, 1, 1, 2] + [3] * 5),
+        # Once the evaluation is one interval old.
+        ((StageSettings(score=50.0), StageSettings(horizon=50)), {1: 10.0, 3: 50.0, 5: 0.0}, [1] * 6 + [2] * 3),
+    ],
+)
+def test_a_stage_ends_after_its_own_generations_or_steps_or_by_a_score(stages, means, found):
+    assert numbers(scheduled(*stages), history(*[10] * 8), evaluated(means)) == found
 
 
 def test_scores_of_earlier_stages_or_unscheduled_evaluations_end_no_stage():

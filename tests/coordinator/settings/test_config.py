@@ -13,12 +13,13 @@ from dreamfleet.common.protocol.tasks import Description
 from dreamfleet.common.runs.lookup import find_subspace
 from dreamfleet.common.runs.records import RunSettings, StageSettings
 from dreamfleet.common.schema.validation import to_plain
-from dreamfleet.coordinator.settings.config import RunConfig, config_values
+from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.presets import PRESETS, find_preset
 from dreamfleet.coordinator.settings.start import StartPoint
 from dreamfleet.worker.tasks.api import Task
 from tests.support.bundles import states, write_random_bundle
+from tests.support.frozen_settings import comes_back
 
 
 @pytest.mark.parametrize(
@@ -35,9 +36,7 @@ def test_a_runs_controller_is_as_configured_and_journalled(random_bundle, flags,
     settings = freeze(config, random_bundle)
     assert settings.controller.size == size
     assert (settings.task.controller is None) == (not flags)
-    assert RunSettings.from_json(settings.to_json()) == settings
-    again = config_values(settings, random_bundle.path)
-    assert freeze(RunConfig(**again), random_bundle) == settings
+    assert comes_back(settings, random_bundle)
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS.keys() - {"takecover", "takecover-real", "pixels"}))
@@ -46,17 +45,17 @@ def test_a_preset_of_a_run_is_one_that_can_begin_and_be_configured_again(name):
     preset = dict(PRESETS[name])
     loaded_subspace = find_subspace(preset["subspace"]) if "subspace" in preset else None
     settings = freeze(RunConfig(**preset, loaded_subspace=loaded_subspace), bundle)
-    assert (
-        freeze(RunConfig(**config_values(settings, bundle.path), loaded_subspace=loaded_subspace), bundle) == settings
-    )
-    assert RunSettings.from_json(settings.to_json()) == settings
+    assert comes_back(settings, bundle, loaded_subspace=loaded_subspace)
 
 
-def test_a_default_controller_leaves_the_words_of_the_first_version(random_bundle):
+def test_a_run_that_says_nothing_keeps_the_words_of_the_first_version(random_bundle):
     text = json.loads(freeze(RunConfig(), random_bundle).to_json())
     assert text["controller"] == {"features": 288, "actions": 3}
-    assert not {"features", "racing"} & text.keys()
+    assert not {"features", "racing", "optimiser", "optimiser_options"} & text.keys()
     assert "controller" not in text["task"]
+    assert RunSettings.from_json(json.dumps(text)).optimiser == "cma"
+    said = RunConfig(variant=("pedals=two", "decide_every=1", "feedback=none"))
+    assert json.loads(freeze(said, random_bundle).to_json()) == text
 
 
 def test_jobs_of_other_controllers_have_other_digests(random_bundle):
@@ -70,29 +69,12 @@ def test_a_share_of_recorded_states_is_frozen_with_a_dream_and_can_be_configured
     bundle = write_random_bundle(tmp_path / "b.zip", recorded=states(3))
     settings = freeze(RunConfig(task="dream", recorded=0.5), bundle)
     assert (settings.task.recorded, settings.task.version, settings.task.options) == (0.5, 1, "")
-    assert RunSettings.from_json(settings.to_json()) == settings
-    assert freeze(RunConfig(**config_values(settings, bundle.path)), bundle) == settings
+    assert comes_back(settings, bundle)
     plain = freeze(RunConfig(task="dream"), bundle)
     assert "recorded" not in plain.to_json()
     assert freeze(RunConfig(task="dream", recorded=0.0), bundle) == plain
     assert settings.task.digest("score", b"x", (1,)) != plain.task.digest("score", b"x", (1,))
     assert settings.task.with_overrides(100, 50).recorded == 0.5
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"task": "dream", "recorded": -0.1},
-        {"task": "dream", "recorded": 1.5},
-        {"recorded": 0.5},
-        {"task": "gym:CartPole-v1", "recorded": 0.5},
-        {"task": "dream", "recorded": 0.5},
-    ],
-)
-def test_recorded_states_that_there_are_not_are_refused_in_one_line(random_bundle, changes):
-    with pytest.raises(DreamfleetError, match="--recorded") as error:
-        freeze(RunConfig(**changes), random_bundle)
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -111,16 +93,10 @@ def test_a_variant_is_frozen_with_a_run_and_can_be_configured_again(random_bundl
     assert json.loads(settings.task.options) == options
     assert (settings.controller.features, settings.controller.actions) == shape
     assert (settings.task.controller is None) == (shape == (288, 3))
-    assert RunSettings.from_json(settings.to_json()) == settings
-    assert freeze(RunConfig(**config_values(settings, random_bundle.path)), random_bundle) == settings
+    assert comes_back(settings, random_bundle)
     plain = freeze(RunConfig(), random_bundle)
     assert settings.task.digest("score", b"x", (1,)) != plain.task.digest("score", b"x", (1,))
     assert freeze(RunConfig(variant=texts, task="dream"), random_bundle) if "time_cost=1" not in texts else True
-
-
-def test_a_variant_that_says_nothing_leaves_the_words_of_the_first_version(random_bundle):
-    said = freeze(RunConfig(variant=("pedals=two", "decide_every=1", "feedback=none")), random_bundle)
-    assert said.to_json() == freeze(RunConfig(), random_bundle).to_json()
 
 
 @pytest.mark.parametrize(
@@ -144,10 +120,21 @@ def test_a_run_of_task_dream_that_drives_too_may_charge_its_drives(random_bundle
         ({"variant": ("offroad_cost=2",), "task": "dream"}, "offroad_cost"),
         ({"variant": ("pedals=one",), "task": "tests.support.tasks:Toy"}, "tests.support.tasks:Toy"),
         ({"task_options": '{"pedals": "one"}'}, "--task-options"),
+        ({"task": "dream", "recorded": -0.1}, "--recorded"),
+        ({"task": "dream", "recorded": 1.5}, "--recorded"),
+        ({"recorded": 0.5}, "--recorded"),
+        ({"task": "gym:CartPole-v1", "recorded": 0.5}, "--recorded"),
+        ({"task": "dream", "recorded": 0.5}, "--recorded"),  # the bundle holds no such states
+        ({"optimiser": "cmea"}, "'cmea'"),
+        ({"optimiser": "cmaes-sep", "covariance": "full"}, "--covariance"),
+        ({"optimiser_options": ("restarts=3",)}, "'restarts'.* covariance"),
+        ({"population": 2}, "867 .*--population"),
+        ({"controller": "hidden", "hidden_units": 10**5, "covariance": "full"}, "--covariance"),
+        ({"controller": "hidden", "hidden_units": 10**5, "population": 10**5}, "--hidden-units.*--population"),
     ],
 )
-def test_a_variant_that_there_is_not_is_refused_in_one_line(random_bundle, changes, names):
-    with pytest.raises(UsageError, match=names) as error:
+def test_what_a_run_cannot_be_is_refused_in_one_line_before_there_is_one(random_bundle, changes, names):
+    with pytest.raises(DreamfleetError, match=names) as error:
         freeze(RunConfig(**changes), random_bundle)
     assert "\n" not in str(error.value)
 
@@ -193,40 +180,32 @@ def test_a_preset_with_a_world_model_is_of_that_world_alone():
         freeze(found, None)
 
 
+ARTICLE = {"preset": "article", "preset_variant": ("pedals=half",)}
+REAL = {"preset": "real", "preset_variant": ("offroad_cost=0.5",)}
+
+
 @pytest.mark.parametrize(
-    ("own", "texts", "options"),
+    ("preset", "own", "texts", "options"),
     [
-        ("", (), ""),
-        (HALF, (), HALF),
-        (HALF, ("time_cost=1",), '{"pedals": "half", "time_cost": 1.0}'),
-        ('{"decide_every": 2, "time_cost": 1.0}', (), '{"decide_every": 2, "time_cost": 1.0}'),
-        ('{"decide_every": 2, "time_cost": 1.0}', ("offroad_cost=2",), '{"decide_every": 2, "offroad_cost": 2.0}'),
+        (ARTICLE, "", (), ""),
+        (ARTICLE, HALF, (), HALF),
+        (ARTICLE, HALF, ("time_cost=1",), '{"pedals": "half", "time_cost": 1.0}'),
+        (ARTICLE, '{"decide_every": 2, "time_cost": 1.0}', (), '{"decide_every": 2, "time_cost": 1.0}'),
+        (ARTICLE, '{"decide_every": 2, "time_cost": 1.0}', ("offroad_cost=2",),
+         '{"decide_every": 2, "offroad_cost": 2.0}'),
+        (REAL, "", (), '{"offroad_cost": 0.5}'),
+        (REAL, '{"offroad_cost": 2.0}', (), '{"offroad_cost": 0.5}'),
+        (REAL, HALF, ("offroad_cost=1",), '{"offroad_cost": 1.0, "pedals": "half"}'),
+        (REAL | {"task": "dream"}, '{"offroad_cost": 2.0, "pedals": "half"}', ("offroad_cost=0",), HALF),
     ],
-)
-def test_a_start_keeps_its_way_of_driving_whatever_a_preset_does(random_bundle, own, texts, options):
-    config = RunConfig(preset="article", variant=texts, preset_variant=("pedals=half",))
+)  # fmt: skip
+def test_a_start_keeps_its_way_of_driving_and_a_preset_says_what_candidates_pay(
+    random_bundle, preset, own, texts, options
+):
     start = StartPoint(np.zeros(867), random_bundle.sha256, "run night", own)
-    settings = freeze(start.apply_to(config), random_bundle)
+    settings = freeze(start.apply_to(RunConfig(variant=texts, **preset)), random_bundle)
     start.check(settings, random_bundle)
     assert settings.task.options == options
-
-
-@pytest.mark.parametrize(
-    ("task", "own", "texts", "options"),
-    [
-        (None, "", (), '{"offroad_cost": 0.5}'),
-        (None, '{"offroad_cost": 2.0}', (), '{"offroad_cost": 0.5}'),
-        (None, HALF, ("offroad_cost=1",), '{"offroad_cost": 1.0, "pedals": "half"}'),
-        ("dream", '{"offroad_cost": 2.0, "pedals": "half"}', ("offroad_cost=0",), HALF),
-    ],
-)
-def test_what_a_preset_lets_candidates_pay_is_stronger_than_what_a_starts_paid(
-    random_bundle, task, own, texts, options
-):
-    given = {} if task is None else {"task": task}
-    config = RunConfig(preset="real", variant=texts, preset_variant=("offroad_cost=0.5",), **given)
-    start = StartPoint(np.zeros(867), random_bundle.sha256, "run night", own)
-    assert freeze(start.apply_to(config), random_bundle).task.options == options
 
 
 def test_the_dream_of_a_start_that_paid_has_no_price(random_bundle):
@@ -243,47 +222,13 @@ def test_a_start_of_another_length_is_refused(random_bundle):
         start.check(freeze(RunConfig(features="z"), random_bundle), random_bundle)
 
 
-@pytest.mark.parametrize("temperature", [0.0, -1.0, 5000.0, float("nan"), float("inf")])
-def test_a_temperature_that_a_journal_cannot_keep_is_refused(temperature):
-    with pytest.raises(UsageError, match="--temperature"):
-        RunConfig(temperature=temperature)
-
-
-def test_a_hidden_layer_has_units():
-    with pytest.raises(UsageError, match="hidden-units"):
-        RunConfig(hidden_units=0)
-
-
 def test_an_optimiser_is_journalled_and_can_be_configured_again(random_bundle):
     config = RunConfig(
         optimiser="tests.support.optimisers:ParentsAndChildren", optimiser_options=("parents=2", ""), features="z"
     )
     settings = freeze(config, random_bundle)
     assert settings.optimiser_options == ("parents=2",)
-    assert RunSettings.from_json(settings.to_json()) == settings
-    assert freeze(RunConfig(**config_values(settings, random_bundle.path)), random_bundle) == settings
-
-
-def test_a_run_that_says_nothing_of_optimisers_keeps_the_words_of_the_first_version(random_bundle):
-    text = json.loads(freeze(RunConfig(), random_bundle).to_json())
-    assert not {"optimiser", "optimiser_options"} & text.keys()
-    assert RunSettings.from_json(json.dumps(text)).optimiser == "cma"
-
-
-@pytest.mark.parametrize(
-    ("changes", "names"),
-    [
-        ({"optimiser": "cmea"}, "'cmea'"),
-        ({"optimiser": "cmaes-sep", "covariance": "full"}, "--covariance"),
-        ({"optimiser_options": ("restarts=3",)}, "'restarts'.* covariance"),
-        ({"population": 2}, "867 .*--population"),
-        ({"controller": "hidden", "hidden_units": 10**5, "covariance": "full"}, "--covariance"),
-        ({"controller": "hidden", "hidden_units": 10**5, "population": 10**5}, "--hidden-units.*--population"),
-    ],
-)
-def test_what_an_optimiser_cannot_do_is_refused_before_there_is_a_run(random_bundle, changes, names):
-    with pytest.raises(UsageError, match=names):
-        freeze(RunConfig(**changes), random_bundle)
+    assert comes_back(settings, random_bundle)
 
 
 @pytest.mark.parametrize(
@@ -294,6 +239,8 @@ def test_what_an_optimiser_cannot_do_is_refused_before_there_is_a_run(random_bun
         ({"seed": 10**20}, "--seed"),
         ({"population": 10**11}, "--population .*100000"),
         ({"hidden_units": 10**12}, "--hidden-units .*100000"),
+        ({"hidden_units": 0}, "--hidden-units .*100000"),
+        *(({"temperature": each}, "--temperature") for each in (0.0, -1.0, 5000.0, float("nan"), float("inf"))),
         ({"sigma0": 1e300}, "--sigma0"),
         ({"task": ""}, r"\bgym\b"),
         ({"task": "a b:x"}, "a b:x"),

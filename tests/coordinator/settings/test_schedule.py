@@ -7,12 +7,13 @@ import pytest
 from dreamfleet.common.cli.config import read_toml
 from dreamfleet.common.cli.global_config import ARRAYS, TABLES
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.runs.records import RunSettings, StageSettings
+from dreamfleet.common.runs.records import StageSettings
 from dreamfleet.common.runs.stages import stages_of
 from dreamfleet.coordinator.settings.config import RunConfig, config_values
 from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.run_setup import _with_stages, load_run_config
 from dreamfleet.coordinator.settings.schedule import find_schedule, remaining_settings
+from tests.support.frozen_settings import comes_back
 
 WHOLE = """
 [[stage]]
@@ -62,8 +63,7 @@ def test_what_the_first_stage_does_not_name_is_as_the_flags_say(settings):
 
 def test_a_schedule_is_journalled_and_can_be_configured_again(settings, random_bundle):
     found = settings(WHOLE)
-    assert RunSettings.from_json(found.to_json()) == found
-    assert freeze(RunConfig(**config_values(found, random_bundle.path)), random_bundle) == found
+    assert comes_back(found, random_bundle)
 
 
 def test_one_stage_without_an_end_is_a_run_without_a_schedule(settings, random_bundle):
@@ -122,11 +122,6 @@ def test_what_this_run_cannot_do_is_one_line(read, settings, text, names):
     assert read(text), "each stage by itself is well-formed"
     with pytest.raises(UsageError, match=f"(?<![0-9.]){names}"):
         settings(text)
-
-
-def test_a_score_needs_evaluations(settings):
-    with pytest.raises(UsageError, match=r"1 .*--evaluate-every"):
-        settings("[[stage]]\nscore = 1.0\n" + NEXT, evaluate_every=0)
 
 
 def args(file=None, given=()):
@@ -200,7 +195,16 @@ def test_what_cannot_be_driven_is_said(flags, names):
         RunConfig(**flags)
 
 
-def test_a_later_stage_that_mixes_is_looked_at_as_the_first_is(settings):
-    text = "[[stage]]\ngenerations = 3\n[[stage]]\ndriven = 0.1\nepisodes = 4\n"
-    with pytest.raises(UsageError, match=r"2.*--driven .*0\.1 .*4"):
-        settings(text, task="dream")
+@pytest.mark.parametrize(
+    ("text", "flags", "names"),
+    [
+        ("[[stage]]\nscore = 1.0\n" + NEXT, {"evaluate_every": 0}, "1 .*--evaluate-every"),
+        (
+            "[[stage]]\ngenerations = 3\n[[stage]]\ndriven = 0.1\nepisodes = 4\n",
+            {"task": "dream"}, r"2.*--driven .*0\.1 .*4",
+        ),
+    ],
+)  # fmt: skip
+def test_what_this_run_cannot_do_with_its_flags_names_the_stage(settings, text, flags, names):
+    with pytest.raises(UsageError, match=names):
+        settings(text, **flags)

@@ -10,11 +10,10 @@ from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts, WorldFacts
 from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.protocol.messages import OWN_END_VERSION, TaskSpec
-from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.common.worlds import shipped
 from dreamfleet.coordinator.service.main import RunRequest, _resolve_settings
-from dreamfleet.coordinator.settings.config import RunConfig, config_values
+from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
@@ -23,6 +22,7 @@ from dreamfleet.coordinator.settings.start import StartPoint
 from dreamfleet.experiments.demo import DemoConfig
 from tests.support.bundles import write_world_bundle
 from tests.support.dreams import ABOUT, DRAWN, MODELS, VAE, WORLDS, write_bundle_of
+from tests.support.frozen_settings import comes_back
 
 ABSENT = "a.package.that.is.not.here:Task"
 
@@ -46,8 +46,7 @@ def test_a_run_begins_without_the_worlds_package_and_can_be_configured_again(bun
     assert settings.task.version == 3
     assert settings.task.options == '{"decide_every": 4, "feedback": "last"}'
     assert settings.controller == ControllerShape(3 + 4 + 2 * 3, 3)
-    assert RunSettings.from_json(settings.to_json()) == settings
-    assert freeze(RunConfig(**config_values(settings, bundle.path)), bundle) == settings
+    assert comes_back(settings, bundle)
 
 
 def test_without_a_task_it_is_the_bundles_own_world(bundle, random_bundle):
@@ -120,8 +119,7 @@ def test_an_end_rule_of_the_runs_own_is_another_version(bundle):
     assert bundle.manifest.world.end == DRAWN
     plain, own = settings_of(bundle, task="dream"), settings_of(bundle, task="dream", end="0.250")
     assert (own.task.end, own.task.version, own.task.world_version) == ("0.25", 3 + OWN_END_VERSION, 3)
-    assert RunSettings.from_json(own.to_json()) == own
-    assert freeze(RunConfig(**config_values(own, bundle.path)), bundle) == own
+    assert comes_back(own, bundle)
     assert own.task.digest("score", b"x", (1,)) != plain.task.digest("score", b"x", (1,))
     assert own.task.with_overrides(horizon=20).end == "0.25"
     assert settings_of(bundle, task="dream", end="drawn") == plain, "the bundle's own rule is no rule of the run's own"
@@ -129,6 +127,7 @@ def test_an_end_rule_of_the_runs_own_is_another_version(bundle):
 
 def test_a_dream_of_the_first_world_may_have_an_end_too(random_bundle):
     plain = settings_of(random_bundle, task="dream")
+    assert plain.task.horizon == 1000
     assert "end" not in to_plain(plain.task)
     assert settings_of(random_bundle, task="dream", end="0.5") == plain
     assert settings_of(random_bundle, task="dream", end="drawn").task.version == 1 + OWN_END_VERSION
@@ -150,7 +149,7 @@ def test_presets_of_other_worlds_begin_on_their_bundles(tmp_path, name):
     bundle = write_world_bundle(tmp_path / "b.zip", facts, "takecover", vae=VAE, rnn=MODELS["choices"])
     preset = find_preset(name) | {"bundle": str(bundle.path)}
     settings = freeze(RunConfig(**preset), bundle)
-    assert freeze(RunConfig(**config_values(settings, bundle.path)), bundle) == settings
+    assert comes_back(settings, bundle)
 
 
 @pytest.mark.parametrize(("limit", "given", "horizon"), [(200, None, 200), (5000, None, 1000), (200, 400, 400)])
@@ -160,11 +159,7 @@ def test_episodes_are_no_longer_than_the_bundles_world_unless_a_run_says_so(tmp_
     preset = find_preset("pixels") | ({"horizon": given} if given else {})
     settings = settings_of(bundle, **preset)
     assert settings.task.horizon == horizon
-    assert freeze(RunConfig(**config_values(settings, bundle.path)), bundle) == settings
-
-
-def test_episodes_of_the_first_world_have_its_thousand_steps(random_bundle):
-    assert settings_of(random_bundle, task="dream").task.horizon == 1000
+    assert comes_back(settings, bundle)
 
 
 def test_each_demonstration_has_a_world_model_that_ships():

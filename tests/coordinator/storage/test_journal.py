@@ -138,10 +138,6 @@ def test_only_the_last_two_states_stay(journal):
     assert count == 2
 
 
-def test_incarnations_count(journal):
-    assert [journal.begin_incarnation(), journal.begin_incarnation()] == [1, 2]
-
-
 def test_evaluations_are_kept_until_finished(journal):
     journal.schedule_evaluation(Evaluation(4, VECTORS[0], 2))
     assert journal.pending_evaluations() == [Evaluation(4, VECTORS[0], 2)]
