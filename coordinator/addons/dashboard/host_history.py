@@ -11,6 +11,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dreamfleet.common.printable import printable
 from dreamfleet.common.runs.records import StoredEvent, StoredWork
 
@@ -27,7 +30,7 @@ class _Host:
     results: int = 0
     steps: float = 0.0
     seconds: float = 0.0
-    binned_steps: list[float] = field(default_factory=lambda: [0.0] * BINS)
+    binned_steps: NDArray[np.float64] = field(default_factory=lambda: np.zeros(BINS))
     present: list[tuple[float, float]] = field(default_factory=list)
 
 
@@ -50,8 +53,7 @@ def host_history(
         host.results += each.results
         host.steps += each.steps
         host.seconds += each.seconds
-        for at, share in _shares(*spans(each), since, width):
-            host.binned_steps[at] += each.steps * share
+        host.binned_steps += each.steps * _shares(*spans(each), since, width)
     for name, life, came, went in _stays(events, sorted(moments), end):
         host = hosts.setdefault(name, _Host())
         host.lives.add(life)
@@ -90,15 +92,13 @@ class _Spans:
         return opened if closed is None else closed, self._end if until is None else until
 
 
-def _shares(began: float, ended: float, since: float, width: float) -> Iterator[tuple[int, float]]:
-    """The bins that a span lies in, and its share in each; the shares add up to 1."""
+def _shares(began: float, ended: float, since: float, width: float) -> NDArray[np.float64]:
+    """The share of a span in each bin `(BINS,)`; they add up to 1."""
     first = min(max((began - since) / width, 0.0), BINS - 1e-9)
-    last = min(max((ended - since) / width, first), float(BINS))
-    if last - first < 1e-9:
-        yield int(first), 1.0
-        return
-    for at in range(int(first), min(int(last), BINS - 1) + 1):
-        yield at, (min(last, at + 1.0) - max(first, float(at))) / (last - first)
+    last = min(max((ended - since) / width, first + 1e-9), float(BINS))
+    edges = np.arange(BINS + 1.0)
+    inside: NDArray[np.float64] = np.minimum(edges[1:], last) - np.maximum(edges[:-1], first)
+    return inside.clip(0.0) / (last - first)
 
 
 def _stays(
@@ -123,15 +123,6 @@ def _stays(
     yield from ((*worker, came, max(end, came)) for worker, came in here.items())
 
 
-def _count_present(present: Sequence[tuple[float, float]], since: float, width: float) -> list[float]:
-    """How many workers were there, on average in each bin."""
-    counts = [0.0] * BINS
-    for came, went in present:
-        for at, share in _shares(came, went, since, width):
-            counts[at] += share * (went - came) / width
-    return [float(f"{each:.3g}") for each in counts]
-
-
 def _covered(present: Sequence[tuple[float, float]]) -> float:
     """Seconds in which at least one worker was there."""
     seconds, reached = 0.0, float("-inf")
@@ -142,14 +133,12 @@ def _covered(present: Sequence[tuple[float, float]]) -> float:
 
 
 def _row(name: str, host: _Host, since: float, width: float) -> dict[str, Any]:
+    counts = np.zeros(BINS)  # workers that were there, on average in each bin
+    for came, went in host.present:
+        counts += (went - came) / width * _shares(came, went, since, width)
     return {
-        "host": printable(name),
-        "lives": len(host.lives),
-        "results": host.results,
-        "steps": host.steps,
-        "seconds": host.seconds,
-        "rate": [float(f"{each / width:.4g}") for each in host.binned_steps],
-        "there": _covered(host.present),
-        "workers": _count_present(host.present, since, width),
+        "host": printable(name), "lives": len(host.lives), "results": host.results, "steps": host.steps,
+        "seconds": host.seconds, "rate": [float(f"{each / width:.4g}") for each in host.binned_steps.tolist()],
+        "there": _covered(host.present), "workers": [float(f"{each:.3g}") for each in counts.tolist()],
         "present": host.present,
-    }
+    }  # fmt: skip

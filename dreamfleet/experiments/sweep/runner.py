@@ -6,7 +6,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,8 +24,8 @@ from dreamfleet.coordinator.settings.environment_check import CHECKED
 from dreamfleet.experiments import local_run
 from dreamfleet.experiments.command_lines import Words, command
 from dreamfleet.experiments.local_run import POLL_INTERVAL, has_begun, has_ended, task_flags
-from dreamfleet.experiments.sweep.folder import SweepFolder
-from dreamfleet.experiments.sweep.plan import Sweep, SweepRun, staggered_share
+from dreamfleet.experiments.sweep.folder import StoredSweep, SweepFolder
+from dreamfleet.experiments.sweep.plan import SweepRun, staggered_share
 
 STATUS_INTERVAL = 2.0  # seconds between two looks at all runs
 RESTART_PAUSE = 5.0  # seconds of life after which a worker or router that was killed is started again
@@ -77,11 +77,9 @@ class RunProgress:
 class SweepRunner:
     """Serves all runs of a sweep to their ends; leaving the context ends its processes."""
 
-    def __init__(
-        self, sweep: Sweep, tasks: Sequence[str], folder: SweepFolder, fleet: SweepFleet, config: Path | None
-    ) -> None:
-        self.progress = [RunProgress(each) for each in sweep.runs]
-        self._sweep, self._tasks, self._folder, self._fleet = sweep, tasks, folder, fleet
+    def __init__(self, stored: StoredSweep, folder: SweepFolder, fleet: SweepFleet, config: Path | None) -> None:
+        self._sweep, self._tasks, self._folder, self._fleet = stored.sweep, stored.tasks, folder, fleet
+        self.progress = [RunProgress(each) for each in self._sweep.runs]
         self._config = () if config is None else ("--config", str(config))
         self._coordinators: dict[str, VerbProcess] = {}
         self._helpers: dict[str, tuple[Words, VerbProcess, float]] = {}  # router and workers, with when they started

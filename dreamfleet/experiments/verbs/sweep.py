@@ -207,7 +207,7 @@ def _serve(
     what = f"{runs}, {fleet.parallel} at a time, {workers} here"
     print(f"sweep {sweep.name}: {what}; more join with: {join}", file=sys.stderr)
     try:
-        with SweepRunner(sweep, stored.tasks, folder, fleet, args.config) as runner, showing(runner.progress) as update:
+        with SweepRunner(stored, folder, fleet, args.config) as runner, showing(runner.progress) as update:
             runner.serve(stop, update)
             update()
     except StoppedError as error:
