@@ -32,6 +32,7 @@ PROSE = re.compile(r"(?<![\w<{./-])[a-z]{2,}[,;:]? (?:[a-z]+[,;:]? )+[a-z]{2,}")
 NO_PROSE = re.compile(
     r"^\s*(?:SELECT|INSERT|UPDATE|DELETE|CREATE|PRAGMA|ALTER|WITH|BEGIN|<)|</|/>|\bimport \w|\bdef \w"
     r"|^\s*\w+(?:, \w+)+\s*$"  # columns of a table
+    r"|^outside \w+ \w+$"  # matplotlib's place of a legend
 )
 # What is data within a sentence: flags, numbers, names in backquotes, places that values come to, ends of lines.
 DATA = re.compile(

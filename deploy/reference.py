@@ -30,8 +30,7 @@ from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.experiments.demo import DemoConfig
 from dreamfleet.experiments.iteration.config import IterateConfig
 from dreamfleet.experiments.started_run import setting_names
-from dreamfleet.worker.addons.baselines.agent_config import AgentConfig
-from dreamfleet.worker.addons.baselines.learning_config import LearningConfig
+from dreamfleet.worker.addons.baselines.presets import AgentConfig, LearningConfig
 from dreamfleet.worker.service.config import WorkerConfig
 from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig

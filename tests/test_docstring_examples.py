@@ -10,9 +10,9 @@ import dreamfleet
 from deploy.structure import ROOT, SIDES, module_of, sources
 from dreamfleet.common.artifacts.trained_agent import AgentManifest, TrainedAgent
 from dreamfleet.coordinator.optimisers import api as optimisers_api
-from dreamfleet.worker.addons.baselines.agent_config import AgentConfig
 from dreamfleet.worker.addons.baselines.export import export_network
 from dreamfleet.worker.addons.baselines.network import Networks
+from dreamfleet.worker.addons.baselines.presets import AgentConfig
 from dreamfleet.worker.tasks import api as tasks_api
 from tests.support.processes import processes_in
 

@@ -17,6 +17,7 @@ from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.driving import FIRST_WORLD, Variant
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.artifacts.world_facts import EndRule
+from dreamfleet.common.cli.bounds import check_bounds
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.cli.key_values import parse_arguments
 from dreamfleet.common.cli.presets import preset_help_text
@@ -35,7 +36,6 @@ from dreamfleet.common.runs.records import (
     StageSettings,
 )
 from dreamfleet.common.schema.validation import Count
-from dreamfleet.coordinator.settings.bounds import check_bounds
 
 DEFAULT_BUNDLE, NO_BUNDLE, NO_SUBSPACE = "tiny", "none", "none"
 DEFAULT_HORIZON = 1000  # steps

@@ -8,9 +8,9 @@ from typing import Annotated
 
 from msgspec import Meta
 
+from dreamfleet.common.cli.bounds import check_bounds
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
-from dreamfleet.coordinator.settings.bounds import check_bounds
 
 MOST_OF_A_LIMIT = 2**53  # every float below it is exact
 Limit = Annotated[int, Meta(ge=0, le=MOST_OF_A_LIMIT)]

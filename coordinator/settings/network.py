@@ -7,10 +7,10 @@ from typing import Annotated
 
 from msgspec import Meta
 
+from dreamfleet.common.cli.bounds import check_bounds
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.protocol.messages import FleetShare, Share
 from dreamfleet.common.transport.network import parse_metrics_address
-from dreamfleet.coordinator.settings.bounds import check_bounds
 from dreamfleet.coordinator.settings.live_log import parse_sinks
 
 

@@ -45,3 +45,7 @@ def write_encoded_drives(folder):
     for _ in encode(folder):
         pass
     return folder
+
+
+def ignore(*_):
+    """Take no notice of a stage's progress."""

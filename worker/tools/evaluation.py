@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from statistics import fmean
 from time import perf_counter
-from typing import ClassVar
 
 from dreamfleet.common.errors import DreamfleetError, StoppedError
 from dreamfleet.common.host.fingerprint import fingerprint
@@ -22,11 +22,14 @@ from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
 from dreamfleet.common.runs.evaluation_report import EvaluationReport
 from dreamfleet.common.runs.standard_error import format_with_error, standard_error
 from dreamfleet.worker.scoring.agents import Agent
+from dreamfleet.worker.scoring.episode import EpisodeConfig, Transition, score
 from dreamfleet.worker.scoring.failure_cause import crash, failure_of
-from dreamfleet.worker.tools.agent_evaluator import AgentEvaluator
+from dreamfleet.worker.tasks.api import Score, World
+from dreamfleet.worker.tasks.closing import close_environment
 
 Episode = EpisodeResult | FailedEpisode
 log = logging.getLogger(__name__)
+SPEED, BRAKE = "speed", "brake"  # names in a task's true state, and among a world's actions
 FIRST_LOSSES = 3  # processes lost before any episode has ended, after which the evaluation ends
 
 
@@ -78,20 +81,37 @@ def evaluate_in_processes(
         return lost[-1]
 
     pin_thread_pools()
-    start, drive = _ProcessEvaluator.start, _ProcessEvaluator.drive
-    for each in map_in_processes(jobs, start, (agent,), drive, seeds, lose, stall, has_failed=has_failed):
+    # A process has a copy, whose first episode loads the agent: its errors are that episode's. No Ctrl-C raises there.
+    drive = _Driver(agent, (BaseException,)).drive
+    for each in map_in_processes(jobs, draw_unseen, (), drive, seeds, lose, stall, has_failed=has_failed):
         ended = ended or each not in lost
         yield each
 
 
-def run_evaluation(
-    name: str, agent: Agent, seeds: tuple[int, ...], jobs: int, on_episode: Callable[[list[Episode]], None]
+def judge(
+    name: str, agent: Agent, seeds: tuple[int, ...], jobs: int, note: Callable[[str], object] = log.warning
 ) -> EvaluationReport:
-    """Evaluate an agent and report it under `name`; `on_episode` gets all episodes so far after each."""
-    began, episodes = perf_counter(), list[Episode]()
-    for each in evaluate_in_processes(agent, seeds, jobs):
-        episodes.append(each)
-        on_episode(episodes)
+    """Drive one whole episode per seed, with a progress bar on stderr; `note` gets a line for each that fails.
+
+    `name` is the agent's in the report. `StoppedError` for a Ctrl-C once an episode has a score: it says the mean of
+    those that have.
+    """
+    from dreamfleet.common.cli.progress import progress_bar
+
+    began, episodes, scores = perf_counter(), list[Episode](), list[float]()
+    with progress_bar("evaluate", len(seeds), "episodes") as bar:
+        try:
+            for each in evaluate_in_processes(agent, seeds, jobs):
+                episodes.append(each)
+                scores += [each.score] if isinstance(each, EpisodeResult) else []
+                bar.update(len(episodes), f"mean {format_with_error(fmean(scores), None)}" if scores else "")
+                if isinstance(each, FailedEpisode):
+                    note(f"an episode failed: {each}")
+        except KeyboardInterrupt:
+            if not scores:
+                raise
+            mean = format_with_error(fmean(scores), standard_error(scores))
+            raise StoppedError(f"interrupted after {len(scores)} of {plural(len(seeds), 'episode')}: {mean}") from None
     results, world = EpisodeResults.of(episodes), agent.world
     return EvaluationReport(
         name, agent.sha256, agent.task, agent.reality, agent.bundle.sha256 if agent.bundle else "",
@@ -101,32 +121,62 @@ def run_evaluation(
     )  # fmt: skip
 
 
-def judge(
-    name: str, agent: Agent, seeds: tuple[int, ...], jobs: int, note: Callable[[str], object] = log.warning
-) -> EvaluationReport:
-    """Drive one whole episode per seed, with a progress bar on stderr; `note` gets a line for each that fails.
+class AgentEvaluator:
+    """Drives an agent in its evaluation environment, one episode after another."""
 
-    `StoppedError` for a Ctrl-C once an episode has a score: it says the mean of those that have.
-    """
-    from dreamfleet.common.cli.progress import progress_bar
-
-    def move(episodes: list[Episode]) -> None:
-        so_far[:] = episodes
-        scores = [each.score for each in episodes if isinstance(each, EpisodeResult)]
-        bar.update(len(episodes), f"mean {format_with_error(sum(scores) / len(scores), None)}" if scores else "")
-        if not isinstance(last := episodes[-1], EpisodeResult):
-            note(f"an episode failed: {last}")
-
-    so_far: list[Episode] = []
-    with progress_bar("evaluate", len(seeds), "episodes") as bar:
+    def __init__(self, agent: Agent) -> None:
+        # First of all, so that nothing else makes one to ask for the world: many simulators allow one a process.
+        self._environment = agent.make_evaluation_environment()
         try:
-            return run_evaluation(name, agent, seeds, jobs, move)
-        except KeyboardInterrupt:
-            scores = [each.score for each in so_far if isinstance(each, EpisodeResult)]
-            if not scores:
-                raise
-            mean = format_with_error(sum(scores) / len(scores), standard_error(scores))
-            raise StoppedError(f"interrupted after {len(scores)} of {plural(len(seeds), 'episode')}: {mean}") from None
+            self._world, self._parameters, self._truth = agent.world, agent.parameters, agent.truth
+            self._policies = agent.make_policies()
+        except BaseException:
+            self.close()
+            raise
+
+    def drive(self, seed: int, on_step: Callable[[int], None] = lambda _steps: None) -> EpisodeResult:
+        """Drive one whole episode; `on_step` gets the number of each step. The statistics do not change its score."""
+        truth, episode_config = self._truth, EpisodeConfig(seed, self._world.horizon)
+        watch = DriveStatistics(self._world, None if truth is None else lambda: truth(self._environment))
+        driven = score(
+            self._environment, self._policies(seed), self._parameters, episode_config, on_step,
+            on_transition=watch.on_transition,
+        )  # fmt: skip
+        return watch.drive(seed, driven)
+
+    def close(self) -> None:
+        """Release the environment."""
+        close_environment(self._environment)
+
+
+class DriveStatistics:
+    """Collects statistics of one episode, as far as its world reports them."""
+
+    def __init__(self, world: World, truth: Callable[[], dict[str, float]] | None) -> None:
+        self._truth, self._finish = truth, world.finish
+        named = truth is not None and BRAKE in world.action_names
+        self._brake = world.action_names.index(BRAKE) if named else None
+        self._speeds: list[float] = []
+        self._braked: list[bool] = []
+        self._finished = False
+
+    def on_transition(self, moment: Transition) -> None:
+        """Add a step."""
+        self._finished = bool(moment.info.get(self._finish, False))
+        true_state = self._truth() if self._truth is not None else {}
+        if SPEED in true_state:
+            self._speeds.append(true_state[SPEED])
+        if self._brake is not None:
+            self._braked.append(bool(moment.action[self._brake] > 0))
+
+    def drive(self, seed: int, score: Score) -> EpisodeResult:
+        """The result of the whole episode."""
+        finished = self._finished if self._finish else None
+        return EpisodeResult(seed, score.fitness, score.steps, finished, _mean(self._speeds), _mean(self._braked))
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return fmean(values) if values else None
 
 
 class _Driver:
@@ -160,21 +210,3 @@ class _Driver:
         """Release the environment."""
         if self._evaluator is not None:
             self._evaluator.close()
-
-
-class _ProcessEvaluator:
-    """Drives episodes in a child process."""
-
-    driver: ClassVar[_Driver]
-
-    @classmethod
-    def start(cls, agent: Agent) -> None:
-        """Initialise the process."""
-        draw_unseen()
-        # The first episode loads the agent, so that errors are reported as that episode's. No Ctrl-C raises here.
-        cls.driver = _Driver(agent, (BaseException,))
-
-    @classmethod
-    def drive(cls, seed: int) -> Episode:
-        """Drive one whole episode."""
-        return cls.driver.drive(seed)

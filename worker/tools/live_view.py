@@ -95,8 +95,13 @@ class LiveCanvas(Board):
         else:
             self._text("this task shows no picture", (EDGE, EDGE), self._small, FAINT)
         self._draw_words(live)
-        shown = {"drawn": bool(self._captions), "captions": self._captions}
-        return CaptionedFrame(pixels(self._surface), {**frame_facts(self._run, live), **shown})
+        frame = live.frame
+        facts = {
+            "run": self._run, "worker": live.worker, "kind": frame.kind, "generation": frame.generation,
+            "candidate": frame.candidate, "seed": frame.seed, "step": frame.step, "score": frame.reward,
+            "drawn": bool(self._captions), "captions": self._captions,
+        }  # fmt: skip
+        return CaptionedFrame(pixels(self._surface), facts)
 
     def _draw_model(self, seen: Frame | None, dream: DecodedDream) -> None:
         """Draw observation and decoded latent side by side; without an observation, the decoded latent alone."""
@@ -139,12 +144,3 @@ class LiveCanvas(Board):
         self._text(label, corner, self._small, FAINT)
         size = max(1, round(width * scale)), max(1, round(height * scale))
         self._picture(picture, (corner[0], corner[1] + LABEL), size, smooth=height != width)
-
-
-def frame_facts(run: str, live: LiveFrame) -> dict[str, Any]:
-    """The facts of a frame, for captions and JSON."""
-    frame = live.frame
-    return {
-        "run": run, "worker": live.worker, "kind": frame.kind, "generation": frame.generation,
-        "candidate": frame.candidate, "seed": frame.seed, "step": frame.step, "score": frame.reward,
-    }  # fmt: skip

@@ -28,7 +28,8 @@ def find_controller(name: str, runs_dir: Path | str | None = None) -> Controller
     >>> find_controller("tiny").parameters.shape
     (867,)
     """
-    controller, _ = lookup.find_controller(name, _folder(runs_dir))
+    folder = run_paths.default_runs_dir() if runs_dir is None else Path(runs_dir)
+    controller, _ = lookup.find_controller(name, folder)
     return controller
 
 
@@ -103,7 +104,3 @@ def evaluate(
 
 def _agent(controller: Controller | TrainedAgent, bundle: Bundle | None) -> Agent:
     return make_agent(controller, bundle or lookup.find_bundle_of(controller, None))
-
-
-def _folder(runs_dir: Path | str | None) -> Path:
-    return run_paths.default_runs_dir() if runs_dir is None else Path(runs_dir)

@@ -8,13 +8,14 @@ from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, ClassVar, NoReturn
+from typing import Any, NoReturn
 
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.files.atomic_write import reporting_write_errors
 from dreamfleet.common.host.process_pool import count_step, map_in_processes
 from dreamfleet.common.host.stall_watch import STALL_SECONDS
 from dreamfleet.common.host.stop_signals import Stop, never_stop
+from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
 from dreamfleet.worker.scoring.agents import Agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
@@ -74,34 +75,23 @@ def record_in_process(
     with reporting_write_errors(out), TemporaryDirectory(prefix=f".{out.stem}-", dir=out.parent) as folder:
         video = Path(folder).absolute() / out.name  # a simulator may change the current folder of its process
         items = [(film, seed, video)]
-        (made,) = map_in_processes(1, _Recorder.start, (is_stopped,), _Recorder.record, items, lose, stall, look)
+        (made,) = map_in_processes(1, draw_unseen, (), partial(_record, is_stopped), items, lose, stall, look)
         video.replace(out)
     return made
 
 
-class _Recorder:
-    """Records in a child process."""
+def _record(is_stopped: Any, item: tuple[partial[float], int, Path]) -> tuple[float, int]:
+    """Record one episode in a child process until the parent stops it; return its score and its steps."""
+    film, seed, out = item
+    steps = 0
 
-    is_stopped: ClassVar[Any]
+    def on_step(made: int) -> None:
+        nonlocal steps
+        steps = made
+        count_step()
 
-    @classmethod
-    def start(cls, is_stopped: Any) -> None:
-        """Initialise the process; the parent says when to stop."""
-        cls.is_stopped = is_stopped
-
-    @classmethod
-    def record(cls, item: tuple[partial[float], int, Path]) -> tuple[float, int]:
-        """Record one episode; return its score and its steps."""
-        film, seed, out = item
-        steps = 0
-
-        def on_step(made: int) -> None:
-            nonlocal steps
-            steps = made
-            count_step()
-
-        try:
-            score = film(seed=seed, out=out, on_step=on_step, stop=lambda: bool(cls.is_stopped.value))
-        except (KeyboardInterrupt, SystemExit, GeneratorExit) as error:  # of the simulator: no Ctrl-C raises here
-            raise DreamfleetError(f"the episode of seed {seed} failed: {failure_of(error).text}") from error
-        return score, steps
+    try:
+        score = film(seed=seed, out=out, on_step=on_step, stop=lambda: bool(is_stopped.value))
+    except (KeyboardInterrupt, SystemExit, GeneratorExit) as error:  # of the simulator: no Ctrl-C raises here
+        raise DreamfleetError(f"the episode of seed {seed} failed: {failure_of(error).text}") from error
+    return score, steps

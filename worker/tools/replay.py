@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import DreamfleetError
@@ -159,42 +159,34 @@ def _drive_all(
 
     pin_thread_pools()
     attempts = map_in_processes(
-        1, _Replayer.start, (spec, bundle, torch_device), _Replayer.drive, items, lose, stall,
+        1, draw_unseen, (), _Replayer(spec, bundle, torch_device).drive, items, lose, stall,
         has_failed=lambda attempt: attempt.error is not None,
     )  # fmt: skip
     return {each.episode: each for each in attempts}
 
 
 class _Replayer:
-    """Drives episodes in a child process."""
+    """Drives episodes in a child process, which has a copy of it."""
 
-    spec: ClassVar[TaskSpec]
-    bundle: ClassVar[Path | None]
-    torch_device: ClassVar[str]
-    scorer: ClassVar[Scorer | None] = None
+    def __init__(self, spec: TaskSpec, bundle: Path | None, torch_device: str) -> None:
+        self._spec, self._bundle, self._torch_device = spec, bundle, torch_device
+        self._scorer: Scorer | None = None
 
-    @classmethod
-    def start(cls, spec: TaskSpec, bundle: Path | None, torch_device: str) -> None:
-        """Initialise the process."""
-        draw_unseen()
-        cls.spec, cls.bundle, cls.torch_device = spec, bundle, torch_device
-
-    @classmethod
-    def drive(cls, item: Item) -> ReplayAttempt:
+    def drive(self, item: Item) -> ReplayAttempt:
         """Drive one episode; `DreamfleetError` if the task cannot be scored here."""
         from dreamfleet.worker.scoring.scorer import Scorer
 
         episode, parameters, seed, spec = item
         host_class = ""
         try:
-            if cls.scorer is None:
-                opened = None if cls.bundle is None else Bundle.open(cls.bundle, cls.spec.bundle)
-                cls.scorer = Scorer(cls.spec, opened, cls.torch_device)
-            host_class = cls.scorer.host_class  # before the episode, as it drives the environment too
+            if self._scorer is None:
+                opened = None if self._bundle is None else Bundle.open(self._bundle, self._spec.bundle)
+                self._scorer = Scorer(self._spec, opened, self._torch_device)
+            host_class = self._scorer.host_class  # before the episode, as it drives the environment too
             count_step()
-            score = cls.scorer.score("score", parameters, seed, count_step, spec=spec)
+            score = self._scorer.score("score", parameters, seed, count_step, spec=spec)
             return ReplayAttempt(episode, host_class, score.fitness)
         except BaseException as error:  # a simulator may raise anything, and no Ctrl-C raises here
-            if cls.scorer is None and isinstance(error, DreamfleetError):
+            if self._scorer is None and isinstance(error, DreamfleetError):
                 raise
             return ReplayAttempt(episode, host_class, error=failure_of(error))

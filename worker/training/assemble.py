@@ -7,6 +7,7 @@ import json
 import logging
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -39,7 +40,7 @@ from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld
 from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.training import train_mdnrnn, train_vae
-from dreamfleet.worker.training.checkpoint import load_config, load_weights
+from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights
 from dreamfleet.worker.training.data.data_folder import explain_write_errors
 from dreamfleet.worker.training.data.dataset import (
     episode_paths,
@@ -65,10 +66,8 @@ from dreamfleet.worker.worldmodel.mdnrnn_config import REWARDED, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
 
 QUALITY = "quality.json"
-MEASURED, CIRCUMSTANCES = (
-    ("probe", "losses", "likeness"),
-    ("driver", "noise", "first_seed"),
-)  # keys of the output of `inspect --json`
+MEASURED = ("probe", "losses", "likeness")  # keys of the output of `inspect --json`
+CIRCUMSTANCES = ("driver", "noise", "first_seed")  # likewise
 MOST_FIGURES = 1 << 18  # bytes; a manifest has at most a million
 INITIAL_LATENTS = 256
 log = logging.getLogger(__name__)
@@ -131,9 +130,9 @@ def assemble(
     if with_weights:
         tensors = {f"vae.{key}": value for key, value in vae.items()} | {f"mdnrnn.{k}": v for k, v in rnn.items()}
         parts[WEIGHTS] = save(tensors)  # without metadata, which it writes in any order: the manifest has the layers
+    manifest = make_manifest(name, provenance, *configs, world, facts, preprocessing)
     if measurements:
         with TemporaryDirectory() as aside:
-            manifest = make_manifest(name, provenance, *configs, world, facts, preprocessing)
             bare = write_bundle(Path(aside) / out.name, manifest, parts).sha256
         for path, of, _ in measurements:
             if of != bare:
@@ -141,9 +140,9 @@ def assemble(
                     f"{path} was measured on the world model {str(of)[:12]}..., and this folder makes {bare[:12]}...: "
                     "bundle it without --measured, and measure that bundle"
                 )
-        provenance["measured"] = [figures for *_, figures in measurements]
+        manifest = replace(manifest, provenance=provenance | {"measured": [figures for *_, figures in measurements]})
     with explain_write_errors(out):
-        return write_bundle(out, make_manifest(name, provenance, *configs, world, facts, preprocessing), parts)
+        return write_bundle(out, manifest, parts)
 
 
 def _load_models(folder: Path) -> tuple[Weights, Weights, VAEConfig, MDNRNNConfig]:
@@ -156,7 +155,7 @@ def _load_models(folder: Path) -> tuple[Weights, Weights, VAEConfig, MDNRNNConfi
             raise DatasetError(f"{path} holds NaN or infinity; train again with --new")
     if vae_config.latent != rnn_config.latent:
         raise DatasetError(f"the VAE has {vae_config.latent} latents, the MDN-RNN {rnn_config.latent}: train it again")
-    if train_mdnrnn.mdnrnn_vae_hash(folder) != latents_encoder_hash(folder):
+    if load_progress(paths[1]).get("vae") != latents_encoder_hash(folder):
         raise DatasetError(f"the MDN-RNN in {folder} was trained on another VAE: train it again before you bundle")
     return vae, rnn, vae_config, rnn_config
 

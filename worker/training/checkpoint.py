@@ -54,7 +54,8 @@ def load_checkpoint(
             progress: dict[str, Any] = json.loads(file.metadata()["progress"])
         weights, moments = _select_prefix(tensors, "model."), _select_prefix(tensors, "adam.")
         if extensible and load_config(path, type(model.config)) != model.config:
-            moments = _drop_parameters(moments, _add_rows(weights, model))
+            grown = _add_rows(weights, model)
+            moments = {name: tensor for name, tensor in moments.items() if int(name.partition(".")[0]) not in grown}
         model.load_state_dict(weights)
         if optimiser is not None:
             _restore_adam(optimiser, moments)
@@ -64,11 +65,10 @@ def load_checkpoint(
 
 
 def load_config(path: Path, kind: type[T]) -> T:
-    """Load the configuration of a checkpoint's model; old checkpoints without one have the defaults."""
-    about = _read_metadata(path)
+    """Load the configuration of a checkpoint's model."""
     try:
-        return from_plain(kind, json.loads(about["config"])) if "config" in about else kind()
-    except (ValueError, TypeError, RecursionError, MalformedError, UsageError) as error:
+        return from_plain(kind, json.loads(_read_metadata(path)["config"]))
+    except (ValueError, KeyError, TypeError, RecursionError, MalformedError, UsageError) as error:
         raise DatasetError(f"checkpoint {path} is damaged ({error}); {_remedy(path)}") from error
 
 
@@ -118,10 +118,6 @@ def _add_rows(weights: dict[str, torch.Tensor], model: torch.nn.Module) -> set[i
             weights[name] = torch.cat([weights[name], own[name].cpu()[len(weights[name]) :]])
             grown.add(index)
     return grown
-
-
-def _drop_parameters(moments: Mapping[str, torch.Tensor], parameters: set[int]) -> dict[str, torch.Tensor]:
-    return {name: tensor for name, tensor in moments.items() if int(name.partition(".")[0]) not in parameters}
 
 
 def check_config(path: Path, config: Any, extensible: frozenset[str] = frozenset()) -> None:

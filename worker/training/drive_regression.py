@@ -16,14 +16,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.printable import plural
 from dreamfleet.worker.scoring.rollout import DataWorld
-from dreamfleet.worker.training.data.dataset import (
-    check_whole,
-    episode_paths,
-    kind_of,
-    load_pictures,
-    load_steps,
-    pad,
-)
+from dreamfleet.worker.training.data.dataset import check_whole, kind_of, load_pictures, load_steps, pad
 from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, RewardLabel
 from dreamfleet.worker.worldmodel.observation import join_features
 
@@ -117,11 +110,6 @@ class SplitSums:
         side = "held_out" if number % HELD_OUT_EVERY == HELD_OUT_EVERY - 1 else "fit"
         so_far = getattr(self, side)
         setattr(self, side, sums if so_far is None else so_far + sums)
-
-
-def last_drives(folder: Path, count: int) -> list[Path]:
-    """A folder's last `count` drives at most: controllers' drives are newer than random ones."""
-    return episode_paths(folder)[-count:]
 
 
 def check_drives(paths: Sequence[Path], bundle: Bundle) -> None:

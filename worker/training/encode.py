@@ -47,8 +47,6 @@ Latents = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 def encode(folder: Path) -> Iterator[int]:
     """Encode the episodes without latents of this VAE; yield the number of frames of each."""
-    if not (folder / CHECKPOINT).exists():
-        raise DatasetError(f"no {folder / CHECKPOINT}: run `dreamfleet train vae --data {folder}` first")
     config = load_config(folder / CHECKPOINT, VAEConfig)
     encode_pictures = _make_encoder(folder, config)
     vae, mirrors = encoder_hash(folder), encodes_mirrored(folder)
@@ -85,8 +83,6 @@ def count_unencoded(folder: Path) -> int:
 
 def latents_encoder_hash(folder: Path) -> str:
     """The hash of a folder's encoder; `DatasetError` if its latents come from another one."""
-    if not (folder / CHECKPOINT).exists():
-        raise DatasetError(f"no {folder / CHECKPOINT}: run `dreamfleet train vae --data {folder}` first")
     vae = encoder_hash(folder)
     for path in episode_paths(folder, ENCODED):
         if str(load_arrays(path, "vae")["vae"]) != vae:

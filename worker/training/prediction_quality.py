@@ -43,13 +43,15 @@ def foresight(model: MDNRNN, held_out: Sequence[Path]) -> dict[str, float]:
         prediction = model.predict(hidden)
         labels = _labels(model, rollouts)
         mask = rollouts.mask > 0
-        figures = {name: _score_head(model, name, _head(prediction, name)[mask], labels[name][mask]) for name in labels}
+        figures = {
+            name: _score_head(model, name, getattr(prediction, name)[mask], label[mask])
+            for name, label in labels.items()
+        }
         for ahead, (seen, predicted, latents) in _dream(model, rollouts, states).items():
             rows, steps = seen
             for name in labels:
-                figures[f"{name}_after_{ahead}"] = _score_head(
-                    model, name, _head(predicted, name), labels[name][rows, steps]
-                )
+                scores = getattr(predicted, name)
+                figures[f"{name}_after_{ahead}"] = _score_head(model, name, scores, labels[name][rows, steps])
             error = (latents - rollouts.mu[rows, steps]).square().mean().sqrt() / rollouts.mu[mask].std()
             figures[f"latent_error_after_{ahead}"] = float(error)
     named = {name if "error" in name else _figure_name(model, name): value for name, value in figures.items()}
@@ -129,10 +131,6 @@ def _labels(model: MDNRNN, rollouts: Rollouts) -> dict[str, Tensor]:
     if config.done:
         labels["done"] = done_labels(config, rollouts)
     return labels
-
-
-def _head(prediction: Prediction, name: str) -> Tensor:
-    return prediction.reward if name == "reward" else prediction.done
 
 
 def _score_head(model: MDNRNN, name: str, predicted: Tensor, label: Tensor) -> float:

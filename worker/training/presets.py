@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, get_type_hints
+from typing import Annotated, Any, get_type_hints
+
+from msgspec import Meta
 
 from dreamfleet.common.artifacts.driving import FIRST_WORLD
+from dreamfleet.common.cli.bounds import NotNegative, Positive, check_bounds
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.cli.presets import check_preset
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.schema.validation import Count
 from dreamfleet.common.worlds.shipped import WORLDS
 from dreamfleet.worker.training.data.collect_config import CollectConfig
 from dreamfleet.worker.worldmodel import mdnrnn_config, vae_config
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 
-LARGEST_SEED = 2**43  # of a training: times a million it is still a seed of torch
+Seed = Annotated[int, Meta(ge=0, le=2**43)]  # of a training: times a million it is still a seed of torch
 
 
 def required(text: str) -> Any:
@@ -28,28 +31,22 @@ def required(text: str) -> Any:
 class TrainConfig:
     """How one model is trained: Adam at `rate` for `updates` updates of `batch` pictures or drives."""
 
-    updates: int = required("updates in total, those already made included")
-    batch: int = required("pictures, or drives, per update")
+    updates: Positive = required("updates in total, those already made included")
+    batch: Positive = required("pictures, or drives, per update")
     rate: float = required("Adam's learning rate")
-    clip: float = option(1.0, "largest norm of the gradients; 0: no limit")
-    seed: int = option(0, "random seed of the training: of first weights, batches and noise")
+    clip: NotNegative = option(1.0, "largest norm of the gradients; 0: no limit")
+    seed: Seed = option(0, "random seed of the training: of first weights, batches and noise")
     decay: float = option(1.0, "factor of the rate per epoch, in which each recorded frame or drive is shown once")
-    patience: int = option(0, "validations without a better held-out loss before training ends; 0: never")
-    validate_every: int = option(200, "updates between validations on held-out drives, each with a checkpoint")
-    keep_every: int = option(
+    patience: Count = option(0, "validations without a better held-out loss before training ends; 0: never")
+    validate_every: Positive = option(200, "updates between validations on held-out drives, each with a checkpoint")
+    keep_every: Count = option(
         0, "updates between checkpoints that are kept beside the last one, as vae.000400.safetensors; 0: none"
     )
 
     def __post_init__(self) -> None:
-        for name in ("updates", "batch", "validate_every"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if self.keep_every < 0:
-            raise UsageError(f"keep_every must be at least 1, or 0 for none, not {self.keep_every}")
-        if not (self.rate > 0 and self.clip >= 0 and 0 < self.decay <= 1 and self.patience >= 0):
-            raise UsageError("rate must be positive, decay in (0, 1], clip and patience not negative")
-        if not 0 <= self.seed <= LARGEST_SEED:
-            raise UsageError(f"seed must be from 0 to {LARGEST_SEED}, not {self.seed}")
+        check_bounds(self, are_flags=False)
+        if not (self.rate > 0 and 0 < self.decay <= 1):
+            raise UsageError(f"rate must be positive, and decay in (0, 1], not {self.rate} and {self.decay}")
 
 
 @dataclass(frozen=True)
@@ -122,14 +119,11 @@ PIXELS = TrainingPreset(
 )
 
 
-def _preset_of_world(task: str, name: str, given: Mapping[str, Mapping[str, Any]]) -> TrainingPreset:
-    """A preset that a world gives as mappings."""
-    kinds = get_type_hints(TrainingPreset)
-    return TrainingPreset(name=name, task=task, **{each: kinds[each](**values) for each, values in given.items()})
-
-
+KINDS = get_type_hints(TrainingPreset)
 OF_WORLDS = tuple(
-    _preset_of_world(world.task, *each) for world in WORLDS.values() for each in world.training_presets.items()
+    TrainingPreset(name=name, task=world.task, **{part: KINDS[part](**values) for part, values in given.items()})
+    for world in WORLDS.values()
+    for name, given in world.training_presets.items()
 )
 PRESETS = {each.name: each for each in (TINY, NOTEBOOK, ARTICLE, ATTENTIVE, PAPER, PIXELS, *OF_WORLDS)}
 

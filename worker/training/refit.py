@@ -63,7 +63,8 @@ def refit(
         return RefitResult(replace(controller, bundle=bundle.sha256), 0, 0, ())
     _check_compatible(controller, own, bundle, paths)
     driving = bundle.driving_of(controller.options)
-    shape = bundle.shape_of(_feature_set(controller, own), controller.shape.hidden, driving)
+    features = "zh" if controller.shape.features > own.manifest.latent else "z"
+    shape = bundle.shape_of(features, controller.shape.hidden, driving)
     fitted, lost_after = bundle.with_options(shape, controller.options), task_of(own).world.lost_after
     old, new = FeatureExtractor(own.for_controller(controller)), FeatureExtractor(fitted)
     lowest, highest = output_bounds(controller, own)
@@ -133,10 +134,6 @@ def output_names(controller: Controller, own: Bundle) -> tuple[str, ...]:
     if is_named and not controller.shape.hidden and len(names) == count:
         return names
     return tuple(f"output {number + 1}" for number in range(count))
-
-
-def _feature_set(controller: Controller, own: Bundle) -> str:
-    return "zh" if controller.shape.features > own.manifest.latent else "z"
 
 
 def _check_compatible(controller: Controller, own: Bundle, bundle: Bundle, paths: Sequence[Path]) -> None:

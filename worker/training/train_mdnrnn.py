@@ -13,15 +13,14 @@ from torch import Tensor
 
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.host.stop_signals import Stop, never_stop
-from dreamfleet.worker.training.checkpoint import load_config, load_progress
+from dreamfleet.worker.training.checkpoint import load_config
 from dreamfleet.worker.training.data.dataset import episode_paths, existing_episodes, load_steps, split_held_out
 from dreamfleet.worker.training.data.rollouts import Rollouts, done_labels, load_rollouts, model_inputs
 from dreamfleet.worker.training.encode import ENCODED, encodes_mirrored, latents_encoder_hash
-from dreamfleet.worker.training.loss_curve import AddPoint, open_loss_curve
 from dreamfleet.worker.training.prediction_quality import end_quality, foresight
 from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.training.train_vae import ReportProgress
-from dreamfleet.worker.training.training_state import TrainingState
+from dreamfleet.worker.training.training_state import AddPoint, TrainingState, open_loss_curve
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, binary_loss, latent_loss, reward_labels, reward_loss
 from dreamfleet.worker.worldmodel.mdnrnn_config import ADDABLE_HEADS, REWARDED, MDNRNNConfig
 
@@ -110,11 +109,6 @@ def _record_validation(
     parts = validate(model, paths, device)
     point(update=update, **{f"held_out_{name}": part for name, part in parts.items()})
     return sum(weight_losses(model.config, parts).values())
-
-
-def mdnrnn_vae_hash(folder: Path) -> str:
-    """The hash of the encoder on whose latents the folder's MDN-RNN was trained."""
-    return str(load_progress(folder / CHECKPOINT).get("vae"))
 
 
 def backward(

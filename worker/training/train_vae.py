@@ -23,9 +23,8 @@ from dreamfleet.worker.training.data.dataset import (
     picture_batches,
     split_held_out,
 )
-from dreamfleet.worker.training.loss_curve import AddPoint, open_loss_curve
 from dreamfleet.worker.training.presets import TrainConfig
-from dreamfleet.worker.training.training_state import TrainingState
+from dreamfleet.worker.training.training_state import AddPoint, TrainingState, open_loss_curve
 from dreamfleet.worker.worldmodel.vae import VAE, PixelWeights
 from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
 

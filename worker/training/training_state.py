@@ -1,23 +1,22 @@
-"""The state of a training: progress, optimiser and checkpoints, early stopping; and the device it runs on."""
+"""The state of a training: progress, optimiser, checkpoints and loss curve, early stopping; and its device."""
 
 from __future__ import annotations
 
+import json
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from dreamfleet.common.errors import DatasetError, StoppedError, UsageError
+from dreamfleet.common.files.tensorboard import open_event_file
 from dreamfleet.common.host.stop_signals import Stop
-from dreamfleet.worker.training.checkpoint import (
-    check_config,
-    load_checkpoint,
-    load_progress,
-    save_checkpoint,
-)
+from dreamfleet.worker.training.checkpoint import check_config, load_checkpoint, load_progress, save_checkpoint
+from dreamfleet.worker.training.data.data_folder import explain_write_errors
 from dreamfleet.worker.training.presets import TrainConfig
 
 
@@ -43,7 +42,11 @@ class TrainingState:
         begun = not new and path.exists() and load_progress(path).get("update") != 0
         if not new and (found := load_checkpoint(path, model, self.optimiser, frozenset() if begun else extensible)):
             self.progress = found
-            _check_seed(path, found.get("seed", config.seed), config.seed)
+            if (own := found.get("seed", config.seed)) != config.seed:
+                raise UsageError(
+                    f"{path} was begun with --seed {own}, and this is --seed {config.seed}: give --seed {own} to "
+                    "continue it. For another training choose another --data, or start over with --new"
+                )
         elif other is not None and load_checkpoint(other, model, self.optimiser, extensible) is None:
             raise UsageError(f"--continue-from: no checkpoint at {other}")
         # A training that stopped early resumes only with other data, or with patience 0.
@@ -114,7 +117,9 @@ class TrainingState:
         if better and self._config.patience:
             self.save(self._best_path)
         if 0 < self._config.patience <= self.progress["idle"]:
-            self._stop_early()
+            update = self.update
+            best = load_checkpoint(self._best_path, self._model, self.optimiser) or {}
+            self.progress = {**best, "stopped": self._episodes, "idle": 0, "given_up_at": update}
         self.save()
 
     def _record_held_out_loss(self, loss: float) -> bool:
@@ -124,11 +129,6 @@ class TrainingState:
         )
         self.progress |= {"best": loss, "idle": 0} if better else {"idle": self.progress.get("idle", 0) + 1}
         return better
-
-    def _stop_early(self) -> None:
-        update = self.update
-        best = load_checkpoint(self._best_path, self._model, self.optimiser) or {}
-        self.progress = {**best, "stopped": self._episodes, "idle": 0, "given_up_at": update}
 
     def _has_best_checkpoint(self) -> bool:
         """Whether the saved best state is this training's; without patience none is saved."""
@@ -144,15 +144,6 @@ class TrainingState:
         for each in (self._best_path, self._path.with_suffix(".jsonl"), *kept):
             if other is None or each.resolve() != other.resolve():
                 each.unlink(missing_ok=True)
-
-
-def _check_seed(path: Path, own: Any, given: int) -> None:
-    """`UsageError` if a training would resume with another seed."""
-    if own != given:
-        raise UsageError(
-            f"{path} was begun with --seed {own}, and this is --seed {given}: give --seed {own} to continue it. "
-            "For another training choose another --data, or start over with --new"
-        )
 
 
 def numbered_path(path: Path, update: int) -> Path:
@@ -206,3 +197,38 @@ def disable_triton_after_mesa(maps: Path = Path("/proc/self/maps")) -> None:
         return
     if drawn and "triton" not in sys.modules:
         sys.modules["triton"] = None  # type: ignore[assignment] # makes its import raise ModuleNotFoundError
+
+
+AddPoint = Callable[..., None]  # `point(update=120, error=0.3)`
+
+
+@contextmanager
+def open_loss_curve(path: Path, events: Path | None, update: int) -> Iterator[AddPoint]:
+    """Yield a function that appends points to the curve; `events` is a folder for TensorBoard events, or `None`.
+
+    The training resumes after `update`: events beyond it are superseded. `MissingExtraError` if events cannot be
+    written.
+    """
+    if events is None:
+        yield lambda **values: append_point(path, **values)
+        return
+    with open_event_file(events / path.stem, since=update + 1) as file:
+
+        def point(*, update: int, **values: float) -> None:
+            append_point(path, update=update, **values)
+            file.add(update, **{f"loss__{name}": value for name, value in values.items()})
+
+        yield point
+
+
+def append_point(path: Path, **values: float) -> None:
+    """Append a point as a line of JSON, whole or not at all; `DatasetError` if it cannot be written."""
+    line = (json.dumps({name: round(value, 6) for name, value in values.items()}) + "\n").encode()
+    with explain_write_errors(path), path.open("ab", buffering=0) as file:
+        end = file.seek(0, 2)
+        try:
+            while line:
+                line = line[file.write(line) :]
+        except OSError:
+            file.truncate(end)
+            raise

@@ -47,7 +47,10 @@ def unbundle(bundle: Bundle, folder: Path) -> tuple[Path, Path]:
     for path in paths:
         if path_exists(path):
             raise UsageError(f"{path} exists: choose another --data")
-    vae, rnn = _rebuild_models(bundle)
+    found = restore_models(bundle)
+    vae, rnn = VAE(found.vae_config), MDNRNN(found.mdnrnn_config)
+    vae.load_state_dict(_tensors(found.vae))
+    rnn.load_state_dict(_tensors(found.mdnrnn))
     with explain_folder_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -97,23 +100,12 @@ def _restore(bundle: Bundle) -> Models:
     return models
 
 
-def _rebuild_models(bundle: Bundle) -> tuple[VAE, MDNRNN]:
-    found = restore_models(bundle)
-    vae, rnn = VAE(found.vae_config), MDNRNN(found.mdnrnn_config)
-    vae.load_state_dict(_tensors(found.vae))
-    rnn.load_state_dict(_tensors(found.mdnrnn))
-    return vae, rnn
-
-
 def _weights(bundle: Bundle, vae: VAEConfig, rnn: MDNRNNConfig) -> tuple[Weights, Weights]:
     """The trained weights if the bundle has them, otherwise those in its graphs."""
     if WEIGHTS in bundle.manifest.parts:
         kept = load(bundle.read(WEIGHTS))
         return _select_model("vae", kept), _select_model("mdnrnn", kept)
-    return (
-        vae_weights(bundle.read(ENCODER), bundle.read(DECODER), vae),
-        mdnrnn_weights(bundle.read(DREAM_GRAPH), rnn),
-    )
+    return (vae_weights(bundle.read(ENCODER), bundle.read(DECODER), vae), mdnrnn_weights(bundle.read(DREAM_GRAPH), rnn))
 
 
 def _select_model(model: str, kept: Weights) -> Weights:

@@ -1,4 +1,4 @@
-"""Tests config.py, freezing.py, bounds.py, limits.py, network.py and presets.py."""
+"""Tests config.py, freezing.py, limits.py, network.py, presets.py and common/cli/bounds.py."""
 
 import json
 

@@ -14,8 +14,8 @@ from dreamfleet.worker.scoring.agents import make_agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig, Transition, score
 from dreamfleet.worker.tasks.api import Score, World
 from dreamfleet.worker.tasks.registry import find_task
-from dreamfleet.worker.tools import agent_evaluator as judging
-from dreamfleet.worker.tools.agent_evaluator import AgentEvaluator, DriveStatistics
+from dreamfleet.worker.tools import evaluation as judging
+from dreamfleet.worker.tools.evaluation import AgentEvaluator, DriveStatistics
 
 STEPS = 12
 SEED = 20_003

@@ -77,6 +77,8 @@ def test_the_viewer_decodes_a_workers_frame_and_continues_it_as_a_dream(random_b
     )
     shown = LiveCanvas("night", ("steer", "gas", "brake"), dreamer).draw(live)
     assert shown.picture.shape == (*SIZE[::-1], 3)
+    captions = shown.facts.pop("captions")
+    assert len(captions) == len(AHEAD) + (1 if task == "dream" else 2)
     assert shown.facts == {
         "run": "night", "worker": "host-a/0a1b2c3d", "kind": "score", "generation": 7, "candidate": 2, "seed": 2**20,
         "step": 9, "score": live.frame.reward, "drawn": True,

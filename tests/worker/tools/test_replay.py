@@ -25,35 +25,41 @@ def finished_run(processes, random_bundle):
     return processes.runs / "test"
 
 
-@pytest.mark.slow
-def test_a_fitness_that_differs_from_the_stored_one_is_reported_and_exits_1(processes, finished_run):
-    replay = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
-    code, out, _ = call_here(*replay)
-    assert (code, out.count("same bits")) == (0, 2)
-    with closing(sqlite3.connect(finished_run / JOURNAL)) as connection, connection:
-        connection.execute("UPDATE result SET fitness = fitness + 1e-9 WHERE candidate = 1 AND episode = 1")
-    connection.close()
-    code, out, _ = call_here(*replay)
-    assert (code, out.count("same bits"), out.count("DIFFERS")) == (1, 1, 1)
-    code, _, err = call_here("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", "5/0")
-    assert code == 1
-    assert "5/0" in err
+def verify(processes, candidate, *flags):
+    """The exit code of `verify candidate`, what it prints, and its errors."""
+    words = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", candidate, *flags)
+    code, out, err = call_here(*words)
+    assert "Traceback" not in err
+    return code, json.loads(out) if out and "--json" in flags else out, err
+
+
+def same(found):
+    """Whether each episode has the stored score again."""
+    return [each["stored"] is not None and each["stored"] == each["replayed"] for each in found["episodes"]]
+
+
+def change(folder, statement, *values):
+    with closing(sqlite3.connect(folder / JOURNAL)) as connection, connection:
+        connection.execute(statement, values)
 
 
 @pytest.mark.slow
-def test_results_of_another_host_class_are_counted_and_optionally_compared(processes, finished_run):
-    with closing(sqlite3.connect(finished_run / JOURNAL)) as connection, connection:
-        connection.execute("UPDATE result SET fitness = fitness + 0.5, host_class = 'there' WHERE episode = 1")
-    connection.close()
-    replay = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
-    code, out, err = call_here(*replay)
-    assert (code, out.count("same bits"), out.count("not checkable here: of class there")) == (0, 1, 1)
-    assert "--tolerance" in err
-    found = json.loads(call_here(*replay, "--json")[1])
-    assert (found["identical"], found["unchecked"]) == (False, 1)
-    code, out, err = call_here(*replay, "--tolerance", 1)
-    assert (code, out.count("within 1, of class there"), err) == (0, 1, "")
-    assert call_here(*replay, "--tolerance", 0.25)[0] == 1
+def test_another_fitness_exits_1_and_one_of_another_host_class_is_counted_and_optionally_compared(
+    processes, finished_run
+):
+    code, found, _ = verify(processes, "0/1", "--json")
+    assert (code, found["identical"], found["unchecked"], same(found)) == (0, True, 0, [True, True])
+    change(finished_run, "UPDATE result SET fitness = fitness + 1e-9 WHERE candidate = 1 AND episode = 1")
+    code, found, _ = verify(processes, "0/1", "--json")
+    assert (code, found["identical"], found["unchecked"], same(found)) == (1, False, 0, [True, False])
+    code, _, err = verify(processes, "5/0")
+    assert (code, "5/0" in err) == (1, True)
+    change(finished_run, "UPDATE result SET fitness = fitness + 0.5, host_class = 'there' WHERE episode = 1")
+    code, found, err = verify(processes, "0/1", "--json")
+    assert (code, found["identical"], found["unchecked"], "--tolerance" in err) == (0, False, 1, True)
+    code, out, err = verify(processes, "0/1", "--tolerance", 1)
+    assert (code, len(out.splitlines()), out.count("there"), err) == (0, 2, 1, "")
+    assert verify(processes, "0/1", "--tolerance", 0.25)[0] == 1
 
 
 def score_generation(processes, bundle, task, episodes):
@@ -86,8 +92,8 @@ def test_an_episode_fails_only_in_a_fresh_process(processes, random_bundle, monk
     monkeypatch.setenv("DREAMFLEET_TRUST", rough_tasks.MODULE)
     task = rough_tasks.name_of(rough_tasks.Poisoned)
     score_generation(processes, random_bundle, task, 2)
-    code, out, err = call_here("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", "0/1")
-    assert (code, out.count("same bits")) == (0, 2), (out, err)
+    code, found, err = verify(processes, "0/1", "--json")
+    assert (code, same(found)) == (0, [True, True]), err
 
 
 @pytest.mark.slow
@@ -97,19 +103,8 @@ def test_what_only_python_itself_should_raise_is_an_episodes_failure(processes, 
     score_generation(processes, random_bundle, task, 2)
     monkeypatch.setenv(rough_tasks.PLACE, place)
     monkeypatch.setenv(rough_tasks.ERROR, "KeyboardInterrupt")
-    replay = (
-        "verify",
-        "candidate",
-        "test",
-        "--runs-dir",
-        processes.runs,
-        "--candidate",
-        "0/1",
-        "--trust",
-        rough_tasks.MODULE,
-    )
-    code, out, err = call_here(*replay)
-    assert (code, out.count("(KeyboardInterrupt"), "Traceback" in err) == (1, 2, False), (out, err)
+    code, out, err = verify(processes, "0/1", "--trust", rough_tasks.MODULE)
+    assert (code, out.count("(KeyboardInterrupt")) == (1, 2), (out, err)
 
 
 @pytest.fixture
@@ -126,53 +121,35 @@ def brittle_run(processes, random_bundle):
     return run
 
 
-def change_failures(folder, cause, fault="other"):
-    with closing(sqlite3.connect(folder / JOURNAL)) as connection, connection:
-        connection.execute("UPDATE failure SET cause = ?, fault = ?", (cause, fault))
-    connection.close()
-
-
 @pytest.mark.slow
-def test_a_candidate_that_failed_is_driven_again_and_its_cause_compared(processes, brittle_run):
+def test_a_candidate_that_failed_is_driven_again_its_cause_compared_and_one_that_scored_and_now_fails_differs(
+    processes, brittle_run
+):
     folder = brittle_run("worst")
     with RunFolder(folder) as run:
         place = run.failures()[0]
         failed = sum((each.generation, each.candidate) == (0, place.candidate) for each in run.failures())
-    replay = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", f"0/{place.candidate}")
-    code, out, err = call_here(*replay)
-    assert (code, out.count("same cause"), "DIFFERS" in out) == (0, failed, False), err
-    assert "failed then (ArithmeticError: the world of" in out
-    assert "fails now (ArithmeticError: the world of" in out
-    found = json.loads(call_here(*replay, "--json")[1])
+    candidate = f"0/{place.candidate}"
+    code, out, err = verify(processes, candidate)
+    assert (code, out.count("(ArithmeticError: the world of")) == (0, 2 * failed), err
+    _, found, _ = verify(processes, candidate, "--json")
     assert (found["identical"], found["fitness"], found["stored_fitness"]) == (True, None, None)
-    change_failures(folder, "ValueError")
-    code, out, err = call_here(*replay)
-    assert (code, out.count("DIFFERS")) == (1, failed), err
-    change_failures(folder, "killed by SIGSEGV", "crash")
-    code, out, err = call_here(*replay)
-    assert (out.count("not driven again"), "DIFFERS" in out, "Traceback" in err) == (failed, False, False)
-
-
-@pytest.mark.slow
-def test_a_candidate_that_scored_and_now_fails_differs(processes, brittle_run):
-    folder = brittle_run("worst")
-    with RunFolder(folder) as run:
-        place = run.failures()[0]
-    with closing(sqlite3.connect(folder / JOURNAL)) as connection, connection:
-        connection.execute(
-            "INSERT INTO result (digest, kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, "
-            "fingerprint, incarnation, host_class) SELECT f.digest, f.kind, f.generation, f.candidate, f.episode, "
-            "f.seed, -1.0, 10, 0.1, r.worker, r.fingerprint, r.incarnation, r.host_class FROM failure f, result r "
-            "WHERE f.candidate = ? LIMIT 1",
-            (place.candidate,),
-        )
-        connection.execute("DELETE FROM failure")
-    connection.close()
-    code, out, err = call_here(
-        "verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", f"0/{place.candidate}"
-    )
-    assert (code, "stored -1.0  fails now (ArithmeticError" in out, "DIFFERS" in out) == (1, True, True), err
-    assert "Traceback" not in err
+    change(folder, "UPDATE failure SET cause = 'ValueError'")
+    code, found, _ = verify(processes, candidate, "--json")
+    assert (code, found["identical"]) == (1, False)
+    change(folder, "UPDATE failure SET cause = 'killed by SIGSEGV', fault = 'crash'")
+    _, found, _ = verify(processes, candidate, "--json")
+    assert [bool(each["error"]) for each in found["episodes"] if each["failure"]] == [False] * failed, "not driven"
+    change(
+        folder, "INSERT INTO result (digest, kind, generation, candidate, episode, seed, fitness, steps, seconds, "
+        "worker, fingerprint, incarnation, host_class) SELECT f.digest, f.kind, f.generation, f.candidate, f.episode, "
+        "f.seed, -1.0, 10, 0.1, r.worker, r.fingerprint, r.incarnation, r.host_class FROM failure f, result r "
+        "WHERE f.candidate = ? LIMIT 1", place.candidate,
+    )  # fmt: skip
+    change(folder, "DELETE FROM failure")
+    code, found, _ = verify(processes, candidate, "--json")
+    assert code == 1
+    assert any(each["stored"] == -1 and each["error"].startswith("ArithmeticError") for each in found["episodes"])
 
 
 @pytest.mark.slow
@@ -182,9 +159,8 @@ def test_a_candidate_that_was_drawn_anew_is_compared_with_its_final_vector_alone
         stored = {number: len(run.results(0, number)) for number in numbers}
     number = max(stored, key=stored.__getitem__)
     assert stored[number] > 3, "choose another seed"
-    replay = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", f"0/{number}")
-    code, out, err = call_here(*replay)
-    assert (code, out.count("same bits"), len(out.splitlines())) == (0, 3, 3), (out, err)
+    code, found, err = verify(processes, f"0/{number}", "--json")
+    assert (code, same(found)) == (0, [True] * 3), err
 
 
 @pytest.mark.slow
@@ -194,11 +170,7 @@ def test_a_candidate_whose_generation_got_other_seeds_is_compared_on_these_alone
         seeds = run.training_seeds(0)
         assert run.failures()[0].seed not in seeds
         number = next(number for number in range(4) if run.fitness(0, number) is not None)
-    replay = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", f"0/{number}")
-    code, out, err = call_here(*replay)
-    assert (code, out.count("same bits"), len(out.splitlines())) == (0, 3, 3), (out, err)
-    with closing(sqlite3.connect(folder / JOURNAL)) as connection, connection:
-        connection.execute("UPDATE generation SET seeds = '7', checksum = NULL")
-    connection.close()
-    code, _, err = call_here(*replay)
-    assert (code, "Traceback" in err) == (1, False), err
+    code, found, err = verify(processes, f"0/{number}", "--json")
+    assert (code, same(found)) == (0, [True] * 3), err
+    change(folder, "UPDATE generation SET seeds = '7', checksum = NULL")
+    assert verify(processes, f"0/{number}")[0] == 1

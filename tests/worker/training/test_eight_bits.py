@@ -138,8 +138,7 @@ def test_a_row_has_the_bits_that_it_has_alone_and_reality_those_of_dreams(tmp_pa
 
 
 @pytest.mark.parametrize(
-    "memory",
-    [replace(MEMORY, reward="value", previous_reward=True), replace(ATTENTIVE, latent=4, hidden=6, window=3)],
+    "memory", [replace(MEMORY, reward="value", previous_reward=True), replace(ATTENTIVE, latent=4, hidden=6, window=3)]
 )
 def test_an_lstm_with_inputs_of_unknown_size_stays_as_it_is(tmp_path, memory):
     whole = write_random_bundle(tmp_path / "whole.zip", 3, EYES, memory)

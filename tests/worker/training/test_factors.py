@@ -20,15 +20,11 @@ from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae import VAE, PixelWeights
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
-from tests.support.drives import write_drives
+from tests.support.drives import ignore, write_drives
 from tests.support.phase_requests import requests
 
 LAYERS, RNN = VAEConfig(latent=4, channels=(4, 4, 8, 8)), MDNRNNConfig(latent=4, hidden=8, mixtures=2)
 SHORT = TrainConfig(updates=2, batch=8, rate=1e-3, validate_every=1)
-
-
-def ignore(_done, _note):
-    pass
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +118,7 @@ def test_at_one_nothing_is_written_and_files_from_before_factors_open(trained, t
 def test_a_training_goes_on_under_its_own_factors_only(trained):
     with pytest.raises(DatasetError, match=r"error_factor.*1\.0.*4\.0"):
         train_vae.train_vae(trained, SHORT, ignore, replace(LAYERS, error_factor=4.0))
-    with pytest.raises(DatasetError, match=r"z_factor 1\.0, not 2\.0"):
+    with pytest.raises(DatasetError, match=r"z_factor.*1\.0.*2\.0"):
         train_mdnrnn.train_mdnrnn(trained, SHORT, ignore, replace(RNN, z_factor=2.0))
 
 

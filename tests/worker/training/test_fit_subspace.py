@@ -1,7 +1,6 @@
 """A subspace of features that predict a driver's actions and rewards.
 Tests worker/training/stages/subspace.py and worker/verbs/subspace.py."""
 
-import argparse
 import json
 
 import numpy as np
@@ -18,7 +17,8 @@ from dreamfleet.worker.verbs import subspace as verb
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
-from tests.support.drives import write_drive
+from tests.support.drives import ignore, write_drive
+from tests.support.verbs import run_verb
 
 
 @pytest.fixture(scope="module")
@@ -45,10 +45,6 @@ def drives(folder):
         np.savez(path, **arrays)
         paths.append(path)
     return paths
-
-
-def ignore(_):
-    pass
 
 
 def test_a_target_is_the_mean_of_the_steps_to_come():
@@ -136,28 +132,22 @@ def test_the_features_of_a_rounded_world_model_fit_the_whole_one_too(drives):
     assert find_subspace(find_bundle("tiny-int8"), drives, ignore).subspace.bundle == find_bundle("tiny").sha256
 
 
-def call(*arguments):
-    parser = argparse.ArgumentParser()
-    verb.configure(parser)
-    return verb.run(parser.parse_args([str(each) for each in arguments]))
-
-
 def test_the_verb_writes_one_and_prints_what_it_predicts(bundle, drives, folder, tmp_path, capsys):
     flags = (bundle.path, "--data", folder / "data", "--out", tmp_path / "few.npz")
-    assert call(*flags, "--json") == 0
+    assert run_verb(verb, *flags, "--json") == 0
     printed = json.loads(capsys.readouterr().out)
     subspace = Subspace.load(tmp_path / "few.npz")
     assert (printed["sha256"], printed["bundle"], printed["drives"]) == (subspace.sha256, bundle.sha256, 20)
     assert tuple(printed["features"]) == subspace.names
     assert len(printed["r_squared"]) == len(subspace.names)
-    assert call(*flags) == 0
+    assert run_verb(verb, *flags) == 0
     assert "steer 0-3" in capsys.readouterr().out
     assert Subspace.load(tmp_path / "few.npz").sha256 == subspace.sha256, "equal drives make equal subspaces"
     with pytest.raises(UsageError):
-        call(*flags, "--episodes", 4)
+        run_verb(verb, *flags, "--episodes", 4)
     with pytest.raises(UsageError, match="--views"):
-        call(*flags, "--views", -1)
+        run_verb(verb, *flags, "--views", -1)
     with pytest.raises(UsageError):
-        call(bundle.path, "--data", folder / "data", "--out", tmp_path)
+        run_verb(verb, bundle.path, "--data", folder / "data", "--out", tmp_path)
     with pytest.raises(DatasetError):
-        call(bundle.path, "--data", tmp_path / "nothing", "--out", tmp_path / "few.npz")
+        run_verb(verb, bundle.path, "--data", tmp_path / "nothing", "--out", tmp_path / "few.npz")

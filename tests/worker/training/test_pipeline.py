@@ -5,7 +5,6 @@ train_vae.py, worker/training/stages/encode.py, worker/verbs/encode.py and
 dreamfleet/experiments/verbs/pipeline.py.
 """
 
-import argparse
 import json
 import shutil
 from pathlib import Path
@@ -24,17 +23,14 @@ from dreamfleet.worker.training.checkpoint import load_weights
 from dreamfleet.worker.training.data.dataset import load_arrays
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.prediction_quality import area_under_curve
-from dreamfleet.worker.training.presets import PRESETS, TrainConfig, find_preset
+from dreamfleet.worker.training.presets import PRESETS, TrainConfig
 from dreamfleet.worker.worldmodel.inference import Encoder, PolicyStep
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
-from tests.support.drives import write_drive, write_drives
+from tests.support.drives import ignore, write_drive, write_drives
+from tests.support.verbs import parse, run_verb
 
 SHORT = TrainConfig(updates=2, batch=8, rate=1e-3)
-
-
-def ignore(_done, _note):
-    pass
 
 
 @pytest.fixture(scope="module")
@@ -66,21 +62,6 @@ def test_a_bundle_encodes_as_its_training_did(trained, tmp_path):
     mirrored = np.ascontiguousarray(pictures[:, :, ::-1])
     assert np.array_equal(Encoder(bundle).encode(mirrored)[0], encoded["mirrored_mu"])
     assert PolicyStep(bundle).shape == bundle.controller_shape
-
-
-@pytest.mark.slow
-def test_training_goes_on_where_it_stopped(tmp_path):
-    write_drives(tmp_path, episodes=4, steps=6)
-    seen = []
-    train_vae.train_vae(tmp_path, SHORT, lambda done, _: seen.append(done))
-    before = load_weights(tmp_path / train_vae.CHECKPOINT)
-    train_vae.train_vae(tmp_path, SHORT, lambda done, _: seen.append(done))
-    unchanged = load_weights(tmp_path / train_vae.CHECKPOINT)
-    train_vae.train_vae(tmp_path, TrainConfig(3, 8, 1e-3), lambda done, _: seen.append(done))
-    after = load_weights(tmp_path / train_vae.CHECKPOINT)
-    assert seen == [0, 1, 2, 2, 2, 3]
-    assert all(np.array_equal(before[name], unchanged[name]) for name in before)
-    assert not all(np.array_equal(before[name], after[name]) for name in before)
 
 
 def test_the_mdnrnn_goes_on_to_the_same_weights_as_without_a_stop(trained, tmp_path):
@@ -142,11 +123,6 @@ def test_a_damaged_checkpoint_is_refused_with_the_remedy(tmp_path, content):
             attempt()
 
 
-def test_an_unknown_preset_lists_those_that_exist():
-    with pytest.raises(UsageError, match="'huge'"):
-        find_preset("huge")
-
-
 @pytest.mark.parametrize(
     ("scores", "positive", "area"),
     [([1, 2, 3, 4], [0, 0, 1, 1], 1.0), ([4, 3, 2, 1], [0, 0, 1, 1], 0.0), ([1, 2, 3, 4], [1, 0, 0, 1], 0.5)],
@@ -155,21 +131,12 @@ def test_the_area_under_the_curve(scores, positive, area):
     assert area_under_curve(np.array(scores, np.float32), np.array(positive, bool)) == area
 
 
-# SWIG warns as Box2D is imported, and an error there kills the process.
-pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
 SHARES = {"tiny": 0.004, "notebook": 0.0005, "article": 0.0002, "attentive": 0.001, "paper": 0.00002, "pixels": 0.005}
 FEW = ("--jobs", "1", "--collect-flags", "--steps 24", "--vae-flags", "--batch 4", "--yes")
 
 
-@pytest.fixture(autouse=True)
-def no_display(monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-
-
 def call(*arguments):
-    parser = argparse.ArgumentParser()
-    pipeline.configure(parser)
-    return pipeline.run(parser.parse_args([str(each) for each in arguments]))
+    return run_verb(pipeline, *arguments)
 
 
 def made(folder, preset):
@@ -227,9 +194,7 @@ def test_nothing_is_made_on_a_vae_that_is_no_better_than_the_mean_picture(tmp_pa
 
 
 def asked(*arguments):
-    parser = argparse.ArgumentParser()
-    pipeline.configure(parser)
-    return pipeline.make_request(parser.parse_args(["--data", "data", *arguments]))
+    return pipeline.make_request(parse(pipeline, "--data", "data", *arguments))
 
 
 def test_the_world_is_of_collecting():
@@ -269,17 +234,12 @@ def test_a_share_of_every_amount_is_rounded_up():
         (("--bundle-flags", "--out b.zip"), "--bundle-flags.* --out"),
         (("--bundle-flags", "--end 7"), "7"),
         (("--preset", "dream"), "'dream'"),
+        (("--mdnrnn-flags", "--ghost 1"), "--ghost"),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_is_driven(tmp_path, flags, named):
     with pytest.raises(UsageError, match=named):
         call("--data", tmp_path / "data", *flags)
-    assert not (tmp_path / "data").exists()
-
-
-def test_an_unknown_flag_of_a_stage_is_refused_before_anything_is_driven(tmp_path):
-    with pytest.raises(UsageError, match="--ghost"):
-        call("--data", tmp_path / "data", "--mdnrnn-flags", "--ghost 1")
     assert not (tmp_path / "data").exists()
 
 

@@ -1,9 +1,8 @@
 """Presets match their sources; a data folder keeps the preset it was begun with."""
 
-import argparse
 import json
+from argparse import ArgumentParser
 from dataclasses import fields
-from pathlib import Path
 
 import pytest
 import torch
@@ -22,28 +21,12 @@ from dreamfleet.worker.verbs import collect, train
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import NOTEBOOK, REWARDED, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
-from tests.support.drives import write_drive, write_drives
+from tests.support.drives import ignore, write_drive, write_drives
+from tests.support.verbs import run_verb
 
-# SWIG warns as Box2D is imported, and an error there kills the process.
-pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
 SHORT = TrainConfig(updates=2, batch=8, rate=1e-3)
 SMALL = {64: VAEConfig(channels=(2, 2, 4, 4)), 96: VAEConfig(picture=96, channels=(2, 2, 4, 4))}
 VERBS = ((collect,), (train, "vae"), (train, "mdnrnn"))
-
-
-def ignore(_done, _note):
-    pass
-
-
-def parsed(verb, *arguments):
-    parser = argparse.ArgumentParser()
-    verb.configure(parser)
-    parser.set_defaults(runs_dir=Path("runs"))
-    return parser.parse_args(arguments)
-
-
-def call(verb, *arguments):
-    return verb.run(parsed(verb, *arguments))
 
 
 def test_tiny_is_what_it_was():
@@ -131,15 +114,14 @@ def test_a_drive_follows_from_the_first_reward_in_training_and_behind_it():
 
 @pytest.mark.parametrize("verb", [collect, train])
 def test_every_flag_says_what_it_does(verb):
-    parser = argparse.ArgumentParser()
+    parser = ArgumentParser()
     verb.configure(parser)
     assert [each.dest for each in parser._actions if not each.help] == []
     assert parser.format_help()
 
 
 @pytest.mark.parametrize(
-    ("verb", "kinds"),
-    [("collect", (CollectConfig,)), ("train", (TrainConfig, VAEConfig, MDNRNNConfig))],
+    ("verb", "kinds"), [("collect", (CollectConfig,)), ("train", (TrainConfig, VAEConfig, MDNRNNConfig))]
 )
 def test_every_amount_and_layer_has_a_flag_or_a_key(verb, kinds):
     parser = build_parser(verb, {"collect": collect, "train": train}[verb])
@@ -149,16 +131,18 @@ def test_every_amount_and_layer_has_a_flag_or_a_key(verb, kinds):
 
 def test_a_later_verb_without_the_data_sets_preset_is_refused(tmp_path, capsys):
     assert (
-        call(collect, "--data", str(tmp_path), "--preset", "article", "--episodes", "2", "--steps", "3", "--jobs", "1")
+        run_verb(
+            collect, "--data", str(tmp_path), "--preset", "article", "--episodes", "2", "--steps", "3", "--jobs", "1"
+        )
         == 0
     )
     assert load_preset(tmp_path) == "article"
     for verb, *model in VERBS:
         with pytest.raises(UsageError, match="--preset article"):
-            call(verb, *model, "--data", str(tmp_path))
+            run_verb(verb, *model, "--data", str(tmp_path))
         with pytest.raises(UsageError, match=r"--preset paper.*--preset article"):
-            call(verb, *model, "--data", str(tmp_path), "--preset", "paper")
-    assert call(train, "vae", "--data", str(tmp_path), "--preset", "article", "--summary") == 0
+            run_verb(verb, *model, "--data", str(tmp_path), "--preset", "paper")
+    assert run_verb(train, "vae", "--data", str(tmp_path), "--preset", "article", "--summary") == 0
     assert "2,115,971" in capsys.readouterr().out
 
 

@@ -1,7 +1,6 @@
 """A controller fitted to another world model.
 Tests drive_regression.py, worker/training/stages/refit.py and worker/verbs/refit.py."""
 
-import argparse
 import json
 from dataclasses import replace
 
@@ -18,7 +17,8 @@ from dreamfleet.worker.verbs import refit as verb
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
-from tests.support.drives import write_drive, write_drives
+from tests.support.drives import ignore, write_drive, write_drives
+from tests.support.verbs import run_verb
 
 EYES = VAEConfig(latent=4, channels=(2, 2, 2, 2))
 MEMORY = MDNRNNConfig(latent=4, hidden=6)
@@ -44,10 +44,6 @@ def controller(bundle, features="zh", hidden=0, variant=DEFAULT_VARIANT):
     shape = bundle.shape_of(features, hidden, variant)
     parameters = np.random.default_rng(3).normal(size=shape.size).astype(np.float32)
     return Controller(shape, parameters, "car-racing", bundle.sha256, options=variant.options)
-
-
-def ignore(_):
-    pass
 
 
 def first_values(chosen, bundle, paths):
@@ -143,24 +139,18 @@ def test_what_cannot_be_fitted_is_refused(bundles, drives, folder, tmp_path):
         refit(controller(old), old, new, [lost], ignore)
 
 
-def call(*arguments):
-    parser = argparse.ArgumentParser()
-    verb.configure(parser)
-    return verb.run(parser.parse_args([str(each) for each in arguments]))
-
-
 def test_the_verb_writes_a_controller_of_the_other_model(bundles, drives, folder, tmp_path, capsys):
     old, new = bundles
     controller(old).save(tmp_path / "before.npz")
     flags = ("--bundle", old.path, "--data", folder / "data", "--out", tmp_path / "after.npz", "--runs-dir", tmp_path)
-    assert call(tmp_path / "before.npz", "--to", new.path, *flags, "--episodes", 10, "--json") == 0
+    assert run_verb(verb, tmp_path / "before.npz", "--to", new.path, *flags, "--episodes", 10, "--json") == 0
     printed = json.loads(capsys.readouterr().out)
     after = Controller.load(tmp_path / "after.npz")
     assert (printed["sha256"], printed["bundle"], printed["drives"]) == (after.sha256, Bundle.open(new.path).sha256, 10)
     assert len(printed["r_squared"]) == 3
     with pytest.raises(UsageError, match="--episodes"):
-        call(tmp_path / "before.npz", "--to", new.path, *flags, "--episodes", 1)
+        run_verb(verb, tmp_path / "before.npz", "--to", new.path, *flags, "--episodes", 1)
     with pytest.raises(UsageError):
-        call(tmp_path / "before.npz", "--to", new.path, *flags, "--out", tmp_path)
+        run_verb(verb, tmp_path / "before.npz", "--to", new.path, *flags, "--out", tmp_path)
     with pytest.raises(ControllerError):
-        call(tmp_path / "before.npz", "--to", new.path, *flags, "--bundle", new.path)
+        run_verb(verb, tmp_path / "before.npz", "--to", new.path, *flags, "--bundle", new.path)

@@ -1,8 +1,6 @@
 """Tests config_flags.py, worker/training/stages/collect.py, worker/verbs/collect.py and worker/verbs/train.py."""
 
-import argparse
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,18 +12,12 @@ from dreamfleet.worker.verbs import collect, train
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.drives import write_drive, write_drives
 from tests.support.events import scalars
-
-
-def call(verb, *arguments):
-    parser = argparse.ArgumentParser()
-    verb.configure(parser)
-    parser.set_defaults(runs_dir=Path("runs"))
-    return verb.run(parser.parse_args(arguments))
+from tests.support.verbs import run_verb
 
 
 def test_flags_change_what_a_preset_says(tmp_path, capsys):
     write_drives(tmp_path, episodes=3, steps=4)
-    call(
+    run_verb(
         train, "vae", "--data", str(tmp_path), "--updates", "1", "--set", "channels=2,2,4,4", "batch_norm=false",
         "--set", "padding=same",
     )  # fmt: skip
@@ -35,23 +27,24 @@ def test_flags_change_what_a_preset_says(tmp_path, capsys):
 
 def test_a_flag_says_how_large_pictures_are(tmp_path, capsys):
     write_drives(tmp_path, episodes=3, steps=4, picture=96)
-    call(train, "vae", "--data", str(tmp_path), "--updates", "1", "--set", "picture=96", "channels=2,2,4,4")
+    run_verb(train, "vae", "--data", str(tmp_path), "--updates", "1", "--set", "picture=96", "channels=2,2,4,4")
     assert load_config(tmp_path / "vae.safetensors", VAEConfig).picture == 96
-    assert call(collect, "--data", str(tmp_path), "--episodes", "3", "--picture", "96") == 0
-    assert "0 new episodes with 0 frames; 3 episodes in all" in capsys.readouterr().out
+    capsys.readouterr()
+    assert run_verb(collect, "--data", str(tmp_path), "--episodes", "3", "--picture", "96", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["new_episodes"], found["new_frames"], found["episodes"]) == (0, 0, 3)
     with pytest.raises(DatasetError, match="--picture"):
-        call(collect, "--data", str(tmp_path), "--episodes", "4")
+        run_verb(collect, "--data", str(tmp_path), "--episodes", "4")
 
 
 def test_a_set_that_has_more_than_is_asked_for_is_counted_whole(tmp_path, capsys):
     write_drives(tmp_path, episodes=3, steps=4)
     write_drive(tmp_path, 7, steps=4)
     flags = ("--episodes", "4", "--jobs", "1", "--preset", "tiny")
-    assert call(collect, "--data", str(tmp_path), *flags) == 0
+    assert run_verb(collect, "--data", str(tmp_path), *flags, "--json") == 0
     printed = capsys.readouterr()
-    assert ": 1 new episode with " in printed.out
-    assert "5 episodes in all" in printed.out
-    assert "5/5" in printed.err
+    found = json.loads(printed.out)
+    assert (found["new_episodes"], found["episodes"], "5/5" in printed.err) == (1, 5, True)
 
 
 def test_a_file_and_variables_say_settings_too(tmp_path, monkeypatch, capsys):
@@ -90,14 +83,14 @@ def test_a_wrong_setting_is_one_line_with_the_right_one(tmp_path, capsys, words,
 
 @pytest.mark.parametrize(("model", "count"), [("vae", "4,348,547"), ("mdnrnn", "422,368")])
 def test_a_summary_trains_nothing(tmp_path, capsys, model, count):
-    assert call(train, model, "--data", str(tmp_path / "absent"), "--preset", "paper", "--summary") == 0
+    assert run_verb(train, model, "--data", str(tmp_path / "absent"), "--preset", "paper", "--summary") == 0
     assert count in capsys.readouterr().out
 
 
 def test_a_set_goes_on_with_drives_of_controllers(tmp_path, capsys):
     write_drives(tmp_path, episodes=3, steps=4)
     flags = ("--episodes", "4", "--jobs", "1", "--steps", "5", "--runs-dir", str(tmp_path))
-    assert call(collect, "--data", str(tmp_path), *flags, "--controller", "tiny", "--noise", "0.1", "--json") == 0
+    assert run_verb(collect, "--data", str(tmp_path), *flags, "--controller", "tiny", "--noise", "0.1", "--json") == 0
     assert json.loads(capsys.readouterr().out)["episodes"] == 4
     with np.load(tmp_path / "episodes" / "000003.npz") as drive:
         assert (str(drive["driver"]), len(drive["action"])) == ("controller", 5)
@@ -115,7 +108,7 @@ def test_a_set_goes_on_with_drives_of_controllers(tmp_path, capsys):
 )
 def test_flags_of_controllers_that_do_not_drive_are_refused(tmp_path, flags, named):
     with pytest.raises(UsageError, match=named):
-        call(collect, "--data", str(tmp_path), *flags)
+        run_verb(collect, "--data", str(tmp_path), *flags)
 
 
 def test_losses_go_to_tensorboard_too_and_a_continued_training_adds_to_them(tmp_path, capsys):
@@ -124,7 +117,7 @@ def test_losses_go_to_tensorboard_too_and_a_continued_training_adds_to_them(tmp_
     settings = ("--set", "channels=2,2,4,4", "validate_every=1")
     flags = ("vae", "--data", str(data), *settings, "--tensorboard", str(events))
     for updates in ("1", "3"):
-        call(train, *flags, "--updates", updates)
+        run_verb(train, *flags, "--updates", updates)
     points = [json.loads(line) for line in (data / "vae.jsonl").read_text().splitlines()]
     found = scalars(events / "vae")
     assert [step for step, _ in found["loss/held_out"]] == [1, 2, 3]

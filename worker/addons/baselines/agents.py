@@ -11,25 +11,48 @@ from typing import Any
 
 import numpy as np
 from numpy.random import SeedSequence
+from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.actions import FIVE_CHOICES, STEERING_GAS_BRAKE
+from dreamfleet.common.artifacts.actions import FIVE_CHOICES, STEERING_GAS_BRAKE, Actions, Discrete, one_hot
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.errors import MissingExtraError, UsageError
 from dreamfleet.common.files.regular_files import is_file
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import describe_task
-from dreamfleet.worker.addons.baselines.policies import RandomPolicy
 from dreamfleet.worker.addons.baselines.presets import CHECKPOINT
 from dreamfleet.worker.scoring.agents import Agent, EvolvedAgent
 from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT
+from dreamfleet.worker.tasks.drivers import UniformActions
 from dreamfleet.worker.tasks.policy import NO_PARAMETERS
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.tools.drivers import DISCRETE, RANDOM
 from dreamfleet.worker.worlds.car_racing.agents import NetworkAgent, PictureAgent
 from dreamfleet.worker.worlds.car_racing.preprocessing import RAW
 
+Floats = NDArray[np.float32]
 ACTIONS_KEY = (3,)  # of the seed's child that random actions come from
+
+
+class RandomPolicy:
+    """Draws each action uniformly: one of its choices, or a number between the bounds of each component.
+
+    >>> RandomPolicy(np.random.default_rng(1), Discrete(3, first=5)).act(None)
+    np.int64(6)
+    """
+
+    def __init__(self, random: np.random.Generator, actions: Actions) -> None:
+        self._driver = UniformActions(random, one_hot(actions.outputs) if isinstance(actions, Discrete) else actions)
+        self._convert: Callable[[Floats], Any] = (
+            actions.to_action if isinstance(actions, Discrete) else lambda drawn: drawn
+        )
+
+    def begin(self, parameters: Floats) -> None:
+        """Do nothing: it has no memory."""
+
+    def act(self, _observation: Any) -> Any:
+        """Return an action as the environment's `step` takes it."""
+        return self._convert(self._driver.act())
 
 
 @dataclass(frozen=True)

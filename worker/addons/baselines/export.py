@@ -12,9 +12,8 @@ from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.artifacts.trained_agent import AgentManifest, TrainedAgent
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.host.packages import package_version
-from dreamfleet.worker.addons.baselines.agent_config import AgentConfig
 from dreamfleet.worker.addons.baselines.network import Networks
-from dreamfleet.worker.addons.baselines.presets import CHECKPOINT, DRQN
+from dreamfleet.worker.addons.baselines.presets import CHECKPOINT, DRQN, AgentConfig
 from dreamfleet.worker.addons.baselines.progress import parse_progress
 from dreamfleet.worker.training.checkpoint import load_checkpoint, load_config
 from dreamfleet.worker.training.data.dataset import preprocessing_of_size

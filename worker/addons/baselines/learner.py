@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from dreamfleet.common.errors import DatasetError
-from dreamfleet.worker.addons.baselines.learning_config import LearningConfig
 from dreamfleet.worker.addons.baselines.network import Networks, QNetwork
+from dreamfleet.worker.addons.baselines.presets import LearningConfig
 from dreamfleet.worker.addons.baselines.replay_buffer import TraceBatch
 
 
@@ -37,7 +37,7 @@ class Learner:
         self._optimiser.step()
         self.updates += 1
         if self.updates % self._config.target_every == 0:
-            self._networks.update_target()
+            self._networks.target.load_state_dict(self._networks.online.state_dict())
         return value
 
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import copy
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from dreamfleet.worker.addons.baselines.agent_config import AgentConfig
+from dreamfleet.worker.addons.baselines.presets import AgentConfig
+from dreamfleet.worker.tasks.policy import FrameSkipPolicy
 
 Memory = tuple[Tensor, Tensor]
 """Hidden and cell state `(1, N, hidden)`."""
@@ -43,17 +46,13 @@ class QNetwork(nn.Module):
 
     def warm_up(self, features: Tensor, real: Tensor) -> Memory:
         """The memory after burn-in features `(N, B, flat)`, without gradients; zero while `real` (N, B) is 0."""
-        memory = self.zero_memory(len(features), features.device)
+        zeros = torch.zeros(1, len(features), self.config.hidden, device=features.device)
+        memory = zeros, zeros
         with torch.no_grad():
             for step in range(features.shape[1]):
                 _, (hidden, cell) = self.lstm(features[:, step : step + 1], memory)
                 memory = hidden * real[:, step, None], cell * real[:, step, None]
         return memory
-
-    def zero_memory(self, rows: int, device: torch.device | None = None) -> Memory:
-        """The memory at the beginning of an episode."""
-        zeros = torch.zeros(1, rows, self.config.hidden, device=device)
-        return zeros, zeros
 
 
 class Networks(nn.Module):
@@ -65,10 +64,6 @@ class Networks(nn.Module):
         self.online = QNetwork(config)
         self.target = copy.deepcopy(self.online).requires_grad_(requires_grad=False)
 
-    def update_target(self) -> None:
-        """Copy the online network's weights to the target network."""
-        self.target.load_state_dict(self.online.state_dict())
-
 
 def duelling(value: Tensor, advantage: Tensor) -> Tensor:
     """Wang et al. 2016 (arXiv:1511.06581), equation 9: Q(s, a) = V(s) + A(s, a) - mean over a of A(s, a).
@@ -76,3 +71,34 @@ def duelling(value: Tensor, advantage: Tensor) -> Tensor:
     `value` is `(..., 1)`, `advantage` and the result are `(..., choices)`.
     """
     return value + advantage - advantage.mean(dim=-1, keepdim=True)
+
+
+class QPolicy(FrameSkipPolicy):
+    """Epsilon-greedy policy of the network while it learns.
+
+    The LSTM's memory advances at each decision, random ones included. With `epsilon` 1 the network is not evaluated.
+    """
+
+    def __init__(self, network: QNetwork, epsilon: float = 0.0, random: np.random.Generator | None = None) -> None:
+        """`random` is needed unless `epsilon` is 0."""
+        super().__init__(network.config.table, network.config.frame_skip)
+        self._network, self._epsilon, self._random = network, epsilon, random
+        self._memory: Memory | None = None
+
+    def reset_memory(self) -> None:
+        """Forget the last episode."""
+        self._memory = None
+
+    def choose(self, picture: NDArray[np.uint8]) -> int:
+        """Return the number of the best choice, or of a random one."""
+        best = self._best(picture) if self._epsilon < 1 else 0
+        if self._random is not None and self._random.random() < self._epsilon:
+            return int(self._random.integers(len(self._network.config.table)))
+        return best
+
+    def _best(self, picture: NDArray[np.uint8]) -> int:
+        network = self._network
+        with torch.no_grad():
+            seen = torch.from_numpy(picture[None, None]).to(network.value.weight.device)
+            worth, self._memory = network(network.features(seen), self._memory)
+        return int(worth[0, 0].argmax())

@@ -1,15 +1,23 @@
-"""The replay buffer: whole episodes, sampled as traces of consecutive decisions."""
+"""The replay buffer: whole episodes, sampled as traces of consecutive decisions, each episode also a file on disk."""
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.worker.addons.baselines.learning_config import LearningConfig
+from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.files.archives import ArchiveLimits, read_arrays
+from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.worker.addons.baselines.presets import LearningConfig
+from dreamfleet.worker.training.data.data_folder import explain_write_errors
+
+_LIMITS = ArchiveLimits(4 << 30, members=4)
+KINDS = {"picture": "uint8", "choice": "int64", "reward": "float32"}
 
 
 @dataclass(frozen=True)
@@ -23,6 +31,26 @@ class Episode:
 
     def __len__(self) -> int:
         return len(self.choice)
+
+    def save(self, path: Path) -> None:
+        """Write it atomically; `DatasetError` if it cannot be written."""
+        with explain_write_errors(path), atomic_write(path) as file:
+            np.savez_compressed(file, **{name: np.asarray(value) for name, value in vars(self).items()})  # type: ignore[arg-type]
+
+    @classmethod
+    def load(cls, path: Path, picture: int) -> Episode:
+        """Read one whose pictures have this side; `DatasetError` for a missing or damaged file, or another size."""
+        try:
+            arrays = read_arrays(path, _LIMITS, (*KINDS, "terminal"))
+            terminal, length = bool(arrays.pop("terminal")), len(arrays["choice"])
+            shapes = {"picture": (length, picture, picture, 3), "choice": (length,), "reward": (length,)}
+            if {name: each.shape for name, each in arrays.items()} != shapes or not length:
+                raise ValueError("its arrays are of other shapes")
+            if {name: each.dtype.name for name, each in arrays.items()} != KINDS:
+                raise ValueError("its arrays hold something else")
+        except (OSError, ValueError, TypeError) as error:
+            raise DatasetError(f"{path} is missing or damaged ({error}): give --new to start over") from error
+        return cls(**arrays, terminal=terminal)
 
 
 @dataclass(frozen=True)

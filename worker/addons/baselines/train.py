@@ -18,13 +18,9 @@ from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.locks import folder_lock
 from dreamfleet.common.host.stop_signals import Stop, never_stop
 from dreamfleet.common.runs.seeds import training_seed
-from dreamfleet.worker.addons.baselines.agent_config import AgentConfig
-from dreamfleet.worker.addons.baselines.episode_files import delete_episodes_before, load_episode, save_episode
 from dreamfleet.worker.addons.baselines.learner import Learner
-from dreamfleet.worker.addons.baselines.learning_config import LearningConfig, epsilon_of
-from dreamfleet.worker.addons.baselines.network import Networks
-from dreamfleet.worker.addons.baselines.policies import QPolicy
-from dreamfleet.worker.addons.baselines.presets import CHECKPOINT
+from dreamfleet.worker.addons.baselines.network import Networks, QPolicy
+from dreamfleet.worker.addons.baselines.presets import CHECKPOINT, AgentConfig, LearningConfig, epsilon_of
 from dreamfleet.worker.addons.baselines.progress import (
     EpisodeRecord,
     TrainingProgress,
@@ -48,13 +44,10 @@ OnEpisode = Callable[[int, TrainingReport | None], None]
 """Called after each episode with the number driven, and a report when one is due."""
 
 
-def ignore_episode(_episodes: int, _report: TrainingReport | None) -> None:
-    """Do nothing: the default `OnEpisode`."""
-
-
 def train_drqn(
-    folder: Path, layers: AgentConfig, config: LearningConfig, on_episode: OnEpisode = ignore_episode,
-    device: torch.device | None = None, stop: Stop = never_stop, new: bool = False,
+    folder: Path, layers: AgentConfig, config: LearningConfig,
+    on_episode: OnEpisode = lambda _episodes, _report: None, device: torch.device | None = None,
+    stop: Stop = never_stop, new: bool = False,
 ) -> dict[str, float]:  # fmt: skip
     """Train, or resume, up to `config.episodes` or the goal; return the figures of the training.
 
@@ -137,13 +130,16 @@ class AgentTraining:
         before = sum(each.decisions for each in self._records)
         for moment in run_episode(self._environment, policy, episode_config):
             if stop():
-                self._raise_stopped()
+                raise StoppedError(
+                    f"stopped in episode {number + 1} of {config.episodes}: {self._path} keeps those before it; "
+                    f"{resume_command(self._new)} drives it again and continues from there"
+                )
             drive.see(moment, policy)
             due = policy.is_new_decision and (before + drive.decisions) % config.learn_every == 0
             if due and number >= config.random_episodes and (traces := self._replay.sample(random)):
                 losses.append(self._learner.learn(traces))
         episode = drive.episode
-        save_episode(self._folder, number, episode)
+        episode.save(episode_file(self._folder, number))
         self._replay.add(episode)
         loss = fmean(losses) if losses else None
         self._records.append(EpisodeRecord(drive.score, drive.steps, len(episode), epsilon, loss))
@@ -154,7 +150,9 @@ class AgentTraining:
         progress = TrainingProgress(self._learner.updates, self._oldest, tuple(self._records), asdict(self._config))
         save_checkpoint(self._path, self._networks, self._optimiser, asdict(progress))
         self._write_curve()
-        delete_episodes_before(self._folder, self._oldest)
+        for path in (self._folder / "replay").glob("[0-9]*.npz"):
+            if path < episode_file(self._folder, self._oldest):
+                path.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Release the environment."""
@@ -174,7 +172,7 @@ class AgentTraining:
         for group in self._optimiser.param_groups:
             group["lr"] = self._config.rate
         for number in range(self._oldest, self.episodes):
-            self._replay.add(load_episode(self._folder, number, self._layers.picture))
+            self._replay.add(Episode.load(episode_file(self._folder, number), self._layers.picture))
         self._write_curve()
 
     def _write_curve(self) -> None:
@@ -183,11 +181,10 @@ class AgentTraining:
         with explain_write_errors(path), atomic_write(path) as file:
             file.write("".join(f"{line}\n" for line in lines).encode())
 
-    def _raise_stopped(self) -> None:
-        raise StoppedError(
-            f"stopped in episode {self.episodes + 1} of {self._config.episodes}: {self._path} keeps those before it; "
-            f"{resume_command(self._new)} drives it again and continues from there"
-        )
+
+def episode_file(folder: Path, number: int) -> Path:
+    """The path of a training's episode, from which a resumed training refills its replay buffer."""
+    return folder / "replay" / f"{number:06d}.npz"
 
 
 class EpisodeRecorder:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import base64
 import http.client
 import json
-import statistics
-import time
-from collections.abc import Callable
+from itertools import count, islice
 from typing import Any
 
 import numpy as np
@@ -15,10 +13,10 @@ import numpy as np
 from dreamfleet.common.client.remote_scorer import RemoteScorer
 from dreamfleet.common.host.processes import VerbProcess
 from dreamfleet.common.host.reports import ADDRESS
-from dreamfleet.worker.addons.bench.dispatch import BenchRun, Figures
+from dreamfleet.worker.addons.bench.dispatch import Figures, start_run
+from dreamfleet.worker.addons.bench.measurement import TimedCall, time_alternately
 from dreamfleet.worker.addons.bench.sleep_tasks import NULL_TASK
 
-BLOCKS = 9  # of each kind, in turn; the first of each is not counted
 POPULATIONS = (1, 64, 1024)
 EPISODES = 1
 
@@ -28,31 +26,29 @@ def bench_batches() -> Figures:
 
     An evaluation is one episode of one vector of 867 numbers. The caller waits for each batch before the next.
     """
-    with BenchRun(NULL_TASK, 64, EPISODES, external=True) as run, run.crowd(2, 32):
+    with start_run(NULL_TASK, 64, EPISODES, external=True) as run, run.crowd(2, 32):
         run.coordinator.wait_for_report(ADDRESS)
         with (
             RemoteScorer(run.endpoint, "bench") as scorer,
             VerbProcess("serve", "--connect", run.endpoint, "--port", 0) as bridge,
         ):
             address = bridge.wait_for_report(ADDRESS)
-            ways: dict[str, Callable[[np.ndarray[Any, Any], list[int]], None]] = {
+            ways = {
                 "zenoh": lambda vectors, seeds: _score(scorer, vectors, seeds),
-                "http": HttpCaller(address, packed=False).score, "http_base64": HttpCaller(address, packed=True).score,
-            }  # fmt: skip
-            rates: Figures = {}
-            seeds = iter(range(10**9))
-            for population in POPULATIONS:
-                vectors = np.random.default_rng(1).normal(size=(population, scorer.size)).astype(np.float32)
-                seconds: dict[str, list[float]] = {way: [] for way in ways}
-                for _ in range(BLOCKS):
-                    for way, score in ways.items():
-                        own = [next(seeds) for _ in range(EPISODES)]
-                        started = time.perf_counter()
-                        score(vectors, own)
-                        seconds[way].append(time.perf_counter() - started)
-                rates[f"population_{population}"] = {
-                    way: round(population * EPISODES / statistics.median(each[1:])) for way, each in seconds.items()
-                }
+                "http": HttpCaller(address, packed=False).score,
+                "http_base64": HttpCaller(address, packed=True).score,
+            }
+            seeds, random = count(), np.random.default_rng(1)
+
+            def batch(way: str, population: int) -> TimedCall:
+                vectors = random.normal(size=(population, scorer.size)).astype(np.float32)
+                return lambda: ways[way](vectors, list(islice(seeds, EPISODES)))
+
+            cases = {(way, population): batch(way, population) for population in POPULATIONS for way in ways}
+            seconds = time_alternately(cases)
+            rates: Figures = {f"population_{population}": {} for population in POPULATIONS}
+            for (way, population), each in seconds.items():
+                rates[f"population_{population}"][way] = round(population * EPISODES / each)
             return {"evaluations_per_second": rates, "numbers_per_vector": scorer.size}
 
 

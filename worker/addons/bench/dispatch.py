@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import queue
-import socket
 import statistics
-import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from importlib import import_module
 from importlib.util import find_spec
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.host.child import FunctionChild
 from dreamfleet.common.host.processes import VerbProcess
 from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.worker.addons.bench.measurement import free_endpoint
 from dreamfleet.worker.addons.bench.simulated_workers import run_simulated_workers
 from dreamfleet.worker.addons.bench.sleep_tasks import NULL_TASK, SLEEP_SECONDS, SLEEP_TASK
 
@@ -40,34 +40,17 @@ def bench_dispatch(crowd: int) -> Figures:
 
     `crowd` is a number of simulated workers for a third run; 0: none.
     """
-    naps, null = measure_sleep_jobs(), measure_null_jobs()
-    peers: dict[str, Figures | None] = {}
-    for name, run in (("pool", pool_peer), ("dask", dask_peer), ("ray", ray_peer)):
-        if name == "pool" or find_spec({"dask": "distributed"}.get(name, name)):
-            peers[name] = run_peer(run)
-    figures: Figures = {
-        "efficiency_50ms": round(naps, 4),
-        "null_jobs_per_second": round(null["jobs_per_second"]),
-        "coordinator_rss_mb": round(null["rss_mb"], 1),
-        "peers": peers,
-    }
+    figures: Figures = {}
+    with start_run(SLEEP_TASK, CANDIDATES, 1) as run, run.workers("--task", SLEEP_TASK, "--slots", SLOTS):
+        run.finish()
+        figures["efficiency_50ms"] = round(ROUNDS * SLEEP_SECONDS / run.generation_seconds(), 4)
+    with start_run(NULL_TASK, 64, NULL_JOBS // 64) as run, run.crowd(2, 32):
+        figures |= run.finish_null_jobs()
+    peers = (("pool", "multiprocessing", pool_peer), ("dask", "distributed", dask_peer), ("ray", "ray", ray_peer))
+    figures["peers"] = {name: run_peer(peer) for name, package, peer in peers if find_spec(package)}
     if crowd:
         figures["crowd"] = measure_crowd(crowd)
     return figures
-
-
-def measure_sleep_jobs() -> float:
-    """The ideal makespan of a generation of 50 ms jobs divided by the measured one, on a real worker."""
-    with BenchRun(SLEEP_TASK, CANDIDATES, 1) as run, run.workers("--task", SLEEP_TASK, "--slots", SLOTS):
-        run.finish()
-        return ROUNDS * SLEEP_SECONDS / run.generation_seconds()
-
-
-def measure_null_jobs() -> Figures:
-    """Jobs per second of empty jobs on two simulated workers of 32 slots each, and the coordinator's peak memory."""
-    with BenchRun(NULL_TASK, 64, NULL_JOBS // 64) as run, run.crowd(2, 32):
-        run.finish()
-        return {"jobs_per_second": NULL_JOBS / run.generation_seconds(), "rss_mb": run.peak_mb}
 
 
 def measure_crowd(count: int) -> Figures:
@@ -77,14 +60,9 @@ def measure_crowd(count: int) -> Figures:
     `CROWD_SLOTS` slots.
     """
     started = time.monotonic()
-    with BenchRun(NULL_TASK, 64, NULL_JOBS // 64) as run, run.crowd(count, 1):
-        run.finish()
-        crowd = {
-            "workers": count,
-            "seconds_in_all": round(time.monotonic() - started, 1),
-            "null_jobs_per_second": round(NULL_JOBS / run.generation_seconds()),
-            "coordinator_rss_mb": round(run.peak_mb, 1),
-        }
+    with start_run(NULL_TASK, 64, NULL_JOBS // 64) as run, run.crowd(count, 1):
+        null = run.finish_null_jobs()
+        crowd = {"workers": count, "seconds_in_all": round(time.monotonic() - started, 1), **null}
     return {**crowd, "efficiency_1s": round(measure_long_jobs(count), 4)}
 
 
@@ -94,37 +72,34 @@ def measure_long_jobs(slots: int) -> float:
     slots = workers * CROWD_SLOTS
     parts = -(-slots // MOST_EPISODES)
     with (
-        BenchRun(NULL_TASK, CROWD_ROUNDS * parts, slots // parts) as run,
+        start_run(NULL_TASK, CROWD_ROUNDS * parts, slots // parts) as run,
         run.crowd(workers, CROWD_SLOTS, seconds=1.0),
     ):
         run.finish()
         return CROWD_ROUNDS / run.generation_seconds()
 
 
+@contextmanager
+def start_run(task: str, population: int, episodes: int, *, external: bool = False) -> Iterator[BenchRun]:
+    """Start a coordinator in its own process and folder: a run of `GENERATIONS` generations, or an external one."""
+    endpoint = free_endpoint()
+    search = ("--optimiser", "external") if external else ("--generations", GENERATIONS, "--evaluate-every", 0)
+    with (
+        TemporaryDirectory() as folder,
+        VerbProcess(
+            "coordinator", "--run", "bench", "--runs-dir", folder, "--listen", endpoint, "--task", task,
+            "--population", population, "--episodes", episodes, *search,
+        ) as coordinator,
+    ):  # fmt: skip
+        yield BenchRun(endpoint, Path(folder), coordinator)
+
+
 class BenchRun:
-    """A real coordinator in its own process and folder: a run of `GENERATIONS` generations, or an external one."""
+    """The run of a real coordinator."""
 
-    def __init__(self, task: str, population: int, episodes: int, *, external: bool = False) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
-        self.peak_mb = 0.0
-        self._arguments = (
-            "--listen", self.endpoint, "--task", task, "--population", population, "--episodes", episodes,
-            *(("--optimiser", "external") if external else ("--generations", GENERATIONS, "--evaluate-every", 0)),
-        )  # fmt: skip
-
-    def __enter__(self) -> BenchRun:
-        with ExitStack() as stack:
-            self._runs = stack.enter_context(tempfile.TemporaryDirectory())
-            self.coordinator = stack.enter_context(
-                VerbProcess("coordinator", "--run", "bench", "--runs-dir", self._runs, *self._arguments)
-            )
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self._stack.close()
+    def __init__(self, endpoint: str, runs: Path, coordinator: VerbProcess) -> None:
+        self.endpoint, self.coordinator = endpoint, coordinator
+        self._runs, self._peak_mb = runs, 0.0
 
     def workers(self, *arguments: object) -> AbstractContextManager[object]:
         """Start a real worker; the context manager stops it."""
@@ -134,28 +109,30 @@ class BenchRun:
     def crowd(self, count: int, slots: int, seconds: float = 0.0) -> Iterator[None]:
         """Start `count` simulated workers in one process, whose jobs take so many `seconds`."""
         arguments = self.endpoint, count, slots, seconds
-        with FunctionChild(_run_simulated_workers, *arguments, on_message=lambda _message: None, is_own=True):
+        with FunctionChild(run_simulated_workers, *arguments, on_message=lambda _message: None, is_own=True):
             yield
 
     def finish(self) -> None:
         """Wait until the run ends; `DreamfleetError` if it fails or takes too long."""
         deadline = time.monotonic() + RUN_SECONDS
         while self.coordinator.exit_code is None:
-            self.peak_mb = max(self.peak_mb, self.coordinator.memory / 1e6)
+            self._peak_mb = max(self._peak_mb, self.coordinator.memory / 1e6)
             if time.monotonic() > deadline:
                 raise DreamfleetError(f"the run did not end within {RUN_SECONDS:g} s")
             time.sleep(0.1)
         if self.coordinator.exit_code:
             raise DreamfleetError("the run's coordinator failed")
 
+    def finish_null_jobs(self) -> Figures:
+        """Wait until the run ends; its jobs per second, and the coordinator's peak memory."""
+        self.finish()
+        rate = round(NULL_JOBS / self.generation_seconds())
+        return {"null_jobs_per_second": rate, "coordinator_rss_mb": round(self._peak_mb, 1)}
+
     def generation_seconds(self) -> float:
         """The median makespan of a generation, in seconds; the first one, in which workers join, is left out."""
-        with open_run(Path(self._runs), "bench") as run:
+        with open_run(self._runs, "bench") as run:
             return statistics.median(each.seconds for each in run.history()[1:])
-
-
-def _run_simulated_workers(_pipe: Connection[Any, Any], *arguments: Any) -> None:
-    run_simulated_workers(*arguments)
 
 
 # ---- peers: the same work ----
@@ -185,10 +162,6 @@ def run_peer(peer: Peer) -> Figures | None:
 
 
 def _send_figures(pipe: Connection[Figures, Any], peer: Peer) -> None:
-    pipe.send(peer_figures(peer))
-
-
-def peer_figures(peer: Peer) -> Figures:
     """Measure the same two figures of a peer with 8 processes."""
     with peer() as run:
         run(null_job, 100)  # starts its processes
@@ -198,10 +171,8 @@ def peer_figures(peer: Peer) -> Figures:
         started = time.perf_counter()
         run(null_job, NULL_JOBS)
         null = time.perf_counter() - started
-    return {
-        "efficiency_50ms": round(ROUNDS * SLEEP_SECONDS / makespan, 4),
-        "null_jobs_per_second": round(NULL_JOBS / null),
-    }
+    efficiency = round(ROUNDS * SLEEP_SECONDS / makespan, 4)
+    pipe.send({"efficiency_50ms": efficiency, "null_jobs_per_second": round(NULL_JOBS / null)})
 
 
 @contextmanager

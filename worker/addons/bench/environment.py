@@ -104,8 +104,7 @@ class RecordedDrive:
 
 def record_drive(seed: int) -> RecordedDrive:
     """Record the shipped controller on a track until the lap ends, or for 1000 steps."""
-    policy, controller = shipped_driver(find_bundle("tiny"))
-    policy.begin(controller.parameters)
+    policy = shipped_driver(find_bundle("tiny"))
     environment = make_car_racing(preprocessing=BOX.name)
     actions = [np.array(moment.action) for moment in run_episode(environment, policy, EpisodeConfig(seed, STEPS))]
     environment.close()
@@ -241,14 +240,15 @@ def random_discrete_action(_step: int, _picture: Any, random: np.random.Generato
 
 def make_driver(bundle: Bundle) -> ActionSource:
     """The shipped controller as a source of actions."""
-    policy, controller = shipped_driver(bundle)
-    policy.begin(controller.parameters)
+    policy = shipped_driver(bundle)
     return lambda _step, picture, _random: policy.act(picture)
 
 
-def shipped_driver(bundle: Bundle) -> tuple[ModelPolicy, Controller]:
-    """A bundle's policy and the controller shipped with it; `ControllerError` if it belongs to another bundle."""
+def shipped_driver(bundle: Bundle) -> ModelPolicy:
+    """A bundle's policy under the controller shipped with it; `ControllerError` if it belongs to another bundle."""
     controller = Controller.load(pretrained_folder() / f"{bundle.manifest.name}.npz")
     if controller.bundle != bundle.sha256:
         raise ControllerError(f"the shipped controller {bundle.manifest.name} is not of {bundle.path}")
-    return ModelPolicy(bundle), controller
+    policy = ModelPolicy(bundle)
+    policy.begin(controller.parameters)
+    return policy

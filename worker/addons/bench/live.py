@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import queue
-import socket
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
 from time import perf_counter
 from typing import Any
 
@@ -18,7 +18,7 @@ from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.messages import Intervals, Job, TaskSpec
 from dreamfleet.common.transport.session import Network, open_session
-from dreamfleet.worker.addons.bench.measurement import TimedCall, time_alternately
+from dreamfleet.worker.addons.bench.measurement import TimedCall, free_endpoint, time_alternately
 from dreamfleet.worker.scoring.episode import score
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.service.admission import Admission
@@ -51,7 +51,7 @@ def bench_live(bundle: Bundle) -> Figures:
         spec = TaskSpec(task, bundle.sha256, HORIZON, 0, temperature=1.0 if task == "dream" else None)
         vectors = np.random.default_rng(0).normal(0, 0.1, (rows, bundle.controller_shape.size)).astype(np.float32)
         bare = time_alternately(_bare_cases(spec, bundle, vectors))
-        with WatchedSlot(spec, bundle, vectors) as slot:
+        with watch_slot(spec, bundle, vectors) as slot:
             seconds = time_alternately({"unwatched": slot.score, "watched": slot.score_watched})
         figures[task] = {
             "unwatched": round(bare["scorer"] / bare["loop"], 4),
@@ -78,39 +78,33 @@ def _bare_cases(spec: TaskSpec, bundle: Bundle, vectors: Floats) -> dict[str, Ti
     return {"loop": lambda: score(environment, policy, vectors[0], episode_config), "scorer": whole}
 
 
+@contextmanager
+def watch_slot(spec: TaskSpec, bundle: Bundle, vectors: Floats) -> Iterator[WatchedSlot]:
+    """Start a worker's slot whose frames go through a router to one subscriber."""
+    endpoint = free_endpoint()
+    networks = Network(listen=(endpoint,)), Network(connect=(endpoint,)), Network(connect=(endpoint,))
+    events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+    with ExitStack() as stack:
+        _, worker, viewer = [stack.enter_context(closing(open_session(network))) for network in networks]
+        slot = Slot(0, ScorerArguments(spec, bundle.path, (spec.task,)), events)
+        stack.callback(slot.stop)
+        jobs = [_make_job(spec, vector, number) for number, vector in enumerate(vectors)]
+        watched = WatchedSlot(slot, events, jobs, FramePublisher(worker, RUN, WORKER, lambda _status: None))
+        viewer.declare_subscriber(keys.view(RUN, WORKER), zenoh.handlers.Callback(watched.count_frame, indirect=False))
+        while not slot.ready:
+            slot.handle(events.get()[1])
+        yield watched
+
+
 class WatchedSlot:
-    """A worker's slot whose frames go through a router to one subscriber; a context manager."""
+    """A slot that runs one group of jobs a turn, with or without a subscriber to its frames."""
 
-    def __init__(self, spec: TaskSpec, bundle: Bundle, vectors: Floats) -> None:
+    def __init__(
+        self, slot: Slot, events: queue.SimpleQueue[tuple[str, Any]], jobs: list[JobWithVector],
+        frame_publisher: FramePublisher,
+    ) -> None:  # fmt: skip
         self.frames, self.watched = 0, 0.0  # frames that arrived; seconds of watched turns
-        self._spec, self._bundle = spec, bundle
-        self._make_job = [_make_job(spec, vector, number) for number, vector in enumerate(vectors)]
-        self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
-
-    def __enter__(self) -> WatchedSlot:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
-        with ExitStack() as stack:
-            sessions = []
-            for network in (Network(listen=(endpoint,)), Network(connect=(endpoint,)), Network(connect=(endpoint,))):
-                sessions.append(open_session(network))
-                stack.callback(sessions[-1].close)
-            _, worker, viewer = sessions
-            viewer.declare_subscriber(
-                keys.view(RUN, WORKER), zenoh.handlers.Callback(self._count_frame, indirect=False)
-            )
-            self._frame_publisher = FramePublisher(worker, RUN, WORKER, lambda _status: None)
-            arguments = ScorerArguments(self._spec, self._bundle.path, (self._spec.task,))
-            self._slot = Slot(0, arguments, self._events)
-            stack.callback(self._slot.stop)
-            while not self._slot.ready:
-                self._slot.handle(self._events.get()[1])
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self._stack.close()
+        self._slot, self._events, self._jobs, self._frame_publisher = slot, events, jobs, frame_publisher
 
     def score(self) -> None:
         """Run one turn without a subscriber."""
@@ -125,7 +119,7 @@ class WatchedSlot:
         self.watched += perf_counter() - began
 
     def _score_group(self) -> None:
-        self._slot.submit(self._make_job)
+        self._slot.submit(self._jobs)
         while True:
             event = self._events.get()[1]
             if isinstance(event.message, SampledFrame):
@@ -135,7 +129,8 @@ class WatchedSlot:
             elif self._slot.handle(event):
                 return
 
-    def _count_frame(self, _sample: object) -> None:
+    def count_frame(self, _sample: object) -> None:
+        """Count a frame that arrived."""
         self.frames += 1
 
 

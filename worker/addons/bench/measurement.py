@@ -1,24 +1,23 @@
-"""Measure a world model in a child process of one thread, and time calls in alternating blocks."""
+"""Time calls in alternating blocks."""
 
 from __future__ import annotations
 
+import socket
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    pass
+from typing import Any, TypeVar
 
 BLOCKS = 15
 BLOCK_SECONDS = 0.15
 TimedCall = Callable[[], Any]
+Case = TypeVar("Case", bound=Hashable)
 
 
-def time_alternately(cases: dict[str, TimedCall]) -> dict[str, float]:
+def time_alternately(cases: dict[Case, TimedCall]) -> dict[Case, float]:
     """Seconds per call of each case: the median over alternating blocks, so that a slow phase hits all alike."""
     counts = {name: _count_calls_per_block(call) for name, call in cases.items()}
-    blocks: dict[str, list[float]] = {name: [] for name in cases}
+    blocks: dict[Case, list[float]] = {name: [] for name in cases}
     for _ in range(BLOCKS):
         for name, call in cases.items():
             started = perf_counter()
@@ -35,3 +34,10 @@ def _count_calls_per_block(call: TimedCall) -> int:
         call()
         calls += 1
     return calls
+
+
+def free_endpoint() -> str:
+    """An endpoint on this host that nobody listens on."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{free.getsockname()[1]}"

@@ -40,7 +40,7 @@ class SimulatedWorker:
     identity: str
     admission: Admission
     slots: int
-    seconds: float = 0.0
+    seconds: float
     backlog: Backlog = field(init=False)
     outbox: Outbox = field(init=False)
     running: deque[tuple[float, Result]] = field(init=False, default_factory=deque)  # with the moment of its end
@@ -85,7 +85,7 @@ class SimulatedWorker:
         )  # fmt: skip
 
 
-def run_simulated_workers(endpoint: str, count: int, slots: int, seconds: float = 0.0) -> None:
+def run_simulated_workers(_pipe: object, endpoint: str, count: int, slots: int, seconds: float) -> None:
     """Join the coordinator at `endpoint` as `count` workers of `slots` slots, and work until killed.
 
     A job takes so many `seconds` of a slot, and nothing of a processor.
@@ -124,7 +124,6 @@ def _handle_and_send(
     wait: float,
 ) -> None:
     """Handle the received job batches, then send the results and heartbeats that are due."""
-    active: set[str] = set()
     try:
         _, sample = events.get(timeout=wait) if wait else events.get_nowait()
         while True:
@@ -137,16 +136,11 @@ def _handle_and_send(
         pass
     now = time.monotonic()
     for identity, worker in crowd.items():
-        run = worker.admission
-        if worker.work(now):
-            active.add(identity)
-        if now >= worker.beat_at:
+        run, is_due, is_active = worker.admission, now >= worker.beat_at, worker.work(now)
+        if is_due:
             worker.beat_at = now + run.intervals.beat
-            active.add(identity)
             session.put(keys.heartbeat(run.run, identity), encode(worker.beat()), encoding=encoding(Heartbeat))
-        if identity not in active:
-            continue
-        for results in worker.outbox.due(now):
+        for results in worker.outbox.due(now) if is_due or is_active else ():
             message = ResultBatch(
                 run_uid=run.run_uid, incarnation=run.incarnation, fingerprint=fingerprint(run.packages), results=results
             )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 SUMMARY = "measure how fast a part is: policy, dream, env, live, dispatch or batches"
 EXTRAS = ("worker",)
 BUNDLE, EPISODES = "tiny", 3
+Figures = dict[str, Any]
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -43,65 +44,63 @@ def run(args: argparse.Namespace) -> int:
     if foreign := [name for name in given if name not in part.flags]:
         raise UsageError(f"--{foreign[0]} is of {', '.join(n for n, p in PARTS.items() if foreign[0] in p.flags)}")
     args.bundle = args.bundle or BUNDLE
-    return part.measure(args)
+    figures = part.measure(args)
+    if args.json:
+        print(json.dumps(figures))
+    elif not args.exact:  # which prints each comparison
+        for name, value in figures.items():
+            print(f"{name:>22}  {value}")
+    return 0 if figures.get("exact", True) else 1
 
 
-def measure_policy(args: argparse.Namespace) -> int:
-    """Measure a policy step on one thread."""
+def _measure_policy(args: argparse.Namespace) -> Figures:
     from dreamfleet.worker.addons.bench.policy import bench_policy
 
-    return _print_figures(args, measure_on_one_thread(bench_policy, args.bundle))
+    return measure_on_one_thread(bench_policy, args.bundle)
 
 
-def measure_dream(args: argparse.Namespace) -> int:
-    """Measure dreamed steps on one thread."""
+def _measure_dream(args: argparse.Namespace) -> Figures:
     from dreamfleet.worker.addons.bench.dream import bench_dream
 
-    return _print_figures(args, measure_on_one_thread(bench_dream, args.bundle))
+    return measure_on_one_thread(bench_dream, args.bundle)
 
 
-def measure_dispatch(args: argparse.Namespace) -> int:
-    """Measure how fast a coordinator dispatches."""
+def _measure_dispatch(args: argparse.Namespace) -> Figures:
     from dreamfleet.worker.addons.bench.dispatch import bench_dispatch
 
-    return _print_figures(args, bench_dispatch(max(0, args.workers or 0)))
+    return bench_dispatch(max(0, args.workers or 0))
 
 
-def measure_batches(args: argparse.Namespace) -> int:
-    """Measure how fast submitted batches are scored."""
+def _measure_batches(_args: argparse.Namespace) -> Figures:
     from dreamfleet.worker.addons.bench.batches import bench_batches
 
-    return _print_figures(args, bench_batches())
+    return bench_batches()
 
 
-def measure_live(args: argparse.Namespace) -> int:
-    """Measure what the live view costs each task."""
+def _measure_live(args: argparse.Namespace) -> Figures:
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.common.host.resource_limits import pin_thread_pools
 
     pin_thread_pools()
     from dreamfleet.worker.addons.bench.live import bench_live
 
-    return _print_figures(args, bench_live(find_bundle(args.bundle)))
+    return bench_live(find_bundle(args.bundle))
 
 
-def measure_env(args: argparse.Namespace) -> int:
-    """Measure the environment on one thread, or compare it with gymnasium's; exit 1 if anything differs."""
+def _measure_env(args: argparse.Namespace) -> Figures:
     if args.exact:
-        return _compare(args)
+        return _compare(args.bundle)
     from dreamfleet.worker.addons.bench.environment import bench_env
 
-    figures = measure_on_one_thread(
-        bench_env, args.bundle, max(1, EPISODES if args.episodes is None else args.episodes)
-    )
-    _print_figures(args, figures)
-    return 0 if figures["exact"] else 1
+    rounds = max(1, EPISODES if args.episodes is None else args.episodes)
+    return measure_on_one_thread(bench_env, args.bundle, rounds)
 
 
-def _compare(args: argparse.Namespace) -> int:
+def _compare(bundle_name: str) -> Figures:
+    """Compare the environment with gymnasium's, and print each comparison on stderr."""
     from dreamfleet.common.artifacts.bundle_store import find_bundle
 
-    bundle = find_bundle(args.bundle)
+    bundle = find_bundle(bundle_name)
     _pin_libraries()
     from dreamfleet.worker.addons.bench.environment import check_exact
 
@@ -111,12 +110,10 @@ def _compare(args: argparse.Namespace) -> int:
         compared.append(what)
         outcome = "the same" if difference is None else f"DIFFERS at step {difference.step}: {difference.what}"
         print(f"{what}: {outcome}", file=sys.stderr)
-    if args.json:
-        print(json.dumps({"exact": not differences, "compared": compared, "differences": differences}))
-    return 1 if differences else 0
+    return {"exact": not differences, "compared": compared, "differences": differences}
 
 
-def measure_on_one_thread(measure: Callable[..., dict[str, Any]], bundle_name: str, *more: object) -> dict[str, Any]:
+def measure_on_one_thread(measure: Callable[..., Figures], bundle_name: str, *more: object) -> Figures:
     """The figures of `measure(bundle, *more)`, called in a child process whose libraries use one thread."""
     from concurrent.futures.process import BrokenProcessPool
     from functools import partial
@@ -144,31 +141,25 @@ def _pin_libraries() -> None:
     pin_thread_pools()
 
 
-def _print_figures(args: argparse.Namespace, figures: Mapping[str, Any]) -> int:
-    if args.json:
-        print(json.dumps(figures))
-    else:
-        for name, value in figures.items():
-            print(f"{name:>22}  {value}")
-    return 0
-
-
 @dataclass(frozen=True)
 class Part:
-    """A part that can be measured: what about it, by which function, and the flags that it takes."""
+    """A part that can be measured: what about it, by which function, and the flags that it takes.
+
+    `exact` among its figures says whether it passed.
+    """
 
     text: str
-    measure: Callable[[argparse.Namespace], int]
+    measure: Callable[[argparse.Namespace], Figures]
     flags: tuple[str, ...] = ("bundle",)
 
 
 PARTS = {
-    "policy": Part("a policy step, against this core's matrix rate and against torch", measure_policy),
-    "dream": Part("dreamed steps a second, against their matrix products alone and against torch", measure_dream),
-    "env": Part("the environment against gymnasium's own", measure_env, ("bundle", "episodes", "exact")),
-    "live": Part("what the live view costs a slot, unwatched and watched", measure_live),
-    "dispatch": Part("jobs a second through real Zenoh, beside Dask and Ray where installed", measure_dispatch,
+    "policy": Part("a policy step, against this core's matrix rate and against torch", _measure_policy),
+    "dream": Part("dreamed steps a second, against their matrix products alone and against torch", _measure_dream),
+    "env": Part("the environment against gymnasium's own", _measure_env, ("bundle", "episodes", "exact")),
+    "live": Part("what the live view costs a slot, unwatched and watched", _measure_live),
+    "dispatch": Part("jobs a second through real Zenoh, beside Dask and Ray where installed", _measure_dispatch,
                      ("workers",)),
     "batches": Part("evaluations a second that a search elsewhere reaches, over Zenoh and over HTTP",
-                     measure_batches),
+                     _measure_batches),
 }  # fmt: skip

@@ -22,7 +22,10 @@ class PictureWindow:
     def __enter__(self) -> PictureWindow:
         self._open(INITIAL_SIZE)
         pygame.font.init()
-        self._show_text("waiting for the first picture")
+        self._surface.fill(BACKGROUND)
+        text = pygame.font.Font(None, 30).render("waiting for the first picture", True, FAINT)
+        self._surface.blit(text, (24, 24))
+        pygame.display.flip()
         return self
 
     def __exit__(self, *_error: object) -> None:
@@ -45,8 +48,3 @@ class PictureWindow:
     def _open(self, size: tuple[int, int]) -> None:
         self._surface = open_display(size, REMEDY)
         pygame.display.set_caption(f"dreamfleet: {printable(self._name)}")
-
-    def _show_text(self, text: str) -> None:
-        self._surface.fill(BACKGROUND)
-        self._surface.blit(pygame.font.Font(None, 30).render(text, True, FAINT), (24, 24))
-        pygame.display.flip()

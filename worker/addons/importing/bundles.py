@@ -50,11 +50,10 @@ def import_checkpoints(folder: Path, out: Path) -> Bundle:
     if seeing is None or remembering is None:
         raise DatasetError(f"{folder} lacks {VAE if seeing is None else MDRNN}/best.tar: a bundle needs both")
     vae, rnn = checkpoints.read_vae(seeing), checkpoints.read_mdnrnn(remembering)
-    if vae.config.latent != rnn.config.latent:
-        raise DatasetError(
-            f"{seeing} has {vae.config.latent} latents, {remembering} {rnn.config.latent}: they do not belong together"
-        )
-    initial = np.zeros((1, 2, vae.config.latent), np.float32)
+    latents, others = vae[1].latent, rnn[1].latent
+    if latents != others:
+        raise DatasetError(f"{seeing} has {latents} latents, {remembering} {others}: they do not belong together")
+    initial = np.zeros((1, 2, latents), np.float32)
     return _write(out, checkpoints.SOURCE, vae, rnn, initial, find_world().preprocessings[checkpoints.PICTURES])
 
 

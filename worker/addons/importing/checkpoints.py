@@ -9,7 +9,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -25,93 +25,117 @@ from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 SOURCE = "ctallec/world-models"
 ACTIONS = 3
 PICTURES = "whole-64"
-State = dict[str, torch.Tensor]
+T = TypeVar("T")
 
 
-class MDNRNNWeights(NamedTuple):
-    """The weights of an MDN-RNN with torch's names, and its layers."""
+class _Checkpoint:
+    """A file of this program, and the tensors of its `state_dict`; `DatasetError` if it has none.
 
-    weights: Weights
-    config: MDNRNNConfig
+    `path`, `content`: what it is and holds. An LSTM's tensors have the names of a cell's.
+    """
+
+    def __init__(self, path: Path, needed: str = "", what: str = "") -> None:
+        """`needed` is a tensor of a checkpoint of `what`."""
+        self.path, self.content = path, read_torch_file(path)
+        state = self.content.get("state_dict") if isinstance(self.content, Mapping) else None
+        pairs: list[tuple[Any, Any]] = list(state.items()) if isinstance(state, dict) else [(None, None)]
+        if not all(isinstance(name, str) and isinstance(each, torch.Tensor) for name, each in pairs):
+            raise DatasetError(f"{path} holds no state_dict of tensors: it is no checkpoint of {SOURCE}")
+        self.tensors: dict[str, torch.Tensor] = {name.removesuffix("_l0"): tensor for name, tensor in pairs}
+        if needed and needed not in self.tensors:
+            raise DatasetError(f"{path} holds no {needed}: it is not {what} of {SOURCE}")
+
+    def axes(self, name: str) -> tuple[int, int]:
+        """The sizes of a matrix."""
+        shape = tuple(self.tensors[name].shape) if name in self.tensors else ()
+        if len(shape) != 2:
+            raise DatasetError(f"{self.path}: {name} must have two axes, not {shape}")
+        return shape[0], shape[1]
+
+    def layer(self, theirs: str, ours: str, shape: tuple[int, ...], outputs: int) -> Weights:
+        """The weight, of this shape, and the bias of a layer, under our name."""
+        weight, bias = self.array(f"{theirs}.weight", shape), self.array(f"{theirs}.bias", (outputs,))
+        return {f"{ours}.weight": weight, f"{ours}.bias": bias}
+
+    def array(self, name: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
+        """A tensor of this shape as numbers."""
+        tensor = self.tensors.get(name)
+        if tensor is None or tensor.shape != shape:
+            found = "is missing" if tensor is None else f"has the shape {tuple(tensor.shape)}"
+            raise DatasetError(f"{self.path}: {name} {found}, and {SOURCE} has {shape} there")
+        if not tensor.is_floating_point():
+            raise DatasetError(f"{self.path}: {name} is of type {tensor.dtype}, not of floating-point numbers")
+        array = array_of(tensor, self.path)
+        if not np.isfinite(array).all():
+            raise DatasetError(f"{self.path}: {name} holds NaN, infinity, or numbers beyond single precision")
+        return array
+
+    def configure(self, kind: type[T], **values: Any) -> T:
+        """A configuration of these values."""
+        try:
+            return kind(**values)
+        except UsageError as error:
+            raise DatasetError(f"{self.path}: {error}") from error
 
 
-class _Checkpoint(NamedTuple):
-    """What a file holds, and the tensors of its `state_dict`."""
-
-    path: Path
-    content: Mapping[str, Any]
-    weights: State
-
-
-class VAEWeights(NamedTuple):
-    """The weights of a VAE with torch's names, and its layers."""
-
-    weights: Weights
-    config: VAEConfig
-
-
-def read_vae(path: Path) -> VAEWeights:
-    """The VAE of a checkpoint; `DatasetError` for other layers."""
-    state = _read_state(path, "encoder.fc_mu.weight", "the VAE").weights
-    latent, _ = _two_axes(path, state, "encoder.fc_mu.weight")
-    config = _configure(path, VAEConfig, latent=latent, activate_dense=True)
+def read_vae(path: Path) -> tuple[Weights, VAEConfig]:
+    """The VAE of a checkpoint, with torch's names, and its layers; `DatasetError` for other layers."""
+    checkpoint = _Checkpoint(path, "encoder.fc_mu.weight", "the VAE")
+    latent, _ = checkpoint.axes("encoder.fc_mu.weight")
+    config = checkpoint.configure(VAEConfig, latent=latent, activate_dense=True)
     weights: Weights = {}
     for part, layers, theirs in (("encoder", config.down, "conv"), ("decoder", config.up, "deconv")):
         for index, layer in enumerate(layers):
             ends = (layer.outputs, layer.inputs) if part == "encoder" else (layer.inputs, layer.outputs)
-            name = f"{part}.{theirs}{index + 1}"
-            weights |= _pair(path, state, name, f"{part}.{index * config.modules_a_layer}",
-                             (*ends, layer.kernel, layer.kernel), layer.outputs)  # fmt: skip
-    weights |= _pair(path, state, "encoder.fc_mu", "mu", (latent, config.flat), latent)
-    spread = _pair(path, state, "encoder.fc_logsigma", "logvar", (latent, config.flat), latent)
+            name, ours = f"{part}.{theirs}{index + 1}", f"{part}.{index * config.modules_a_layer}"
+            weights |= checkpoint.layer(name, ours, (*ends, layer.kernel, layer.kernel), layer.outputs)
+    weights |= checkpoint.layer("encoder.fc_mu", "mu", (latent, config.flat), latent)
+    spread = checkpoint.layer("encoder.fc_logsigma", "logvar", (latent, config.flat), latent)
     weights |= {name: 2 * array for name, array in spread.items()}  # the log of a variance
     first = config.up[0].inputs
-    weights |= _pair(path, state, "decoder.fc1", "dense", (first, latent), first)
-    return VAEWeights(weights, config)
+    return weights | checkpoint.layer("decoder.fc1", "dense", (first, latent), first), config
 
 
-def read_mdnrnn(path: Path) -> MDNRNNWeights:
-    """The MDN-RNN of a checkpoint; `DatasetError` for other layers.
+def read_mdnrnn(path: Path) -> tuple[Weights, MDNRNNConfig]:
+    """The MDN-RNN of a checkpoint, with torch's names, and its layers; `DatasetError` for other layers.
 
     Its reward head was trained only with `--include_reward`; without, its weights never had a gradient, as the
     optimiser's state in the file says. The model then has no such head.
     """
-    checkpoint = _read_state(path, "gmm_linear.weight", "the MDN-RNN")
-    state = {name.removesuffix("_l0"): tensor for name, tensor in checkpoint.weights.items()}  # an LSTM's, or a cell's
-    rows, hidden = _two_axes(path, state, "gmm_linear.weight")
-    latent = _two_axes(path, state, "rnn.weight_ih")[1] - ACTIONS
+    checkpoint = _Checkpoint(path, "gmm_linear.weight", "the MDN-RNN")
+    rows, hidden = checkpoint.axes("gmm_linear.weight")
+    latent = checkpoint.axes("rnn.weight_ih")[1] - ACTIONS
     mixtures, rest = divmod(rows - 2, 2 * latent + 1) if latent > 0 else (0, 1)
     if rest or mixtures < 1:
         raise DatasetError(f"{path}: {rows} outputs are no mixture of {latent} latents with a reward and an end")
     reward = "none" if _is_reward_untrained(checkpoint, (rows, hidden)) else "value"
-    config = _configure(
-        path, MDNRNNConfig, latent=latent, hidden=hidden, mixtures=mixtures, reward=reward, done=True, joint=True
+    config = checkpoint.configure(
+        MDNRNNConfig, latent=latent, hidden=hidden, mixtures=mixtures, reward=reward, done=True, joint=True
     )
-    heads = _pair(path, state, "gmm_linear", "heads", (rows, hidden), rows)
     order = _heads_order(config)
+    weights = {
+        name: array[order] for name, array in checkpoint.layer("gmm_linear", "heads", (rows, hidden), rows).items()
+    }
     inputs = np.r_[ACTIONS : ACTIONS + latent, :ACTIONS]  # theirs: action, latent
-    weights = {name: array[order] for name, array in heads.items()}
-    for name, shape in (
-        ("weight_ih", (4 * hidden, latent + ACTIONS)), ("weight_hh", (4 * hidden, hidden)),
-        ("bias_ih", (4 * hidden,)), ("bias_hh", (4 * hidden,)),
-    ):  # fmt: skip
-        weights[f"lstm.{name}_l0"] = _array(path, state, f"rnn.{name}", shape)
-    weights["lstm.weight_ih_l0"] = np.ascontiguousarray(weights["lstm.weight_ih_l0"][:, inputs])
-    weights["lstm.bias_ih_l0"] = weights["lstm.bias_ih_l0"] + weights["lstm.bias_hh_l0"]  # ours has one bias
+    kernel = checkpoint.array("rnn.weight_ih", (4 * hidden, latent + ACTIONS))
+    weights["lstm.weight_ih_l0"] = np.ascontiguousarray(kernel[:, inputs])
+    weights["lstm.weight_hh_l0"] = checkpoint.array("rnn.weight_hh", (4 * hidden, hidden))
+    biases = (checkpoint.array(f"rnn.{name}", (4 * hidden,)) for name in ("bias_ih", "bias_hh"))
+    weights["lstm.bias_ih_l0"] = np.add(*biases)  # ours has one bias
     weights["lstm.bias_hh_l0"] = np.zeros(4 * hidden, np.float32)
-    return MDNRNNWeights(weights, config)
+    return weights, config
 
 
 def read_controller(path: Path) -> NDArray[np.float32]:
     """The parameters `(size,)` of a checkpoint's controller: weights (actions, latent + hidden), then biases."""
-    state = _read(path).weights
-    if "fc.weight" not in state:
+    checkpoint = _Checkpoint(path)
+    if "fc.weight" not in checkpoint.tensors:
         raise DatasetError(f"{path} holds no controller, but a part of a world model: {world_command(path)} reads both")
-    outputs, inputs = _two_axes(path, state, "fc.weight")
+    outputs, inputs = checkpoint.axes("fc.weight")
     if outputs != ACTIONS:
         raise DatasetError(f"{path}: its controller has {outputs} outputs, and {SOURCE} has {ACTIONS}")
-    pair = _pair(path, state, "fc", "fc", (outputs, inputs), outputs)
-    return np.concatenate([pair["fc.weight"].ravel(), pair["fc.bias"]])
+    layer = checkpoint.layer("fc", "fc", (outputs, inputs), outputs)
+    return np.concatenate([layer["fc.weight"].ravel(), layer["fc.bias"]])
 
 
 def world_command(path: Path) -> str:
@@ -139,53 +163,3 @@ def _heads_order(config: MDNRNNConfig) -> NDArray[np.int64]:
     logits = 2 * width + np.arange(config.mixtures)
     last = 2 * width + config.mixtures
     return np.concatenate([logits, means, width + means, np.arange(last + (not config.has_reward_head), last + 2)])
-
-
-def _configure(path: Path, kind: Any, **values: Any) -> Any:
-    try:
-        return kind(**values)
-    except UsageError as error:
-        raise DatasetError(f"{path}: {error}") from error
-
-
-def _read_state(path: Path, needed: str, what: str) -> _Checkpoint:
-    found = _read(path)
-    if needed not in found.weights:
-        raise DatasetError(f"{path} holds no {needed}: it is not {what} of {SOURCE}")
-    return found
-
-
-def _read(path: Path) -> _Checkpoint:
-    content = read_torch_file(path)
-    state = content.get("state_dict") if isinstance(content, Mapping) else None
-    pairs: list[tuple[Any, Any]] = list(state.items()) if isinstance(state, dict) else [(None, None)]
-    if not all(isinstance(name, str) and isinstance(each, torch.Tensor) for name, each in pairs):
-        raise DatasetError(f"{path} holds no state_dict of tensors: it is no checkpoint of {SOURCE}")
-    return _Checkpoint(path, content, dict(pairs))
-
-
-def _two_axes(path: Path, state: State, name: str) -> tuple[int, int]:
-    shape = tuple(state[name].shape) if name in state else ()
-    if len(shape) != 2:
-        raise DatasetError(f"{path}: {name} must have two axes, not {shape}")
-    return shape[0], shape[1]
-
-
-def _pair(path: Path, state: State, theirs: str, ours: str, shape: tuple[int, ...], outputs: int) -> Weights:
-    return {
-        f"{ours}.weight": _array(path, state, f"{theirs}.weight", shape),
-        f"{ours}.bias": _array(path, state, f"{theirs}.bias", (outputs,)),
-    }
-
-
-def _array(path: Path, state: State, name: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    tensor = state.get(name)
-    if tensor is None or tensor.shape != shape:
-        found = "is missing" if tensor is None else f"has the shape {tuple(tensor.shape)}"
-        raise DatasetError(f"{path}: {name} {found}, and {SOURCE} has {shape} there")
-    if not tensor.is_floating_point():
-        raise DatasetError(f"{path}: {name} is of type {tensor.dtype}, not of floating-point numbers")
-    array = array_of(tensor, path)
-    if not np.isfinite(array).all():
-        raise DatasetError(f"{path}: {name} holds NaN, infinity, or numbers beyond single precision")
-    return array

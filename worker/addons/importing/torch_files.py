@@ -33,7 +33,9 @@ def read_torch_file(path: Path) -> Any:
     try:
         data = read_regular(path, LIMITS.size)
         if data.startswith(ZIP_MARK):
-            _check_zip(data)
+            with open_archive(io.BytesIO(data), LIMITS) as archive:  # it may be larger when torch unpacks it
+                if not any(name.endswith("data.pkl") for name in archive.names):
+                    raise DamagedArchiveError("it is a zip without the data.pkl of torch.save")
         with torch.serialization.safe_globals(NUMBERS):
             return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except FileNotFoundError:
@@ -44,13 +46,6 @@ def read_torch_file(path: Path) -> Any:
             raise DatasetError(f"{path} was not read: {what}") from error
         reason = one_line(str(error))[:200]
         raise DatasetError(f"{path} is no file of torch.save that can be read ({reason})") from error
-
-
-def _check_zip(data: bytes) -> None:
-    """Refuse a zip that is larger when it is unpacked, before torch unpacks it."""
-    with open_archive(io.BytesIO(data), LIMITS) as archive:
-        if not any(name.endswith("data.pkl") for name in archive.names):
-            raise DamagedArchiveError("it is a zip without the data.pkl of torch.save")
 
 
 def array_of(tensor: torch.Tensor, path: Path) -> NDArray[np.float32]:

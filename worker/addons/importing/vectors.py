@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.errors import ControllerError, DatasetError
-from dreamfleet.common.files.archives import DamagedArchiveError, parse_array
+from dreamfleet.common.files.archives import parse_array
 from dreamfleet.common.files.regular_files import read_regular, read_text
 from dreamfleet.worker.addons.importing.json_weights import read_json
 
@@ -35,7 +35,10 @@ def read_vector(path: Path) -> NDArray[np.float64]:
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise DatasetError(f"{path}: a vector is a file {', '.join(readers)}, or a folder that pycma wrote")
-    vector = reader(path)
+    try:
+        vector = reader(path)
+    except (OSError, ValueError, IndexError, OverflowError) as error:
+        raise DatasetError(f"{path} holds no vector of numbers ({error})") from error
     if vector.ndim != 1 or not len(vector):
         raise DatasetError(f"{path} holds an array of shape {vector.shape}, not one vector")
     if not np.isfinite(vector).all():
@@ -69,33 +72,21 @@ def _from_json(path: Path) -> NDArray[np.float64]:
     if isinstance(value, list) and value and isinstance(value[0], list):
         value = value[0]  # the vector, then what it scored
     if not isinstance(value, list) or not all(type(each) in (int, float) for each in value):
-        raise DatasetError(f"{path} is no list of numbers")
-    try:
-        return np.array(value, np.float64)
-    except OverflowError as error:
-        raise DatasetError(f"{path} holds a number beyond double precision") from error
+        raise ValueError("it is no list of numbers")
+    return np.array(value, np.float64)
 
 
 def _from_npy(path: Path) -> NDArray[np.float64]:
-    try:
-        found = parse_array(read_regular(path, MOST_BYTES), path.name)
-    except (OSError, DamagedArchiveError) as error:
-        raise DatasetError(f"{path} is no array of numbers ({error})") from error
+    found = parse_array(read_regular(path, MOST_BYTES), path.name)
     if found.dtype.kind not in "iuf":
-        raise DatasetError(f"{path} is no array of numbers, but of type {found.dtype}")
+        raise ValueError(f"they are of type {found.dtype}")
     return found.astype(np.float64)
 
 
 def _from_text(path: Path) -> NDArray[np.float64]:
-    try:
-        return np.array([float(each) for each in read_text(path, MOST_TEXT).replace(",", " ").split()])
-    except (OSError, ValueError) as error:
-        raise DatasetError(f"{path} is no list of numbers ({error})") from error
+    return np.array([float(each) for each in read_text(path, MOST_TEXT).replace(",", " ").split()])
 
 
 def _from_pycma(path: Path) -> NDArray[np.float64]:
-    try:
-        lines = [line for line in read_text(path, MOST_BYTES).splitlines() if line.strip() and line[0] not in "%#"]
-        return np.array([float(each) for each in lines[-1].split()[CMA_COLUMNS:]])
-    except (OSError, ValueError, IndexError) as error:
-        raise DatasetError(f"{path} has no row of numbers as pycma's logger writes it ({error})") from error
+    lines = [line for line in read_text(path, MOST_BYTES).splitlines() if line.strip() and line[0] not in "%#"]
+    return np.array([float(each) for each in lines[-1].split()[CMA_COLUMNS:]])

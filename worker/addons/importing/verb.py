@@ -60,8 +60,12 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"nothing at {args.source}")
     if args.out.is_file() and args.out.resolve().is_relative_to(args.source.resolve()):
         raise UsageError(f"--out {args.out} would replace a file of the source: choose another")
-    from dreamfleet.worker.addons.importing.refusals import refuse_unreadable
-    from dreamfleet.worker.addons.importing.sources import drive_paths, holds_checkpoints, holds_json_model
+    from dreamfleet.worker.addons.importing.sources import (
+        drive_paths,
+        holds_checkpoints,
+        holds_json_model,
+        refuse_unreadable,
+    )
 
     source: Path = args.source
     if source.is_dir() and holds_checkpoints(source):

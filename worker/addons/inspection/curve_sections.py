@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import cycle
 from typing import Any
 
@@ -21,36 +20,28 @@ from dreamfleet.worker.addons.inspection.training_curves import MODELS, UNITS, L
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 MARKED = 25  # approximate number of markers on a line
-Style = dict[str, Any]
+Styles = tuple[dict[str, Any], dict[str, Any]]
 
 
-@dataclass(frozen=True)
-class CurveStyle:
-    """The line styles of training batches and of held-out drives."""
-
-    trained: Style
-    held_out: Style
-
-    @classmethod
-    def of(cls, trained: str, held_out: str, marker: str = "o", alpha: float = 1.0) -> CurveStyle:
-        """Make the styles from two colours."""
-        held = {"color": held_out, "linewidth": 1.6, "marker": marker, "markersize": 4}
-        return cls({"color": trained, "linewidth": 1.2, "alpha": alpha}, held)
+def curve_styles(trained: str, held_out: str, marker: str = "o", alpha: float = 1.0) -> Styles:
+    """The line styles of training batches and of held-out drives, of two colours."""
+    held = {"color": held_out, "linewidth": 1.6, "marker": marker, "markersize": 4}
+    return {"color": trained, "linewidth": 1.2, "alpha": alpha}, held
 
 
-ALONE, ANY = CurveStyle.of("tab:blue", "tab:orange"), CurveStyle.of("tab:gray", "tab:gray", "", 0.5)
+ALONE, ANY = curve_styles("tab:blue", "tab:orange"), curve_styles("tab:gray", "tab:gray", "", 0.5)
 
 
 def loss_sections(found: Sequence[TrainingCurves]) -> list[Section]:
     """Return a section for each trained model."""
     names = dict.fromkeys(each.name for each in found)
-    looks = {name: CurveStyle.of(colour, colour, marker, 0.5)
+    looks = {name: curve_styles(colour, colour, marker, 0.5)
              for name, colour, marker in zip(names, cycle(PLOT_COLOURS), cycle(MARKERS), strict=False)}  # fmt: skip
     models = [model for model in MODELS if any(each.model == model for each in found)]
     return [_loss_section([each for each in found if each.model == model], model, looks) for model in models]
 
 
-def _loss_section(found: Sequence[TrainingCurves], model: str, looks: Mapping[str, CurveStyle]) -> Section:
+def _loss_section(found: Sequence[TrainingCurves], model: str, looks: Mapping[str, Styles]) -> Section:
     """Draw a panel for each part of a loss, with the curves of batches and held-out drives of each training."""
     parts = [part for part in UNITS if any(part in each.curves for each in found)]
     figure, axes = new_figure(3.6 if len(found) == 1 else 4.0, 1, len(parts))
@@ -72,29 +63,22 @@ def _loss_section(found: Sequence[TrainingCurves], model: str, looks: Mapping[st
     return Section(f"loss-{model}", f"How {MODELS[model]} learnt", text, render_png(figure))
 
 
-def _draw(panel: Any, curve: LossCurve, look: CurveStyle) -> None:
-    trained, held = curve.trained, curve.held_out
+def _draw(panel: Any, curve: LossCurve, look: Styles) -> None:
+    trained, held, (thin, thick) = curve.trained, curve.held_out, look
     if look is ALONE:
-        panel.plot(trained.updates, trained.values, **{**look.trained, "alpha": 0.3, "linewidth": 0.8})
+        panel.plot(trained.updates, trained.values, **{**thin, "alpha": 0.3, "linewidth": 0.8})
     if len(trained):
         mean = np.ones(width := max(1, len(trained) // 20)) / width
-        panel.plot(
-            *(np.convolve(each, mean, mode="valid") for each in (trained.updates, trained.values)), **look.trained
-        )
-    panel.plot(held.updates, held.values, markevery=max(1, len(held) // MARKED), **look.held_out)
+        panel.plot(*(np.convolve(each, mean, mode="valid") for each in (trained.updates, trained.values)), **thin)
+    panel.plot(held.updates, held.values, markevery=max(1, len(held) // MARKED), **thick)
 
 
-def _legend_handles(names: Sequence[str], looks: Mapping[str, CurveStyle]) -> list[Line2D]:
+def _legend_handles(names: Sequence[str], looks: Mapping[str, Styles]) -> list[Line2D]:
     """Legend handles of the two kinds of lines, and of each training if there are several."""
-    kinds, named = (
-        (ALONE, []) if len(names) == 1 else (ANY, [_legend_handle(name, looks[name].held_out) for name in names])
-    )
-    whose = f"{names[0]}: " if len(names) == 1 else ""
-    return [*named, _legend_handle(f"{whose}batches", kinds.trained), _legend_handle("held-out drives", kinds.held_out)]
-
-
-def _legend_handle(label: str, style: Style) -> Line2D:
-    return Line2D([], [], label=label, **style)
+    (trained, held_out), whose = (ALONE, f"{names[0]}: ") if len(names) == 1 else (ANY, "")
+    labelled = [(name, looks[name][1]) for name in names] if len(names) > 1 else []
+    labelled += [(f"{whose}batches", trained), ("held-out drives", held_out)]
+    return [Line2D([], [], label=label, **style) for label, style in labelled]
 
 
 def _scale(panel: Any, lines: Sequence[NDArray[np.float64]]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import count
 from typing import Any
 
@@ -78,17 +78,6 @@ class DisturbedDrive:
         return join_features(self.latent, self.state, self.hidden)
 
 
-@dataclass
-class DriveColumns:
-    """The columns of a drive while it is recorded, one entry per step."""
-
-    latent: list[Floats] = field(default_factory=list)
-    state: list[Floats] = field(default_factory=list)
-    truth: list[dict[str, float]] = field(default_factory=list)
-    action: list[Floats] = field(default_factory=list)
-    push: list[Floats] = field(default_factory=list)
-
-
 class DisturbedDriveRecorder(DisturbedPolicy):
     """A policy that disturbs an actor's actions, and records the true state and the world model's state."""
 
@@ -97,16 +86,14 @@ class DisturbedDriveRecorder(DisturbedPolicy):
     ) -> None:
         super().__init__(actor, disturbance, recurrent)
         self._recurrent, self._truth = recurrent, truth
-        self.recorded, self.hidden = DriveColumns(), recurrent.hidden
+        self.hidden = recurrent.hidden
+        self.true_states: list[dict[str, float]] = []
+        self.recorded: list[tuple[Floats, Floats, Floats, Floats]] = []  # latent, state, action and push of a step
 
     def on_action(self, action: Floats, push: Floats) -> None:
         """Record a step."""
-        recorded, recurrent = self.recorded, self._recurrent
-        recorded.latent.append(recurrent.latent[0])
-        recorded.state.append(recurrent.state[0])
-        recorded.truth.append(self._truth())
-        recorded.action.append(action[0])
-        recorded.push.append(push[0])
+        self.true_states.append(self._truth())
+        self.recorded.append((self._recurrent.latent[0], self._recurrent.state[0], action[0], push[0]))
 
 
 def record_disturbed_drives(
@@ -151,16 +138,16 @@ def _drive(
     begin: ResetHook | None,
 ) -> DisturbedDrive:
     recorder.begin()
-    recorded, rewards, lost, off = recorder.recorded, [], None, 0
+    truth, rewards, lost, off = recorder.true_states, [], None, 0
     for moment in run_episode(environment, recorder, episode_config, begin):
         rewards.append(moment.reward)
-        off = off + 1 if recorded.truth[-1].get(OFF) else 0
+        off = off + 1 if truth[-1].get(OFF) else 0
         if lost is None and off == config.lasting:
             lost = moment.step - config.lasting
         if lost is not None and moment.step >= lost + config.after:
             break
-    columns = {name: np.array([each[name] for each in recorded.truth]) for name in recorded.truth[0]}
-    latent, state, action, push = map(np.stack, (recorded.latent, recorded.state, recorded.action, recorded.push))
+    columns = {name: np.array([each[name] for each in truth]) for name in truth[0]}
+    latent, state, action, push = map(np.stack, zip(*recorder.recorded, strict=True))
     return DisturbedDrive(
         episode_config.seed, latent, state, recorder.hidden, columns, action, push, np.array(rewards), lost
     )

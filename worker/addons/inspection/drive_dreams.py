@@ -55,11 +55,13 @@ class DriveDreamer:
             for row in range(rows)
         ]
         latent, state = (np.repeat(each[segment.step][None], rows, axis=0) for each in (drive.latent, drive.state))
-        going = np.ones((rows, 1), dtype=bool)
+        going, actions = np.ones((rows, 1), dtype=bool), self._world.actions
         for action, push in zip(drive.action[segment.steps], drive.push[segment.steps], strict=True):
             features.append(join_features(latent, state, self._hidden))
             chosen = self._controllers.act(self._parameters, latent, state) if own else None
-            done = np.repeat(action[None], rows, axis=0) if chosen is None else self._pushed(chosen, push)
+            done = np.repeat(action[None], rows, axis=0)
+            if chosen is not None:
+                done = add_disturbance(actions, chosen, push[None])
             draw = stack_draws([noise.next() for noise in noises], axis=0).map(np.concatenate)
             moment = self._world.imagine(latent, done, state, draw, chosen)
             rewards.append(np.where(going[:, 0], moment.reward, 0.0))
@@ -78,6 +80,3 @@ class DriveDreamer:
         moment = self._world.imagine(drive.latent, drive.action, drive.state, draw)
         latent = np.concatenate([drive.latent[:1], moment.latent[:-1]])
         return join_features(latent, drive.state, self._hidden), moment.reward
-
-    def _pushed(self, chosen: Floats, push: Floats) -> Floats:
-        return add_disturbance(self._world.actions, chosen, push[None])

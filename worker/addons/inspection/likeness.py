@@ -52,7 +52,7 @@ class LikenessReport:
 def compare_frequencies(
     drives: Sequence[DisturbedDrive], bundle: Bundle, controller: Controller, opening: int, dreams: int,
     temperature: float,
-) -> list[RareFrequency]:  # fmt: skip
+) -> LikenessReport:  # fmt: skip
     """Compare each drive, from its opening until it leaves the road, with dreams of the same length and disturbance.
 
     `UsageError` if fewer than two drives stay on the road for long enough.
@@ -84,10 +84,11 @@ def compare_frequencies(
     if len(shares) < 2:
         raise UsageError("the dreams of all drives but one end as they begin: nothing can be measured on them")
     found = {where: np.stack([each[where] for each in shares], axis=1) for where in shares[0]}
-    return [
+    quantities = tuple(
         RareFrequency(name, float(rare[row]), {where: Estimate.of(list(each[row])) for where, each in found.items()})
         for row, name in enumerate(names)
-    ]
+    )
+    return LikenessReport(len(drives), dreams, temperature, quantities)
 
 
 def _before_ends(features: NDArray[np.float32]) -> NDArray[np.float32]:

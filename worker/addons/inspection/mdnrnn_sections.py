@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,15 +22,14 @@ TEMPERATURES = (0.5, 1.0)
 LEAST = 1e-4  # of the probabilities that are drawn
 
 
-def recurrent_states(bundle: Bundle, drive: EncodedRollout) -> Floats:
-    """The recurrent state `(T, 1, state)` before each step of the drive, as a controller would see it."""
+def follow_drive(bundle: Bundle, drive: EncodedRollout) -> Iterator[tuple[Floats, Floats, Floats]]:
+    """Each step's latent `(1, latent)` and action `(1, actions)`, and the state `(1, state)` that a controller sees."""
     model, label = DreamStep(bundle), RewardLabel(bundle)
-    state, states = model.zero_state(1), []
-    for latent, action, reward in zip(drive.mu, drive.action, drive.reward, strict=True):
-        states.append(state)
-        state = model.advance(latent[None], action[None], state)
+    state = model.zero_state(1)
+    for latent, action, reward in zip(drive.mu[:, None], drive.action[:, None], drive.reward, strict=True):
+        yield latent, action, state
+        state = model.advance(latent, action, state)
         label.write(state, np.array([reward]))
-    return np.stack(states)
 
 
 def dream_latents(bundle: Bundle, drive: EncodedRollout, temperature: float, seed: int = 0) -> Floats:
@@ -64,10 +65,7 @@ def dream_section(bundle: Bundle, drive: EncodedRollout, vae_view: VAEView) -> S
 def reward_section(bundle: Bundle, drive: EncodedRollout) -> Section:
     """Draw the predicted and the real reward of each step, and their running sums."""
     world, zeros = DreamWorld(bundle, 1.0), np.zeros((1, bundle.manifest.latent), np.float32)
-    awake = [
-        world.imagine(latent[None], action[None], state, Draw(zeros, zeros)).reward[0]
-        for latent, action, state in zip(drive.mu, drive.action, recurrent_states(bundle, drive), strict=True)
-    ]
+    awake = [world.imagine(*step, Draw(zeros, zeros)).reward[0] for step in follow_drive(bundle, drive)]
     asleep = _dreamt_rewards(world, drive)
     figure, axes = new_figure(5.2, 2, sharex=True)
     for panel, change, what in ((axes[0, 0], np.asarray, "reward of a step"), (axes[1, 0], np.cumsum, "summed")):
@@ -99,10 +97,7 @@ def _dreamt_rewards(world: DreamWorld, drive: EncodedRollout) -> list[float]:
 def ends_section(bundle: Bundle, drive: EncodedRollout) -> Section:
     """Draw the predicted probability that each step of the drive is its last, on a logarithmic axis."""
     model, zeros = DreamStep(bundle), np.zeros((1, bundle.manifest.latent), np.float32)
-    predicted = [
-        float(model.imagine(latent[None], action[None], state, zeros, zeros, 1.0, None).done[0])
-        for latent, action, state in zip(drive.mu, drive.action, recurrent_states(bundle, drive), strict=True)
-    ]
+    predicted = [model.imagine(*step, zeros, zeros, 1.0, None).done[0] for step in follow_drive(bundle, drive)]
     figure, axes = new_figure(2.8)
     panel = axes[0, 0]
     panel.plot(np.maximum(predicted, LEAST), color="tab:blue", linewidth=1.2)
@@ -127,10 +122,7 @@ def attention_section(bundle: Bundle, drive: EncodedRollout) -> Section | None:
     model = DreamStep(bundle)
     if not model.has_attention:
         return None
-    weights = np.concatenate([
-        model.attend(latent[None], action[None], state)
-        for latent, action, state in zip(drive.mu, drive.action, recurrent_states(bundle, drive), strict=True)
-    ])  # fmt: skip
+    weights = np.concatenate([model.attend(*step) for step in follow_drive(bundle, drive)])
     window = weights.shape[1]
     figure, axes = new_figure(3.4, 1, 2, width_ratios=(4, 1))
     draw_heatmap(axes[0, 0], weights.T, "weight of each input at each step", cmap="magma", vmin=0)

@@ -10,7 +10,7 @@ from pathlib import Path
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.bundle_store import find_bundle, shipped_names
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.artifacts.world_facts import DRAWN, EndRule, RewardFacts
+from dreamfleet.common.artifacts.world_facts import DRAWN, EndRule
 from dreamfleet.common.errors import BundleError, JournalError, MissingExtraError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write, reporting_unwritable_folder
 from dreamfleet.common.files.regular_files import is_file
@@ -55,8 +55,11 @@ class InspectionSubject:
 
 
 @contextmanager
-def find_subject(name: str, runs_dir: Path) -> Iterator[InspectionSubject]:
-    """Find a bundle by its file or shipped name, else a run by its name."""
+def find_subject(name: str | None, runs_dir: Path) -> Iterator[InspectionSubject]:
+    """Find a bundle by its file or shipped name, else a run by its name, which stays open; without a name nothing."""
+    if not name:
+        yield InspectionSubject(None)
+        return
     if is_file(Path(name)) or name in shipped_names():
         yield InspectionSubject(find_bundle(name))
         return
@@ -66,15 +69,12 @@ def find_subject(name: str, runs_dir: Path) -> Iterator[InspectionSubject]:
         shipped = ", ".join(shipped_names()) or "none"
         raise BundleError(f"no bundle {name!r} (a file, or one that ships: {shipped}), and {error}") from error
     with run:
-        if not run.spec.bundle:
-            yield InspectionSubject(None, run=run)
-            return
-        bundle = Bundle.open(run.bundle_path, run.spec.bundle)
-        if not run.controller_path.exists():
-            yield InspectionSubject(bundle, run=run)
-            return
-        controller = Controller.load(run.controller_path)
-        yield InspectionSubject(bundle.for_controller(controller), controller, run)
+        bundle = Bundle.open(run.bundle_path, run.spec.bundle) if run.spec.bundle else None
+        controller: Controller | None = None
+        if bundle is not None and run.controller_path.exists():
+            controller = Controller.load(run.controller_path)
+            bundle = bundle.for_controller(controller)
+        yield InspectionSubject(bundle, controller, run)
 
 
 def write_page(
@@ -140,7 +140,8 @@ def sections_of(
         yield from _bundle_sections(subject.bundle, subject, config)
     else:
         yield from _vae_sections(data, config)
-    yield from _fitness_section(subject)
+    if subject.run is not None and (evolved := curve_sections.fitness_section(subject.run)):
+        yield evolved
     yield from curve_sections.loss_sections(trained)
 
 
@@ -180,38 +181,20 @@ def _bundle_sections(bundle: Bundle, subject: InspectionSubject, config: DriveCo
     driven, vae_view = record_drive(bundle, subject.controller, config, subject.own), VAEView.of_bundle(bundle)
     yield vae_sections.reconstructions(driven, vae_view)
     yield from _latent_sections(driven, vae_view)
-    yield from _dream_sections(bundle, driven, vae_view)
+    yield mdnrnn_sections.dream_section(bundle, driven, vae_view)
+    heads = bundle.manifest.models.get("mdnrnn", {})
+    if heads.get("reward", "none") != "none":
+        yield mdnrnn_sections.reward_section(bundle, driven)
+    if heads.get("done"):
+        yield mdnrnn_sections.ends_section(bundle, driven)
+    if looked := mdnrnn_sections.attention_section(bundle, driven):
+        yield looked
 
 
 def _latent_sections(driven: EncodedRollout, vae_view: VAEView) -> Iterator[Section]:
     yield vae_sections.traversals(driven, vae_view)
     yield vae_sections.latent_moments(driven)
     yield vae_sections.samples(vae_view)
-
-
-def _fitness_section(subject: InspectionSubject) -> Iterator[Section]:
-    if subject.run is not None and (evolved := curve_sections.fitness_section(subject.run)):
-        yield evolved
-
-
-def _dream_sections(bundle: Bundle, driven: EncodedRollout, vae_view: VAEView) -> Iterator[Section]:
-    yield mdnrnn_sections.dream_section(bundle, driven, vae_view)
-    if bundle.manifest.models.get("mdnrnn", {}).get("reward", "none") != "none":
-        yield mdnrnn_sections.reward_section(bundle, driven)
-    if bundle.manifest.models.get("mdnrnn", {}).get("done"):
-        yield mdnrnn_sections.ends_section(bundle, driven)
-    if looked := mdnrnn_sections.attention_section(bundle, driven):
-        yield looked
-
-
-def _with_unit(name: str, value: object) -> str:
-    """Format a quality figure with its unit and which values are good."""
-    return next((f"{value} ({unit})" for known, unit in UNITS.items() if known in name), str(value))
-
-
-def _reward_text(reward: RewardFacts) -> str:
-    cost = f" - {reward.cost:g}" if reward.cost else ""
-    return f"{reward.gain:g} x {reward.source}{cost}"
 
 
 def _end_text(end: EndRule) -> str:
@@ -234,12 +217,14 @@ def manifest_facts(bundle: Bundle) -> list[tuple[str, str]]:
         ("attention window", str(model.get("window", 0) or "none")),
         ("recorded states", str(bundle.recorded_count or "none")),
     ]
-    facts = manifest.facts
-    rows += [("options", facts.options or "none"), ("reward of a dream", _reward_text(facts.reward))]
+    facts, reward = manifest.facts, manifest.facts.reward
+    cost = f" - {reward.cost:g}" if reward.cost else ""
+    rows += [("options", facts.options or "none"), ("reward of a dream", f"{reward.gain:g} x {reward.source}{cost}")]
     rows += [("a dream ends", _end_text(facts.end))]
     rows += [(name, str(provenance[name])) for name in DRIVEN if name in provenance]
-    if isinstance(quality, dict):
-        rows += [(f"quality: {name}", _with_unit(name, value)) for name, value in quality.items()]
+    for name, value in quality.items() if isinstance(quality, dict) else ():
+        unit = next((f" ({unit})" for known, unit in UNITS.items() if known in name), "")
+        rows.append((f"quality: {name}", f"{value}{unit}"))
     measured = provenance.get("measured", [])
     rows += [row for each in measured for row in measured_rows(each)] if isinstance(measured, list) else []
     return [(name.replace("_", " "), value) for name, value in rows]

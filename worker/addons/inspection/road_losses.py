@@ -122,7 +122,10 @@ def collect_losing_drives(
     """Collect drives until `config.losses` have lost the road; `UsageError` if ten times as many drives have not."""
     taken, losses = list[DisturbedDrive](), 0
     for drive in islice(drives, PATIENCE * config.losses):
-        _check_truth(drive)
+        if lacking := {OFF, OFFSET} - drive.truth.keys():
+            raise UsageError(
+                f"the world's true state lacks {' and '.join(sorted(lacking))}: losses of the road cannot be seen"
+            )
         taken.append(drive)
         losses += has_usable_loss(drive, config, driven)
         on_loss(losses)
@@ -140,7 +143,7 @@ def compare_losses(
     controller: Controller,
     config: RoadLossConfig,
     driven: DisturbedDriveConfig,
-) -> list[RoadLossComparison]:
+) -> LossReport:
     """Compare losses, and stretches without one, with dreams begun there, by probes fitted on other folds' drives."""
     dreamer = DriveDreamer(bundle, controller, config.temperature, config.dreams)
     foreseen = [dreamer.predict_next(drive) for drive in drives]
@@ -153,7 +156,7 @@ def compare_losses(
     for name, beginnings in _dream_segments(drives, config, driven):
         outcomes = [_outcomes(each, foreseen[row], dreamer, probes[row]) for row, each in beginnings.items()]
         found.append(RoadLossComparison(name, len(outcomes), _average(outcomes, driven.lasting)))
-    return found
+    return LossReport(len(drives), config.dreams, config.temperature, driven.lasting, tuple(found))
 
 
 def _average(outcomes: Sequence[dict[str, RoadOutcome]], lasting: int) -> dict[str, dict[str, Estimate]]:
@@ -208,10 +211,3 @@ def has_usable_loss(drive: DisturbedDrive, config: RoadLossConfig, driven: Distu
     if drive.lost is None:
         return False
     return drive.lost - max(config.before) >= driven.opening and drive.lost + driven.after <= len(drive)
-
-
-def _check_truth(drive: DisturbedDrive) -> None:
-    if lacking := {OFF, OFFSET} - drive.truth.keys():
-        raise UsageError(
-            f"the world's true state lacks {' and '.join(sorted(lacking))}: losses of the road cannot be seen"
-        )

@@ -7,7 +7,7 @@ reality, dreams are too easy. It needs no true state, so it tests world models o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,10 +53,6 @@ class SurvivalConfig:
     def seeds(self) -> range:
         """The seeds of the episodes."""
         return range(self.first_seed, self.first_seed + self.episodes)
-
-    def rule(self, bundle: Bundle) -> str:
-        """The rule by which dreams of the bundle end, as a text."""
-        return DreamEnds(bundle, self.temperature, self.end).rule.text
 
 
 @dataclass(frozen=True)
@@ -125,22 +121,18 @@ def measure_survival(
         raise UsageError("the controller must be of this world model, as it acts in its dreams too")
     fitting = bundle if controller is None else bundle.for_controller(controller)
     task, assignment = task_of(bundle), Assignment.of(bundle.manifest.task, fitting)
-    world, rule = DreamWorld(fitting, config.temperature, end=config.end), config.rule(bundle)
+    world = DreamWorld(fitting, config.temperature, end=config.end)
+    rule = DreamEnds(bundle, config.temperature, config.end).rule.text
     drivers: dict[str, DriverMaker | None] = {**fixed_drivers(task, task.world_of(assignment))}
     if controller is not None:
         drivers[CONTROLLER] = None
-    reality = _Reality(task, assignment, controller)
-    try:
-        for name, make in drivers.items():
-            reality.drive(name, make, config.seeds, on_episode)
-    finally:
-        reality.close()
+    lengths, limit = _real_lengths(task, assignment, drivers, controller, config.seeds, on_episode)
     found = []
-    for name, make in drivers.items():
-        dreamt = _dream_lengths(world, make, controller, config.seeds, reality.limit)
-        found.append(PolicySurvival.of(name, np.array(reality.lengths[name]), dreamt, reality.limit))
+    for (name, make), real in zip(drivers.items(), lengths, strict=True):
+        dreamt = _dream_lengths(world, make, controller, config.seeds, limit)
+        found.append(PolicySurvival.of(name, real, dreamt, limit))
         on_episode((len(drivers) + len(found)) * len(config.seeds))
-    return Survival.of(config, reality.limit, rule, tuple(found))
+    return Survival.of(config, limit, rule, tuple(found))
 
 
 def fixed_drivers(task: Task, world: World) -> dict[str, DriverMaker]:
@@ -170,33 +162,29 @@ def _constant(action: Sequence[float], world: World) -> DriverMaker:
     return lambda _random: driver
 
 
-class _Reality:
-    """Drives episodes in the world. Their `limit` falls to that of the simulator where this ends one by a limit."""
+def _real_lengths(
+    task: Task, assignment: Assignment, drivers: Mapping[str, DriverMaker | None], controller: Controller | None,
+    seeds: Sequence[int], on_episode: Callable[[int], None],
+) -> tuple[list[Lengths], int]:  # fmt: skip
+    """The lengths `(seeds,)` of episodes in the world under each driver, or the controller, and the longest possible.
 
-    def __init__(self, task: Task, assignment: Assignment, controller: Controller | None) -> None:
-        self.limit = min(task.world_of(assignment).horizon, LONGEST)
-        self.lengths: dict[str, list[int]] = {}
-        self._controller, self._policy = controller, task.make_policy(assignment)
-        self._environment = task.make_environment(assignment)
-
-    def drive(
-        self, name: str, make: DriverMaker | None, seeds: Sequence[int], on_episode: Callable[[int], None]
-    ) -> None:
-        """Add the lengths of a driver's episodes, or of the controller's; `on_episode` gets the number of all."""
-        before = sum(map(len, self.lengths.values()))
-        self.lengths[name] = []
-        for seed in seeds:
-            policy = self._policy if make is None else DriverPolicy(make(np.random.default_rng(seed)))
-            policy.begin(NO_PARAMETERS if self._controller is None else self._controller.parameters)
-            *_, last = run_episode(self._environment, policy, EpisodeConfig(seed, self.limit))
-            self.lengths[name].append(last.step)
-            on_episode(before + len(self.lengths[name]))
-            if last.ended and not last.terminal:
-                self.limit = last.step
-
-    def close(self) -> None:
-        """Release the environment."""
-        close_environment(self._environment)
+    That limit falls to the simulator's where this ends an episode by one.
+    """
+    limit, lengths = min(task.world_of(assignment).horizon, LONGEST), list[int]()
+    policy, environment = task.make_policy(assignment), task.make_environment(assignment)
+    try:
+        for make in drivers.values():
+            for seed in seeds:
+                actor = policy if make is None else DriverPolicy(make(np.random.default_rng(seed)))
+                actor.begin(NO_PARAMETERS if controller is None else controller.parameters)
+                *_, last = run_episode(environment, actor, EpisodeConfig(seed, limit))
+                lengths.append(last.step)
+                on_episode(len(lengths))
+                if last.ended and not last.terminal:
+                    limit = last.step
+    finally:
+        close_environment(environment)
+    return list(np.array(lengths).reshape(len(drivers), len(seeds))), limit
 
 
 def _dream_lengths(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,10 +38,6 @@ class LossLine:
     def __len__(self) -> int:
         return len(self.updates)
 
-    def at(self, update: float) -> float:
-        """The loss at an update that is on the line."""
-        return float(self.values[self.updates == update][0])
-
 
 @dataclass(frozen=True)
 class LossCurve:
@@ -69,9 +65,10 @@ class TrainingCurves:
         """The number of updates, and the held-out losses at the best one."""
         if self.best is None:
             return f"{plural(round(self.updates), 'update')}"
-        held = {part: each.held_out for part, each in self.curves.items()}
         parts = [
-            f"{UNITS[part][0]} {line.at(self.best):.4g}" for part, line in held.items() if self.best in line.updates
+            f"{UNITS[part][0]} {loss:.4g}"
+            for part, curve in self.curves.items()
+            for loss in curve.held_out.values[curve.held_out.updates == self.best]
         ]
         return (
             f"{plural(round(self.updates), 'update')}; held-out drives lost least in all at "
@@ -105,7 +102,7 @@ def _names(folders: Sequence[Path]) -> list[str]:
 def _load_training(path: Path, name: str, model: str) -> TrainingCurves:
     rows = merge_points(read_points(path))
     found = {part: LossCurve(_make_line(rows, part), _make_line(rows, HELD_OUT + part)) for part in UNITS}
-    curves = {part: curve for part, curve in found.items() if list(_lines(curve))}
+    curves = {part: curve for part, curve in found.items() if len(curve.trained) or len(curve.held_out)}
     if not curves:
         raise DatasetError(f"{path} holds no loss curve ({', '.join(UNITS)}); move it away, or choose another --data")
     wholes = {update: whole for update, row in rows.items() if (whole := _held_out(row)) is not None}
@@ -121,10 +118,6 @@ def _held_out(row: Mapping[str, float]) -> float | None:
 def _make_line(rows: Mapping[float, Mapping[str, float]], name: str) -> LossLine:
     found = {update: row[name] for update, row in rows.items() if name in row}
     return LossLine(np.array(list(found), dtype=np.float64), np.array(list(found.values()), dtype=np.float64))
-
-
-def _lines(curve: LossCurve) -> Iterable[LossLine]:
-    return (line for line in (curve.trained, curve.held_out) if len(line))
 
 
 def read_points(path: Path) -> Points:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,9 +22,7 @@ from dreamfleet.worker.addons.inspection.measure import (
     FigureName,
     FigureReport,
     MeasureRequest,
-    choose_driver,
     measure,
-    open_subject,
 )
 
 if TYPE_CHECKING:
@@ -98,10 +95,9 @@ def run(args: argparse.Namespace) -> int:
     if args.end and not args.survival:
         raise UsageError("--end needs the dreams of --survival: give that too")
     if figures := tuple(name for name in FIGURES if getattr(args, name)):
-        if args.picture:
-            raise UsageError("--picture belongs to the page: omit --probe, --losses, --likeness and --survival")
-        if args.action:
-            raise UsageError("--action belongs to the page: omit --probe, --losses, --likeness and --survival")
+        for flag in ("picture", "action"):
+            if getattr(args, flag):
+                raise UsageError(f"--{flag} belongs to the page: omit --probe, --losses, --likeness and --survival")
         return _measure(args, figures)
     if args.driver:
         raise UsageError("--driver drives for figures: give --probe too")
@@ -117,17 +113,17 @@ def _draw_page(args: argparse.Namespace) -> int:
         raise UsageError("only one can drive: give --controller or --action")
     from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.worker.addons.inspection.encoded_rollout import DriveConfig
-    from dreamfleet.worker.addons.inspection.page_builder import write_page
+    from dreamfleet.worker.addons.inspection.page_builder import find_subject, write_page
 
-    with ExitStack() as held:
-        subject = _with_driver(args, open_subject(args.subject, args.runs_dir, held))
+    with find_subject(args.subject, args.runs_dir) as found:
+        subject = _with_driver(args, found)
         if args.action and subject.bundle is None:
             raise UsageError("--action is driven beside a world model's dream: name a bundle, or a run with one")
         sections = SECTIONS + len(args.data)
         config = DriveConfig(args.seed, args.steps, tuple(args.action or ()))
-        bar = held.enter_context(progress_bar("inspect", sections, "sections"))
-        page = write_page(subject, args.out, config, args.data, bar.update, args.picture)
-        bar.update(sections)
+        with progress_bar("inspect", sections, "sections") as bar:
+            page = write_page(subject, args.out, config, args.data, bar.update, args.picture)
+            bar.update(sections)
     print_answer(args, str(page), page=page)
     return 0
 
@@ -156,6 +152,8 @@ def _with_driver(args: argparse.Namespace, subject: InspectionSubject) -> Inspec
     """The subject, with the driver of its page if one is given."""
     if not args.controller:
         return subject
+    from dreamfleet.worker.addons.inspection.measurements import choose_driver
+
     bundle, driving = choose_driver(subject, args.controller, args.runs_dir)
     controller, own = driving.controller, driving.own
     if controller is None or own is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Any, NoReturn
@@ -63,12 +64,11 @@ def collect(
 ) -> Generator[int, None, None]:  # fmt: skip
     """Drive the missing episodes in `jobs` processes; yield the frames of each once it is written.
 
-    Random drivers drive, or `pilots` in turn. Before any drive it raises `DatasetError` if existing episodes are of
-    another world or have other pictures, `ControllerError` if a pilot does, and `UsageError` if the world lacks what
-    `config` asks for. When closed early, it waits until running drives are written. `DreamfleetError` for a drive that
-    fails, ends its process, or makes no step for `stall` seconds.
+    Random drivers drive, or `pilots` in turn; `config` is of the world, as `check_for` says. Before any drive it raises
+    `DatasetError` if existing episodes are of another world or have other pictures, and `ControllerError` if a pilot
+    does. When closed early, it waits until running drives are written. `DreamfleetError` for a drive that fails, ends
+    its process, or makes no step for `stall` seconds.
     """
-    config.check_for(world)
     preprocessing = preprocessing_of_size(config.picture, world)
     check_pictures(existing_episodes(folder), config.picture, world, preprocessing)
     for pilot in pilots:
@@ -80,19 +80,18 @@ def collect(
         return
     pin_thread_pools()
     absolute = folder.absolute()  # a simulator may change the current folder of its process
-    tasks = [(absolute, config, number, tuple(pilots), world) for number in numbers]
-    yield from map_in_processes(jobs, draw_unseen, (), _collect_one, tasks, _lose, stall)
+    drive = partial(_collect_one, absolute, config, pilots, world)
+    yield from map_in_processes(jobs, draw_unseen, (), drive, numbers, _lose, stall)
 
 
-def _lose(task: tuple[Path, CollectConfig, int, tuple[Pilot, ...], DataWorld], reason: int | str) -> NoReturn:
+def _lose(number: int, reason: int | str) -> NoReturn:
     raise DreamfleetError(
-        f"drive {task[2]} failed: {crash(reason).text}; what was written before is whole, and `dreamfleet doctor` "
+        f"drive {number} failed: {crash(reason).text}; what was written before is whole, and `dreamfleet doctor` "
         "looks for a cause in this host"
     )
 
 
-def _collect_one(task: tuple[Path, CollectConfig, int, tuple[Pilot, ...], DataWorld]) -> int:
-    folder, config, number, pilots, world = task
+def _collect_one(folder: Path, config: CollectConfig, pilots: Sequence[Pilot], world: DataWorld, number: int) -> int:
     try:
         arrays = drive_episode(config, number, pilots, world, kept_environment)
     except (DreamfleetError, MemoryError):
@@ -141,7 +140,6 @@ def drive_episode(
     """Drive an episode of T steps: `picture` (T, side, side, 3) before each `action` (T, A), then `reward` (T,)."""
     random = np.random.default_rng([config.seed, number])
     task = find_world(*world)
-    config.check_for(world)
     name, policy = _driver(task, config, number, pilots, random)
     preprocessing = preprocessing_of_size(config.picture, world)
     begin = _begin_hook(task, config.anywhere, random)

@@ -4,32 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
+from dreamfleet.common.cli.bounds import Positive, check_bounds
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.protocol.messages import Share
+from dreamfleet.common.schema.validation import Count
 from dreamfleet.worker.scoring.rollout import DataWorld
 from dreamfleet.worker.tasks.api import Policy
 from dreamfleet.worker.tasks.policy import ALL_DRIVERS
 from dreamfleet.worker.tasks.recordable import RecordableTask, TaskWithBeginnings, TaskWithPolicies
 from dreamfleet.worker.training.data.dataset import find_world, preprocessing_of_size
 
-MAX_NOISE = 10.0  # in halves of an action's range
+Noise = Annotated[float, Meta(ge=0.0, le=10.0)]  # in halves of an action's range
 
 
 @dataclass(frozen=True)
 class CollectConfig:
     """How much is driven, how, and by which drivers. The numbers are of no world; `check_for` asks one for the rest."""
 
-    episodes: int = option(400, "total number of episodes")
-    steps: int = option(300, "longest episode, in steps")
-    seed: int = option(0, "random seed of the data set")
-    anywhere: float = option(0.6, "share of episodes that start at a random place in the world")
-    patience: int = option(120, "steps without a positive reward after which an episode ends; 0: never")
+    episodes: Positive = option(400, "total number of episodes")
+    steps: Positive = option(300, "longest episode, in steps")
+    seed: Count = option(0, "random seed of the data set")
+    anywhere: Share = option(0.6, "share of episodes that start at a random place in the world")
+    patience: Count = option(120, "steps without a positive reward after which an episode ends; 0: never")
     picture: int = option(64, "height and width of recorded pictures: 64 or 96")
-    noise: float = option(0.3, "noise on a controller's actions, in halves of their range; random drivers have none")
-    spells: float = option(
+    noise: Noise = option(0.3, "noise on a controller's actions, in halves of their range; random drivers have none")
+    spells: Share = option(
         0.0, "chance per step to try an action that a controller keeps at its bound, such as the brake, for a while"
     )
     driver: str = option(
@@ -39,19 +44,7 @@ class CollectConfig:
     )
 
     def __post_init__(self) -> None:
-        for name in ("episodes", "steps"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"--{name} must be at least 1, not {getattr(self, name)}")
-        if self.patience < 0:
-            raise UsageError(f"--patience must be at least 1, or 0 for none, not {self.patience}")
-        if not 0 <= self.anywhere <= 1:
-            raise UsageError(f"--anywhere must be from 0 to 1, not {self.anywhere}")
-        if self.seed < 0:
-            raise UsageError(f"--seed must not be negative, not {self.seed}")
-        if not 0 <= self.noise <= MAX_NOISE:
-            raise UsageError(f"--noise must be from 0 to {MAX_NOISE:g}, not {self.noise}")
-        if not 0 <= self.spells <= 1:
-            raise UsageError(f"--spells must be from 0 to 1, not {self.spells}")
+        check_bounds(self)
 
     def check_for(self, world: DataWorld) -> None:
         """`UsageError` if the world has no such driver or pictures, or no random places to begin at."""

@@ -217,11 +217,6 @@ def kind_of(path: Path) -> tuple[DataWorld, str]:
     return DataWorld.parse(str(arrays.get("world", ""))), str(arrays["preprocessing"])
 
 
-def preprocessing_of(path: Path) -> str:
-    """The name of the preprocessing of an episode's pictures."""
-    return kind_of(path)[1]
-
-
 def load_pictures(path: Path) -> NDArray[np.uint8]:
     """Load an episode's pictures `(T, side, side, 3)`; `DatasetError` if they do not match its preprocessing."""
     arrays = load_arrays(path, "picture", "preprocessing", optional=("world",))

@@ -81,13 +81,12 @@ def sample_steps(
     ]
     lost = [each for each in lost if each.step - LATEST >= first]
     chosen = [lost[index] for index in random.permutation(len(lost))[: count // 2]]
-    before = {DriveStep(drive, _shortly_before(step, first, random)) for drive, step in chosen}
+    before = {
+        DriveStep(drive, int(random.integers(max(first, step - EARLIEST), step - LATEST, endpoint=True)))
+        for drive, step in chosen
+    }
     anywhere = [each for each in _anywhere(drives, count, first, random) if each not in before]
     return SampledSteps(tuple(sorted(before)), tuple(anywhere[: count - len(before)]))
-
-
-def _shortly_before(step: int, first: int, random: np.random.Generator) -> int:
-    return int(random.integers(max(first, step - EARLIEST), step - LATEST, endpoint=True))
 
 
 def _anywhere(drives: Sequence[Floats], count: int, first: int, random: np.random.Generator) -> list[DriveStep]:

@@ -70,14 +70,14 @@ def refit_controller(request: RefitRequest, stop: Stop = never_stop) -> RefitRep
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
-    from dreamfleet.worker.training.drive_regression import last_drives
+    from dreamfleet.worker.training.data.dataset import episode_paths
     from dreamfleet.worker.training.refit import output_names, refit
 
     controller, beside = find_controller(request.controller, request.runs_dir)
     own = find_bundle_of(controller, request.bundle, beside)
     if own is None:
         raise UsageError(f"controller {request.controller} sees no world model: give one that was evolved with one")
-    paths = last_drives(request.data, request.episodes)
+    paths = episode_paths(request.data)[-request.episodes :]  # controllers' drives are newer than random ones
     with progress_bar("refit", len(paths), "drives") as bar:
         fitted = refit(controller, own, find_bundle(request.to), paths, stopping(bar.update, stop))
     with reporting_write_errors(request.out):

@@ -61,10 +61,11 @@ def fit_subspace(request: SubspaceRequest, stop: Stop = never_stop) -> SubspaceR
     check_output_path(request.out)
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.common.cli.progress import progress_bar
-    from dreamfleet.worker.training.drive_regression import last_drives
+    from dreamfleet.worker.training.data.dataset import episode_paths
     from dreamfleet.worker.training.fit_subspace import find_subspace
 
-    bundle, paths = find_bundle(request.bundle), last_drives(request.data, request.episodes)
+    bundle = find_bundle(request.bundle)
+    paths = episode_paths(request.data)[-request.episodes :]  # controllers' drives are newer than random ones
     with progress_bar("subspace", len(paths), "drives") as bar:
         found = find_subspace(bundle, paths, stopping(bar.update, stop), request.views)
     r_squared = tuple(round(each, 4) for each in found.r_squared)

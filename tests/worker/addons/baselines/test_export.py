@@ -1,5 +1,5 @@
 """An exported agent drives like the trained network, without torch; any other file is refused.
-Tests policies.py and common/artifacts/trained_agent.py."""
+Tests common/artifacts/trained_agent.py."""
 
 import hashlib
 import json
@@ -19,16 +19,14 @@ from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import ControllerError, DatasetError
 from dreamfleet.common.runs.evaluation_report import read_evaluation_report
 from dreamfleet.common.runs.lookup import find_agent, find_controller
-from dreamfleet.worker.addons.baselines.agent_config import AgentConfig
 from dreamfleet.worker.addons.baselines.export import export_agent, export_network
-from dreamfleet.worker.addons.baselines.learning_config import LearningConfig
-from dreamfleet.worker.addons.baselines.network import Networks
-from dreamfleet.worker.addons.baselines.policies import QPolicy
+from dreamfleet.worker.addons.baselines.network import Networks, QPolicy
+from dreamfleet.worker.addons.baselines.presets import AgentConfig, LearningConfig
 from dreamfleet.worker.addons.baselines.train import CHECKPOINT, train_drqn
 from dreamfleet.worker.scoring.agents import make_agent
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.policy import NO_PARAMETERS
-from dreamfleet.worker.tools import agent_evaluator, evaluation
+from dreamfleet.worker.tools import evaluation
 from dreamfleet.worker.training.checkpoint import save_checkpoint
 from dreamfleet.worker.worldmodel.inference import open_graph
 from dreamfleet.worker.worlds.car_racing.agents import NetworkPolicy
@@ -41,7 +39,7 @@ LEARNING = LearningConfig(episodes=2, random_episodes=1, steps=12, batch=2, repo
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
-    monkeypatch.setattr(agent_evaluator, "EpisodeConfig", lambda seed, _horizon: EpisodeConfig(seed, STEPS))
+    monkeypatch.setattr(evaluation, "EpisodeConfig", lambda seed, _horizon: EpisodeConfig(seed, STEPS))
     monkeypatch.setattr(evaluation, "evaluate_in_processes", evaluation.evaluate)  # a child would not know it
 
 
@@ -143,16 +141,7 @@ def test_a_training_and_its_file_give_the_same_report_and_compare_takes_both(tra
 def test_it_goes_to_other_processes(file):
     agent = make_agent(TrainedAgent.load(file))
     again = pickle.loads(pickle.dumps(agent))
-    assert agent_evaluator.AgentEvaluator(again).drive(SEED) == agent_evaluator.AgentEvaluator(agent).drive(SEED)
-
-
-@pytest.mark.slow
-def test_a_video_shows_the_same_drive(trained, file, tmp_path, capsys):
-    drive = ["--seed", str(SEED), "--steps", str(STEPS), "--json", "--out", str(tmp_path / "drive.mp4")]
-    assert main(["record", "--controller", str(file), *drive]) == 0
-    assert main(["record", "--controller", str(trained), *drive]) == 0
-    scores = [json.loads(line)["score"] for line in capsys.readouterr().out.splitlines()]
-    assert scores == [agent_evaluator.AgentEvaluator(make_agent(TrainedAgent.load(file))).drive(SEED).score] * 2
+    assert evaluation.AgentEvaluator(again).drive(SEED) == evaluation.AgentEvaluator(agent).drive(SEED)
 
 
 def test_neither_torch_nor_onnx_is_needed_to_drive(file):

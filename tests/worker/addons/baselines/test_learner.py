@@ -1,15 +1,14 @@
 """The equations of an update against numbers worked out by hand; updates converge, and the target network lags.
-Tests learning_config.py and network.py."""
+Tests network.py."""
 
 import numpy as np
 import pytest
 import torch
 
 from dreamfleet.common.errors import DatasetError
-from dreamfleet.worker.addons.baselines.agent_config import AgentConfig
 from dreamfleet.worker.addons.baselines.learner import Learner, double_q_target, masked_loss
-from dreamfleet.worker.addons.baselines.learning_config import LearningConfig, epsilon_of
 from dreamfleet.worker.addons.baselines.network import Networks, duelling
+from dreamfleet.worker.addons.baselines.presets import AgentConfig, LearningConfig, epsilon_of
 from dreamfleet.worker.addons.baselines.replay_buffer import Episode, ReplayBuffer, n_step
 
 LAYERS = AgentConfig(channels=(2,), kernels=(8,), strides=(8,), hidden=8)

@@ -13,7 +13,7 @@ from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.evaluation_report import read_evaluation_report
-from dreamfleet.worker.addons.baselines.policies import RandomPolicy
+from dreamfleet.worker.addons.baselines.agents import RandomPolicy
 from dreamfleet.worker.tools.drivers import find_driver
 
 CARTPOLE, LANDER = "gym:CartPole-v1", "gym:LunarLander-v3"

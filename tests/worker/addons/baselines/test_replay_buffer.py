@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dreamfleet.worker.addons.baselines.learning_config import LearningConfig
+from dreamfleet.worker.addons.baselines.presets import LearningConfig
 from dreamfleet.worker.addons.baselines.replay_buffer import (
     Episode,
     ReplayBuffer,

@@ -1,7 +1,6 @@
 """The network learns in the real CarRacing; an interrupted training resumes to the same bits.
-Tests agent_config.py, episode_files.py, presets.py, progress.py, train.py and verb.py."""
+Tests presets.py, progress.py, train.py and verb.py."""
 
-import argparse
 import json
 import resource
 from dataclasses import replace
@@ -13,15 +12,12 @@ import torch
 from dreamfleet.common.errors import DatasetError, StoppedError, UsageError
 from dreamfleet.worker.addons.baselines import train
 from dreamfleet.worker.addons.baselines import verb as baseline
-from dreamfleet.worker.addons.baselines.agent_config import AgentConfig
-from dreamfleet.worker.addons.baselines.episode_files import episode_file
-from dreamfleet.worker.addons.baselines.learning_config import LearningConfig
-from dreamfleet.worker.addons.baselines.network import Networks
-from dreamfleet.worker.addons.baselines.policies import QPolicy
-from dreamfleet.worker.addons.baselines.presets import LEARNING, NOTEBOOK
-from dreamfleet.worker.addons.baselines.train import CHECKPOINT, CURVE, train_drqn
+from dreamfleet.worker.addons.baselines.network import Networks, QPolicy
+from dreamfleet.worker.addons.baselines.presets import LEARNING, NOTEBOOK, AgentConfig, LearningConfig
+from dreamfleet.worker.addons.baselines.train import CHECKPOINT, CURVE, episode_file, train_drqn
 from dreamfleet.worker.tasks.policy import NO_PARAMETERS
 from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights, save_checkpoint
+from tests.support.verbs import run_verb
 
 LAYERS = AgentConfig(channels=(2,), kernels=(8,), strides=(8,), hidden=4, frame_skip=3)
 SHORT = LearningConfig(
@@ -39,9 +35,7 @@ class KilledError(BaseException):
 
 
 def call(*words):
-    parser = argparse.ArgumentParser()
-    baseline.configure_train(parser)
-    return baseline.train_baseline(parser.parse_args(list(map(str, words))))
+    return run_verb(baseline.TRAIN, *words)
 
 
 def state(folder):
@@ -98,7 +92,7 @@ def test_a_kill_at_any_checkpoint_leads_to_the_same_files(whole, tmp_path, monke
 
 def test_a_stop_says_how_to_go_on_and_costs_nothing(whole, tmp_path):
     steps = iter(range(10**6))
-    with pytest.raises(StoppedError, match=r"drqn\.safetensors"):
+    with pytest.raises(StoppedError, match=r"3.*5.*drqn\.safetensors"):
         train_drqn(tmp_path, LAYERS, SHORT, stop=lambda: next(steps) == 60)
     assert len(load_progress(tmp_path / CHECKPOINT)["episodes"]) == 2
     train_drqn(tmp_path, LAYERS, SHORT)
@@ -121,12 +115,12 @@ def test_flags_change_what_a_preset_says(tmp_path, capsys):
     assert call("drqn", "--data", tmp_path, *FLAGS, "--episodes", 2, "--preset", "notebook", "--json") == 0
     printed = capsys.readouterr()
     assert json.loads(printed.out)["episodes"] == 2
-    assert "episode 1" in printed.err
+    assert "1:" in printed.err
     found = load_config(tmp_path / CHECKPOINT, AgentConfig)
     assert found == replace(LAYERS, picture=96, choices="notebook", heads="softmax")
-    with pytest.raises(DatasetError, match=r"picture 96, not 64; choices notebook.*--new"):
+    with pytest.raises(DatasetError, match=r"picture 96.*64.*choices notebook.*--new"):
         call("drqn", "--data", tmp_path, *FLAGS, "--episodes", 3)
-    with pytest.raises(UsageError, match="--controller"):
+    with pytest.raises(UsageError, match="`dreamfleet evaluate --controller random-discrete`"):
         call("random-discrete", "--data", tmp_path)
 
 
@@ -200,15 +194,9 @@ def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(whole, tmp_path):
 
 @pytest.mark.parametrize(
     "change",
-    [
-        {"picture": 80},
-        {"kernels": (3, 3)},
-        {"kernels": (65,)},
-        {"frame_skip": 0},
-        {"frame_skip": 10**9},
-        {"hidden": 10**9},
-    ],
-)
+    [{"picture": 80}, {"kernels": (3, 3)}, {"kernels": (65,)}, {"frame_skip": 0}, {"frame_skip": 10**9},
+     {"hidden": 10**9}],
+)  # fmt: skip
 def test_an_impossible_agent_is_refused(change):
     with pytest.raises(UsageError):
         replace(LAYERS, **change)
@@ -216,21 +204,11 @@ def test_an_impossible_agent_is_refused(change):
 
 @pytest.mark.parametrize(
     "change",
-    [
-        {"batch": 0},
-        {"burn_in": -1},
-        {"gamma": 1.5},
-        {"rate": 0.0},
-        {"clip": float("nan")},
-        {"goal": float("nan")},
-        {"rate": float("inf")},
-        {"seed": 10**20},
-        {"batch": 10**9},
-        {"n_step": 10**9},
-    ],
-)
+    [{"batch": 0}, {"burn_in": -1}, {"gamma": 1.5}, {"rate": 0.0}, {"clip": float("nan")}, {"goal": float("nan")},
+     {"rate": float("inf")}, {"seed": 10**20}, {"batch": 10**9}, {"n_step": 10**9}],
+)  # fmt: skip
 def test_impossible_learning_is_refused(change):
-    with pytest.raises(UsageError, match=next(iter(change))):
+    with pytest.raises(UsageError):
         replace(SHORT, **change)
 
 

@@ -133,4 +133,4 @@ def test_invalid_arguments_are_refused(arguments):
 
 def test_a_world_model_without_a_dream_is_refused(capsys):
     assert main(["drive", "--temperature", "0.5"]) == UsageError.exit_code
-    assert "add --dream" in capsys.readouterr().err
+    assert "--dream" in capsys.readouterr().err

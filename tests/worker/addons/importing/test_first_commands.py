@@ -1,5 +1,5 @@
 """What people who come from another project type first: it works, or the answer names the command that does it.
-Tests refusals.py, sources.py and verb.py."""
+Tests sources.py and verb.py."""
 
 import json
 import re

@@ -49,18 +49,9 @@ def test_code_is_not_executed(function, legacy, tmp_path, capsys):
     (tmp_path / "ctrl").mkdir()
     path = save(tmp_path / "ctrl" / "best.tar", {"state_dict": Calls(function, *arguments)}, legacy=legacy)
     assert main(["import", str(path), "--bundle", "tiny", "--out", str(tmp_path / "x.npz")]) == 1
-    assert function.__name__ in capsys.readouterr().err
+    assert "best.tar" in capsys.readouterr().err
     assert not mark.exists()
     assert not (tmp_path / "x.npz").exists()
-
-
-def test_a_plain_pickle_is_refused(tmp_path):
-    (tmp_path / "x.tar").write_bytes(pickle.dumps({"state_dict": {}}, protocol=2))
-    with pytest.raises(DatasetError):
-        read_torch_file(tmp_path / "x.tar")
-    (tmp_path / "x.tar").write_bytes(pickle.dumps(Calls(print, "hello"), protocol=0))
-    with pytest.raises(DatasetError):
-        read_torch_file(tmp_path / "x.tar")
 
 
 @pytest.mark.parametrize("legacy", LEGACY)
@@ -101,7 +92,7 @@ def tampered(path, old, new):
 
 def test_huge_tensors_are_refused_before_memory_is_taken(tmp_path):
     path = save(tmp_path / "x.tar", {"state_dict": {"a": torch.ones(77)}})
-    with pytest.raises(DatasetError):
+    with pytest.raises(DatasetError, match=r"x\.tar"):
         read_torch_file(tampered(path, b"K\x4d", b"J\xff\xff\xff\x7f"))
 
 
@@ -145,6 +136,8 @@ def test_a_legacy_file_with_a_storage_of_a_false_length_is_refused(tmp_path):
         b"\x80\x02cos\nsystem\nX\x04\x00\x00\x00true\x85R.",
         b"\x80\x04\x8c\x02os\x8c\x06system\x93\x8c\x04true\x85R.",
         b"\x80\x02K\x01Q.",
+        pickle.dumps({"state_dict": {}}, protocol=2),
+        pickle.dumps(Calls(print, "hello"), protocol=0),
         b"",
     ],
 )
@@ -153,7 +146,7 @@ def test_damaged_and_hostile_pickles_are_refused(pickled, tmp_path):
     with zipfile.ZipFile(tmp_path / "y.tar", "w") as archive:
         archive.writestr("archive/data.pkl", pickled)
     for name in ("x.tar", "y.tar"):
-        with pytest.raises(DatasetError):
+        with pytest.raises(DatasetError, match=name):
             read_torch_file(tmp_path / name)
 
 

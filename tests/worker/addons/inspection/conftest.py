@@ -1,13 +1,12 @@
 """The shipped bundle and controller, to inspect, and the verb that inspects."""
 
-import argparse
-
 import pytest
 
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.runs.lookup import find_controller
 from dreamfleet.worker.addons.inspection import probe
 from dreamfleet.worker.addons.inspection import verb as inspect
+from tests.support.verbs import run_verb
 
 
 @pytest.fixture(scope="module")
@@ -26,11 +25,7 @@ def call(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(probe, "UPDATES", 30)
 
     def run(*arguments):
-        parser = argparse.ArgumentParser()
-        inspect.configure(parser)
-        args = parser.parse_args(arguments)
-        args.runs_dir = tmp_path
-        assert inspect.run(args) == 0
+        assert run_verb(inspect, *arguments, runs_dir=tmp_path) == 0
         return capsys.readouterr().out
 
     return run

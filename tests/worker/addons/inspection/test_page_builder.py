@@ -60,15 +60,7 @@ def test_the_pages_drive_can_be_one_action_alone(attentive):
     assert driven.description.endswith("-0.01 1 0")
 
 
-@pytest.mark.parametrize(
-    "action",
-    [
-        (1.0,),
-        (0.0, 2.0, 0.0),
-        (0.0, float("nan"), 0.0),
-        (0.0, 1e40, 0.0),
-    ],
-)
+@pytest.mark.parametrize("action", [(1.0,), (0.0, 2.0, 0.0), (0.0, float("nan"), 0.0), (0.0, 1e40, 0.0)])
 def test_what_is_no_action_of_the_world_is_refused(attentive, action):
     with pytest.raises(UsageError):
         record_drive(attentive, None, DriveConfig(action=action))

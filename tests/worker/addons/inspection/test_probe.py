@@ -3,8 +3,14 @@
 import numpy as np
 import pytest
 
-from dreamfleet.worker.addons.inspection.knowledge import explained_variance
-from dreamfleet.worker.addons.inspection.probe import Estimate, LinearProbe, NetworkProbe, folds, other_rows
+from dreamfleet.worker.addons.inspection.probe import (
+    Estimate,
+    LinearProbe,
+    NetworkProbe,
+    explained_variance,
+    folds,
+    other_rows,
+)
 
 
 @pytest.fixture

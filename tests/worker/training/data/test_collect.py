@@ -26,14 +26,7 @@ from dreamfleet.worker.worlds.car_racing.random_network import RandomNetworkPoli
 from tests.support import pixel_fakes
 from tests.support.drives import write_drive, write_drives
 
-# SWIG warns as Box2D is imported, and an error there kills the process.
-pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
 TINY = CollectConfig(episodes=3, steps=4, seed=5)
-
-
-@pytest.fixture(autouse=True)
-def no_display(monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
 
 
 def equal(one, other):
@@ -76,15 +69,7 @@ def test_collecting_again_writes_only_what_is_missing_and_the_same(tmp_path):
 
 @pytest.mark.parametrize(
     "changes",
-    [
-        {"episodes": 0},
-        {"steps": 0},
-        {"patience": -1},
-        {"anywhere": 2},
-        {"seed": -1},
-        {"noise": -1},
-        {"spells": 1.1},
-    ],
+    [{"episodes": 0}, {"steps": 0}, {"patience": -1}, {"anywhere": 2}, {"seed": -1}, {"noise": -1}, {"spells": 1.1}],
 )
 def test_impossible_settings_are_refused(changes):
     with pytest.raises(UsageError, match=f"--{next(iter(changes))}"):
@@ -200,8 +185,8 @@ def faulty(fault):
 @pytest.mark.parametrize(
     ("fault", "named"),
     [
-        ("raises", "drive 0 failed: RuntimeError: a broken simulator$"),
-        ("exits", "drive 0 failed: SystemExit: 0"),
+        ("raises", "0.*RuntimeError: a broken simulator$"),
+        ("exits", "0.*SystemExit: 0"),
         ("nan", "nan"),
         ("-inf", "-inf"),
         ("1e39", r"1e\+39"),
@@ -210,7 +195,7 @@ def faulty(fault):
 def test_a_fault_of_the_environment_is_one_line_and_writes_no_drive(fault, named, tmp_path):
     config = CollectConfig(episodes=1, steps=9, anywhere=0.0)
     with pytest.raises(DreamfleetError, match=named):
-        module._collect_one((tmp_path, config, 0, (), faulty(fault)))
+        module._collect_one(tmp_path, config, (), faulty(fault), 0)
     assert not list(tmp_path.rglob("*.npz"))
 
 
@@ -238,7 +223,7 @@ def test_a_drive_that_a_full_disk_cannot_hold_is_named(monkeypatch, tmp_path):
     monkeypatch.setattr(module, "atomic_write", full)
     monkeypatch.setattr(module, "drive_episode", lambda *_: {"action": ()})
     with pytest.raises(DatasetError, match=r"000003\.npz"):
-        module._collect_one((tmp_path, None, 3, (), None))
+        module._collect_one(tmp_path, None, (), None, 3)
 
 
 def test_drives_take_the_next_free_numbers_each_once(tmp_path):

@@ -1,9 +1,7 @@
 """The world of a data set: what is collected in it, how it is named, and that two of them never mix.
 Tests data_folder.py and common/cli/world_flags.py."""
 
-import argparse
 import json
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -19,12 +17,7 @@ from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld, write_e
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tasks.policy import DriverPolicy
 from dreamfleet.worker.training.data import collect as module
-from dreamfleet.worker.training.data.collect import (
-    collect,
-    drive_episode,
-    import_rollouts,
-    kept_environment,
-)
+from dreamfleet.worker.training.data.collect import collect, drive_episode, import_rollouts, kept_environment
 from dreamfleet.worker.training.data.collect_config import CollectConfig
 from dreamfleet.worker.training.data.data_folder import load_preset, resolve_preset, resolve_world, store_preset
 from dreamfleet.worker.training.data.dataset import (
@@ -46,25 +39,16 @@ from dreamfleet.worker.verbs import collect as verb
 from tests.support.bundles import write_world_bundle
 from tests.support.drives import write_drive
 from tests.support.pixel_world import DODGE, DODGE_TASK, DodgeTask
+from tests.support.verbs import run_verb
 
-# SWIG warns as Box2D is imported, and an error there kills the process.
-pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
 TASK, GYM = DataWorld(DODGE_TASK), DataWorld(DODGE)
 LIMITED = DataWorld(DODGE, '{"environment": {"max_episode_steps": 5}}')
 CART = DataWorld("gym:CartPole-v1", '{"observation": "render", "skip": 2}')
 PLAIN = CollectConfig(episodes=3, steps=60, seed=5, anywhere=0.0, patience=0)
 
 
-@pytest.fixture(autouse=True)
-def no_display(monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-
-
 def call(*words):
-    parser = argparse.ArgumentParser()
-    verb.configure(parser)
-    parser.set_defaults(runs_dir=Path("runs"))
-    return verb.run(parser.parse_args([*words, "--jobs", "1"]))
+    return run_verb(verb, *words, "--jobs", 1)
 
 
 def write(folder, number, arrays):
@@ -191,7 +175,7 @@ def test_a_mirrored_drive_has_its_worlds_mirrored_actions_and_no_action_is_widen
     assert batch[0, 0].tolist() == [0, 0, 1]
     assert batch[1, 0].tolist() == [0.5, 0.5, -0.5]
     narrow = encoded_drive(tmp_path, 2, write_drive(tmp_path, 2, actions=1))
-    with pytest.raises(UsageError, match=r"\(12, 1\)"):
+    with pytest.raises(UsageError, match=r"3.*\(12, 1\)"):
         load_rollouts([narrow], np.array([True]))
     for paths in ([car, narrow], [narrow, car]):
         with pytest.raises(DatasetError, match=r"\(1,\).*\(3,\)"):
@@ -200,7 +184,7 @@ def test_a_mirrored_drive_has_its_worlds_mirrored_actions_and_no_action_is_widen
         pad([left, left[:, :1]])
     still = encoded_drive(tmp_path, 3, write_drive(tmp_path, 3, world=GYM._replace(options='{"skip": 2}')))
     load_rollouts([still])
-    with pytest.raises(DatasetError, match=r'gym:.*{"skip": 2}'):
+    with pytest.raises(DatasetError, match=r"gym:.*{\"skip\": 2}"):
         load_rollouts([still], np.array([True]))
 
 
@@ -211,12 +195,12 @@ def test_two_worlds_never_mix(tmp_path):
     with pytest.raises(DatasetError, match=rf"000000\.npz.*car-racing.*{DODGE_TASK}"):
         list(collect(data, PLAIN, 1, world=TASK))
     for folder, drives in ((data, [dodge]), (tmp_path / "new", [dodge, skipped])):
-        with pytest.raises(DatasetError):
+        with pytest.raises(DatasetError, match="npz"):
             list(import_rollouts(folder, drives))
     with pytest.raises(DatasetError, match=rf"{DODGE_TASK}.*car-racing"):
         check_pictures([car, dodge], 64)
     store_preset(tmp_path / "begun", "pixels", 0, GYM)
-    with pytest.raises(DatasetError, match=r"gym:.*Dodge-v0.*car-racing"):
+    with pytest.raises(DatasetError, match=r"gym:.*Dodge-v0.*begun.*car-racing"):
         list(import_rollouts(tmp_path / "begun", [car]))
     assert list(import_rollouts(tmp_path / "new", [dodge])) == [12]
     assert world_of_folder(tmp_path / "new") == TASK
@@ -246,7 +230,7 @@ def test_a_data_set_keeps_the_world_that_it_was_begun_in(tmp_path):
         (None, {"skip": 2}, "--skip"),
         (DODGE_TASK, {"size": 96, "crop": "0:9,0:9"}, "--size, --crop"),
         ("takecover", {"size": 96}, "size"),
-        ("gym:CartPole-v1", {"crop": "half"}, "half"),
+        ("gym:CartPole-v1", {"crop": "half"}, None),
         ("ghost", {}, "ghost"),
     ],
 )
@@ -271,10 +255,10 @@ def test_a_preset_is_of_the_data_sets_world(tmp_path):
     assert resolve_preset(new, None, TASK) == "pixels"
     assert resolve_preset(new, None, DataWorld("takecover")) == "takecover"
     for preset, world, own in (("tiny", TASK, "car-racing"), ("takecover", OF_FIRST_WORLD, "takecover")):
-        with pytest.raises(UsageError, match=rf"{preset}.*{own}.*{world}"):
+        with pytest.raises(UsageError, match=f"{preset}.*{own}.*{world}"):
             resolve_preset(new, preset, world)
     (tmp_path / "preset.json").write_text('{"preset": "pixels", "task": 5}')
-    with pytest.raises(DatasetError):
+    with pytest.raises(DatasetError, match=r"preset\.json"):
         world_of_folder(tmp_path)
 
 
@@ -283,20 +267,6 @@ def test_a_refused_command_begins_no_data_set(tmp_path, flags):
     with pytest.raises(UsageError):
         call("--data", str(tmp_path), "--task", DODGE_TASK, *flags)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("config", "named"),
-    [
-        (CollectConfig(driver="ghost", anywhere=0.0), "random, held, uniform.*'ghost'"),
-        (CollectConfig(anywhere=0.5), "--anywhere 0"),
-        (CollectConfig(picture=96, anywhere=0.0), "--picture 64"),
-    ],
-)
-def test_what_a_world_lacks_is_refused_before_any_drive(tmp_path, config, named):
-    with pytest.raises(UsageError, match=named):
-        list(collect(tmp_path, config, 1, world=TASK))
-    assert not (tmp_path / "episodes").exists()
 
 
 def test_a_controller_of_another_world_drives_for_no_data_set(tmp_path):
