@@ -76,6 +76,12 @@ class Harness:
         for number in numbers:
             self.slot.submit([(job(number, kind, spec=self.spec), VECTOR)])
 
+    def submit_group(self, numbers):
+        """One group of these jobs, which are returned."""
+        jobs = [job(number, spec=self.spec) for number in numbers]
+        self.slot.submit([(each, VECTOR) for each in jobs])
+        return jobs
+
     def lose(self):
         """Kill the child, and handle that it is gone."""
         os.kill(self.slot.pid, signal.SIGKILL)

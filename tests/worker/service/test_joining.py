@@ -3,7 +3,6 @@
 import os
 import queue
 import re
-import shlex
 from dataclasses import dataclass, replace
 from time import monotonic
 
@@ -92,7 +91,7 @@ def test_a_refusal_is_logged_once_for_each_reason_and_the_run_is_asked_again(sta
     hand = stage.hand()
     hand.refusal = ("your moon is full", "wait a week")
     stage.worker()
-    assert re.search(r"your moon is full; wait a week.* 1\b", wait_for(said, "moon"))
+    assert re.search(r"your moon is full.* wait a week.* 1\b", wait_for(said, "moon"))
     for _ in range(2):
         hand.hello()
     assert not [line for line in drained(said) if "moon" in line]
@@ -122,7 +121,7 @@ def test_a_refusal_ends_a_worker_with_exit_when_done(stage):
     _, served = stage.worker(exit_when_done=True)
     error = served.exception(DEADLINE)
     assert isinstance(error, RefusedError)
-    assert "your moon is full; wait a week" in str(error)
+    assert re.search("your moon is full.* wait a week", str(error))
 
 
 def test_a_run_whose_task_a_later_version_describes_is_refused(stage):
@@ -132,13 +131,20 @@ def test_a_run_whose_task_a_later_version_describes_is_refused(stage):
     assert isinstance(served.exception(DEADLINE), RefusedError)
 
 
-def test_with_any_a_run_that_refuses_is_skipped(stage, said, cached):
-    picky = stage.hand(run="picky")
-    picky.refusal = ("your moon is full", "wait a week")
+@pytest.mark.parametrize(
+    ("task", "refusal", "why"),
+    [
+        (tasks.TOY, ("your moon is full", "wait a week"), "your moon is full"),
+        ("os:abort", None, "'os:abort'"),  # which it did not announce
+    ],
+)
+def test_with_any_a_run_that_refuses_or_cannot_be_scored_is_skipped(stage, said, cached, task, refusal, why):
+    picky = stage.hand(task, run="picky")
+    picky.refusal = refusal
     other = stage.also(picky, run="second")
     other.slots = 1
     stage.worker(run=None, any=True)
-    assert re.search(r"your moon is full; wait a week.* 15\b", wait_for(said, "moon"))
+    assert re.search(r"\b15\b", wait_for(said, why))
     other.ready()
 
 
@@ -174,17 +180,8 @@ def test_a_task_that_it_did_not_announce_is_never_imported(stage, cached, tmp_pa
     stage.hand(task)
     _, served = stage.worker(exit_when_done=True)
     assert isinstance(error := served.exception(DEADLINE), RefusedError)
-    assert shlex.join(("dreamfleet", "worker", "--task", task)) in str(error)
+    assert re.search(rf"--task\W+{re.escape(task)}", str(error))
     assert not mark.exists()
-
-
-def test_with_any_a_run_of_an_unannounced_task_is_skipped(stage, said, cached):
-    hand = stage.hand("os:abort", run="evil")
-    other = stage.also(hand, run="second")
-    other.slots = 1
-    stage.worker(run=None, any=True)
-    wait_for(said, "'os:abort'")
-    other.ready()
 
 
 @pytest.mark.parametrize("task", ["foreign_world:World", "gym:foreign_world:X-v0"])

@@ -18,9 +18,7 @@ from tests.support.stage import drained, wait_for
 
 
 def test_with_exit_when_done_it_leaves_when_its_coordinator_says_that_the_run_has_ended(stage, cached):
-    hand = stage.hand(tasks.SLOW_TOY)
-    _, served = stage.worker(exit_when_done=True)
-    hand.beat(lambda beat: beat.capacity > 0)
+    hand, _, served = stage.served(tasks.SLOW_TOY, exit_when_done=True)
     hand.send(1, hand.job())
     hand.beat(lambda beat: beat.running)
     hand.send(0, vectors=(), ended=True)
@@ -160,9 +158,7 @@ def test_late_events_of_the_last_runs_slots_do_not_reach_the_next_run(stage, sai
 
 @pytest.mark.slow
 def test_without_a_flag_it_says_why_its_run_ended_and_waits_for_it(stage, said, cached):
-    hand = stage.hand(tasks.SLOW_TOY)
-    _, served = stage.worker()
-    hand.beat(lambda beat: beat.capacity > 0)
+    hand, _, served = stage.served(tasks.SLOW_TOY)
     hand.answer_no_hello()  # as a run that has ended
     hand.send(0, vectors=(), ended=True, why="2 generations")
     assert hand.beat(lambda beat: beat.reason).reason.endswith("2 generations")

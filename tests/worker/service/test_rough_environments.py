@@ -87,7 +87,7 @@ def test_what_a_hung_child_left_behind_ends_with_it(harness, left):
 def test_what_a_child_left_behind_ends_with_a_stopped_slot(harness, left):
     slot = harness(rough_tasks.ForkingAndHanging)
     slot.wait_ready()
-    slot.slot.submit([(job(0, spec=slot.spec), VECTOR)])
+    slot.submit(0)
     while not list(left.iterdir()):
         sleep(0.01)
     slot.slot.stop()
@@ -139,8 +139,7 @@ def test_only_the_failed_jobs_of_a_group_are_repeated_and_before_what_waited(har
 def test_a_failed_job_that_is_not_wanted_is_not_repeated(harness):
     slot = harness(rough_tasks.PoisonedBatch)
     assert slot.score(0).fitness is not None
-    jobs = [job(number, spec=slot.spec) for number in range(1, 3)]
-    slot.slot.submit([(each, VECTOR) for each in jobs])
+    jobs = slot.submit_group(range(1, 3))
     slot.slot.abandon(jobs[1].digest)
     assert [each.digest for each in slot.results()] == [jobs[0].digest]
     assert slot.slot.running == []
@@ -151,7 +150,7 @@ def test_the_failures_of_a_fresh_childs_first_large_group_are_reported_at_once(h
     slot = harness(tasks.EXPLODING)
     slot.wait_ready()
     pid = slot.slot.pid
-    slot.slot.submit([(job(number, spec=slot.spec), VECTOR) for number in range(MOST_TRIED_ALONE + 1)])
+    slot.submit_group(range(MOST_TRIED_ALONE + 1))
     assert [each.fitness for each in slot.results()] == [None] * (MOST_TRIED_ALONE + 1)
     assert slot.slot.pid == pid
 
@@ -160,8 +159,7 @@ def test_the_failures_of_a_fresh_childs_first_large_group_are_reported_at_once(h
 def test_the_jobs_of_a_small_group_that_failed_are_tried_one_by_one(harness):
     slot = harness(tasks.EXPLODING)
     slot.wait_ready()
-    jobs = [job(number, spec=slot.spec) for number in range(3)]
-    slot.slot.submit([(each, VECTOR) for each in jobs])
+    jobs = slot.submit_group(range(3))
     for each in jobs:
         assert [(result.digest, result.fitness) for result in slot.results()] == [(each.digest, None)]
 
@@ -169,8 +167,7 @@ def test_the_jobs_of_a_small_group_that_failed_are_tried_one_by_one(harness):
 def test_a_job_that_crashes_its_process_takes_no_other_with_it(harness):
     slot = harness(rough_tasks.OneCrashes)
     slot.wait_ready()
-    jobs = [job(number, spec=slot.spec) for number in range(4)]
-    slot.slot.submit([(each, VECTOR) for each in jobs])
+    jobs = slot.submit_group(range(4))
     found = {}
     while len(found) < len(jobs):
         found |= {result.digest: result.fitness is not None for result in slot.results()}
@@ -181,8 +178,7 @@ def test_a_job_that_crashes_its_process_takes_no_other_with_it(harness):
 def test_a_group_that_is_sent_again_without_its_unwanted_jobs_can_still_be_abandoned(harness):
     slot = harness(tasks.SLOW_TOY)
     assert slot.score(99).fitness is not None
-    jobs = [job(number, spec=slot.spec) for number in range(MOST_TRIED_ALONE + 4)]
-    slot.slot.submit([(each, VECTOR) for each in jobs])
+    jobs = slot.submit_group(range(MOST_TRIED_ALONE + 4))
     slot.slot.abandon(jobs[0].digest)
     os.kill(slot.slot.pid, signal.SIGKILL)
     while slot.slot.ready:
@@ -209,7 +205,7 @@ def test_a_second_group_is_not_queued_where_its_vectors_may_not_fit_in_the_pipe(
     slot = harness(tasks.TOY)
     for size, can_queue in ((1000, True), (60_000, False)):
         assert slot.score(size, vector=bytes(size)).fitness is not None
-        slot.slot.submit([(job(1, spec=slot.spec), VECTOR)])
+        slot.submit(1)
         assert slot.slot.can_queue_another == can_queue
         slot.results()
 

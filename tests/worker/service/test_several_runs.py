@@ -136,13 +136,13 @@ def test_a_run_that_cannot_be_scored_ends_no_other(stage, said, cached, monkeypa
 
 @pytest.mark.slow
 def test_children_start_as_jobs_need_them(stage, cached):
-    one = stage.hand(tasks.SECOND_TOY, run="one")
+    one = stage.hand(tasks.HANGING, run="one")
     one.answers = True
-    made, _ = stage.worker(run=None, any=True, slots=3, announced=(tasks.SECOND_TOY,))
+    made, _ = stage.worker(run=None, any=True, slots=3, announced=(tasks.HANGING,))
     assert one.ready().capacity == 3
     (served,) = made._served
     assert sum(slot.parked for slot in served.session._slots._slots) == 2
-    one.send(1, *(one.job(episode) for episode in range(12)))
+    one.send(1, *(one.job(episode) for episode in range(3)))
     one.beat(lambda beat: len(beat.running) > 1)
 
 

@@ -150,8 +150,7 @@ def test_after_a_crash_the_next_child_gets_the_queued_group(harness):
 def test_a_group_ends_only_when_all_its_jobs_are_abandoned(harness):
     slot = harness(tasks.SLOW_TOY)
     slot.wait_ready()
-    jobs = [job(number, spec=slot.spec) for number in range(2)]
-    slot.slot.submit([(each, VECTOR) for each in jobs])
+    jobs = slot.submit_group(range(2))
     slot.slot.abandon(jobs[0].digest)
     results = ()
     while not results:

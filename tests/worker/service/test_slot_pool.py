@@ -103,14 +103,9 @@ def test_a_few_jobs_go_to_as_many_slots(pool):
     assert pool(SIDE_BY_SIDE).score(2)[2] == [1, 1]
 
 
-def test_where_a_second_environment_cannot_be_made_jobs_are_scored_one_by_one(pool):
-    fleet = pool(f"{rough_tasks.MODULE}:OnlyOne")
-    assert (fleet.slots.together, fleet.slots.capacity) == (1, 2)
-    assert fleet.score(5)[2] == [1] * 5
-
-
-def test_jobs_of_a_task_without_such_a_policy_are_scored_one_by_one(pool):
-    fleet = pool(f"{tasks.MODULE}:OneByOne")
+@pytest.mark.parametrize("task", [f"{rough_tasks.MODULE}:OnlyOne", f"{tasks.MODULE}:OneByOne"])
+def test_without_a_second_environment_or_such_a_policy_jobs_are_scored_one_by_one(pool, task):
+    fleet = pool(task)
     assert (fleet.slots.together, fleet.slots.capacity) == (1, 2)
     assert fleet.score(5)[2] == [1] * 5
 

@@ -4,7 +4,6 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -99,7 +98,3 @@ class Bare:
 def test_an_incomplete_task_is_refused_with_what_is_missing(task, named):
     with pytest.raises(UsageError, match=named):
         find_task(f"{__name__}:{task}")
-
-
-def test_the_example_stands_nowhere_else():
-    assert not list(Path(ROOT / "tests").rglob("field.py"))

@@ -1,4 +1,4 @@
-"""Tests api.py, batches.py, policy.py, common/protocol/tasks.py and worker/scoring/scorer.py."""
+"""Tests api.py, assignment.py, batches.py, policy.py, common/protocol/tasks.py and worker/scoring/scorer.py."""
 
 from dataclasses import replace
 

@@ -12,7 +12,6 @@ from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
 from dreamfleet.common.errors import BundleError, RefusedError, UsageError
 from dreamfleet.common.host.trusted_modules import VARIABLE
 from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.common.runs.seeds import fold_seed
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tasks.api import Assignment
@@ -193,13 +192,6 @@ def test_a_limit_is_no_death_whatever_the_environment_says():
     ends = [drive(fake("BothEnds"), seed)[-1] for seed in range(30)]
     assert {(each.terminal, each.step == 25) for each in ends} == {(True, False), (False, True)}
     assert all(each.ended for each in ends)
-
-
-def test_a_seed_of_more_than_32_bits_means_the_folded_one_where_the_environment_takes_no_more():
-    longest, folded = (pictures(drive(fake("BothEnds"), seed)) for seed in (LONGEST, fold_seed(LONGEST)))
-    assert longest == folded
-    longest, folded = (pictures(drive(fake("InDict"), seed)) for seed in (LONGEST, fold_seed(LONGEST)))
-    assert longest != folded
 
 
 def test_an_environment_that_observes_what_it_draws_depends_on_what_draws():
