@@ -57,9 +57,9 @@ class DryRunProcess(CommandChild):
             os.set_blocking(pipe.fileno(), False)
             self._selector.register(pipe, selectors.EVENT_READ, number)
 
-    def end(self, patience: float = 0, limit: float = KILL_GRACE) -> bool:
+    def end(self, timeout: float = 0, limit: float = KILL_GRACE) -> bool:
         """Kill it, and close its pipes."""
-        has_ended = super().end(patience, limit)
+        has_ended = super().end(timeout, limit)
         self.begin()
         self._selector.close()
         for pipe in self._pipes:

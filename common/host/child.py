@@ -22,7 +22,7 @@ from dreamfleet.common.host.descendants import Descendants
 from dreamfleet.common.host.parent_death import exit_with_parent, signals_blocked
 from dreamfleet.common.host.stop_signals import outlive_stop_signals
 
-PATIENCE = 3.0  # seconds to wait after each SIGTERM
+END_TIMEOUT = 3.0  # seconds to wait after each SIGTERM
 KILL_LIMIT = 30.0  # seconds to wait after SIGKILL: a process in a system call that does not return does not end
 FIRST_POLL, LAST_POLL = 0.001, 0.02  # seconds between two looks whether it has ended: few at first, then more
 
@@ -91,11 +91,11 @@ class Child:
         if self._descendants:
             self._descendants.kill()
 
-    def end(self, patience: float = PATIENCE, limit: float = KILL_LIMIT) -> bool:
-        """Send SIGTERM, twice if needed, each with so much `patience`; then kill it. Return whether it has ended."""
-        for _ in range(2 if patience else 0):
+    def end(self, timeout: float = END_TIMEOUT, limit: float = KILL_LIMIT) -> bool:
+        """Send SIGTERM, twice if needed, each with so much `timeout`; then kill it. Return whether it has ended."""
+        for _ in range(2 if timeout else 0):
             self.ask_to_end()
-            self.wait(patience)
+            self.wait(timeout)
         self.kill()
         has_ended = self.wait(limit)
         if self._descendants:
@@ -172,9 +172,9 @@ class FunctionChild(Child):
             pass
         return True
 
-    def end(self, patience: float = 0, limit: float = KILL_LIMIT) -> bool:
+    def end(self, timeout: float = 0, limit: float = KILL_LIMIT) -> bool:
         """As `Child.end`, and close the pipe, unless something still holds its other side after `limit` seconds."""
-        has_ended = super().end(patience, limit)
+        has_ended = super().end(timeout, limit)
         self._reader.join(limit)
         if not self._reader.is_alive():  # else another pipe may get its descriptor while it still reads
             self._pipe.close()

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from dreamfleet.common.errors import DreamfleetError
-from dreamfleet.common.host.child import KILL_LIMIT, PATIENCE, CommandChild
+from dreamfleet.common.host.child import END_TIMEOUT, KILL_LIMIT, CommandChild
 from dreamfleet.common.host.parent_death import parent_death_command
 from dreamfleet.common.host.reports import FAILURE, VARIABLE, ReportPipe
 
@@ -109,9 +109,9 @@ class VerbProcess(CommandChild):
         code = self.exit_code
         return said if code is None or code >= 0 else f"killed by signal {-code}; its last line: {said}"
 
-    def end(self, patience: float = PATIENCE, limit: float = KILL_LIMIT) -> bool:
+    def end(self, timeout: float = END_TIMEOUT, limit: float = KILL_LIMIT) -> bool:
         """As `Child.end`, and wait for the last lines."""
-        has_ended = super().end(patience, limit)
+        has_ended = super().end(timeout, limit)
         self._join()
         return has_ended
 
@@ -122,7 +122,7 @@ class VerbProcess(CommandChild):
 
     def _join(self) -> None:
         for reader in self._readers:
-            reader.join(PATIENCE)  # a grandchild may hold the pipe
+            reader.join(END_TIMEOUT)  # a grandchild may hold the pipe
 
 
 def _drain(stream: IO[bytes], take: Callable[[str], None]) -> None:

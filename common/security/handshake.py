@@ -19,7 +19,7 @@ from dreamfleet.common.errors import AccessError
 from dreamfleet.common.security.credentials import Credentials
 
 NOT_YET_VALID, EXPIRED = 9, 10  # OpenSSL's codes: X509_V_ERR_CERT_NOT_YET_VALID, X509_V_ERR_CERT_HAS_EXPIRED
-PATIENCE = 2.0  # seconds
+TIMEOUT = 2.0  # seconds
 CLOCK_ALERT = "SSLV3_ALERT_CERTIFICATE_EXPIRED"  # also of a certificate that is not yet valid (RFC 8446, 6.2)
 
 
@@ -96,7 +96,7 @@ def diagnose_connection(endpoints: Iterable[str], credentials: Credentials | Non
     for endpoint in endpoints:
         host, _, port = endpoint.partition("/")[2].rpartition(":")
         try:
-            link = socket.create_connection((host.strip("[]"), int(port)), PATIENCE)
+            link = socket.create_connection((host.strip("[]"), int(port)), TIMEOUT)
         except (OSError, ValueError):  # ValueError: an invalid host name
             continue
         with link:

@@ -38,7 +38,7 @@ MAX_FORWARDED = 64 * 1024
 SEND_QUEUE = 16  # batches of 64 KiB that may wait on a link, Zenoh's most; beyond them it drops messages
 # Microseconds that a message waits for room in the queue before it is dropped. A stalled link makes one message wait:
 # Zenoh drops those after it at once, until there is room.
-DROP_PATIENCE = 5_000
+DROP_TIMEOUT = 5_000
 _NO_ROOM = "no network session can be opened: {}; give this host more room (ulimit -n, ulimit -u)"
 __all__ = ["LEASE_MS", "Network", "check_endpoint", "enqueue_into", "open_session", "zenoh_config"]
 
@@ -128,7 +128,7 @@ def zenoh_config(network: Network, timeout: float | None, dictionary: str | None
                 "queue": {
                     "size": {"data": SEND_QUEUE},
                     "congestion_control": {
-                        "drop": {"wait_before_drop": DROP_PATIENCE},
+                        "drop": {"wait_before_drop": DROP_TIMEOUT},
                         "block": {"wait_before_close": 500_000},
                     },
                 },

@@ -137,10 +137,10 @@ class Process(VerbProcess):
     def finish(self, timeout=DEADLINE):
         return super().finish(timeout)
 
-    def end(self, patience=0):
+    def end(self, timeout=0):
         """End it at once, without a grace period by default."""
         self.thaw()
-        super().end(patience)
+        super().end(timeout)
 
 
 class Processes:

@@ -105,7 +105,7 @@ class DreamWorld:
         dream = step(latent, action, state, draw.uniform, draw.normal, self.temperature, draw.mask, chosen)
         return self._make_step(dream, draw)
 
-    def _make_step(self, dream: DreamOutput, draw: Draw) -> DreamtStep:
+    def _make_step(self, dream: DreamOutput[Floats], draw: Draw) -> DreamtStep:
         reward, done = self.judge(dream.reward, dream.done, draw.bar)
         return DreamtStep(dream.latent, dream.state, reward, done, dream.action)
 

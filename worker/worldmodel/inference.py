@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import onnxruntime
@@ -22,6 +22,7 @@ from dreamfleet.common.errors import BundleError
 from dreamfleet.worker.worldmodel.choice_memory import ChoiceMemory, Layer, compute_actions
 
 Floats = NDArray[np.float32]
+Array = TypeVar("Array")  # of NumPy, or of torch
 Pictures = NDArray[np.uint8]
 ATTENTION = "attention"  # output of dream graphs with attention
 
@@ -183,18 +184,18 @@ class Controllers:
         return np.asarray(action, dtype=np.float32)
 
 
-class DreamOutput(NamedTuple):
+class DreamOutput(NamedTuple, Generic[Array]):
     """The outputs of a dream step, one row per dream: `action`, `latent`, `state`, and the heads' outputs (N,).
 
     `reward` is the probability of the reward head's label, or the predicted value; `done` is a probability. Without
     such a head they are zero.
     """
 
-    action: Floats
-    latent: Floats
-    state: Floats
-    reward: Floats
-    done: Floats
+    action: Array
+    latent: Array
+    state: Array
+    reward: Array
+    done: Array
 
 
 class NoiseSize(NamedTuple):
@@ -231,7 +232,7 @@ class DreamStep:
     def step(
         self, latent: Floats, parameters: Floats, state: Floats, uniform: Floats, normal: Floats,
         temperature: float, mask: Floats | None = None,
-    ) -> DreamOutput:  # fmt: skip
+    ) -> DreamOutput[Floats]:  # fmt: skip
         """Act on `latent` (N, latent) and `state` (N, state_size) by `parameters` (N, size), and dream the next step.
 
         `uniform` in [0, 1) and `normal` (N, latent) are random numbers. `mask` (N, hidden) is the dropout of models
@@ -243,7 +244,7 @@ class DreamStep:
     def imagine(
         self, latent: Floats, action: Floats, state: Floats, uniform: Floats, normal: Floats,
         temperature: float, mask: Floats | None = None, chosen: Floats | None = None,
-    ) -> DreamOutput:  # fmt: skip
+    ) -> DreamOutput[Floats]:  # fmt: skip
         """Dream the next step under actions `(N, actions)`; `chosen` are the controllers' own if others are applied."""
         feed = self._feed(latent, action, state, uniform, normal, temperature, mask)
         given = dict(zip(self._names, self._run(self._names, feed), strict=True))

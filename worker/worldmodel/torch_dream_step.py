@@ -14,6 +14,7 @@ from dreamfleet.common.artifacts.bundle_store import describe_bundle
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.schema.validation import from_plain
 from dreamfleet.worker.worldmodel.choice_memory import ChoiceMemory
+from dreamfleet.worker.worldmodel.inference import DreamOutput
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, Prediction
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.weights_from_graphs import mdnrnn_weights
@@ -25,16 +26,6 @@ class StepNoise(NamedTuple):
     uniform: Tensor
     normal: Tensor
     mask: Tensor | None
-
-
-class TorchDreamOutput(NamedTuple):
-    """The outputs of a step, as `inference.DreamOutput`, one row per dream."""
-
-    action: Tensor
-    latent: Tensor
-    state: Tensor
-    reward: Tensor
-    done: Tensor
 
 
 class TorchDreamStep:
@@ -61,7 +52,7 @@ class TorchDreamStep:
         """Let each row act by its controller of `parameters` `(N, size)`; later calls overwrite the first one's."""
         self._controllers.set_parameters(parameters)
 
-    def step(self, latent: Tensor, state: Tensor, noise: StepNoise) -> TorchDreamOutput:
+    def step(self, latent: Tensor, state: Tensor, noise: StepNoise) -> DreamOutput[Tensor]:
         """Act on `latent` (N, latent) and `state` (N, state), and dream the next step."""
         config = self._config
         action = self._controllers.act(latent, state)
@@ -77,7 +68,7 @@ class TorchDreamStep:
         following = self._sample(predicted, noise)
         none = torch.zeros_like(reward)
         done = torch.sigmoid(predicted.done) if config.done else none
-        return TorchDreamOutput(action, following, after, reward if config.has_reward_head else none, done)
+        return DreamOutput(action, following, after, reward if config.has_reward_head else none, done)
 
     def _sample(self, predicted: Prediction, noise: StepNoise) -> Tensor:
         """The next latent (N, latent), sampled as `mdnrnn_graph.export_dream` describes."""

@@ -184,7 +184,7 @@ class _ViewProcess:
         """In a thread: wait for a process whose stream ended; kill any other, which has nothing to lose."""
         if self._ended.is_set():
             self._child.wait(PATIENCE)
-        self._child.end(patience=0)
+        self._child.end(timeout=0)
 
     def _read(self, stream: IO[bytes]) -> None:
         """In a thread: read the process's pictures; repeated ones are sent once."""

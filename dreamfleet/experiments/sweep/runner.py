@@ -14,7 +14,7 @@ from typing import Any
 
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import DreamfleetError, StoppedError
-from dreamfleet.common.host.child import PATIENCE
+from dreamfleet.common.host.child import END_TIMEOUT
 from dreamfleet.common.host.processes import VerbProcess
 from dreamfleet.common.host.stop_signals import Stop, signals_deferred
 from dreamfleet.common.protocol.stop_kind import PauseKind
@@ -227,7 +227,7 @@ class SweepRunner:
         for together in (self._workers, list(self._coordinators.values()), routers):
             for each in together:
                 each.ask_to_end()
-            deadline = time.monotonic() + PATIENCE
+            deadline = time.monotonic() + END_TIMEOUT
             for each in together:
                 each.wait(deadline - time.monotonic())
             for each in together:

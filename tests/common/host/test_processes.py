@@ -34,13 +34,6 @@ def test_a_child_gets_sigterm_before_sigkill(processes, random_bundle):
     assert " asked " in child.lines[-1]
 
 
-def test_output_goes_to_the_log_file(tmp_path):
-    log = tmp_path / "new" / "child.log"
-    with VerbProcess("runs", "show", "absent", "--runs-dir", tmp_path, log=log) as child:
-        assert child.finish(DEADLINE) == (1, "")
-    assert "'absent'" in child.last_line()
-
-
 @pytest.mark.slow
 def test_the_last_line_of_a_killed_child_says_so(processes):
     child = processes.start("worker", "--connect", "tcp/127.0.0.1:1")

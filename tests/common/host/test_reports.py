@@ -20,7 +20,7 @@ REPORTING = (
 
 def test_a_failure_is_reported_whatever_the_log_looks_like(tmp_path):
     environment = {**os.environ, "DREAMFLEET_LOG_FORMAT": "json"}
-    for log in (None, tmp_path / "child.log"):
+    for log in (None, tmp_path / "new" / "child.log"):
         with VerbProcess("coordinator", "--resume", "absent", "--runs-dir", tmp_path, "--generations", 1, log=log,
                          environment=environment) as child:  # fmt: skip
             assert child.finish(DEADLINE)[0] == 1

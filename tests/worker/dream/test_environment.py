@@ -56,36 +56,18 @@ def test_the_hidden_state_behind_the_latent_is_what_a_controller_remembers(rando
 
 
 @pytest.mark.parametrize("features", ["z", "zh"])
-def test_vectorised_dreams_equal_single_ones(random_bundle, features):
-    many = gymnasium.make_vec(
-        CAR_RACING_ENVIRONMENT, num_envs=3, bundle=random_bundle, vectorization_mode="vector_entry_point", horizon=4,
-        features=features,
-    )  # fmt: skip
+def test_vectorised_dreams_equal_single_ones_and_begin_anew(world, world_bundle, features):
+    seeds, made = range(10, 16), {"bundle": world_bundle, "horizon": 6, "features": features}
+    many = gymnasium.make_vec(ENVIRONMENT, num_envs=6, vectorization_mode="vector_entry_point", **made)
     assert isinstance(many.unwrapped, VectorDream)
-    single = [Dream(random_bundle, horizon=4, features=features) for _ in range(3)]
-    latents, _ = many.reset(seed=10)
-    assert np.array_equal(latents, np.stack([each.reset(seed=10 + index)[0] for index, each in enumerate(single)]))
-    for _ in range(4):
-        latents, rewards, _, truncated, _ = many.step(np.tile(ACTION, (3, 1)))
-        steps = [each.step(ACTION) for each in single]
-        assert np.array_equal(latents, np.stack([step[0] for step in steps]))
-        assert list(rewards) == [step[1] for step in steps]
-    assert truncated.all()
-    latents, rewards, _, truncated, _ = many.step(np.tile(ACTION, (3, 1)))
-    assert not rewards.any()
-    assert not truncated.any()
-
-
-def test_vectorised_dreams_of_any_world_equal_single_ones(world, world_bundle):
-    seeds, horizon = range(10, 16), 6
-    many = VectorDream(len(seeds), world_bundle, horizon=horizon)
-    single = [Dream(world_bundle, horizon=horizon) for _ in seeds]
+    single, actions = [Dream(**made) for _ in seeds], np.stack([ACTIONS[world]] * 6)
     latents, _ = many.reset(seed=seeds[0])
     assert np.array_equal(latents, [each.reset(seed=seed)[0] for each, seed in zip(single, seeds, strict=True)])
-    going, ends = set(range(len(seeds))), 0
-    for _ in range(horizon):
-        latents, rewards, done, truncated, _ = many.step(np.stack([ACTIONS[world]] * len(seeds)))
-        for index in sorted(going):
+    going, ends = set(range(6)), 0
+    for _ in range(6):
+        latents, rewards, done, truncated, _ = many.step(actions)
+        last = sorted(going)
+        for index in last:
             latent, reward, *over, _ = single[index].step(ACTIONS[world])
             assert np.array_equal(latents[index], latent)
             assert (rewards[index], [done[index], truncated[index]]) == (reward, over)
@@ -93,6 +75,7 @@ def test_vectorised_dreams_of_any_world_equal_single_ones(world, world_bundle):
             going -= {index} if any(over) else set()
     assert not going
     assert bool(ends) == bool(WORLDS[world]), "the worlds with a drawn rule end some of their dreams"
+    assert not np.stack(many.step(actions)[1:4])[:, last].any(), "those that ended last begin anew"
 
 
 def test_a_choice_may_be_its_number_or_its_row(choices_bundle):
