@@ -7,7 +7,6 @@ import queue
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from time import monotonic
-from types import TracebackType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -71,9 +70,7 @@ class Client(Displayed):
     def __enter__(self) -> Client:
         return self
 
-    def __exit__(
-        self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self.session.close()  # type: ignore[no-untyped-call]
 
     def runs(self, timeout: float = QUERY_TIMEOUT) -> list[str]:

@@ -61,6 +61,13 @@ class EliteArchive:
         return cls(found.axes, dict(sorted(found.elites.items())))
 
     @classmethod
+    def needed(cls, run: RunFolder) -> EliteArchive:
+        """The same; `UsageError` for a run without one."""
+        if (found := cls.of(run)) is None:
+            raise UsageError(f"run {run.name} has no archive: begin one with --archive")
+        return found
+
+    @classmethod
     def empty(cls, settings: RunSettings) -> EliteArchive | None:
         """The archive of a run before its first generation is closed; `None` if it measures nothing."""
         axes = parse_axes(settings.archive)
@@ -189,9 +196,7 @@ def find_elite(runs_dir: Path, name: str, cell: str) -> tuple[Controller, Path, 
     `UsageError` for a run without an archive.
     """
     with open_run(runs_dir, name) as run, run.read_transaction():
-        archive = EliteArchive.of(run)
-        if archive is None:
-            raise UsageError(f"run {name} has no archive, so --cell names nothing: begin one with --archive")
+        archive = EliteArchive.needed(run)
         elite = archive.find(cell)
         return controller_of(run, elite), run.bundle_path, archive.describe_elite(elite)
 

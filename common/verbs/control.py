@@ -48,9 +48,7 @@ class ControlVerb:
 
 
 PAUSE = ControlVerb(
-    "pause",
-    "give out no more jobs; what runs is finished and counts",
-    "is paused; `dreamfleet resume` continues it",
+    "pause", "give out no more jobs; what runs is finished and counts", "is paused; `dreamfleet resume` continues it"
 )
 RESUME = ControlVerb("resume", "go on after a pause; jobs that failed are tried again", "continues")
 DRAIN = ControlVerb(
@@ -58,9 +56,5 @@ DRAIN = ControlVerb(
     coordinator_leaves=True,
 )  # fmt: skip
 STOP = ControlVerb(
-    "stop",
-    "leave now; the run can be continued",
-    "is stopped",
-    request_with_workers="disband",
-    coordinator_leaves=True,
+    "stop", "leave now; the run can be continued", "is stopped", request_with_workers="disband", coordinator_leaves=True
 )

@@ -62,10 +62,7 @@ def run(args: argparse.Namespace) -> int:
     revocations = RevocationWatcher(access_dir, credentials, named=access_dir != GlobalConfig.access_dir)
     default = DEFAULT_ENDPOINT if credentials is None else SECURED_ENDPOINT
     network = Network(
-        config.listen or args.global_config.listen or (default,),
-        config.connect,
-        credentials,
-        revocations.revoked_seats,
+        config.listen or args.global_config.listen or (default,), config.connect, credentials, revocations.revoked_seats
     )
     network.check_open(insecure=config.insecure)
     if args.print_config:

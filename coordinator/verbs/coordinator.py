@@ -146,8 +146,8 @@ def serve_request(
     make_stderr_nonblocking()
     label_logs(f"run {request.name}")
     gc.set_threshold(*COLLECTION)
-    run = serve_run(request, _stop_on_signals)
-    _restore_signals()  # its last word may wait for a reader of stdout
+    run = serve_run(request, _on_signals)
+    _on_signals(None)  # its last word may wait for a reader of stdout
     outcome = ExitReport(code=LEFT_OPEN) if run.state.ended is None else on_ended()
     _report(args, run, request, outcome, nothing_new=len(run.history) == before)
     return outcome.code
@@ -201,14 +201,10 @@ def _kept(setting: str) -> dict[str, dict[str, str]]:
     return {"facts": {"event": "kept", "setting": setting}}
 
 
-def _stop_on_signals(stop: Callable[[], None]) -> None:
+def _on_signals(act: Callable[[], None] | None) -> None:
+    """Let the signals that stop a program do this; `None`: what they do by default."""
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop())
-
-
-def _restore_signals() -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_DFL)
+        signal.signal(number, signal.SIG_DFL if act is None else lambda *_: act())
 
 
 def _describe_failures(request: RunRequest, failed: int) -> str:

@@ -34,9 +34,7 @@ def configure_plot(parser: argparse.ArgumentParser) -> None:
         "elites of cma-me and map-elites (default fitness of one run, learning of several)",
     )  # fmt: skip
     parser.add_argument(
-        "--out",
-        type=Path,
-        help="a PNG or SVG to write (default RUN-KIND.png, with the names of the runs)",
+        "--out", type=Path, help="a PNG or SVG to write (default RUN-KIND.png, with the names of the runs)"
     )
     _add_place_flags(parser)
 
@@ -66,20 +64,17 @@ def _picture_name(runs: Sequence[str], what: str) -> Path:
 
 
 def _draw_one(args: argparse.Namespace, kind: str, out: Path) -> None:
-    from dreamfleet.coordinator.views.plot import plot_fitness, save_figure
+    from dreamfleet.coordinator.views.plot import fitness_figure, save_figure
 
     if len(args.run_names) > 1:
         raise UsageError(f"--kind {kind} draws one run: name one")
     with open_run(args.runs_dir, args.run_names[0]) as stored, stored.read_transaction():
-        if kind == "archive":
-            save_figure(add_on("archive-figure")(stored), out)
-        else:
-            plot_fitness(stored, out)
+        save_figure(add_on("archive-figure")(stored) if kind == "archive" else fitness_figure(stored), out)
 
 
 def _draw_learning(args: argparse.Namespace, out: Path) -> None:
     from dreamfleet.common.runs.learning import LearningCurve
-    from dreamfleet.coordinator.views.plot import plot_learning, published_scores
+    from dreamfleet.coordinator.views.plot import learning_figure, published_scores, save_figure
 
     curves = []
     for name in dict.fromkeys(args.run_names):
@@ -89,7 +84,7 @@ def _draw_learning(args: argparse.Namespace, out: Path) -> None:
     if len(worlds) > 1:
         names = ", ".join(worlds)
         print(f"note: these runs are in different worlds ({names}): their scores do not compare", file=sys.stderr)
-    plot_learning(curves, published_scores(curves), out)
+    save_figure(learning_figure(curves, published_scores(curves)), out)
 
 
 def configure_receipt(parser: argparse.ArgumentParser) -> None:

@@ -57,7 +57,12 @@ def run(args: argparse.Namespace) -> int:
         elif len(documents) > 1:
             print_runs(documents)
         else:
-            _print_once(client, documents[0] if documents else client.document())
+            from rich.console import Console
+
+            from dreamfleet.common.client.status import read_status
+
+            status = read_status(documents[0] if documents else client.document())
+            Console().print(_PanelBuilder(client).build(status))
     return 0
 
 
@@ -96,14 +101,6 @@ def print_runs(documents: Sequence[dict[str, Any]]) -> None:
     ]
     print_rows(rows, right=("generation", "steps/s"), drop_order=("steps/s", "workers", "best"))
     print(f"{plural(len(rows), 'live run')}; `dreamfleet status RUN` shows more", file=sys.stderr)
-
-
-def _print_once(client: Client, document: dict[str, Any]) -> None:
-    from rich.console import Console
-
-    from dreamfleet.common.client.status import read_status
-
-    Console().print(_PanelBuilder(client).build(read_status(document)))
 
 
 def _watch(network: Network, name: str | None, *, as_json: bool) -> int:

@@ -99,10 +99,7 @@ def _print_live(args: argparse.Namespace) -> int:
     if not events:
         print("no such event is kept: it is too old, or has not happened yet", file=sys.stderr)
     elif total > len(events):
-        print(
-            f"the last {len(events)} of {total} kept events; --last shows more, --what filters",
-            file=sys.stderr,
-        )
+        print(f"the last {len(events)} of {total} kept events; --last shows more, --what filters", file=sys.stderr)
     return 0
 
 

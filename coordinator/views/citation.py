@@ -124,6 +124,7 @@ def _commands(run: RunFolder) -> dict[str, str]:
     """Commands that check the run, keyed by what they show."""
     last, classes = max((each.number for each in run.history()), default=0), run.classes
     beside, controller = ("--runs-dir", str(run.path.parent)), str(run.controller_path)
+    first = ("--candidate", f"{last}/0")
     one, whole = "bit-identical on any host of its class", "bit-identical"
     if classes.mixed:
         whole = "not bit-identical: hosts of several classes scored"
@@ -132,15 +133,7 @@ def _commands(run: RunFolder) -> dict[str, str]:
     modules = _task_modules(run)
     trust, trust_all = trust_flag(modules), trust_flag([*modules, module_of(run.settings.optimiser)])
     words = {
-        f"one candidate's fitness again, {one}": (
-            "verify",
-            "candidate",
-            run.name,
-            "--candidate",
-            f"{last}/0",
-            *beside,
-            *trust,
-        ),
+        f"one candidate's fitness again, {one}": ("verify", "candidate", run.name, *first, *beside, *trust),
         f"the whole run again, {whole}": ("verify", "run", run.name, *beside, *trust_all),
         "its score on unseen seeds": ("evaluate", "--controller", controller, "--episodes", "100", *trust),
     }

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -71,10 +70,15 @@ def export_tensorboard(run: RunFolder, folder: Path) -> list[Path]:
     """Write a TensorBoard event file; `UsageError` if the folder has one, since TensorBoard would merge both."""
     if is_folder(folder) and any(folder.glob(EVENTS)):
         raise UsageError(f"{folder} holds TensorBoard's events already: choose another --out")
-    with _remove_on_failure(folder), open_event_file(folder) as events:
-        events.add_text("settings", f"```\n{run.settings.to_json()}\n```")
-        for step, numbers in scalars_of(run):
-            events.add(step, **numbers)
+    try:
+        with open_event_file(folder) as events:
+            events.add_text("settings", f"```\n{run.settings.to_json()}\n```")
+            for step, numbers in scalars_of(run):
+                events.add(step, **numbers)
+    except BaseException:  # an incomplete file would block the next attempt
+        for each in folder.glob(EVENTS):
+            each.unlink(missing_ok=True)
+        raise
     return sorted(folder.glob(EVENTS))
 
 
@@ -99,17 +103,6 @@ def _score(name: str, found: StoredEvaluation | StoredConfirmation) -> dict[str,
     """A mean's score, and its standard error if it has one."""
     error = {} if found.error is None else {f"score__{name}_error": found.error}
     return {f"score__{name}": found.mean, **error}
-
-
-@contextmanager
-def _remove_on_failure(folder: Path) -> Iterator[None]:
-    """Remove an incomplete event file, which would block the next attempt."""
-    try:
-        yield
-    except BaseException:
-        for each in folder.glob(EVENTS):
-            each.unlink(missing_ok=True)
-        raise
 
 
 def columns_of(table: str) -> list[str]:

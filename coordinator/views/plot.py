@@ -58,11 +58,6 @@ class ShownFigure(Figure):
         return stream.getvalue()
 
 
-def plot_fitness(run: RunFolder, path: Path) -> None:
-    """Write the picture of `fitness_figure`."""
-    save_figure(fitness_figure(run), path)
-
-
 def fitness_figure(run: RunFolder) -> Figure:
     """One run's fitness over its generations, with its evaluated and confirmed means, as a matplotlib `Figure`.
 
@@ -114,11 +109,6 @@ def _note(run: RunFolder) -> str:
 def _value_axis(run: RunFolder, axes: Any) -> str:
     goal = "smaller is better" if is_minimised(run.spec) else "larger is better"
     return f"value of the function ({goal}{', log scale' if axes.get_yscale() == 'log' else ''})"
-
-
-def plot_learning(curves: Sequence[LearningCurve], marks: PublishedScores | None, path: Path) -> None:
-    """Write the picture of `learning_figure`."""
-    save_figure(learning_figure(curves, marks), path)
 
 
 def learning_figure(curves: Sequence[LearningCurve], marks: PublishedScores | None) -> Figure:

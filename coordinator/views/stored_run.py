@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 Plot = Literal["fitness", "learning", "archive"]
 TableName = Literal["generations", "candidates", "evaluations", "confirmation", "elites"]
 PLOTS: tuple[Plot, ...] = get_args(Plot)
-NO_ARCHIVE = "run {} has no archive: begin one with --archive"
 
 
 class StoredRun(RunFolder, Displayed):
@@ -83,10 +82,7 @@ class StoredRun(RunFolder, Displayed):
 
         `UsageError` for an empty cell, or a run without an archive.
         """
-        archive = self.archive()
-        if archive is None:
-            raise UsageError(NO_ARCHIVE.format(self.name))
-        return controller_of(self, archive.find(cell))
+        return controller_of(self, EliteArchive.needed(self).find(cell))
 
     def to_pandas(self, table: TableName = "generations") -> pandas.DataFrame:
         """A table as a pandas `DataFrame`: `generations`, `candidates`, `evaluations`, `confirmation` or `elites`.
@@ -140,15 +136,11 @@ class StoredRun(RunFolder, Displayed):
             raise UsageError(f"table must be one of {', '.join((*TABLES, ELITES))}, not {table!r}")
         make: Callable[[dict[str, list[Any]]], Any] = _import(package, f"pip install {package}").DataFrame
         with self.verified_transaction():
-            columns, rows = self._elites() if table == ELITES else (columns_of(table), rows_of(self, table))
+            is_archive = table == ELITES
+            columns, rows = (
+                tables(EliteArchive.needed(self)) if is_archive else (columns_of(table), rows_of(self, table))
+            )
         return make({name: [row[name] for row in rows] for name in columns})
-
-    def _elites(self) -> tuple[list[str], list[dict[str, Any]]]:
-        """Columns and rows of the archive; `UsageError` for a run without one."""
-        archive = self.archive()
-        if archive is None:
-            raise UsageError(NO_ARCHIVE.format(self.name))
-        return tables(archive)
 
 
 def open_run(name: str, runs_dir: Path | str | None = None) -> StoredRun:

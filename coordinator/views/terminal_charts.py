@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from math import ceil
 
 from rich.text import Text
@@ -34,8 +34,9 @@ def candidate_grid(population: Population, width: int, lines: int) -> list[Text]
     """
     found = population.candidates
     group_size = max(1, ceil(len(found) / (width * lines)))
-    best = max((each for each in found if each.fitness is not None), key=_fitness, default=None)
-    cells = [_cell(group, best) for group in _grouped(found, group_size)]
+    best = max((each for each in found if each.fitness is not None), key=lambda each: each.fitness or 0.0, default=None)
+    groups = (found[start : start + group_size] for start in range(0, len(found), group_size))
+    cells = [_cell(group, best) for group in groups]
     return [Text.assemble(*cells[start : start + width]) for start in range(0, len(cells), width)]
 
 
@@ -44,24 +45,11 @@ def candidate_grid_height(population: Population, width: int) -> int:
     return max(1, ceil(len(population.done) / width))
 
 
-def _grouped(found: Sequence[Candidate], group_size: int) -> Iterator[Sequence[Candidate]]:
-    return (found[start : start + group_size] for start in range(0, len(found), group_size))
-
-
-def _fitness(each: Candidate) -> float:
-    return each.fitness or 0.0
-
-
 def _cell(group: Sequence[Candidate], best: Candidate | None) -> tuple[str, str]:
     done, wanted = sum(each.done for each in group), sum(each.wanted for each in group)
     if all(each.has_failed for each in group):
         return FAILED, "red"
     if not done:
         return WAITING, "dim"
-    if best in group:
-        return _filled(done, wanted), "bold yellow"
-    return _filled(done, wanted), "green" if done >= wanted else "cyan"
-
-
-def _filled(done: int, wanted: int) -> str:
-    return EIGHTHS[min(max(1, done * 8 // max(wanted, 1)), 8)]
+    filled = EIGHTHS[min(max(1, done * 8 // max(wanted, 1)), 8)]
+    return filled, "bold yellow" if best in group else "green" if done >= wanted else "cyan"

@@ -32,18 +32,7 @@ COLUMNS: dict[str, Callable[[WorkerStatus], str]] = {
     "load": lambda each: str(each.load),
     "picture": lambda each: each.drawn_by,
 }
-DROP_ORDER = (
-    "picture",
-    "load",
-    "assigned",
-    "finished",
-    "steps/s",
-    "resent",
-    "round trip",
-    "slots",
-    "per job",
-    "state",
-)
+DROP_ORDER = ("picture", "load", "assigned", "finished", "steps/s", "resent", "round trip", "slots", "per job", "state")
 LEFT_ALIGNED = ("worker", "state", "picture")
 
 

@@ -264,11 +264,11 @@ class Demo:
                 self._print(f"  {LiveRunView.of_status(status).summary}")
 
     def _plot(self, demo_run: DemoRun) -> None:
-        from dreamfleet.coordinator.views.plot import plot_fitness
+        from dreamfleet.coordinator.views.plot import fitness_figure, save_figure
 
         path = self._runs_dir / demo_run.run / PLOT
         with open_run(self._runs_dir, demo_run.run) as run:
-            plot_fitness(run, path)
+            save_figure(fitness_figure(run), path)
         self._console.print(f"{path}: fitness over generations", markup=False)
 
     def _print_next_steps(self, folder: Path) -> None:

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.coordinator.views.plot import plot_fitness
+from dreamfleet.coordinator.views.plot import fitness_figure, save_figure
 from dreamfleet.worker.addons.inspection.curve_sections import fitness_section
 from tests.support import tasks
 from tests.support.same_bits import outcome
@@ -84,7 +84,7 @@ def test_a_run_of_three_stages_gives_the_same_bits_however_often_it_is_killed(pr
     assert [each["since"] for each in json.loads(out)["stages"]] == BEGUN
     picture = processes.folder / "fitness.png"
     with open_run(processes.runs, "night") as run:
-        plot_fitness(run, picture)
+        save_figure(fitness_figure(run), picture)
         text = fitness_section(run).text
     assert "4, then 7, then 10 steps an episode" in text
     assert picture.stat().st_size > 1000

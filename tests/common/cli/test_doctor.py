@@ -62,8 +62,7 @@ def test_each_role_is_listed_with_its_remedy(bare, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("role", "code"),
-    [("coordinator", 0), ("worker", 1), ("views", 1), ("train", 1), ("dashboard", 1), ("export", 1)],
+    ("role", "code"), [("coordinator", 0), ("worker", 1), ("views", 1), ("train", 1), ("dashboard", 1), ("export", 1)]
 )
 def test_the_exit_code_is_the_chosen_roles(bare, tmp_path, role, code):
     left, out = doctor(bare, tmp_path, "--role", role, "--json")

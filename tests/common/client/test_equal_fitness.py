@@ -21,10 +21,7 @@ def test_the_last_generations_in_a_row_are_counted(rows, count):
     assert EqualFitness(rows).count == count
 
 
-@pytest.mark.parametrize(
-    ("others", "warned"),
-    [(1, [ENOUGH]), (ENOUGH - 1, [ENOUGH]), (ENOUGH, [ENOUGH, 3 * ENOUGH])],
-)
+@pytest.mark.parametrize(("others", "warned"), [(1, [ENOUGH]), (ENOUGH - 1, [ENOUGH]), (ENOUGH, [ENOUGH, 3 * ENOUGH])])
 def test_a_spell_is_warned_of_again_only_after_as_many_other_generations(others, warned):
     rows = [*[EQUAL] * ENOUGH, *[OTHER] * others, *[EQUAL] * 2 * ENOUGH]
     found = EqualFitness()

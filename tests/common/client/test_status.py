@@ -57,12 +57,7 @@ def test_a_population_has_columns_and_rows():
 
 
 @pytest.mark.parametrize(
-    ("path", "value"),
-    [
-        (("evaluation", "episodes"), 0),
-        (("best", "episodes"), -1),
-        (("population", "done"), [1]),
-    ],
+    ("path", "value"), [(("evaluation", "episodes"), 0), (("best", "episodes"), -1), (("population", "done"), [1])]
 )
 def test_values_out_of_range_are_malformed(path, value):
     document = json.loads(GOLDEN.read_bytes())

@@ -14,7 +14,7 @@ from dreamfleet.common.runs.effort import START_EFFORT, Effort
 from dreamfleet.common.runs.learning import LearningCurve, Point
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.worlds.shipped import WORLDS
-from dreamfleet.coordinator.views.plot import plot_learning
+from dreamfleet.coordinator.views.plot import learning_figure, save_figure
 
 FIRST, LAST = Effort(10**5, 10**4, 0, 10**9), Effort(2 * 10**5, 9 * 10**4, 0, 3 * 10**9)
 PAPERS_NAME = WORLDS["car-racing"].published.source
@@ -87,7 +87,7 @@ def test_runs_of_several_worlds_are_drawn_with_a_note_and_short_ones_without_mar
 def test_a_picture_names_runs_axes_and_published_marks_and_equal_ones_are_equal_files(tmp_path):
     paths = [tmp_path / "a.svg", tmp_path / "b.svg"]
     for path in paths:
-        plot_learning([CURVE], WORLDS["car-racing"].published, path)
+        save_figure(learning_figure([CURVE], WORLDS["car-racing"].published), path)
     assert paths[0].read_bytes() == paths[1].read_bytes()
     text = html.unescape(paths[0].read_text())  # letters are shapes, and what they spell stands beside them
     for said in ("night: 290k", "core-hours", PAPERS_NAME, "823"):
@@ -95,7 +95,7 @@ def test_a_picture_names_runs_axes_and_published_marks_and_equal_ones_are_equal_
 
 
 def test_a_published_score_whose_steps_are_unknown_is_a_line_across_both_pictures(tmp_path):
-    plot_learning([CURVE], WORLDS["takecover"].published, tmp_path / "a.svg")
+    save_figure(learning_figure([CURVE], WORLDS["takecover"].published), tmp_path / "a.svg")
     text = html.unescape((tmp_path / "a.svg").read_text())
     assert WORLDS["takecover"].published.source in text
     assert "night: 290k" in text
@@ -127,6 +127,6 @@ def test_an_axis_is_logarithmic_only_over_a_decade_and_says_so(tmp_path):
     for factor, says in ((20, True), (3, False)):
         points = [Point(Effort(driven=times * 1000, microseconds=10**6), 500.0, 9.0) for times in (1, factor)]
         curve = replace(CURVE, points=tuple(points), confirmed=None, reported=None)
-        plot_learning([curve], None, tmp_path / "a.svg")
+        save_figure(learning_figure([curve], None), tmp_path / "a.svg")
         text = html.unescape((tmp_path / "a.svg").read_text())
         assert ("(log scale)" in text) == says

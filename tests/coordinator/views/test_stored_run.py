@@ -12,7 +12,7 @@ import pytest
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.errors import BundleError, ControllerError, JournalError, UsageError
 from dreamfleet.coordinator.views.export import ELITES, TABLES
-from dreamfleet.coordinator.views.plot import KINDS, plot_fitness
+from dreamfleet.coordinator.views.plot import KINDS, fitness_figure, save_figure
 from dreamfleet.coordinator.views.stored_run import TableName, open_run
 from tests.support.processes import DEADLINE, environment
 
@@ -80,7 +80,7 @@ def test_a_run_without_evaluations_has_its_fitness_plotted(tmp_path):
             run.plot("learning")
         with pytest.raises(UsageError, match=r"archive.*'curve'"):
             run.plot("curve")
-        plot_fitness(run, tmp_path / f"own{KINDS[1]}")
+        save_figure(fitness_figure(run), tmp_path / f"own{KINDS[1]}")
 
 
 SHOWN = """
