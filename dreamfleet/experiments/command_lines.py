@@ -26,18 +26,15 @@ def begin_run(
     name: str, runs_dir: Path, listen: Sequence[str], *flags: object, as_json: bool = True
 ) -> Words:  # fmt: skip
     """The coordinator of a new run."""
-    return command("coordinator", *flags, "--run", name, *_run_place(runs_dir, listen, as_json=as_json))
+    json = ("--json",) if as_json else ()
+    return command("coordinator", *flags, "--run", name, "--runs-dir", runs_dir, *json, "--listen", *listen)
 
 
 def resume_run(name: str, runs_dir: Path, listen: Sequence[str], *flags: object) -> Words:
     """The coordinator of a run that was begun before."""
-    return command("coordinator", "--resume", name, *flags, *_run_place(runs_dir, listen, as_json=True))
+    return command("coordinator", "--resume", name, *flags, "--runs-dir", runs_dir, "--json", "--listen", *listen)
 
 
 def worker(run: str, endpoint: str, slots: int, *more: object) -> Words:
     """A worker of one run, reached at `endpoint`."""
     return command("worker", "--connect", endpoint, "--run", run, "--slots", slots, *more)
-
-
-def _run_place(runs_dir: Path, listen: Sequence[str], *, as_json: bool) -> Words:
-    return command("--runs-dir", runs_dir, *(("--json",) if as_json else ()), "--listen", *listen)

@@ -35,11 +35,6 @@ class Feed:
         """Whether there is no room for another viewer."""
         return self._viewers >= MOST_VIEWERS
 
-    @property
-    def is_polling(self) -> bool:
-        """Whether runs are polled now."""
-        return self._polling is not None
-
     async def snapshots(self) -> AsyncGenerator[DashboardSnapshot, None]:
         """The latest snapshot, then each newer one, until the feed is closed."""
         self._viewers += 1

@@ -105,11 +105,6 @@ def judged_by(results: Sequence[RunResult]) -> str | None:
     return next((kind for kind in kinds if finished and all(kind in each.scores for each in finished)), None)
 
 
-def describe_kind(kind: str, results: Sequence[RunResult]) -> str:
-    """What a score is, in words, and whether less is better."""
-    return with_goal(f"mean {word_of(results)} of the last generation" if kind == FITNESS else kind, results)
-
-
 def word_of(results: Sequence[RunResult]) -> str:
     """What the optimiser is given: a function has values, and no fitness."""
     words = {fitness_word(each.task) for each in results if each.task is not None}

@@ -247,7 +247,8 @@ def print_settings(results: list[RunResult]) -> None:
     shown = [each.in_values for each in results]
     if (kind := summary.judged_by(shown)) is None:
         return
-    heading = summary.describe_kind(kind, shown)
+    what = f"mean {summary.word_of(shown)} of the last generation" if kind == summary.FITNESS else kind
+    heading = summary.with_goal(what, shown)
     means = summary.means(shown, kind)
     print_rows([{"setting": each.setting, "runs": each.runs, heading: each.text} for each in means])
     print("± is the standard error among runs")

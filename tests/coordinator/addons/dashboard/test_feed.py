@@ -81,11 +81,11 @@ def test_polling_stops_without_viewers_and_a_later_viewer_gets_no_stale_snapshot
             break
         while looks.rests == 0:
             await asyncio.sleep(0)
-        assert not feed.is_polling
+        assert feed._polling is None
         before = looks.count
         looks.gate.clear()
         later = asyncio.ensure_future(anext(feed.snapshots()))
-        while not feed.is_polling:
+        while feed._polling is None:
             await asyncio.sleep(0)
         assert not later.done()
         looks.gate.set()
