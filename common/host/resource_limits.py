@@ -103,7 +103,8 @@ def check_room_for_session() -> None:
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY and soft - _open_files() < SESSION_FILES:
         raise DreamfleetError(
-            f"this process may open only {soft} files, too few for a network session: raise the limit (ulimit -n 1024)"
+            f"this process may open only {soft} files, too few for a network session: raise the limit "
+            "(`ulimit -n 1024`)"
         )
     done = threading.Event()
     threads = [threading.Thread(target=done.wait) for _ in range(SESSION_THREADS)]
@@ -113,7 +114,7 @@ def check_room_for_session() -> None:
     except RuntimeError as error:
         raise DreamfleetError(
             "this user may start too few threads for a network session: end other processes, or raise the limit "
-            "(ulimit -u), or that of its memory (ulimit -v)"
+            "(`ulimit -u`), or that of its memory (`ulimit -v`)"
         ) from error
     finally:
         done.set()

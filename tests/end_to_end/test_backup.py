@@ -125,13 +125,13 @@ def test_a_world_model_is_copied_too(processes, tmp_path):
 def test_two_at_once_leave_a_whole_copy(finished, tmp_path, monkeypatch):
     safe = tmp_path / "safe"
     assert back_up(finished, safe)[0] == 0
-    unserved, said = backup._hold_target, []
+    lock, said = backup.run_lock, []
 
     def meanwhile(target):
         said.append(back_up(finished, safe, call=finished.call))
-        return unserved(target)
+        return lock(target)
 
-    monkeypatch.setattr(backup, "_hold_target", meanwhile)
+    monkeypatch.setattr(backup, "run_lock", meanwhile)
     with open_run(finished.runs, "test") as source:
         backup.back_up(source, safe / "test")
     assert [code for code, *_ in said] == [2]

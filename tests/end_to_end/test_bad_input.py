@@ -107,7 +107,7 @@ def odd(begun, tmp_path):
     ("words", "says"),
     [
         (("runs", "delete", "link", "--yes"), "link"),
-        (("runs", "delete", "outer", "--yes"), "(inner)"),
+        (("runs", "delete", "outer", "--yes"), "inner"),
         (("runs", "archive", "whole"), "whole"),
         (("runs", "show", "strange"), "strange"),
     ],

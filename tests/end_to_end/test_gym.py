@@ -88,7 +88,7 @@ def test_what_can_be_scored_in_is_listed(processes):
     ("settings", "says"),
     [
         (("--task", "gym:Nothing-v0"), "'Nothing-v0'"),
-        (("--task", "CartPole-v1"), "gym:CartPole-v1"),
+        (("--task", "CartPole-v1"), "'CartPole-v1'"),
         (("--task", "gym:CartPole-v1", "--environment", "wings"), "wings"),
         (("--task", "gym:CartPole-v1", "--environment", "wings=2"), "wings"),
         (("--task", "gym:CartPole-v1", "--temperature", "1.5"), "--temperature"),

@@ -27,14 +27,16 @@ class Outcome(NamedTuple):
 
 
 def outcome(processes, name):
-    """What a run has come to, candidate by candidate."""
+    """What a run has come to, candidate by candidate; a generation that is open does not count."""
     with open_run(processes.runs, name) as run:
-        places = [(each.generation, each.number) for each in run.candidates()]
+        history = run.history()
+        closed = {each.number for each in history}
+        places = [(each.generation, each.number) for each in run.candidates() if each.generation in closed]
         return Outcome(
             [run.fitness(*place) for place in places],
             [run.candidate(*place).tobytes() for place in places],
             [[(each.seed, each.fitness, each.steps) for each in run.results(*place)] for place in places],
-            [(each.number, each.mean, each.best, each.sigma, each.steps) for each in run.history()],
+            [(each.number, each.mean, each.best, each.sigma, each.steps) for each in history],
             run.evaluations(),
             run.confirmation(),
             np.load(run.controller_path)["parameters"].tobytes(),
