@@ -66,7 +66,7 @@ class FailureJudge:
         for each in failures:
             if len(each.attempts) >= HOST_ATTEMPTS and not any(one.host in self.working_hosts for one in each.attempts):
                 return each
-        if not self._present_hosts() or self.has_hope or not _is_pausing(failures):
+        if not self._present_hosts() or self.may_recover or not _is_pausing(failures):
             return None
         is_early = at_once and not self.working_hosts and len(failures) >= ENOUGH_JOBS
         if not is_early and len(failures) < len(self._jobs):
@@ -96,7 +96,7 @@ class FailureJudge:
         return any(each.is_proof for each in self._jobs.failures)
 
     @property
-    def has_hope(self) -> bool:
+    def may_recover(self) -> bool:
         """Whether a host is here that has scored, or that has not failed yet."""
         hosts = self._present_hosts()
         tried = {attempt.host for each in self._jobs.failures for attempt in each.attempts}

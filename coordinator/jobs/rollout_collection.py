@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from dreamfleet.common.errors import write_error
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.protocol.failures import Failure
-from dreamfleet.common.protocol.messages import Job, Result, TaskSpec
+from dreamfleet.common.protocol.messages import Result, TaskSpec
 from dreamfleet.common.runs.run_paths import rollout_path
 from dreamfleet.common.runs.seeds import collection_seed
 from dreamfleet.coordinator.jobs.upload_assembler import UploadAssembler
@@ -83,13 +83,10 @@ class RolloutCollections:
         data = self.uploads.get_complete(worker, result.digest, result.upload)
         if data is None:
             return None
-        self._save_rollout(work.job, data)
-        return result
-
-    def _save_rollout(self, job: Job, data: bytes) -> None:
-        path = rollout_path(self._folder, job.generation, job.episode)
+        path = rollout_path(self._folder, work.job.generation, work.job.episode)
         try:
             with atomic_write(path) as file:
                 file.write(data)
         except OSError as error:
             raise write_error(path, error) from error
+        return result

@@ -91,7 +91,7 @@ class FailurePolicy:
         return None
 
     def _no_able_host(self, failure: PendingJob, *, has_score: bool) -> Pause:
-        jobs, until_host = self._fleet.jobs, not self._fleet.failure_judge.has_hope
+        jobs, until_host = self._fleet.jobs, not self._fleet.failure_judge.may_recover
         is_loss = all(each.error == WORKER_ENDED for each in failure.attempts)
         hint = LOST_WORKERS if is_loss else "" if has_score else OTHER_SEEDS
         why = (

@@ -107,11 +107,6 @@ class ControllerWriter:
         withdraw_controller(self._path)
         self._saved = None
 
-    @property
-    def path(self) -> Path | None:
-        """The file of the reported controller; `None` before it was saved."""
-        return self._path if self._saved is not None else None
-
 
 def withdraw_controller(path: Path) -> None:
     """Remove a run's reported controller, durably; `JournalError` where the disk refuses.

@@ -298,7 +298,7 @@ class Run:
         if (paused := self.state.paused) is None:
             if (pause := self.failure_policy.find_pause(self.generation)) is not None:
                 self.pause(pause)
-        elif paused.until_host and judge.has_hope:
+        elif paused.until_host and judge.may_recover:
             self.fleet.note("a host has joined that may be able to score: the run continues", "continues")
             self._go_on()
 

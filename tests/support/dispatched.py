@@ -47,9 +47,13 @@ def fleet_of(*names, capacity=1, jobs=10):
     fleet = Fleet(BEAT)
     fleet.jobs.offer(work(jobs))
     for name in names:
-        fleet.add_worker(name, capacity, "f", 0.0)
-        fleet.handle_heartbeat(name, beat(capacity), 0.0)
+        join(fleet, name, 0.0, capacity)
     return fleet
+
+
+def join(fleet, name, now, capacity=1):
+    fleet.add_worker(name, capacity, "f", now)
+    fleet.handle_heartbeat(name, beat(capacity), now)
 
 
 def digests(sends, name):

@@ -109,12 +109,16 @@ class Bench:
         sends = self.run.fleet.dispatch(self.now)
         return [(send.identity, each.digest, each.verdict) for send in sends for each in send.verdicts]
 
+    def score(self, fitness=lambda job: 1.0):
+        """Score what is given now."""
+        for send in self.run.fleet.dispatch(self.now):
+            for work in send.work:
+                self.deliver(send.identity, Result(work.job.digest, fitness(work.job), 10, 0.1, None, None))
+
     def reach_collection(self):
         """Score the only generation; the collection jobs, each with its holder."""
         while not self.run.fleet.drain_background:
-            for send in self.run.fleet.dispatch(self.now):
-                for work in send.work:
-                    self.deliver(send.identity, Result(work.job.digest, 1.0, 10, 0.1, None, None))
+            self.score()
         return self.collecting()
 
     def collecting(self):

@@ -9,7 +9,7 @@ from dreamfleet.common.protocol.messages import TAG_BYTES, Heartbeat, Result, Ru
 from dreamfleet.coordinator.dispatch.deficit_round_robin import OUTLIER, DeficitCounter
 from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.jobs.work import make_work, vector_bytes
-from tests.support.dispatched import A, B, beat, fleet_of
+from tests.support.dispatched import A, B, fleet_of, join
 from tests.support.samples import HEAD, SPEC
 
 
@@ -210,6 +210,5 @@ def test_a_lost_workers_evaluation_goes_again_at_once():
     assert [each.job.kind for send in fleet.dispatch(0.0) for each in send.work] == ["evaluate", "score"]
     fleet.handle_departure(A, 0.1)
     fleet.tick(1.0)
-    fleet.add_worker(B, 1, "f", 1.0)
-    fleet.handle_heartbeat(B, beat(), 1.0)
+    join(fleet, B, 1.0)
     assert [each.job.kind for send in fleet.dispatch(1.0) for each in send.work] == ["evaluate", "score"]

@@ -19,7 +19,7 @@ from dreamfleet.coordinator.dispatch.fleet import (
 from dreamfleet.coordinator.dispatch.member import DEPARTED_TIMEOUT, MAX_DEPARTED
 from dreamfleet.coordinator.dispatch.speculative_execution import LONGEST_HELD, LONGEST_HELD_TIMES, UPLOAD_SECONDS
 from dreamfleet.coordinator.jobs.work import make_work, vector_bytes
-from tests.support.dispatched import BEAT, A, B, Fleet, beat, digests, fleet_of, result, work
+from tests.support.dispatched import BEAT, A, B, Fleet, beat, digests, fleet_of, join, result, work
 from tests.support.failures import failure
 from tests.support.samples import SPEC
 
@@ -139,8 +139,7 @@ def test_a_worker_that_vanishes_without_leaving_is_listed_as_lost_until_it_is_ba
     assert (fleet.departed, next(latest(fleet.event_log.view())).what) == ({}, "back")
     vanish(A, 4.0)
     another_life = "a/00000009"
-    fleet.add_worker(another_life, 1, "f", 5.0)
-    fleet.handle_heartbeat(another_life, beat(), 5.0)
+    join(fleet, another_life, 5.0)
     assert not fleet.departed
     vanish(another_life, 6.0)
     fleet.tick(6.0 + DEPARTED_TIMEOUT)
@@ -159,8 +158,7 @@ def test_a_worker_that_says_why_it_leaves_is_listed_with_that_and_its_jobs_are_f
     event = next(each for each in latest(fleet.event_log.view(), A) if each.what == "left")
     assert event.why == gone.farewell
     assert gone.farewell in fleet.notes[-1].text
-    fleet.add_worker(A, 1, "f", 3.0)
-    fleet.handle_heartbeat(A, beat(), 3.0)
+    join(fleet, A, 3.0)
     assert not fleet.departed, "it is back"
 
 
@@ -193,8 +191,7 @@ def test_what_a_lost_worker_had_done_of_a_job_is_waste_once_another_has_scored_i
     fleet.handle_heartbeat(A, beat(seen=1, steps=4, **{shown: [digest]}), 1.0)
     fleet.handle_departure(A, 1.0)
     fleet.tick(2.0)
-    fleet.add_worker(B, 1, "f", 2.0)
-    fleet.handle_heartbeat(B, beat(), 2.0)
+    join(fleet, B, 2.0)
     assert digests(fleet.dispatch(2.0), B) == [digest]
     assert fleet.counts["discarded_steps"] == 0
     fleet.handle_result(B, result(digest), 3.0)
@@ -310,8 +307,7 @@ def test_a_failed_job_waits_for_another_worker_that_is_busy():
 )
 def test_evaluations_fill_a_quarter_of_the_idle_slots_and_lead_where_they_have_a_share(share, kinds):
     fleet = Fleet(BEAT, share)
-    fleet.add_worker(A, 4, "f", 0.0)
-    fleet.handle_heartbeat(A, beat(4), 0.0)
+    join(fleet, A, 0.0, 4)
     fleet.jobs.offer(work(3) + work(5, "evaluate"))
     assert [each.job.kind for send in fleet.dispatch(0.0) for each in send.work] == kinds
     fleet.drain_background = True
@@ -369,8 +365,7 @@ def test_a_paused_fleet_gives_no_jobs_and_still_judges_results():
 def test_a_newcomer_takes_over_what_another_worker_has_waiting():
     fleet = fleet_of(A, capacity=2, jobs=4)
     given = digests(fleet.dispatch(0.0), A)
-    fleet.add_worker(B, 1, "f", 0.1)
-    fleet.handle_heartbeat(B, beat(1), 0.1)
+    join(fleet, B, 0.1)
     sends = fleet.dispatch(0.2)
     assert digests(sends, B) == [given[-1]], "what was given last begins last"
     assert cancelled(sends, A) == [given[-1]]
@@ -381,8 +376,7 @@ def test_a_newcomer_takes_over_what_another_worker_has_waiting():
 def test_what_runs_is_not_recalled():
     fleet = fleet_of(A, capacity=1, jobs=1)
     fleet.dispatch(0.0)
-    fleet.add_worker(B, 1, "f", 0.1)
-    fleet.handle_heartbeat(B, beat(1), 0.1)
+    join(fleet, B, 0.1)
     assert fleet.dispatch(0.2) == []
 
 
@@ -421,8 +415,7 @@ def test_what_waits_for_a_slot_that_another_run_uses_is_taken_over_and_not_copie
     fleet = fleet_of(A, capacity=2, jobs=2)
     given = digests(fleet.dispatch(0.0), A)
     fleet.handle_heartbeat(A, replace(beat(2, seen=1, queued=given), taken=2), 0.1)
-    fleet.add_worker(B, 1, "f", 0.1)
-    fleet.handle_heartbeat(B, beat(1), 0.1)
+    join(fleet, B, 0.1)
     sends = fleet.dispatch(0.2)
     assert digests(sends, B) == [given[-1]]
     assert cancelled(sends, A) == [given[-1]]
@@ -641,8 +634,7 @@ def test_an_error_of_a_job_that_its_worker_does_not_hold_is_no_failure():
 def test_a_job_with_more_steps_than_it_can_have_goes_to_others_and_its_late_result_still_counts():
     fleet = fleet_of(A, jobs=1)
     (digest,) = digests(fleet.dispatch(0.0), A)
-    fleet.add_worker(B, 1, "f", 0.1)
-    fleet.handle_heartbeat(B, beat(), 0.1)
+    join(fleet, B, 0.1)
     fleet.handle_heartbeat(A, beat(seen=1, running=[digest], steps=10**12), 1.0)
     fleet.overrun(A, digest)
     sends = fleet.dispatch(1.0)
@@ -727,8 +719,7 @@ def test_a_hosts_record_outlives_a_hello_and_its_worker():
 def test_a_newcomer_beside_a_worker_with_a_record_gets_a_trial_copy():
     fleet = fleet_of(A, jobs=3)
     now = known(fleet, A)
-    fleet.add_worker(B, 1, "f", now)
-    fleet.handle_heartbeat(B, beat(), now)
+    join(fleet, B, now)
     fleet.jobs.offer(work(6, generation=1))
     held = digests(fleet.dispatch(now), A)
     (copied,) = digests(fleet.dispatch(now), B)
@@ -746,8 +737,7 @@ def test_a_host_that_is_lost_again_and_again_gets_only_what_it_returns_in_time()
     now = known(fleet, A, seconds=1.0)
     for life in range(3):
         name = f"b/{life:08x}"
-        fleet.add_worker(name, 1, "f", now)
-        fleet.handle_heartbeat(name, beat(), now)
+        join(fleet, name, now)
         fleet.jobs.offer(work(4, generation=life + 1))
         fleet.dispatch(now)
         fleet.dispatch(now)

@@ -31,9 +31,8 @@ def make(tmp_path, random_bundle):
 
 def test_a_controller_is_there_from_the_first_closed_generation_on(make):
     bench = make(replace(EVALUATED, evaluate_every=0))
-    assert (bench.saved(), bench.run.background_jobs.report.path) == (None, None)
+    assert bench.saved() is None
     bench.close(1)
-    assert bench.run.background_jobs.report.path == bench.path / CONTROLLER
     assert bench.saved().provenance["generation"] == 0
 
 
@@ -81,7 +80,6 @@ def test_a_run_that_resumes_beyond_its_limit_writes_the_controller_and_the_reaso
     bench.limits = LimitsConfig(generations=2)
     bench.restart()
     assert bench.run.state.ended == StopReason(StopKind.GENERATIONS, "3 generations")
-    assert bench.run.background_jobs.report.path == bench.path / CONTROLLER
     assert bench.saved() is not None
     with RunFolder(bench.path) as stored:
         assert stored.ended == "3 generations"

@@ -203,9 +203,7 @@ def test_a_run_whose_population_is_one_point_ends_with_that_reason(tmp_path, ran
     bench = Bench(tmp_path / "night", random_bundle.path, settings, generations=0)
     for _ in range(2):
         while bench.run.state.ended is None:
-            for send in bench.run.fleet.dispatch(bench.now):
-                for work in send.work:
-                    bench.deliver(send.identity, Result(work.job.digest, 1.0, 10, 0.1, None, None))
+            bench.score()
         assert bench.run.state.ended.kind is StopKind.ONE_POINT
         closed = len(bench.run.history)
         bench.restart()
@@ -221,9 +219,7 @@ def test_parted_compares_the_same_scores_before_and_after_a_restart(tmp_path, ra
     settings = replace(SETTINGS, collect_every=0, evaluate_every=1, evaluation_episodes=4)
     bench = Bench(tmp_path / "night", random_bundle.path, settings, generations=3)
     while bench.run.state.ended is None:
-        for send in bench.run.fleet.dispatch(bench.now):
-            for work in send.work:
-                bench.deliver(send.identity, Result(work.job.digest, work.job.digest[0] / 10, 10, 0.1, None, None))
+        bench.score(lambda job: job.digest[0] / 10)
 
     def compared():
         jobs = bench.run.background_jobs
@@ -248,17 +244,13 @@ def test_a_reached_limit_stays_reached_when_the_last_evaluation_contradicts_it(t
     bench.restart()
     level = {0: 9.0, 1: 1.0}
 
-    def step():
-        for send in bench.run.fleet.dispatch(bench.now):
-            for work in send.work:
-                noise = work.job.digest[0] / 1000
-                fitness = level.get(work.job.generation, 9.0) + noise if work.job.kind == "evaluate" else noise
-                bench.deliver(send.identity, Result(work.job.digest, fitness, 10, 0.1, None, None))
+    def fitness(job):
+        return job.digest[0] / 1000 + (level.get(job.generation, 9.0) if job.kind == "evaluate" else 0.0)
 
     while bench.journal.fact("ending") is None:
-        step()
+        bench.score(fitness)
     closed = len(bench.run.history)
     bench.restart()
     while bench.run.state.ended is None:
-        step()
+        bench.score(fitness)
     assert (bench.run.state.ended.kind, len(bench.run.history)) == (StopKind.PARTED, closed)
