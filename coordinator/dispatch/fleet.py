@@ -82,9 +82,9 @@ class Fleet:
             self.remove_worker(guests[0].identity)
         slots, joined_at = min(slots, MAX_SLOTS), now if old is None else old.joined_at
         host_stats = self._hosts.join(identity, None if old is None else old.host_stats)
-        member = Member(identity, slots, fingerprint, next(self._numberings), now, joined_at, host_stats)
-        self.members[identity] = member
-        return member.numbering
+        numbering = next(self._numberings)
+        self.members[identity] = Member(identity, slots, fingerprint, numbering, now, joined_at, host_stats)
+        return numbering
 
     def handle_departure(self, identity: str, now: float) -> None:
         """Note that a worker's token vanished."""
@@ -377,8 +377,7 @@ class Fleet:
     def _note_arrival(self, identity: str, what: Literal["joined", "back"]) -> None:
         self.event_log.add(what, identity)
         self.jobs.forgive_losses(identity)
-        words = "joined" if what == "joined" else "is back"
-        self.notes.append(Note(f"worker {identity} {words}", what, identity))
+        self.notes.append(Note(f"worker {identity} {'joined' if what == 'joined' else 'is back'}", what, identity))
 
     def _release_lost(self, member: Member, now: float, what: str) -> None:
         """Release and log a worker that is gone or silent; its host's record counts a loss of jobs."""
