@@ -41,16 +41,8 @@ from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld
 from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights
+from dreamfleet.worker.training.data import dataset
 from dreamfleet.worker.training.data.data_folder import explain_write_errors
-from dreamfleet.worker.training.data.dataset import (
-    episode_paths,
-    find_world,
-    load_arrays,
-    preprocessing_of_drives,
-    preprocessing_of_size,
-    split_held_out,
-    world_of_folder,
-)
 from dreamfleet.worker.training.data.recorded_states import compute_recorded_states
 from dreamfleet.worker.training.dream_facts import RecordedRewards, Source, describe_world, warn_of_unsure_ends
 from dreamfleet.worker.training.encode import ENCODED, latents_encoder_hash
@@ -111,9 +103,9 @@ def assemble(
     measurements = [(path, *_load_measurements(path)) for path in measured]
     vae, rnn, vae_config, rnn_config = _load_models(folder)
     configs = vae_config, rnn_config
-    paths = episode_paths(folder)
-    provenance, world, facts = _make_provenance(folder), world_of_folder(folder), None
-    preprocessing = preprocessing_of_drives(paths, vae_config.picture, world)
+    paths = dataset.episode_paths(folder)
+    provenance, world, facts = _make_provenance(folder), dataset.world_of_folder(folder), None
+    preprocessing = dataset.preprocessing_of_drives(paths, vae_config.picture, world)
     if world != OF_FIRST_WORLD:
         rewards = RecordedRewards.load(paths)
         facts = describe_world(world, rewards, rnn_config, reward, end)
@@ -162,11 +154,11 @@ def _load_models(folder: Path) -> tuple[Weights, Weights, VAEConfig, MDNRNNConfi
 
 def _make_provenance(folder: Path) -> dict[str, Any]:
     """What a bundle's manifest says of its data, the quality of its models, and the packages that trained them."""
-    paths = episode_paths(folder)
+    paths = dataset.episode_paths(folder)
     return {
         "episodes": len(paths),
-        "frames": sum(len(load_arrays(path, "reward")["reward"]) for path in paths),
-        "held_out_episodes": len(split_held_out(paths)[1]),
+        "frames": sum(len(dataset.load_arrays(path, "reward")["reward"]) for path in paths),
+        "held_out_episodes": len(dataset.split_held_out(paths)[1]),
         "quality": load_quality(folder),
         "versions": {package: package_version(package) for package in ("dreamfleet", "gymnasium", "torch")},
     }
@@ -174,7 +166,7 @@ def _make_provenance(folder: Path) -> dict[str, Any]:
 
 def _describe_drives(folder: Path, rewards: RecordedRewards, facts: WorldFacts) -> dict[str, Any]:
     """What the provenance of a world that is described says besides."""
-    drivers = Counter(str(load_arrays(path, "driver")["driver"]) for path in episode_paths(folder))
+    drivers = Counter(str(dataset.load_arrays(path, "driver")["driver"]) for path in dataset.episode_paths(folder))
     packages = sorted({"dreamfleet", "torch", *facts.packages})
     return {
         "drivers": dict(sorted(drivers.items())),
@@ -205,7 +197,7 @@ def make_manifest(
 
     `preprocessing` is that of its pictures, by default the world's of their size.
     """
-    preprocessing = preprocessing or preprocessing_of_size(vae.picture, world)
+    preprocessing = preprocessing or dataset.preprocessing_of_size(vae.picture, world)
     return BundleManifest(
         name=name,
         task=world.task,
@@ -237,7 +229,7 @@ def export_graphs(
     }
     if facts is not None:
         return parts
-    actions = find_world().world.actions
+    actions = dataset.find_world().world.actions
     assert isinstance(actions, Continuous)
     return parts | {
         POLICY: export_policy(vae, rnn, vae_config, rnn_config, actions),
@@ -255,7 +247,7 @@ def _npy(array: NDArray[Any]) -> bytes:
 def initial_latents(folder: Path) -> NDArray[np.float32]:
     """The first `mu` and `logvar` of recorded rollouts, `(N, 2, latent)`, from which dreams begin."""
     firsts = []
-    for path in episode_paths(folder, ENCODED)[:INITIAL_LATENTS]:
-        arrays = load_arrays(path, "mu", "logvar")
+    for path in dataset.episode_paths(folder, ENCODED)[:INITIAL_LATENTS]:
+        arrays = dataset.load_arrays(path, "mu", "logvar")
         firsts.append(np.stack([arrays["mu"][0], arrays["logvar"][0]]))
     return np.stack(firsts).astype(np.float32)

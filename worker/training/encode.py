@@ -19,19 +19,8 @@ from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.printable import plural
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
+from dreamfleet.worker.training.data import dataset
 from dreamfleet.worker.training.data.data_folder import explain_write_errors
-from dreamfleet.worker.training.data.dataset import (
-    check_pictures,
-    check_whole,
-    episode_paths,
-    existing_episodes,
-    find_world,
-    load_arrays,
-    load_pictures,
-    load_steps,
-    preprocessing_of_drives,
-    world_of_folder,
-)
 from dreamfleet.worker.training.train_vae import CHECKPOINT
 from dreamfleet.worker.worldmodel.export import export_encoder
 from dreamfleet.worker.worldmodel.inference import open_graph
@@ -50,20 +39,20 @@ def encode(folder: Path) -> Iterator[int]:
     config = load_config(folder / CHECKPOINT, VAEConfig)
     encode_pictures = _make_encoder(folder, config)
     vae, mirrors = encoder_hash(folder), encodes_mirrored(folder)
-    check_whole(episode_paths(folder), "picture", "preprocessing", "action", "reward", "ended")
-    check_pictures(episode_paths(folder), config.picture)
-    for path in episode_paths(folder):
+    dataset.check_whole(dataset.episode_paths(folder), "picture", "preprocessing", "action", "reward", "ended")
+    dataset.check_pictures(dataset.episode_paths(folder), config.picture)
+    for path in dataset.episode_paths(folder):
         target = folder / ENCODED / path.name
         if target.exists() and _is_current(target, vae):
             continue
-        pictures = load_pictures(path)
-        drive = load_steps(path)
+        pictures = dataset.load_pictures(path)
+        drive = dataset.load_steps(path)
         if len(drive["action"]) != len(pictures):
             raise DatasetError(
                 f"{path} holds {plural(len(pictures), 'picture')} and another number of actions; delete it"
             )
         mu, logvar = encode_pictures(pictures)
-        more: dict[str, Any] = load_arrays(path, optional=COPIED)
+        more: dict[str, Any] = dataset.load_arrays(path, optional=COPIED)
         if mirrors:
             found = encode_pictures(np.ascontiguousarray(pictures[:, :, ::-1]))
             more |= zip(("mirrored_mu", "mirrored_logvar"), found, strict=True)
@@ -84,17 +73,17 @@ def count_unencoded(folder: Path) -> int:
 def latents_encoder_hash(folder: Path) -> str:
     """The hash of a folder's encoder; `DatasetError` if its latents come from another one."""
     vae = encoder_hash(folder)
-    for path in episode_paths(folder, ENCODED):
-        if str(load_arrays(path, "vae")["vae"]) != vae:
+    for path in dataset.episode_paths(folder, ENCODED):
+        if str(dataset.load_arrays(path, "vae")["vae"]) != vae:
             raise DatasetError(f"{path} belongs to another VAE: run `dreamfleet encode --data {folder}` again")
     return vae
 
 
 def encodes_mirrored(folder: Path) -> bool:
     """Whether mirrored pictures of the folder's VAE can occur in a drive."""
-    size, world = load_config(folder / CHECKPOINT, VAEConfig).picture, world_of_folder(folder)
-    preprocessing = preprocessing_of_drives(existing_episodes(folder), size, world)
-    return preprocessing.mirrors and find_world(*world).world.mirror is not None
+    size, world = load_config(folder / CHECKPOINT, VAEConfig).picture, dataset.world_of_folder(folder)
+    preprocessing = dataset.preprocessing_of_drives(dataset.existing_episodes(folder), size, world)
+    return preprocessing.mirrors and dataset.find_world(*world).world.mirror is not None
 
 
 def encoder_hash(folder: Path) -> str:
@@ -110,7 +99,7 @@ def encoder_hash(folder: Path) -> str:
 def _is_current(target: Path, vae: str) -> bool:
     """Whether an encoded episode is readable, has the arrays of this version, and comes from this VAE."""
     try:
-        return str(load_arrays(target, "vae", "ended", "mu")["vae"]) == vae
+        return str(dataset.load_arrays(target, "vae", "ended", "mu")["vae"]) == vae
     except DatasetError:
         return False
 

@@ -14,15 +14,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.stop_signals import Stop, never_stop
-from dreamfleet.worker.training.data.dataset import (
-    POOL_EPISODES,
-    check_pictures,
-    check_whole,
-    episode_paths,
-    load_pictures,
-    picture_batches,
-    split_held_out,
-)
+from dreamfleet.worker.training.data import dataset
 from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.training.training_state import AddPoint, TrainingState, open_loss_curve
 from dreamfleet.worker.worldmodel.vae import VAE, PixelWeights
@@ -60,9 +52,9 @@ def train_vae(
     changes no bit: batches and noise depend on the seed and the update alone. `StoppedError` if `stop` asks for a stop.
     `events` is a folder for TensorBoard events.
     """
-    train, held_out = split_held_out(episode_paths(folder))
-    check_whole([*train, *held_out], "picture", "preprocessing")
-    check_pictures([*train, *held_out], layers.picture)
+    train, held_out = dataset.split_held_out(dataset.episode_paths(folder))
+    dataset.check_whole([*train, *held_out], "picture", "preprocessing")
+    dataset.check_pictures([*train, *held_out], layers.picture)
     torch.manual_seed(config.seed)
     model = VAE(layers).to(device)
     if decoder_only and continue_from is None and (new or not (folder / CHECKPOINT).exists()):
@@ -72,8 +64,10 @@ def train_vae(
     pixels = _pixel_weights(layers, progress, train, device)
     report(schedule.update, "")
     validation = held_out_pictures(held_out, CURVE_PICTURES)
-    batches = picture_batches(train, config.batch, config.seed, progress.get("pool", 0), progress.get("taken", 0))
-    epoch_pools = max(1, len(train) // POOL_EPISODES)
+    batches = dataset.picture_batches(
+        train, config.batch, config.seed, progress.get("pool", 0), progress.get("taken", 0)
+    )
+    epoch_pools = max(1, len(train) // dataset.POOL_EPISODES)
     with open_loss_curve(folder / CURVE, events, schedule.update) as point:
         while schedule.should_continue(stop):
             pool, taken, batch = next(batches)
@@ -103,10 +97,10 @@ def measure_pixels(paths: Sequence[Path]) -> dict[str, Any]:
 
     Both follow from integers alone, so that they are the same on every host.
     """
-    parts = [(len(pictures), pictures.sum(axis=0, dtype=np.int64)) for pictures in map(load_pictures, paths)]
+    parts = [(len(pictures), pictures.sum(axis=0, dtype=np.int64)) for pictures in map(dataset.load_pictures, paths)]
     count, total = sum(length for length, _ in parts), np.sum([each for _, each in parts], axis=0)
     mean = (2 * total + count) // (2 * count)
-    away = sum(int(np.abs(load_pictures(path) - mean).sum()) for path in paths)
+    away = sum(int(np.abs(dataset.load_pictures(path) - mean).sum()) for path in paths)
     deviation = away / (255 * count * mean.size)
     return {"mean": base64.b64encode(mean.astype(np.uint8).tobytes()).decode(), "deviation": deviation}
 
@@ -168,7 +162,7 @@ def held_out_pictures(held_out: Sequence[Path], most: int) -> NDArray[np.uint8]:
     """Every fifth picture of held-out episodes, `most` at most: `(N, side, side, 3)`."""
     found: list[NDArray[np.uint8]] = []
     for path in held_out:
-        found.append(load_pictures(path)[::5])
+        found.append(dataset.load_pictures(path)[::5])
         if sum(len(each) for each in found) >= most:
             break
     return np.concatenate(found)[:most]

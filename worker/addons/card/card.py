@@ -15,19 +15,7 @@ from dreamfleet.common.host.stop_signals import Stop, never_stop
 from dreamfleet.common.runs.episode_results import EpisodeResult
 from dreamfleet.common.runs.evaluation_report import EvaluationReport
 from dreamfleet.common.worlds.known_score import first_seed
-from dreamfleet.worker.addons.card.card_page import (
-    BUNDLE,
-    CONTROLLER,
-    DRIVER,
-    PAGE,
-    REPORT,
-    SCORES,
-    SCRIPT,
-    VIDEO,
-    CardContents,
-    describe_card,
-    read_install_command,
-)
+from dreamfleet.worker.addons.card import card_page
 from dreamfleet.worker.scoring.agents import Agent, make_agent, make_evaluation_spec
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_scored_task, task_of
@@ -35,7 +23,7 @@ from dreamfleet.worker.tools.video_cli import MOST_STEPS
 
 
 def write_card(
-    contents: CardContents, folder: Path, steps: int, on_step: Callable[[int], None] = lambda _steps: None,
+    contents: card_page.CardContents, folder: Path, steps: int, on_step: Callable[[int], None] = lambda _steps: None,
     stop: Stop = never_stop,
 ) -> list[str]:  # fmt: skip
     """Write the folder with a video of `steps` at most, 0: none; return the names of its files.
@@ -52,24 +40,24 @@ def write_card(
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
             raise UsageError(f"{folder} holds files: choose an empty --out")
-        controller.save(folder / CONTROLLER)
+        controller.save(folder / card_page.CONTROLLER)
         if contents.bundle is not None:
-            (folder / BUNDLE).write_bytes(read_regular(contents.bundle.path, MAX_BUNDLE))
-            _try(contents, DRIVER, lambda: _write_driver(contents, folder / DRIVER))
-        _try(contents, SCRIPT, lambda: _write_script(contents, folder))
+            (folder / card_page.BUNDLE).write_bytes(read_regular(contents.bundle.path, MAX_BUNDLE))
+            _try(contents, card_page.DRIVER, lambda: _write_driver(contents, folder / card_page.DRIVER))
+        _try(contents, card_page.SCRIPT, lambda: _write_script(contents, folder))
         if report is not None:
             from dreamfleet.worker.addons.card.score_chart import draw_scores  # matplotlib
 
-            (folder / REPORT).write_text(report.to_json() + "\n")
-            (folder / SCORES).write_bytes(draw_scores(report, contents.name))
+            (folder / card_page.REPORT).write_text(report.to_json() + "\n")
+            (folder / card_page.SCORES).write_bytes(draw_scores(report, contents.name))
         if steps:
-            _try(contents, VIDEO, lambda: _film(contents, folder / VIDEO, steps, on_step, stop))
+            _try(contents, card_page.VIDEO, lambda: _film(contents, folder / card_page.VIDEO, steps, on_step, stop))
         files = sorted(each.name for each in folder.iterdir())
-        (folder / PAGE).write_text("\n".join(describe_card(contents, files)) + "\n")
+        (folder / card_page.PAGE).write_text("\n".join(card_page.describe_card(contents, files)) + "\n")
     return sorted(each.name for each in folder.iterdir())
 
 
-def _try(contents: CardContents, name: str, write: Callable[[], None]) -> None:
+def _try(contents: card_page.CardContents, name: str, write: Callable[[], None]) -> None:
     try:
         write()
     except StoppedError:
@@ -78,7 +66,7 @@ def _try(contents: CardContents, name: str, write: Callable[[], None]) -> None:
         contents.missing[name] = str(error)
 
 
-def _write_driver(contents: CardContents, path: Path) -> None:
+def _write_driver(contents: card_page.CardContents, path: Path) -> None:
     from dreamfleet.worker.worldmodel.driver_graph import export_driver, largest_difference  # the package onnx
 
     assert contents.bundle is not None
@@ -87,7 +75,7 @@ def _write_driver(contents: CardContents, path: Path) -> None:
     contents.difference = largest_difference(contents.bundle, contents.controller, graph)
 
 
-def _write_script(contents: CardContents, folder: Path) -> None:
+def _write_script(contents: card_page.CardContents, folder: Path) -> None:
     controller, bundle = contents.controller, contents.bundle
     if bundle is not None and contents.difference is None:
         return
@@ -95,11 +83,11 @@ def _write_script(contents: CardContents, folder: Path) -> None:
     task = find_scored_task(controller.task, None) if bundle is None else task_of(bundle)
     script = task.find_standalone_script(Assignment(make_evaluation_spec(controller, bundle), bundle))
     if script is not None:
-        contents.install = read_install_command(script)
-        shutil.copyfile(script, folder / SCRIPT)
+        contents.install = card_page.read_install_command(script)
+        shutil.copyfile(script, folder / card_page.SCRIPT)
 
 
-def _film(contents: CardContents, path: Path, steps: int, on_step: Callable[[int], None], stop: Stop) -> None:
+def _film(contents: card_page.CardContents, path: Path, steps: int, on_step: Callable[[int], None], stop: Stop) -> None:
     from dreamfleet.worker.tools.recording import record, record_in_process  # PyAV
 
     agent = make_agent(contents.controller, contents.bundle)

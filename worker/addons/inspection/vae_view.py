@@ -61,20 +61,15 @@ class VAEView:
 
 def held_out_drive(folder: Path, vae_view: VAEView, config: DriveConfig) -> EncodedRollout:
     """Load the first held-out drive of a data set, `config.steps` steps at most."""
-    from dreamfleet.worker.training.data.dataset import (
-        check_pictures,
-        episode_paths,
-        find_world,
-        load_pictures,
-        load_steps,
-        split_held_out,
-        world_of_folder,
-    )
+    from dreamfleet.worker.training.data import dataset
 
-    _, (path, *_) = split_held_out(episode_paths(folder))
-    check_pictures([path], vae_view.side)
-    seen, steps = load_pictures(path)[: config.steps], load_steps(path)
+    _, (path, *_) = dataset.split_held_out(dataset.episode_paths(folder))
+    dataset.check_pictures([path], vae_view.side)
+    seen, steps = dataset.load_pictures(path)[: config.steps], dataset.load_steps(path)
     mu, logvar = vae_view.encode(seen)
     action, reward = (steps[name][: len(seen)] for name in ("action", "reward"))
-    about, opening = f"drive {path.stem}, which is held out", find_world(*world_of_folder(folder)).world.opening
+    about, opening = (
+        f"drive {path.stem}, which is held out",
+        dataset.find_world(*dataset.world_of_folder(folder)).world.opening,
+    )
     return EncodedRollout(seen, mu, logvar, action, reward.astype(np.float64), about, opening)

@@ -29,21 +29,9 @@ from dreamfleet.worker.tasks.api import Policy
 from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tasks.policy import ALL_DRIVERS, DriverPolicy
 from dreamfleet.worker.tasks.recordable import RecordableTask, TaskWithBeginnings
+from dreamfleet.worker.training.data import dataset
 from dreamfleet.worker.training.data.collect_config import CollectConfig, source_policies
 from dreamfleet.worker.training.data.data_folder import explain_folder_errors, explain_write_errors
-from dreamfleet.worker.training.data.dataset import (
-    REMEDY,
-    check_pictures,
-    episode_path,
-    existing_episodes,
-    find_own_world,
-    find_world,
-    kind_of,
-    load_arrays,
-    load_pictures,
-    load_steps,
-    preprocessing_of_size,
-)
 from dreamfleet.worker.training.data.pilot import Pilot
 
 Environment = gymnasium.Env[Any, Any]
@@ -55,7 +43,7 @@ _kept: tuple[Environment, Finalize] | None = None  # in a process of the pool
 
 def missing_numbers(folder: Path, config: CollectConfig) -> list[int]:
     """The numbers of the episodes that are still missing."""
-    return [number for number in range(config.episodes) if not episode_path(folder, number).exists()]
+    return [number for number in range(config.episodes) if not dataset.episode_path(folder, number).exists()]
 
 
 def collect(
@@ -69,8 +57,8 @@ def collect(
     does. When closed early, it waits until running drives are written. `DreamfleetError` for a drive that fails, ends
     its process, or makes no step for `stall` seconds.
     """
-    preprocessing = preprocessing_of_size(config.picture, world)
-    check_pictures(existing_episodes(folder), config.picture, world, preprocessing)
+    preprocessing = dataset.preprocessing_of_size(config.picture, world)
+    dataset.check_pictures(dataset.existing_episodes(folder), config.picture, world, preprocessing)
     for pilot in pilots:
         pilot.check(preprocessing.name, world)
     numbers = missing_numbers(folder, config)
@@ -98,7 +86,7 @@ def _collect_one(folder: Path, config: CollectConfig, pilots: Sequence[Pilot], w
         raise
     except BaseException as error:  # a simulator may raise anything, also `SystemExit`
         raise DreamfleetError(f"drive {number} failed: {failure_of(error).text}") from error
-    path = episode_path(folder, number)
+    path = dataset.episode_path(folder, number)
     with explain_write_errors(path), atomic_write(path) as file:
         write_episode(file, arrays)
     return len(arrays["action"])
@@ -139,9 +127,9 @@ def drive_episode(
 ) -> dict[str, NDArray[Any]]:  # fmt: skip
     """Drive an episode of T steps: `picture` (T, side, side, 3) before each `action` (T, A), then `reward` (T,)."""
     random = np.random.default_rng([config.seed, number])
-    task = find_world(*world)
+    task = dataset.find_world(*world)
     name, policy = _driver(task, config, number, pilots, random)
-    preprocessing = preprocessing_of_size(config.picture, world)
+    preprocessing = dataset.preprocessing_of_size(config.picture, world)
     begin = _begin_hook(task, config.anywhere, random)
     episode_config = EpisodeConfig(int(random.integers(2**20, 2**31)), config.steps, config.patience)
     rollout = Rollout(name, preprocessing.name, world)
@@ -183,7 +171,7 @@ def import_rollouts(folder: Path, rollouts: Sequence[Path]) -> Iterator[int]:
 
     `DatasetError` before any copy if the drives, the data set's included, have different worlds or preprocessings.
     """
-    there = existing_episodes(folder)
+    there = dataset.existing_episodes(folder)
     _check_one_kind(folder, [*there, *rollouts])
     sizes = {path.stat().st_size for path in rollouts if path.exists()}
     known = {hash_file(path) for path in there if path.stat().st_size in sizes}
@@ -196,7 +184,7 @@ def import_rollouts(folder: Path, rollouts: Sequence[Path]) -> Iterator[int]:
         with (
             explain_folder_errors(folder),
             path.open("rb") as source,
-            atomic_write(episode_path(folder, number)) as target,
+            atomic_write(dataset.episode_path(folder, number)) as target,
         ):
             shutil.copyfileobj(source, target)
         number += 1
@@ -205,23 +193,23 @@ def import_rollouts(folder: Path, rollouts: Sequence[Path]) -> Iterator[int]:
 
 def _check_one_kind(folder: Path, drives: Sequence[Path]) -> None:
     """`DatasetError` names two drives, or the folder and a drive, that are of two worlds or have other pictures."""
-    kinds = {path: kind_of(path) for path in drives}
-    own = find_own_world(folder)
+    kinds = {path: dataset.kind_of(path) for path in drives}
+    own = dataset.find_own_world(folder)
     worlds = ({own: folder} if own else {}) | {world: path for path, (world, _) in kinds.items()}
     if len(worlds) > 1:
         found = " and ".join(f"of {world} ({path})" for world, path in worlds.items())
-        raise DatasetError(f"a data set has one world, and these are {found}; {REMEDY}")
+        raise DatasetError(f"a data set has one world, and these are {found}; {dataset.REMEDY}")
     pictures = {name: path for path, (_, name) in kinds.items()}
     if len(pictures) > 1:
         found = " and ".join(f"{name!r} ({path})" for name, path in pictures.items())
-        raise DatasetError(f"a data set's pictures must be of one kind, and these are {found}; {REMEDY}")
+        raise DatasetError(f"a data set's pictures must be of one kind, and these are {found}; {dataset.REMEDY}")
 
 
 def _check_drive(path: Path) -> int:
     """Check a drive, which an untrusted worker may have sent, and return its number of frames."""
-    frames = len(load_pictures(path))
-    load_arrays(path, "driver")
-    if len(load_steps(path)["reward"]) != frames:
+    frames = len(dataset.load_pictures(path))
+    dataset.load_arrays(path, "driver")
+    if len(dataset.load_steps(path)["reward"]) != frames:
         raise DatasetError(
             f"{path} holds {plural(frames, 'picture')} and another number of actions or rewards; delete it"
         )

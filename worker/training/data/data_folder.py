@@ -15,15 +15,7 @@ from dreamfleet.common.files.atomic_write import atomic_write, reporting_unwrita
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld
 from dreamfleet.worker.tasks.recordable import TaskWithOptions
 from dreamfleet.worker.tasks.registry import find_task
-from dreamfleet.worker.training.data.dataset import (
-    BEGUN,
-    REMEDY,
-    existing_episodes,
-    find_own_world,
-    find_world,
-    load_begun,
-    world_of_folder,
-)
+from dreamfleet.worker.training.data import dataset
 from dreamfleet.worker.training.presets import find_preset
 
 
@@ -32,8 +24,8 @@ def store_preset(folder: Path, preset: str, seed: int, world: DataWorld = OF_FIR
 
     `DatasetError` if it cannot be written.
     """
-    path = folder / BEGUN
-    if not path.exists() and not existing_episodes(folder):
+    path = folder / dataset.BEGUN
+    if not path.exists() and not dataset.existing_episodes(folder):
         own = {name: value for name, value in world._asdict().items() if value} if world != OF_FIRST_WORLD else {}
         with explain_folder_errors(folder), atomic_write(path) as file:
             file.write(json.dumps({"preset": preset, "seed": seed, **own}).encode())
@@ -41,18 +33,18 @@ def store_preset(folder: Path, preset: str, seed: int, world: DataWorld = OF_FIR
 
 def load_preset(folder: Path) -> str | None:
     """The preset of a data set; `None` for old data sets, and for those without `collect`."""
-    begun = load_begun(folder)
+    begun = dataset.load_begun(folder)
     try:
         return check_preset("training", begun["preset"]) if begun else None
     except UsageError as error:
         raise DatasetError(
-            f"{folder / BEGUN} names no preset ({error}); write the one that collected the data into it"
+            f"{folder / dataset.BEGUN} names no preset ({error}); write the one that collected the data into it"
         ) from error
 
 
 def check_seed(folder: Path, seed: int) -> None:
     """`UsageError` if the data set was begun with another seed; old data sets have stored none."""
-    own = load_begun(folder).get("seed", seed)
+    own = dataset.load_begun(folder).get("seed", seed)
     if own != seed:
         raise UsageError(
             f"{folder} was begun with --seed {own}, and this is --seed {seed}: give --seed {own} to continue it, or "
@@ -65,7 +57,7 @@ def resolve_world(folder: Path, task: str | None, arguments: Mapping[str, Any]) 
 
     Without any it is the data set's own. `UsageError` if the data set is of another, or the task has no such options.
     """
-    own = find_own_world(folder)
+    own = dataset.find_own_world(folder)
     if task is None and not arguments:
         return own or OF_FIRST_WORLD
     name, options = task or (own or OF_FIRST_WORLD).task, ""
@@ -76,7 +68,9 @@ def resolve_world(folder: Path, task: str | None, arguments: Mapping[str, Any]) 
         raise UsageError(f"task {name} has no options: omit {', '.join(f'--{each}' for each in arguments)}")
     given = DataWorld(name, options)
     if own not in (None, given):
-        raise UsageError(f"{folder} holds data of {own}, and this is {given}: a data set has one world; {REMEDY}")
+        raise UsageError(
+            f"{folder} holds data of {own}, and this is {given}: a data set has one world; {dataset.REMEDY}"
+        )
     return given
 
 
@@ -85,8 +79,8 @@ def resolve_preset(folder: Path, given: str | None, world: DataWorld | None = No
 
     `UsageError` if the data set was begun with another, or the preset is of another world.
     """
-    world = world or world_of_folder(folder)
-    default = find_world(*world).world.preset
+    world = world or dataset.world_of_folder(folder)
+    default = dataset.find_world(*world).world.preset
     chosen, own = check_preset("training", given or default), load_preset(folder)
     if own not in (None, chosen):
         reason = f"--preset {given} is another" if given else f"without --preset it would be {default}"
@@ -104,7 +98,7 @@ FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 def explain_folder_errors(folder: Path) -> AbstractContextManager[None]:
     """Raise an `OSError` as a `DatasetError` that asks for another data folder than `folder`."""
-    return reporting_unwritable_folder(folder, REMEDY)
+    return reporting_unwritable_folder(folder, dataset.REMEDY)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ import torch
 
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import DatasetError
-from dreamfleet.worker.addons.importing.torch_files import array_of, read_torch_file
+from dreamfleet.worker.addons.importing.checkpoints import array_of, read_torch_file
 
 LEGACY = [False, True]
 
