@@ -329,7 +329,7 @@ def test_what_cannot_be_gone_on_from_is_refused_before_anything_is_driven(tmp_pa
         (("--run-flags", "--generations 1 --sigma0 -1"), "--sigma0"),
         (("--vae-flags", "--updates 0"), "--vae-flags"),
         (("--bundle-flags", "--reward luck"), "'luck'"),
-        (("--bundle-flags", "--end 7"), "--bundle-flags"),
+        (("--bundle-flags", "--end 7"), "7.0"),
         (("--vae-flags", "--set error_factor=4", "--mdnrnn-flags", "--set z_factor=0"), "--mdnrnn-flags"),
         (("--local", 0), "--listen"),
         (("--go-on", "--run-flags", "--generations 1 --variant feedback=last"), "--go-on"),

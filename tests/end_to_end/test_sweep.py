@@ -13,8 +13,10 @@ import time
 import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.experiments.sweep import runner
 from tests.support import tasks
+from tests.support.access import until
 from tests.support.processes import DEADLINE, ROOT, call_here
 
 FLAGS = ("--population", 4, "--episodes", 1, "--evaluate-every", 0, "--parallel", 3, "--workers", 2)
@@ -88,7 +90,8 @@ def test_of_two_that_begin_at_once_one_goes_on_and_ctrl_c_ends_it_in_order(proce
     refused = next(each for each in _until_one_ended(both) if each.popen.poll() is not None)
     assert refused.finish()[0] == 2
     (served,) = (each for each in both if each is not refused)
-    served.wait_for("running")
+    begun = [processes.runs / f"toys-seed{seed}" / JOURNAL for seed in (1, 2)]
+    until(lambda: all(each.exists() for each in begun), "both runs begin")
     copy = start(processes, processes.runs, "--resume", "toys")
     assert copy.finish()[0] == 2
     assert str(processes.runs) in copy.last_line()
