@@ -45,6 +45,7 @@ def environment(cache, root=ROOT):
         "PYTHONPATH": os.pathsep.join(filter(None, (str(root), os.environ.get("PYTHONPATH")))),
         "DREAMFLEET_CACHE": str(cache),
         "PYTHONUNBUFFERED": "1",
+        "PYTHONFAULTHANDLER": "1",  # a crash in native code leaves the stacks of its threads
         "COLUMNS": "120",
     }
 
