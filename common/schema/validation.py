@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
+from threading import Lock
 from types import NoneType, UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -53,12 +55,26 @@ class Packed(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True
     """
 
 
+_first_use = Lock()
+_used: set[Any] = set()
+
+
 def convert(kind: type[T], plain: Any) -> T:
     """Build what msgspec alone checks, such as a message; `MalformedError` with its sentence if that does not fit."""
+    if kind not in _used:
+        _prepare(kind)
     try:
         return msgspec.convert(plain, kind, builtin_types=(bytes,))  # else it takes base64 for bytes
     except (msgspec.ValidationError, UnicodeEncodeError, AttributeError) as error:
         raise MalformedError(truncate(str(error), MAX_SENTENCE), SCHEMA) from error
+
+
+def _prepare(kind: Any) -> None:
+    """Let msgspec describe a type and those in it, in one thread: a second one would read a half-built description."""
+    with _first_use:
+        with suppress(msgspec.ValidationError):
+            msgspec.convert(None, kind)
+        _used.add(kind)
 
 
 def from_plain(kind: type[T], plain: Any) -> T:

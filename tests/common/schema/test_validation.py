@@ -1,5 +1,7 @@
 """What msgspec checks of documents, and what it leaves open: fields, numbers and texts that only JSON has."""
 
+import subprocess
+import sys
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, get_args
 
@@ -112,3 +114,33 @@ def test_msgspec_knows_each_default_of_a_message_again():
         default = each.default
         is_small = isinstance(default, int) and 0 <= default <= 256
         assert is_small or any(default is known for known in (None, "", b"", (), *get_args(each.type))), each
+
+
+FIRST_USES = """
+import sys
+from dataclasses import make_dataclass
+from threading import Barrier, Thread
+from dreamfleet.common.schema.validation import Packed, convert
+
+def use(kind, together):
+    together.wait()
+    convert(kind, {"inner": {"one": 1, "two": "2"}, "list": []})
+
+sys.setswitchinterval(1e-6)
+for _ in range(100):
+    class Inner(Packed, frozen=True):
+        one: int
+        two: str
+        three: tuple[int, ...] = ()
+    kind = make_dataclass("Kind", [("inner", Inner), ("list", list[Inner])])
+    threads = [Thread(target=use, args=(kind, together)) for together in [Barrier(4)] * 4]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join()
+"""
+
+
+def test_threads_that_use_a_type_first_at_the_same_time_wait_for_its_description():
+    """By itself msgspec reads a half-built one then, which ends the process by a segmentation fault."""
+    assert subprocess.run([sys.executable, "-c", FIRST_USES], check=False).returncode == 0
