@@ -137,7 +137,7 @@ def test_a_worker_a_mean_and_an_earlier_generations_are_chosen_and_what_is_gone_
         with tab(browser) as other:
             other.goto(started.address)
             other.locator("[data-part=view]").scroll_into_view_if_needed()
-            say(other, "1 live views are open, and no more")
+            say(other, "1 live views")
         page.wait_for_selector(f"{WHOM} option[value^=generation]", state="attached")
         run.worker.popen.kill()
         say(page, "has left run test")

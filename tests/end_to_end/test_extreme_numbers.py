@@ -17,7 +17,7 @@ def test_extreme_numbers_pause_the_run_with_their_reason_and_it_can_be_continued
     processes.worker("--task", task)
     coordinator.wait_for_event("paused")
     status = processes.status()
-    assert (status["state"], status["pauses"]) == ("paused", [PauseKind.FAILED_JOB])
+    assert (status["state"], status["pauses"]) == ("paused", [PauseKind.NO_ABLE_HOST])
     assert processes.call("stop", "test", "--connect", processes.endpoint)[0] == 0
     assert coordinator.finish()[0] == 130
     again = processes.resume()

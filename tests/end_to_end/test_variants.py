@@ -88,7 +88,7 @@ def test_a_run_begins_from_a_controller_that_drives_alike_alone(processes, rando
     two = ("coordinator", "--run", "two")
     for flags, datum in (
         ((*two, "--init", "one", "--variant", "decide_every=4"), '{"pedals": "one"}'),
-        ((*two, "--init", "tiny", "--bundle", "tiny", "--variant", "pedals=one"), "--init"),
+        ((*two, "--init", "tiny", "--bundle", "tiny", "--variant", "pedals=one"), "--variant"),
         (("coordinator", "--from", "one", "--variant", "feedback=last"), "--variant"),
         ((*two, "--variant", "pedal=one"), "actions, "),
         ((*two, "--task", "gym:CartPole-v1", "--variant", "pedals=one"), "--variant"),
