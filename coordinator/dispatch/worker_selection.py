@@ -287,7 +287,7 @@ def assign_jobs(
             continue
         awaited = drain_background and pending.is_background
         name = selection.pick_for_background(eligible) if awaited else selection.pick(eligible)
-        if name is None and not pending.avoided_workers and not pending.is_proof:
+        if name is None and eligible is shares and not pending.is_proof:  # else the faster one may not be given it
             passed_over.append(digest)
             break  # the jobs after it wait for a faster worker too
         name = name or min(eligible, key=lambda name: shares[name])
