@@ -97,7 +97,7 @@ class Fleet:
     def over(self):
         """Whether the run has ended; one that was paused by a failing job is resumed, as somebody would."""
         lines, self._heard = self.coordinator.lines[self._heard :], len(self.coordinator.lines)
-        if any(line.tells("paused") for line in lines):
+        if any(line.is_event("paused") for line in lines):
             self.later(0.5, self.processes.call, "resume", "run", "--connect", self.processes.endpoint)
         code = self.coordinator.popen.poll()
         if code is None or code == 0:

@@ -219,14 +219,14 @@ def outcome(processes, generations):
         return computed, lost, run.events(), Counter(each.cause for each in run.failures())
 
 
-def is_told(story, happened, restarts):
+def is_reported(story, happened, restarts):
     """For each kind of fault: whether the story has at least as many events as there were faults."""
-    told = Counter(each.what for each in story)
-    gone = told["lost"] + told["silent"] + told["left"]
+    counts = Counter(each.what for each in story)
+    gone = counts["lost"] + counts["silent"] + counts["left"]
     cuts = happened["link"] + happened["links"] + happened["worker"] + happened["leave"] + happened["stopped worker"]
     return {
         "coordinator": len({each.incarnation for each in story}) >= 1 + happened["coordinator"] + happened["full disk"],
-        "clock step": told["clock"] >= happened["clock step"] - happened["coordinator"],
+        "clock step": counts["clock"] >= happened["clock step"] - happened["coordinator"],
         "workers": gone >= cuts // 2,
         "restarts": sum(restarts.values()) >= happened["coordinator"] + happened["worker"],
     }
@@ -263,11 +263,11 @@ def main():
         "faults": dict(happened),
         "restarts": dict(restarts),
         "worker_exits": exits,
-        "told": is_told(found[2], happened, restarts),
+        "reported": is_reported(found[2], happened, restarts),
         "seconds": round(time.monotonic() - started),
     }
     print(json.dumps(figures))
-    return 0 if not different and not found[1] and not any(exits) and all(figures["told"].values()) else 1
+    return 0 if not different and not found[1] and not any(exits) and all(figures["reported"].values()) else 1
 
 
 if __name__ == "__main__":

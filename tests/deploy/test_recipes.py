@@ -161,7 +161,7 @@ def test_one_command_begins_a_run_and_goes_on_with_it(processes, random_bundle):
     }  # fmt: skip
     words = [str(DEPLOY / "begin.sh"), "night", *map(str, settings)]
     with started(words, env=surroundings, stderr=subprocess.PIPE, text=True) as begun:
-        while not Line(begun.stderr.readline()).tells("begin", incarnation=1):
+        while not Line(begun.stderr.readline()).is_event("begin", incarnation=1):
             assert begun.poll() is None
         begun.send_signal(signal.SIGTERM)
         assert begun.wait(DEADLINE) == 130
@@ -170,8 +170,8 @@ def test_one_command_begins_a_run_and_goes_on_with_it(processes, random_bundle):
         processes.worker("--run", "night", "--task", tasks.TOY, "--exit-when-done")
         said = [Line(each) for each in again.stderr]
         assert again.wait(DEADLINE) == 0, said
-    assert any(line.tells("begin", incarnation=2) for line in said)
-    assert any(line.tells("generation", number=2) for line in said)
+    assert any(line.is_event("begin", incarnation=2) for line in said)
+    assert any(line.is_event("generation", number=2) for line in said)
 
 
 def test_what_a_recipe_is_and_how_it_is_tested_stands_in_the_table():

@@ -73,7 +73,7 @@ class Line(str):
         said.facts = facts
         return said
 
-    def tells(self, event, **facts):
+    def is_event(self, event, **facts):
         """Whether it is the record of this event with these facts."""
         return {"event": event, **facts}.items() <= self.facts.items()
 
@@ -109,11 +109,11 @@ class Process(VerbProcess):
 
     def events(self, event, **facts):
         """The log's records of this event with these facts so far, the oldest first."""
-        return [line.facts for line in self.lines if line.tells(event, **facts)]
+        return [line.facts for line in self.lines if line.is_event(event, **facts)]
 
     def wait_for_event(self, event, times=1, timeout=DEADLINE, **facts):
         """Block until the log has `times` new records of this event with these facts; returns the last of them."""
-        return self._wait(lambda line: line.tells(event, **facts), f"{event} {facts}", times, timeout).facts
+        return self._wait(lambda line: line.is_event(event, **facts), f"{event} {facts}", times, timeout).facts
 
     def wait_for_report(self, name, timeout=DEADLINE):
         return super().wait_for_report(name, timeout)

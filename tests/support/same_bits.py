@@ -1,4 +1,4 @@
-"""What a run came to, whoever scored it; and a short run in the dream."""
+"""The outcome of a run, and a short run in the dream."""
 
 from typing import NamedTuple
 
